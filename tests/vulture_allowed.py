@@ -147,3 +147,4 @@ Barometer, Thermometer  # contracts of drivers, which packages of others fill
 _.reason_code  # compared with the rest of its dataclass
 attr  # the first argument of a Bokeh callback
 _.beside_heading  # read by the template of a report page
+(_.status_code, _.in_contact, _.has_report)  # of HTTP answers, written as a whole

@@ -55,13 +55,14 @@ def _words(most_bytes: int) -> AfterValidator:
 
 
 class OnBehalf(Section):
-    """For whom a program sends a request: the page for its viewers, a bridge for other systems.
+    """For whom a program sends a request: the service for the viewers of its page and for programs
+    with a token, a bridge for other systems.
 
     The hold accepts the account only from a process of its own user on the socket file. From
     anybody the role only lowers the sender's own.
     """
 
-    via: Literal["page", "bridge"]
+    via: Literal["page", "token", "bridge"]
     # name with which the person logged in; empty: without a login
     account: Annotated[str, _words(WHO_BYTES - 8)] = ""
     name: Annotated[str, _words(WHO_BYTES - 8)] = ""  # who it is, for people, if there is no login
@@ -320,7 +321,7 @@ def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
     if on_behalf is None:
         return Sender(peer.who, peer.role, account=peer.who, session=peer.session)
     role = min(peer.role, on_behalf.role, key=_RANK.__getitem__)
-    from_person = on_behalf.via == "page"
+    from_person = on_behalf.via != "bridge"
     if (
         not peer.is_own_user
     ):  # anybody could state this: it proves no login, and the peer sends it for somebody else

@@ -19,7 +19,8 @@ from membrane_ctrl.config.port import OpcuaConfig
 from membrane_ctrl.doors.names import TABLE, Door, Value
 from membrane_ctrl.doors.opcua_server import AnonymousClients, BridgeServer, NamedClients, caller
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.service.access import Action, KnownUser, known_users
+from membrane_ctrl.service.access import Action
+from membrane_ctrl.service.accounts import KnownUser, known_users
 
 _UNITS = "http://www.opcfoundation.org/UA/units/un/cefact"
 _OPEN = [ua.SecurityPolicyType.NoSecurity]

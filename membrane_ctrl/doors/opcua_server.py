@@ -29,7 +29,7 @@ from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import nodeid_from_binary, struct_from_binary
 
 from membrane_ctrl.control_port.endpoint import Turns
-from membrane_ctrl.service.access import KnownUser, known_user
+from membrane_ctrl.service.accounts import KnownUser, known_user
 
 _CALL = ua.NodeId(ua.ObjectIds.CallRequest_Encoding_DefaultBinary)
 _ACTIVATE = ua.NodeId(ua.ObjectIds.ActivateSessionRequest_Encoding_DefaultBinary)

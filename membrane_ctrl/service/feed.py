@@ -170,15 +170,19 @@ class HoldFeed:
         """Send a request on a connection of its own; returns what became of it."""
         what = str(request["do"]).replace("_", " ")
         try:
-            with connected(self._where, notice=lambda _: None) as client:
-                if client.greeting["run"] != self.seen.name:
-                    return Outcome.failed(
-                        what, "not sent: another run is listening now; look again"
-                    )
-                answer = client.ask(**request)
+            answer = self.ask_hold(request)
         except errors.CommandError as error:
             return Outcome.failed(what, "; ".join(error.lines))
         return Outcome.from_answer(what, answer)
+
+    def ask_hold(self, request: Message) -> Message:
+        """Send a request on a connection of its own; returns the hold's answer. Raises DeviceError
+        without an answer.
+        """
+        with connected(self._where, notice=lambda _: None) as client:
+            if client.greeting["run"] != self.seen.name:
+                raise errors.DeviceError("not sent: another run is listening now; look again")
+            return client.ask(**request)
 
     def _follow(self) -> None:
         while not self._ending.is_set():

@@ -16,22 +16,23 @@ from __future__ import annotations
 import asyncio
 import html
 import math
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import Literal
 from urllib.parse import parse_qs
 
+from starlette.middleware.sessions import SessionMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from membrane_ctrl.service.access import COOKIE, DEVICE_COOKIE, Accounts, WebUser
+from membrane_ctrl.service.access import WebUser
+from membrane_ctrl.service.accounts import DEVICE_COOKIE, SESSION_COOKIE, SESSION_S, Accounts
 from membrane_ctrl.service.connections import ConnectionGuard
 from membrane_ctrl.service.public_address import PublicAddress, host_name
+from membrane_ctrl.service.tokens import TokenBook
 from membrane_ctrl.service.work_pools import KNOWN_PASSWORDS, STRANGERS_PASSWORDS, PoolFullError
 
 LOGIN_PATH = "/login"
-STOP_PATH = "/stop"
 _FORM_BYTES_MAX = 4096
 _FORM_S = 5.0
 _TARGET_LENGTH_MAX = 4096
@@ -39,7 +40,6 @@ _HEAD_BYTES_MAX = 32_768
 _BUSY_S = 1.0  # until passwords that wait have been evaluated
 
 Header = tuple[bytes, bytes]
-StopHandler = Callable[[WebUser, str], Awaitable[tuple[HTTPStatus, str]]]
 
 _LOGIN = """<!doctype html><html lang="en"><meta charset="utf-8"><title>membrane_ctrl</title>
 <meta name="viewport" content="width=device-width,initial-scale=1">
@@ -59,6 +59,7 @@ _HEADERS: tuple[Header, ...] = (
     # origin `null`
     (b"referrer-policy", b"same-origin"),
 )
+_BEARER = "bearer "
 _CLOSE: Header = (b"connection", b"close")
 
 
@@ -71,21 +72,21 @@ class Refusal:
 
 
 class LoginMiddleware:
-    """ASGI middleware: lets in whoever has a session, and asks the others for the link or a
-    password.
+    """ASGI middleware: lets in whoever has a session or a token, and asks the others for the link
+    or a password. `with_login` puts the framework's sessions around it.
 
     `scope["membrane_user"]` holds the `WebUser` of a request that was let in.
 
     Parameters
     ----------
     app
-        The page.
+        The page and the interface for programs.
     accounts
         Who may log in.
     address
         Where browsers find the page.
-    stop
-        Stops the hold of a name. `POST /stop` is answered here, before the page's own routes.
+    tokens
+        The tokens of programs.
     guard
         The connections of strangers.
     """
@@ -95,10 +96,10 @@ class LoginMiddleware:
         app: ASGIApp,
         accounts: Accounts,
         address: PublicAddress,
-        stop: StopHandler | None = None,
+        tokens: TokenBook | None = None,
         guard: ConnectionGuard | None = None,
     ) -> None:
-        self._app, self._accounts, self._address, self._stop = app, accounts, address, stop
+        self._app, self._accounts, self._address, self._tokens = app, accounts, address, tokens
         self._guard = guard or ConnectionGuard()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -111,7 +112,14 @@ class LoginMiddleware:
             await self._refuse(scope, send, refusal)
             return
         cookies = _cookies(headers)
-        user = self._accounts.user(cookies.get(COOKIE, ""))
+        user = self._accounts.user_of_session(scope["session"])
+        authorization = headers.get("authorization", "")
+        if user is None and authorization.lower().startswith(_BEARER):
+            user = self._find_program(authorization[len(_BEARER) :].strip())
+            if user is None:
+                refusal = Refusal(HTTPStatus.UNAUTHORIZED, "unknown or revoked token")
+                await self._refuse(scope, send, refusal)
+                return
         if user is not None:
             self._guard.mark_known(scope.get("client"))
         if scope.get("method") == "POST" and self._address.path_inside(scope["path"]) == LOGIN_PATH:
@@ -145,6 +153,10 @@ class LoginMiddleware:
             return Refusal(HTTPStatus.FORBIDDEN, "a request of another page")
         return None
 
+    def _find_program(self, token: str) -> WebUser | None:
+        """Return whose token this is; None if nobody's."""
+        return None if self._tokens is None else self._tokens.find_user(token)
+
     def _inside(self, scope: Scope, user: WebUser) -> Scope:
         """Return the request as the page sees it: its path without the prefix, and the prefix from
         the settings.
@@ -168,12 +180,6 @@ class LoginMiddleware:
             scope["path"] == ""
         ):  # the address without its last slash: links of the page are relative to it
             await _answer(scope, send, HTTPStatus.PERMANENT_REDIRECT, "", [self._location()])
-        elif (
-            self._stop is not None and scope["path"] == STOP_PATH and scope.get("method") == "POST"
-        ):
-            query = parse_qs(scope["query_string"].decode("latin-1"))
-            status, text = await self._stop(scope["membrane_user"], query.get("hold", [""])[0])
-            await _answer(scope, send, status, f"{text}\n", [_text_type("plain")])
         else:
             await self._app(scope, receive, _guarded(send))
 
@@ -224,8 +230,12 @@ class LoginMiddleware:
 
     async def _admit(self, scope: Scope, send: Send, user: WebUser, device: str) -> None:
         """Give a user a session and show the page."""
-        cookies = [(b"set-cookie", each.encode()) for each in self._accounts.cookies(user, device)]
-        await _answer(scope, send, HTTPStatus.SEE_OTHER, "", [self._location(), *cookies])
+        scope["session"].update(self._accounts.make_session(user))
+        headers = [self._location()]
+        cookie = self._accounts.device_cookie(user, device)
+        if cookie is not None:
+            headers.append((b"set-cookie", cookie.encode()))
+        await _answer(scope, send, HTTPStatus.SEE_OTHER, "", headers)
 
     async def _show_form(
         self, scope: Scope, send: Send, status: HTTPStatus, text: str, retry_s: float | None = None
@@ -253,6 +263,28 @@ class LoginMiddleware:
             if name == b"x-forwarded-for"
         ]
         return self._address.source_of(peer, forwarded)
+
+
+def with_login(
+    app: ASGIApp,
+    accounts: Accounts,
+    address: PublicAddress,
+    session_key: str,
+    tokens: TokenBook | None = None,
+    guard: ConnectionGuard | None = None,
+) -> ASGIApp:
+    """Return an application that only those who are let in can reach; parameters as for
+    `LoginMiddleware`, and the key with which sessions are signed.
+    """
+    return SessionMiddleware(
+        LoginMiddleware(app, accounts, address, tokens, guard),
+        session_key,
+        session_cookie=SESSION_COOKIE,
+        max_age=SESSION_S,
+        path=address.prefix or "/",
+        same_site="strict",
+        https_only=address.secure,
+    )
 
 
 def malformation(scope: Scope) -> Refusal | None:

@@ -120,7 +120,7 @@ def add_user(
     role: Annotated[str, typer.Argument(metavar="ROLE", help="read, operate or tune.")],
 ) -> None:
     """Add a user to a users file, or change one; asks for the password."""
-    from membrane_ctrl.service.access import known_user, known_users
+    from membrane_ctrl.service.accounts import known_user, known_users
 
     text = files.read_text(file) if file.exists() else ""
     found = known_users(text, str(file))
@@ -130,3 +130,40 @@ def add_user(
         files.write_text_atomic(file, "".join(f"{each.line()}\n" for each in found.values()))
         file.chmod(0o600)
     print(f"{file}: {len(found)} users", file=sys.stderr)
+
+
+token_app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Tokens for programs, which send them as `Authorization: Bearer TOKEN`.",
+)
+app.add_typer(token_app, name="token")
+
+
+@token_app.command("add")
+def add(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the program.")],
+    role: Annotated[str, typer.Argument(metavar="ROLE", help="read, operate or tune.")],
+) -> None:
+    """Make a token and print it; it cannot be shown again."""
+    from membrane_ctrl.service.tokens import add_token, tokens_file
+
+    print(add_token(tokens_file(), name, role))
+
+
+@token_app.command("list")
+def list_tokens() -> None:
+    """List the tokens of this user's services: name and role."""
+    from membrane_ctrl.service.tokens import read_tokens, tokens_file
+
+    for each in read_tokens(tokens_file()):
+        print(f"{each.name}  {each.role}")
+
+
+@token_app.command("revoke")
+def revoke(name: Annotated[str, typer.Argument(metavar="NAME")]) -> None:
+    """Remove a token: the next request with it is refused."""
+    from membrane_ctrl.service.tokens import revoke_token, tokens_file
+
+    revoke_token(tokens_file(), name)
+    print(f"{name}: revoked", file=sys.stderr)

@@ -20,17 +20,20 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.ctl import Where
-from membrane_ctrl.control_port.service_link import link_key, publish_address
+from membrane_ctrl.control_port.service_link import link_key, publish_address, read_or_make_secret
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.service.access import Accounts, WebUser, known_users
+from membrane_ctrl.service.access import WebUser
+from membrane_ctrl.service.accounts import Accounts, known_users
+from membrane_ctrl.service.api import make_api
 from membrane_ctrl.service.connections import ConnectionGuard, GuardedHttp, raise_file_limit
 from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.service.feed import SIGNALS, SPANS_S, HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.idle_end import IdleEnd
-from membrane_ctrl.service.login import LoginMiddleware
+from membrane_ctrl.service.login import with_login
+from membrane_ctrl.service.path_dispatch import PathDispatch
 from membrane_ctrl.service.public_address import public_address
-from membrane_ctrl.service.stop_route import stop_handler
+from membrane_ctrl.service.tokens import TokenBook, tokens_file
 from membrane_ctrl.service.work_pools import REPORT_FILES, PoolFullError
 from membrane_ctrl.web.figures import REMOVED
 from membrane_ctrl.web.page import SharedViews, WebPage
@@ -114,14 +117,16 @@ def _run_server(
 ) -> None:
     address = public_address(page)
     guard = ConnectionGuard(raise_file_limit())
+    session_key = read_or_make_secret("session-key")
     build_inside = app.build_middleware_stack
 
     def build_middleware_stack() -> ASGIApp:
         """Put the login outside of everything: NiceGUI adds middlewares later than we could with
         `add_middleware`.
         """
-        inside = HangUp(build_inside())
-        return LoginMiddleware(inside, accounts, address, stop_handler(feeds), guard)
+        inside = HangUp(PathDispatch(make_api(feeds, starter), build_inside()))
+        tokens = TokenBook(tokens_file())
+        return with_login(inside, accounts, address, session_key, tokens, guard)
 
     app.build_middleware_stack = build_middleware_stack  # type: ignore[method-assign]
     idle_end = IdleEnd(idle_s, time.monotonic())

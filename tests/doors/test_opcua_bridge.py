@@ -23,7 +23,7 @@ from membrane_ctrl.config.port import DoorsConfig, OpcuaConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.doors import opcua
 from membrane_ctrl.model.errors import DeviceError, InputError
-from membrane_ctrl.service.access import known_user
+from membrane_ctrl.service.accounts import known_user
 from tests.doors.test_doors import door_with, seen_hold
 from tests.worlds.free_port import free_port
 from tests.worlds.port_run import PortRun, port_run

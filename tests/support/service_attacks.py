@@ -34,7 +34,7 @@ class Routes:
     # what a viewer fetches every second
     live: str = "chart?hold=&signal=error_um&span=1+min&utc=true"
     history: str = "chart?hold=&signal={signal}&span={span}&utc={utc}"
-    stop: str = "stop?hold="
+    stop: str = "api/safety/stop?hold="
     socket: str = "_nicegui_ws/socket.io/?EIO=4&transport=websocket"
 
 

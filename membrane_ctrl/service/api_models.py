@@ -1,0 +1,156 @@
+"""What the interface for programs answers and takes, as schemas (OpenAPI).
+
+The client (`api_client`) checks the answers of another service against the same models: it may be
+another program, a damaged service or a hostile one.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from membrane_ctrl.control_port.protocol import TEXT_BYTES, WHY_BYTES, Action
+from membrane_ctrl.controller.commands import Role
+
+_Line = Annotated[str, Field(max_length=2000)]
+_Lines = Annotated[list[_Line], Field(max_length=500)]
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+
+class Reading(_Answer):
+    """A device's last read-back."""
+
+    pump_fraction: float | None
+    vent_fraction: float | None
+    time_utc: _Line
+
+
+class RunEndAnswer(_Answer):
+    """How the newest run ended."""
+
+    run: _Line
+    kind: _Line
+    ended_utc: _Line
+    cause: _Line
+    remedy: _Line
+    lines: _Lines
+    read_back: Reading | None
+
+
+class StateAnswer(_Answer):
+    """A hold at one moment; without a hold, how the newest run ended."""
+
+    hold: _Line
+    run: _Line
+    state: _Line
+    in_contact: bool
+    reason: _Line
+    alarms: _Lines
+    locks: _Lines
+    error_um: float | None
+    status: dict[str, Any]
+    """The status of the control socket (docs/reference/control-port.md); empty without contact."""
+    ended: RunEndAnswer | None
+
+
+class StatesAnswer(_Answer):
+    """All holds of the service."""
+
+    holds: Annotated[list[StateAnswer], Field(max_length=200)]
+
+
+class SignalAnswer(_Answer):
+    """A published signal: a row of the table of telemetry columns, with its present value."""
+
+    name: _Line
+    title: _Line
+    description: _Line
+    unit: _Line
+    value: float | None
+
+
+class HistoryAnswer(_Answer):
+    """A signal over time: least, mean and largest value of windows; null interrupts the line."""
+
+    signal: _Line
+    unit: _Line
+    utc_s: list[float]
+    low: list[float | None]
+    mean: list[float | None]
+    high: list[float | None]
+
+
+class RunAnswer(_Answer):
+    """A run of the folder."""
+
+    name: _Line
+    started_utc: _Line
+    duration_s: float | None
+    std_um: float | None
+    faults: int
+    exit: _Line
+    ended_in: _Line
+    has_report: bool
+
+
+class ConfigurationAnswer(_Answer):
+    """What a hold can be started with."""
+
+    name: _Line
+    has_devices: bool
+    problem: _Line
+
+
+class UserAnswer(_Answer):
+    """Who asks."""
+
+    name: _Line
+    role: Role
+    via: _Line
+
+
+class CommandBody(BaseModel):
+    """A command of `ctl` (docs/reference/control-port.md)."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    do: Action
+    value: float | None = None
+    text: Annotated[str, Field(max_length=TEXT_BYTES)] = ""
+    loop: dict[str, bool | float] | None = None
+    pump: dict[str, Any] | None = None
+    shape_time_constant_s: float | None = None
+    why: Annotated[str, Field(max_length=WHY_BYTES)] = ""
+    take_over: bool = False
+
+
+class SafetyBody(BaseModel):
+    """What may be added to a safety command."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    text: Annotated[str, Field(max_length=TEXT_BYTES)] = ""
+    why: Annotated[str, Field(max_length=WHY_BYTES)] = ""
+
+
+class StartBody(BaseModel):
+    """A hold to start."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    configuration: Annotated[str, Field(max_length=64)]
+    standby: bool = False
+    clear_faults: bool = False
+
+
+class CommandAnswer(_Answer):
+    """What became of a command: `text` is one line for people."""
+
+    done: bool
+    text: _Line
+    answer: dict[str, Any] = {}
+    """The hold's answer, such as the word of a lock."""
