@@ -5,10 +5,11 @@ along its rows. Their frequencies stay, their amplitudes and phases are others i
 bands are as wide as the fringes, a fit without them takes them for shape. What it leaves shows
 them elsewhere: a wave found there joins the fit's unknowns.
 
-`Bands` are those of frames of crossed fringes. `without_bands` finds them in the phase steps of a
-set: frame k shows g_k m_k, with the gain g_k = 1 + a_k w of its rows, of which level, swing and
-phase leave P (g m), P the projector off their columns. Least squares over the bins give a; the
-panel's harmonics and a flickering lamp are unknowns, too.
+`Bands` are those of frames of crossed fringes, one after the other. `band_removal.remove_bands`
+finds them in the phase steps of a set: frame k shows g_k m_k, with the gain g_k = 1 + a_k w of its
+rows, of which level, swing and phase leave P (g m), P the projector off their columns. Least
+squares over the bins give a; the panel's harmonics and a flickering lamp are unknowns, too.
+Derivation: section 9 of docs/explanation/metrology.md.
 """
 
 import numpy as np
@@ -17,91 +18,113 @@ from scipy import ndimage
 from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
-_LEAST_BANDS = 4  # in the picture: maps of the terms follow wider ones
-# Power over the median around it and of all, of one frame and of the mean over some. Without bands
-# it reaches 22 in a thousand frames. Of bands as wide as the fringes a fit leaves little: 100 where
-# figures were 13
-# sigma off.
-_CLEAR, _CLEAR_MEAN = 30.0, 25.0
-# of four tenths of a mean, which five frames make: weak bands, too, spoil the light they give
+# Widths and frequencies are in bands over the picture's height.
+_LEAST_BANDS = 4  # maps of the light's terms follow wider ones
+WAVE_WIDTH = 2  # width of one wave in the spectrum: two of them closer than this are the same
+_AROUND = 10  # half width of the range that a wave's power is compared with
+MOST_BANDS = 6  # waves: the power of pulses falls as the fourth power of their harmonics
+FREQUENCIES_PER_BIN = 16  # steps of the frequency in one band over the picture's height
+
+# Least power of a wave over the median around it and of all: of one frame, and of the mean over
+# some. Without bands it reaches 22 in a thousand frames. A fit leaves little of bands as wide as
+# the fringes: 100 where figures were 13 sigma off.
+_CLEAR = 30.0
+_CLEAR_MEAN = 25.0
+# The same of the mean after five frames, which has reached 40 % of its value: weak bands, too,
+# spoil the light that the first frames give.
 _CLEAR_FIRST = 6.0
 _KEEPS = 0.9  # share of the former frames in the mean
-WAVE_WIDTH, _AROUND = (
-    2,
-    10,
-)  # bands in the picture: a wave's own width, and where the power around it is judged
-MOST_BANDS = 6  # waves: the power of pulses falls as the fourth power of their harmonics
-FREQUENCIES_PER_BIN = 16  # steps of the frequency in one over the picture's height
 
 
 class Bands:
-    """The waves along the rows that frames have shown; `row` (n,) is that of each bin."""
+    """The waves along the rows that frames have shown.
+
+    Parameters
+    ----------
+    row : (n,) int array
+        Row of each bin.
+
+    Attributes
+    ----------
+    waves : (2 k, R) array
+        Cosines, then sines, of the k known frequencies in the picture's R rows.
+    """
 
     def __init__(self, row: IntArray) -> None:
         self.row = row
         self._place = np.arange(int(row.max()) + 1) - row.mean()
-        self._rad_per_row = self._told = np.zeros(0)
-        self.waves = np.zeros((0, self._place.size), np.float32)  # (2 k, R): cosines, sines
-        self._steady, self._mean = (
-            np.ones(row.size, np.float32),
-            np.zeros(self._place.size // 2 * FREQUENCIES_PER_BIN),
-        )
+        self._rad_per_row = np.zeros(0)
+        # Of each frequency, the sum of squares by which `refine` has determined it.
+        self._determined = np.zeros(0)
+        self.waves = np.zeros((0, self._place.size), np.float32)
+        self._steady = np.ones(row.size, np.float32)
+        # Mean over the frames of the clear power of each frequency.
+        self._mean = np.zeros(self._place.size // 2 * FREQUENCIES_PER_BIN)
 
     def gain(self, amplitudes: FloatArray) -> Singles:
-        """What multiplies the light of each bin (n,)."""
-        return (
-            np.asarray(1 + amplitudes @ self.waves, np.float32)[self.row]
-            if amplitudes.size
-            else self._steady
-        )
+        """What multiplies the light of each bin (n,), from the amplitudes (2 k,) of the waves."""
+        if not amplitudes.size:
+            return self._steady
+        gain_of_rows = np.asarray(1 + amplitudes @ self.waves, np.float32)
+        return gain_of_rows[self.row]
 
     def sums(self, values: Singles) -> FloatArray:
-        """Over each row (k, R), of values (k, n)."""
+        """Sums (k, R) over each row, of values (k, n)."""
         return np.asarray(sums_by(self.row, values, self._place.size))
 
     def search(self, rows: FloatArray) -> bool:
-        """Whether sums (2, R), as of `fitted_waves`, of a fit with
-        all known waves show one more.
+        """Whether the rest of a fit with all known waves shows one more, which is then added.
+
+        `rows` (2, R) are the sums of `fitted_waves`.
         """
         clear = clear_power(row_power(rows[0]), _LEAST_BANDS)
         self._mean = _KEEPS * self._mean + (1 - _KEEPS) * clear
         return self._add(np.maximum(clear / _CLEAR, self._mean / _CLEAR_MEAN))
 
     def recall(self) -> bool:
-        """Whether the first frames show one more wave together."""
+        """Whether the first frames show one more wave together, which is then added."""
         return self._add(self._mean / _CLEAR_FIRST)
 
     def _add(self, clear: FloatArray) -> bool:
-        """Whether the clearest wave is one, by its power over what it must have,
-        and was not known.
+        """Add the clearest wave if it is clear enough and not known; returns whether it was added.
+
+        `clear` is the power of each frequency over what a wave must have.
         """
-        found_rad = 2 * np.pi * int(np.argmax(clear)) / (FREQUENCIES_PER_BIN * self._place.size)
-        apart = np.abs(self._rad_per_row - found_rad) > 2 * np.pi * WAVE_WIDTH / self._place.size
-        if len(apart) == MOST_BANDS or not apart.all() or np.max(clear) < 1:
+        rows = self._place.size
+        found_rad = 2 * np.pi * int(np.argmax(clear)) / (FREQUENCIES_PER_BIN * rows)
+        is_other = np.abs(self._rad_per_row - found_rad) > 2 * np.pi * WAVE_WIDTH / rows
+        if len(self._rad_per_row) == MOST_BANDS or not is_other.all() or np.max(clear) < 1:
             return False
         self._mean *= 0
-        self._rad_per_row, self._told = (
-            np.append(self._rad_per_row, found_rad),
-            np.append(self._told, 0.0),
-        )
+        self._rad_per_row = np.append(self._rad_per_row, found_rad)
+        self._determined = np.append(self._determined, 0.0)
         self._draw()
         return True
 
     def keep(self, count: int) -> None:
-        """Forget all waves but the first `count` of 2 k rows."""
-        self._rad_per_row, self._told = self._rad_per_row[: count // 2], self._told[: count // 2]
+        """Forget all waves but those of the first `count` of 2 k amplitudes."""
+        self._rad_per_row = self._rad_per_row[: count // 2]
+        self._determined = self._determined[: count // 2]
         self._draw()
 
     def refine(self, rows: FloatArray, amplitudes: FloatArray) -> None:
-        """Turn the frequencies to what sums (2, R), as of `fitted_waves`, of the fit with these
-        amplitudes show.
+        """Move the frequencies by one step of least squares on what a fit leaves.
+
+        Parameters
+        ----------
+        rows : (2, R) array
+            Sums of `fitted_waves`, of the fit with these amplitudes.
+        amplitudes : (2 k,) array
+            Amplitudes of the cosines and sines.
         """
-        (cosine, sine), (along, across) = np.split(self.waves, 2), np.split(amplitudes[:, None], 2)
-        change = self._place * (across * cosine - along * sine)
-        self._told = (
-            self._told + change**2 @ rows[1]
-        )  # of all frames: where bands vanish, the frequency stays
-        self._rad_per_row = self._rad_per_row + change @ rows[0] / np.maximum(self._told, 1e-30)
+        cosine, sine = np.split(self.waves, 2)
+        of_cosine, of_sine = np.split(amplitudes[:, None], 2)
+        # Change of the waves per rad of change of a row's phase: d/df (a cos f r + b sin f r).
+        change = self._place * (of_sine * cosine - of_cosine * sine)
+        # Over all frames: the frequency stays if bands vanish.
+        self._determined = self._determined + change**2 @ rows[1]
+        step_rad = change @ rows[0] / np.maximum(self._determined, 1e-30)
+        self._rad_per_row = self._rad_per_row + step_rad
         self._draw()
 
     def _draw(self) -> None:
@@ -109,34 +132,45 @@ class Bands:
 
 
 def row_power(rows: FloatArray) -> FloatArray:
-    """Of the frequencies along the rows (..., R)."""
-    return (
-        np.abs(
-            np.fft.rfft(rows, FREQUENCIES_PER_BIN * rows.shape[-1])[
-                ..., : rows.shape[-1] // 2 * FREQUENCIES_PER_BIN
-            ]
-        )
-        ** 2
-    )
+    """Power (..., frequencies) along the rows (..., R).
+
+    Frequencies are in steps of 1 / `FREQUENCIES_PER_BIN` bands over the R rows, up to R // 2 bands.
+    """
+    count = rows.shape[-1]
+    spectrum = np.fft.rfft(rows, FREQUENCIES_PER_BIN * count)
+    return np.abs(spectrum[..., : count // 2 * FREQUENCIES_PER_BIN]) ** 2
 
 
 def fitted_waves(waves: FloatArray | Singles, rows: FloatArray) -> FloatArray:
-    """Amplitudes (2 k,) of waves (2 k, R) from sums (2, R) of light times rest, and of light
-    squared.
+    """Least squares for the amplitudes of waves along the rows.
+
+    Parameters
+    ----------
+    waves : (2 k, R) array
+        Cosines and sines.
+    rows : (2, R) array
+        Sums over the bins of each row: of light times rest, and of light squared.
+
+    Returns
+    -------
+    (2 k,) array
+        Amplitudes, relative to the light.
     """
-    return np.asarray(np.linalg.solve((waves * rows[1]) @ waves.T, waves @ rows[0]), float)
+    normal = (waves * rows[1]) @ waves.T
+    return np.asarray(np.linalg.solve(normal, waves @ rows[0]), float)
 
 
 def clear_power(power: FloatArray, least_bands: int) -> FloatArray:
-    """Power over the median around it and of all; 0 for waves that are too wide."""
+    """Power over the median around it and of all; 0 for waves wider than 1 / `least_bands`."""
     means = power.reshape(-1, FREQUENCIES_PER_BIN).mean(axis=1)
-    around = np.maximum(ndimage.median_filter(means, 2 * _AROUND + 1), np.median(means) + 1e-30)
+    of_neighbours = ndimage.median_filter(means, 2 * _AROUND + 1)
+    around = np.maximum(of_neighbours, np.median(means) + 1e-30)
     clear = power / np.repeat(around, FREQUENCIES_PER_BIN)
     clear[: least_bands * FREQUENCIES_PER_BIN] = 0.0
     return np.asarray(clear)
 
 
 def row_waves(rad_per_row: FloatArray, place: FloatArray | IntArray) -> FloatArray:
-    """Cosines, then sines (2 k, rows) of k frequencies."""
-    turns = rad_per_row[:, None] * place
-    return np.concatenate([np.cos(turns), np.sin(turns)])
+    """Cosines, then sines (2 k, rows), of k frequencies at these rows."""
+    phase_rad = rad_per_row[:, None] * place
+    return np.concatenate([np.cos(phase_rad), np.sin(phase_rad)])

@@ -1,4 +1,7 @@
-"""Backlight bands found in the steps of one set, and divided out of its frames."""
+"""Backlight bands found in the steps of one set, and divided out of its frames.
+
+Derivation: section 9 of docs/explanation/metrology.md.
+"""
 
 from dataclasses import replace
 
@@ -19,181 +22,266 @@ from membrane_ctrl.metrology.phase.full_decoder import CONTRAST_SHARE
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
-_FEWEST_STEPS, _DARKEST = 4, 0.2  # three leave nothing; no row is darker, over its mean
-# power over that around it, in the mean over an axis' steps; without bands it is 10 at most
+_FEWEST_STEPS = 4  # three leave no rest
+_DARKEST = 0.2  # least light of a row over its mean
+# Least power of a wave over that around it, in the mean over an axis' steps; 10 at most without
+# bands.
 _CLEAR_STEPS = 20.0
-_FEWEST_BINS, _ENOUGH_BINS = 1_000, 15_000  # fewer show nothing, more only cost time
-_TURNS = 3  # the last one changes the largest bands by a thousandth
-# share of the largest eigenvalue below which amplitudes are not determined, and stay
+_FEWEST_BINS = 1_000
+_ENOUGH_BINS = 15_000  # more only cost time
+_LEAST_SWING_PERCENTILE = 95  # the swing that `CONTRAST_SHARE` refers to
+_HARMONICS = (2, 3, 4)  # of the fringes: the response of panel and camera
+_TURNS = 3  # of a fit; the last one changes the largest bands by a thousandth
+# Share of the largest eigenvalue below which amplitudes are not determined, and stay.
 _SINGULAR = 1e-3
 _NONE = np.zeros(0)
-_GREAT = 0.05  # a twentieth of what bands do is left: 0.1 µm of figure from here on
-# of bands, times the share that they leave of the rest: those of wrong pictures explain little
+# Largest bands of a set that is not degraded: 5 % of their effect is left, which is 0.1 µm of
+# figure at this size.
+_GREAT = 0.05
+# Limit of the bands' amplitude times the share of the rest that they do not explain: bands that
+# wrong pictures seem to have explain little.
 _UNEXPLAINED = 0.05
 
 
 class _Steps:
-    """The phase steps of one axis in n bins, and the bands of the N frames."""
+    """The phase steps of one axis in n bins, and the bands of the N frames.
+
+    Attributes
+    ----------
+    rad_per_row : (k,) array
+        Frequencies of the bands.
+    amplitudes : (N, 2 k) array
+        Of cosines and sines in each frame, over the light.
+    unexplained : float
+        Largest amplitude times the share of the rest that the bands do not explain.
+    """
 
     def __init__(
         self, stack: FrameStack, binned: Binned, frames: list[int], index: IntArray
     ) -> None:
-        self.frames, (_, rows, columns) = frames, binned.means.shape
-        self._row, self._rows, self._shifts_rad = (
-            index // columns,
-            np.arange(rows),
-            stack.shifts_rad(frames),
-        )
+        self.frames = frames
+        _, rows, columns = binned.means.shape
+        self._row = index // columns
+        self._rows = np.arange(rows)
+        self._shifts_rad = stack.shifts_rad(frames)
         self._seen = binned.means[frames].reshape(len(frames), -1)[:, index]
-        self._design, self._inverse = stack.design(frames), np.linalg.pinv(stack.design(frames))
-        self.unexplained, self.rad_per_row, self.amplitudes = 0.0, _NONE, np.zeros((len(frames), 0))
+        self._design = stack.design(frames)
+        self._inverse = np.linalg.pinv(stack.design(frames))
+        self.unexplained = 0.0
+        self.rad_per_row = _NONE
+        self.amplitudes = np.zeros((len(frames), 0))
         self._fit()
-        self._first = max(float(np.sum(self._rest**2)), 1e-30)
+        self._first_squares = max(float(np.sum(self._rest**2)), 1e-30)
 
     def gain(self, place: FloatArray | IntArray) -> FloatArray:
         """Of the light of rows (N, R)."""
         return np.maximum(1 + self.amplitudes @ row_waves(self.rad_per_row, place), _DARKEST)
 
     def _fit(self) -> None:
-        """Level and phasor of each bin, what they show, and what they leave, without the bands."""
+        """Fit level and phasor of each bin to the light without the present bands.
+
+        `_parts` (3, n) are level, cosine and sine; `_shown` (N, n) is what they show, `_lit` the
+        same over the gain, `_rest` what they leave.
+        """
         gain = self.gain(self._rows)[:, self._row]
         self._parts = self._inverse @ (self._seen / gain)
         self._shown = self._design @ self._parts
-        self._rest, self._lit = self._seen / gain - self._shown, self._shown / gain
+        self._rest = self._seen / gain - self._shown
+        self._lit = self._shown / gain
 
     def _sums(self, values: FloatArray) -> FloatArray:
         """Over each row (N, R), of values (N, n)."""
         return np.asarray(sums_by(self._row, values, self._rows.size))
 
     def left(self) -> FloatArray:
-        """Power of the frequencies along the rows in what the steps leave, weighed with their
-        light.
+        """Power of each frequency along the rows in what the steps leave, weighed with their light;
+        the mean over the steps.
         """
-        return np.asarray(
-            row_power(self._sums((self._rest - self._others) * self._shown)).mean(axis=0)
-        )
+        sums = self._sums((self._rest - self._others) * self._shown)
+        return np.asarray(row_power(sums).mean(axis=0))
 
     def brighter(self, other: "_Steps") -> FloatArray:
-        """Sums (2, R), as in `fitted_waves`, of the light by which the other axis differs."""
-        level, theirs = self._parts[0], other._parts[0]
-        theirs = theirs * (level @ level / (theirs @ level))
-        return self._sums(np.stack([level * (theirs - level), level**2]))
+        """Sums (2, R) of `fitted_waves` for the light by which the other axis differs."""
+        level = self._parts[0]
+        level_of_other = other._parts[0]
+        scale = level @ level / (level_of_other @ level)
+        difference = level_of_other * scale - level
+        return self._sums(np.stack([level * difference, level**2]))
 
     def along(self) -> float:
         """1 if the fringes are along the rows, 0 if they cross them many times."""
-        return float(
-            np.sum(np.hypot(*self._sums(self._parts[1:]))) / np.sum(np.hypot(*self._parts[1:]))
-        )
+        phasors = self._parts[1:]
+        of_rows = np.sum(np.hypot(*self._sums(phasors)))
+        of_bins = np.sum(np.hypot(*phasors))
+        return float(of_rows / of_bins)
 
     def solve(self, rad_per_row: FloatArray) -> float:
-        """Fit the amplitudes of waves along the rows, with harmonics and flicker; returns
-        `unexplained`.
+        """Fit the amplitudes of waves along the rows; returns `unexplained`.
+
+        The other unknowns, whose part of the rest is then known, are the flicker of each frame and
+        the amplitudes of the fringes' harmonics.
         """
-        count, waves = len(self.frames), row_waves(rad_per_row, self._rows)
-        off, every = (
-            np.eye(count) - self._design @ self._inverse,
-            np.vstack([waves, np.ones(self._rows.size)]),
-        )
-        self.rad_per_row, self.amplitudes = rad_per_row, np.zeros((count, len(waves)))
-        for _ in range(_TURNS if len(waves) else 1):
+        count = len(self.frames)
+        waves = row_waves(rad_per_row, self._rows)
+        steady = np.ones(self._rows.size)
+        off = np.eye(count) - self._design @ self._inverse  # the projector P
+        self.rad_per_row = rad_per_row
+        self.amplitudes = np.zeros((count, len(waves)))
+        turns = _TURNS if len(waves) else 1
+        for _ in range(turns):
             self._fit()
-            psi_rad = np.arctan2(self._parts[2], self._parts[1]) + self._shifts_rad[:, None]
-            bent = off @ np.stack(
-                [np.hypot(*self._parts[1:]) * np.cos(n * psi_rad) for n in (2, 3, 4)]
-            )  # (3, N, n)
-            both = np.array(
-                [off[k][:, None] * self._sums(self._lit[k] * self._lit) for k in range(count)]
+            harmonics = self._free_harmonics(off)
+            of_frames, of_harmonics = self._solve_unknowns(
+                off, np.vstack([waves, steady]), harmonics
             )
-            matrix = np.einsum("jkr,pr,qr->jpkq", both, every, every).reshape(
-                2 * (count * len(every),)
-            )
-            aside = np.array(
-                [self._sums(self._lit * one) @ every.T for one in (*bent, self._rest)]
-            ).reshape(4, -1)
-            flat = bent.reshape(3, -1)
-            matrix = np.block([[matrix, aside[:3].T], [aside[:3], flat @ flat.T]])
-            right = np.append(aside[3], flat @ self._rest.ravel())
-            scale = np.sqrt(
-                np.maximum(np.diag(matrix), 1e-12 * np.diag(matrix).max())
-            )  # what vanishes is no unknown
-            found = (
-                np.linalg.pinv(matrix / np.outer(scale, scale), _SINGULAR, hermitian=True)
-                @ (right / scale)
-                / scale
-            )
-            lamps = found[:-3].reshape(count, -1)
-            self.amplitudes += lamps[:, :-1]
-            self._others = off @ (lamps[:, -1:] * self._lit) + np.tensordot(found[-3:], bent, 1)
+            self.amplitudes += of_frames[:, :-1]
+            flicker = of_frames[:, -1:]
+            self._others = off @ (flicker * self._lit) + np.tensordot(of_harmonics, harmonics, 1)
         self._fit()
-        self.unexplained = float(
-            np.abs(self.amplitudes).max(initial=0.0) * np.sum(self._rest**2) / self._first
-        )
+        share_left = np.sum(self._rest**2) / self._first_squares
+        self.unexplained = float(np.abs(self.amplitudes).max(initial=0.0) * share_left)
         return self.unexplained
+
+    def _free_harmonics(self, off: FloatArray) -> FloatArray:
+        """What the model of level and phasor leaves of the fringes' harmonics (h, N, n)."""
+        swing = np.hypot(*self._parts[1:])
+        psi_rad = np.arctan2(self._parts[2], self._parts[1]) + self._shifts_rad[:, None]
+        return off @ np.stack([swing * np.cos(n * psi_rad) for n in _HARMONICS])
+
+    def _solve_unknowns(
+        self, off: FloatArray, waves: FloatArray, harmonics: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Least squares for the waves of each frame, and for the harmonics.
+
+        Frame k leaves sum_j P_kj g_j m_j, so that the rows of the normal matrix need only the sums
+        over each picture row of P_kj m_k m_j.
+
+        Parameters
+        ----------
+        off : (N, N) array
+            P.
+        waves : (w, R) array
+            Along the rows.
+        harmonics : (h, N, n) array
+            As `_free_harmonics` gives them.
+
+        Returns
+        -------
+        of_frames, of_harmonics : (N, w) and (h,) arrays
+        """
+        count = len(self.frames)
+        unknowns_of_frames = count * len(waves)
+
+        # Waves by waves, by harmonics and by the rest; harmonics by harmonics and by the rest.
+        products = np.array(
+            [off[k][:, None] * self._sums(self._lit[k] * self._lit) for k in range(count)]
+        )
+        matrix = np.einsum("jkr,pr,qr->jpkq", products, waves, waves)
+        matrix = matrix.reshape(unknowns_of_frames, unknowns_of_frames)
+        by_waves = np.array(
+            [self._sums(self._lit * one) @ waves.T for one in (*harmonics, self._rest)]
+        ).reshape(len(harmonics) + 1, -1)
+        flat = harmonics.reshape(len(harmonics), -1)
+        matrix = np.block([[matrix, by_waves[:-1].T], [by_waves[:-1], flat @ flat.T]])
+        right = np.append(by_waves[-1], flat @ self._rest.ravel())
+
+        # Scaled to a unit diagonal; an unknown without any effect stays 0.
+        diagonal = np.diag(matrix)
+        scale = np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
+        inverse = np.linalg.pinv(matrix / np.outer(scale, scale), _SINGULAR, hermitian=True)
+        found = inverse @ (right / scale) / scale
+        return found[:unknowns_of_frames].reshape(count, -1), found[unknowns_of_frames:]
 
 
 def remove_bands(
     stack: FrameStack, binned: Binned, known: FloatArray = _NONE
 ) -> tuple[FrameStack, Binned, FloatArray]:
-    """A set with the gain of its rows known, its bins without bands, and the bands' frequencies,
-    `known` the first.
+    """Find the bands of a set and divide them out.
 
-    Unchanged where no bands are seen, and where an axis has three steps, which leave nothing that
-    shows them.
+    Parameters
+    ----------
+    stack, binned : FrameStack, Binned
+        The set, and its frames as means over bins.
+    known : (k,) array
+        Frequencies to begin with, rad per row of bins.
+
+    Returns
+    -------
+    stack : FrameStack
+        The set with the gain of its rows.
+    binned : Binned
+        The bins without bands.
+    rad_per_row : (k,) array
+        The bands' frequencies, `known` the first. All are unchanged, and these empty, where no
+        bands are seen, and where an axis has three steps, which leave nothing that shows them.
     """
     axes = [[k for k in stack.sinusoids(axis) if k not in stack.unusable] for axis in AXES]
-    if (
-        min(map(len, axes)) < _FEWEST_STEPS
-        or (index := _with_fringes(binned, axes)).size < _FEWEST_BINS
-    ):
+    if min(map(len, axes)) < _FEWEST_STEPS:
         return stack, binned, _NONE
-    x, y = steps = [_Steps(stack, binned, one, index) for one in axes]
-    (across, other), rows = sorted(steps, key=_Steps.along), np.arange(binned.means.shape[1])
-    across.solve(known)  # fringes along the rows look like bands
-    while (
-        found := _add_frequency(across.rad_per_row, across.left(), rows)
-    ).size > across.rad_per_row.size:
+    index = _with_fringes(binned, axes)
+    if index.size < _FEWEST_BINS:
+        return stack, binned, _NONE
+
+    # Frequencies are searched in the axis whose fringes cross the rows: fringes along the rows look
+    # like bands.
+    x = _Steps(stack, binned, axes[0], index)
+    y = _Steps(stack, binned, axes[1], index)
+    across, other = sorted([x, y], key=_Steps.along)
+    rows = np.arange(binned.means.shape[1])
+    across.solve(known)
+    while True:
+        found = _add_frequency(across.rad_per_row, across.left(), rows)
+        if found.size == across.rad_per_row.size:
+            break
         across.solve(found)
     if not found.size or max(across.unexplained, other.solve(found)) > _UNEXPLAINED:
         return stack, binned, _NONE
-    y.amplitudes += fitted_waves(
-        row_waves(found, rows), x.brighter(y)
-    )  # else the film seems to move, see `evidence`
-    place = np.arange(stack.size_px[0]) / binned.bin_px - (1 - 1 / binned.bin_px) / 2
-    gain, means = np.ones((len(stack.patterns), place.size)), binned.means.copy()
-    for one in steps:
-        gain[one.frames] = one.gain(place)
-        means[one.frames] /= one.gain(rows)[..., None].astype(np.float32)
+
+    # Bands common to all steps of an axis bend none of its phases, but in the light of the other
+    # axis the film would seem to move (`frame_evidence.estimate_light_and_film`).
+    y.amplitudes += fitted_waves(row_waves(found, rows), x.brighter(y))
+
+    # Bins and rows of pixels are divided by the gain.
+    first_row = (1 - 1 / binned.bin_px) / 2
+    pixel_rows = np.arange(stack.size_px[0]) / binned.bin_px - first_row  # in bins
+    gain = np.ones((len(stack.patterns), pixel_rows.size))
+    means = binned.means.copy()
+    for steps in (x, y):
+        gain[steps.frames] = steps.gain(pixel_rows)
+        means[steps.frames] /= steps.gain(rows)[..., None].astype(np.float32)
     return replace(stack, gain=gain), replace(binned, means=means), found
 
 
 def describe_bands(gain: FloatArray | None) -> str:
     """Why a set with such gains (frames, rows) is degraded; empty if it is not."""
-    most = 0.0 if gain is None else float(np.abs(gain - 1).max())
-    return f"bands of {most:.0%} of the light along the rows: expose for whole backlight pulses" * (
-        most > _GREAT
-    )
+    if gain is None:
+        return ""
+    most = float(np.abs(gain - 1).max())
+    if most <= _GREAT:
+        return ""
+    return f"bands of {most:.0%} of the light along the rows: expose for whole backlight pulses"
 
 
 def _add_frequency(rad_per_row: FloatArray, power: FloatArray, rows: IntArray) -> FloatArray:
-    """Frequencies, with one more if the power shows a wave that is none of them."""
+    """Frequencies (k,) or (k + 1,): one more if the power shows a wave that is none of them."""
     clear = clear_power(power, 1)
-    peak = np.argmax(
-        power * (np.abs(np.arange(clear.size) - np.argmax(clear)) <= FREQUENCIES_PER_BIN)
-    )
+    if len(rad_per_row) == MOST_BANDS or np.max(clear) < _CLEAR_STEPS:
+        return rad_per_row
+    # The clearest band, and within it the frequency with most power.
+    is_near = np.abs(np.arange(clear.size) - np.argmax(clear)) <= FREQUENCIES_PER_BIN
+    peak = np.argmax(power * is_near)
     found_rad = 2 * np.pi * int(peak) / (FREQUENCIES_PER_BIN * rows.size)
-    known = (
-        len(rad_per_row) == MOST_BANDS
-        or (np.abs(rad_per_row - found_rad) < 2 * np.pi * WAVE_WIDTH / rows.size).any()
-    )
-    return (
-        rad_per_row if known or np.max(clear) < _CLEAR_STEPS else np.append(rad_per_row, found_rad)
-    )
+    is_known = np.abs(rad_per_row - found_rad) < 2 * np.pi * WAVE_WIDTH / rows.size
+    if is_known.any():
+        return rad_per_row
+    return np.append(rad_per_row, found_rad)
 
 
 def _with_fringes(binned: Binned, axes: list[list[int]]) -> IntArray:
     """Bins (n,), enough of those in which both axes swing and nothing is saturated."""
     swing = np.minimum(*(np.ptp(binned.means[frames], axis=0) for frames in axes))
-    seen = (swing > CONTRAST_SHARE * np.percentile(swing, 95)) & ~binned.saturated[
-        [*axes[0], *axes[1]]
-    ].any(axis=0)
-    return np.flatnonzero(seen)[:: max(1, np.count_nonzero(seen) // _ENOUGH_BINS)]
+    least_swing = CONTRAST_SHARE * np.percentile(swing, _LEAST_SWING_PERCENTILE)
+    saturated = binned.saturated[[*axes[0], *axes[1]]].any(axis=0)
+    usable = (swing > least_swing) & ~saturated
+    every = max(1, np.count_nonzero(usable) // _ENOUGH_BINS)
+    return np.flatnonzero(usable)[::every]

@@ -1,5 +1,4 @@
-"""What the usable frames show of each bin: light, fringes, wrapped phase, and where the pattern is
-seen.
+"""Light, fringe contrast, wrapped phase and mask of each bin, from the usable frames of a set.
 
 The light of a bin has three estimates, the mean of the x fringes, that of the y fringes, and white
 minus black; the fringes' swing likewise. The median of three is right when one of them is wrong,
@@ -18,6 +17,7 @@ from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 _LEAST_SWING_ADU = 1.0  # less than a rounding step is no fringe
+_BRIGHTEST_PERCENTILE = 95  # the swing that `CONTRAST_SHARE` refers to
 
 
 class NoFigureError(Exception):
@@ -26,13 +26,27 @@ class NoFigureError(Exception):
 
 @dataclass(frozen=True)
 class BinView:
-    """Arrays over the bins, (rows, columns) each."""
+    """What the usable frames show of each bin.
 
-    used: tuple[list[int], list[int]]  # the sinusoids of x and y that the phases are made of
-    phase_rad: FloatArray  # (2, rows, columns): wrapped phase of x and y
-    swing_adu: FloatArray  # (2, rows, columns): fringe amplitude
-    light: FloatArray  # brightness, in units of the fringes' mean
-    mask: BoolArray  # bins that see the pattern in the mirror
+    Attributes
+    ----------
+    used : two lists of int
+        The sinusoids of x and y that the phases are made of.
+    phase_rad : (2, rows, columns) array
+        Wrapped phase of x and y (eq. 1).
+    swing_adu : (2, rows, columns) array
+        Fringe amplitude.
+    light : (rows, columns) array
+        Brightness, in units of the fringes' mean.
+    mask : (rows, columns) bool array
+        Bins that see the pattern in the mirror.
+    """
+
+    used: tuple[list[int], list[int]]
+    phase_rad: FloatArray
+    swing_adu: FloatArray
+    light: FloatArray
+    mask: BoolArray
 
 
 def combine_frames(
@@ -40,12 +54,29 @@ def combine_frames(
 ) -> BinView:
     """Combine the frames that are not excluded.
 
-    `estimate` (rows, columns) is the light that another set saw, the third estimate of a set
-    without white and black. Raises NoFigureError if an axis has fewer than three usable steps, or
-    if there are no fringes.
+    Parameters
+    ----------
+    stack, binned : FrameStack, Binned
+        The set, and its frames as means over bins.
+    excluded : collection of int
+        Frames that do not belong to the set.
+    estimate : (rows, columns) array, optional
+        Light that another set saw: the third estimate of a set without white and black.
+
+    Returns
+    -------
+    BinView
+
+    Raises
+    ------
+    NoFigureError
+        An axis has fewer than three usable steps, or there are no fringes.
     """
     used = tuple([k for k in stack.sinusoids(axis) if k not in excluded] for axis in AXES)
-    light, swing, phase, saturated = [], [], [], np.zeros(binned.means.shape[1:], bool)
+
+    # Mean, amplitude and wrapped phase of the fringes of each axis, by least squares.
+    light, swing, phase = [], [], []
+    saturated = np.zeros(binned.means.shape[1:], bool)
     for axis, frames in zip(AXES, used, strict=True):
         try:
             weights = stack.weights(frames)
@@ -59,24 +90,36 @@ def combine_frames(
         swing.append(np.hypot(cosine, sine))
         phase.append(np.arctan2(sine, cosine))
         saturated |= binned.saturated[frames].any(axis=0)
+    light_estimates = light
+    swing_estimates = swing
     third = _third_estimate(stack, binned, excluded) if estimate is None else estimate
-    seen = _median_of_maps([*swing] if third is None else [*swing, third])
-    brightest = float(np.percentile(seen, 95))
+    if third is not None:
+        light_estimates = [*light, third]
+        swing_estimates = [*swing, third]
+
+    # The mask: bins with enough contrast in both axes, and without a clipped pixel.
+    contrast = _median_of_maps(swing_estimates)
+    brightest = float(np.percentile(contrast, _BRIGHTEST_PERCENTILE))
     if not brightest > _LEAST_SWING_ADU:
         raise NoFigureError(f"no fringes: their largest swing is {brightest:.2g} ADU")
-    mask = seen > CONTRAST_SHARE * brightest
-    mask &= np.minimum(*swing) > FRINGE_SHARE * seen
+    mask = contrast > CONTRAST_SHARE * brightest
+    mask &= np.minimum(*swing) > FRINGE_SHARE * contrast
     mask &= ~saturated
-    every = light if third is None else [*light, third]
     return BinView(
-        (used[0], used[1]), np.stack(phase), np.stack(swing), _median_of_maps(every, mask), mask
+        used=(used[0], used[1]),
+        phase_rad=np.stack(phase),
+        swing_adu=np.stack(swing),
+        light=_median_of_maps(light_estimates, mask),
+        mask=mask,
     )
 
 
 def _third_estimate(
     stack: FrameStack, binned: Binned, excluded: Collection[int]
 ) -> FloatArray | None:
-    white, black = stack.single("white"), stack.single("black")
+    """White minus black; None unless both are usable."""
+    white = stack.single("white")
+    black = stack.single("black")
     if white is None or black is None or {white, black} & set(excluded):
         return None
     return np.asarray(binned.means[white].astype(float) - binned.means[black])

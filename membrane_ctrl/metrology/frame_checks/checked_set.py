@@ -31,21 +31,54 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Checked:
-    """A set whose frames have been checked and whose bins have been fitted."""
+    """A set whose frames have been checked and whose bins have been fitted.
 
-    stack: frame_stack.FrameStack  # the frames, swapped ones put back
-    binned: frame_stack.Binned  # the frames over bins
-    view: bin_view.BinView  # evidence from the usable frames
-    phase_rad: FloatArray  # (2, rows, columns): absolute phases of the bins
-    near: BoolArray  # (rows, columns): bins that may see the mirror
-    tracer: ray_tracing.Tracer  # the bench, with the vertex where the laser saw it
-    state: tracked_points.TrackedPoints  # the bins' points with their surface
-    flags: tuple[frame_faults.Flag, ...]  # frames that do not belong
-    # (n,): of the used sinusoids, x and then y: where the fringes put the film, about its mean
+    Attributes
+    ----------
+    stack : FrameStack
+        The frames, swapped ones put back.
+    binned : Binned
+        The frames as means over bins.
+    view : BinView
+        Light, contrast and wrapped phase of the bins, from the usable frames.
+    phase_rad : (2, rows, columns) array
+        Absolute phases of the bins.
+    near : (rows, columns) bool array
+        Bins that may see the mirror.
+    tracer : Tracer
+        The bench, with the vertex where the laser saw it.
+    state : TrackedPoints
+        The bins' points with their surface.
+    flags : tuple of Flag
+        Frames that do not belong.
+    film_um : (n,) array
+        Displacement of the film during the used sinusoids, x and then y, as the fringes show it,
+        about its mean.
+    film_noise_um : float
+        Standard uncertainty of each of these displacements.
+    light_left : float
+        RMS difference between the light of the used sinusoids and the light with which the phases
+        were computed, relative.
+    held : HeldLight
+        Share of the previous picture in each frame.
+    second : SecondReflection
+        A second image of the screen.
+    response : LightResponse
+        Response of panel and camera, and how even the light is.
+    """
+
+    stack: frame_stack.FrameStack
+    binned: frame_stack.Binned
+    view: bin_view.BinView
+    phase_rad: FloatArray
+    near: BoolArray
+    tracer: ray_tracing.Tracer
+    state: tracked_points.TrackedPoints
+    flags: tuple[frame_faults.Flag, ...]
     film_um: FloatArray
-    film_noise_um: float  # 1 sigma of each of these places
-    light_left: float  # RMS of their light, relative, that the phases do not know of
-    held: held_light.HeldLight = held_light.UNKNOWN  # of the previous picture in each frame
+    film_noise_um: float
+    light_left: float
+    held: held_light.HeldLight = held_light.UNKNOWN
     second: second_reflection.SecondReflection = second_reflection.UNKNOWN
     response: light_response.LightResponse = light_response.UNKNOWN
 
@@ -53,10 +86,8 @@ class Checked:
     def verdict(self) -> tuple[Verdict, str]:
         """Verdict from the frames alone: "ok", or "degraded" with the reason."""
         if self.flags:
-            return (
-                "degraded",
-                f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data",
-            )
+            reason = f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data"
+            return "degraded", reason
         doubts = (
             band_removal.describe_bands(self.stack.gain),
             held_light.describe_held_light(self.held),
@@ -64,7 +95,9 @@ class Checked:
             light_response.describe_response(self.response),
         )
         reason = "; ".join(doubt for doubt in doubts if doubt)
-        return ("degraded", reason) if reason else ("ok", "")
+        if reason:
+            return "degraded", reason
+        return "ok", ""
 
     def places_px(self, index: IntArray) -> FloatArray:
         """Column and row (2, n) of bins' centres."""
@@ -94,10 +127,8 @@ class RejectedSetError(bin_view.NoFigureError):
 
 
 def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:
-    """Position of the vertex at a displacement: z = -(d - reference)."""
-    reference = optics.geometry.reference_displacement_um
-    return (
-        0.0
-        if reference is None or not math.isfinite(displacement_um)
-        else -(displacement_um - reference) * 1e-3
-    )
+    """Position of the vertex at a displacement: z = -(d - reference); 0 if one is not known."""
+    reference_um = optics.geometry.reference_displacement_um
+    if reference_um is None or not math.isfinite(displacement_um):
+        return 0.0
+    return -(displacement_um - reference_um) * 1e-3

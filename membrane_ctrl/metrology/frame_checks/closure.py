@@ -26,76 +26,111 @@ import numpy as np
 from membrane_ctrl.metrology.phase.phase_steps import step_residual, step_weights
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
-_TINY = 1e-9  # share of a frame that the model does not explain; below this it explains any frame
+# Instead of a division by zero; also the least share P_kk of a frame that the model does not
+# explain: below it, the model explains any frame.
+_TINY = 1e-9
 
 
 @dataclass(frozen=True)
 class Closure:
-    """How well N frames agree."""
+    """How well N frames agree.
 
-    rms_adu: float  # the residual, per degree of freedom: the noise, if all is well
-    frame_rms_adu: FloatArray  # (N,): the residual of each frame, over all pixels
-    # (N,): the residual, per degree of freedom, without that frame; NaN where nothing would be left
-    # to test
+    Attributes
+    ----------
+    rms_adu : float
+        The residual per degree of freedom: the noise, if no frame is wrong.
+    frame_rms_adu : (N,) array
+        The residual of each frame, over all pixels.
+    without_rms_adu : (N,) array
+        The residual per degree of freedom without that frame; NaN where no degree of freedom would
+        be left.
+    """
+
+    rms_adu: float
+    frame_rms_adu: FloatArray
     without_rms_adu: FloatArray
 
     @property
     def suspect(self) -> int | None:
         """The frame that explains the disagreement best when left out; None if the data cannot
-        tell.
+        decide.
         """
-        return (
-            None if np.isnan(self.without_rms_adu).any() else int(np.argmin(self.without_rms_adu))
-        )
+        if np.isnan(self.without_rms_adu).any():
+            return None
+        return int(np.argmin(self.without_rms_adu))
 
     @property
     def gain(self) -> float:
-        """How many times better the rest agrees without the suspect:
-        about 1 if no frame is wrong.
-        """
-        return (
-            1.0
-            if self.suspect is None
-            else self.rms_adu / max(float(self.without_rms_adu.min()), _TINY)
-        )
+        """Residual of all frames over that without the suspect: about 1 if no frame is wrong."""
+        if self.suspect is None:
+            return 1.0
+        without_suspect_adu = float(self.without_rms_adu.min())
+        return self.rms_adu / max(without_suspect_adu, _TINY)
 
 
 def compute_closure(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> Closure:
     """Agreement of the frames with a sinusoid of unknown mean, amplitude and phase in each pixel.
 
-    Raises ValueError for fewer than four frames, or steps that determine no phase.
-
     Parameters
     ----------
     frames : (N, ...) array
-        Intensities, N >= 4; pixels without fringes left out or masked by the caller.
+        Intensities, N >= 4; the caller leaves out or masks pixels without fringes.
     shifts_rad : (N,) array
         Phase steps.
+
+    Returns
+    -------
+    Closure
+        Names a suspect from N = 5 on.
+
+    Raises
+    ------
+    ValueError
+        Fewer than four frames, no pixels, or steps that determine no phase.
     """
     stack, shifts = _check_frames(frames, shifts_rad)
     residual = step_residual(stack, shifts)
     design = np.stack([np.ones_like(shifts), np.cos(shifts), -np.sin(shifts)], axis=1)
     free = 1 - np.einsum("kp,pk->k", design, step_weights(shifts))  # diagonal of P
-    return _summarise_residual(
-        residual, np.broadcast_to(free[:, None], residual.shape), len(shifts) - 3
-    )
+    free_of_pixels = np.broadcast_to(free[:, None], residual.shape)
+    return _summarise_residual(residual, free_of_pixels, len(shifts) - 3)
 
 
 def closure_with_phase(
     frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray, phase_rad: FloatArray
 ) -> Closure:
-    """Agreement with a sinusoid of known phase (...) and unknown mean and amplitude; names a frame
-    from N = 4 on.
+    """Agreement with a sinusoid of known phase and unknown mean and amplitude.
 
     An error of the phase shows in all frames, as amplitude times error: it hides faults below that.
+
+    Parameters
+    ----------
+    frames : (N, ...) array
+        Intensities, N >= 4.
+    shifts_rad : (N,) array
+        Phase steps.
+    phase_rad : (...) array
+        Known phase of each pixel.
+
+    Returns
+    -------
+    Closure
+        Names a suspect from N = 4 on.
+
+    Raises
+    ------
+    ValueError
+        As `compute_closure`.
     """
     stack, shifts = _check_frames(frames, shifts_rad)
+    # The model's columns made orthonormal: a constant, and the carrier without its mean.
     carrier = np.cos(np.ravel(phase_rad) + shifts[:, None])
     carrier -= carrier.mean(axis=0)
     carrier /= np.maximum(np.linalg.norm(carrier, axis=0), _TINY)
     centred = stack - stack.mean(axis=0)
     residual = centred - carrier * np.sum(carrier * centred, axis=0)
-    return _summarise_residual(residual, 1 - 1 / len(shifts) - carrier**2, len(shifts) - 2)
+    free = 1 - 1 / len(shifts) - carrier**2
+    return _summarise_residual(residual, free, len(shifts) - 2)
 
 
 def closure_with_level(
@@ -104,37 +139,63 @@ def closure_with_level(
     mean_adu: FloatArray,
     amplitude_adu: FloatArray,
 ) -> Closure:
-    """Agreement with a sinusoid of known mean and amplitude (...) and unknown phase; names a frame
-    from N = 4 on.
+    """Agreement with a sinusoid of known mean and amplitude and unknown phase.
 
-    Linear in cosine and sine with the mean known; the phasor's length, which should be the
-    amplitude, is one more equation. To first order in the noise that is the fit of the phase alone.
+    With the mean known, the model is linear in cosine and sine; the phasor's length, which should
+    be the amplitude, is one more equation. To first order in the noise that is the fit of the phase
+    alone.
+
+    Parameters
+    ----------
+    frames : (N, ...) array
+        Intensities, N >= 4.
+    shifts_rad : (N,) array
+        Phase steps.
+    mean_adu, amplitude_adu : (...) array
+        Known mean and amplitude of each pixel.
+
+    Returns
+    -------
+    Closure
+        Names a suspect from N = 4 on.
+
+    Raises
+    ------
+    ValueError
+        As `compute_closure`.
     """
     stack, shifts = _check_frames(frames, shifts_rad)
-    centred, amplitude = stack - np.ravel(mean_adu), np.ravel(amplitude_adu)
+    count = len(shifts)
+    centred = stack - np.ravel(mean_adu)
+    amplitude = np.ravel(amplitude_adu)
     design = np.stack([np.cos(shifts), -np.sin(shifts)], axis=1)
-    rest = [np.arange(len(shifts)) != k for k in range(len(shifts))]
-    without = [
-        math.sqrt(_level_rss(centred[keep], design[keep], amplitude) / (len(shifts) - 2))
-        for keep in rest
-    ]
-    rms = math.sqrt(_level_rss(centred, design, amplitude) / (len(shifts) - 1))
+
+    # One equation is the phasor's length: N + 1 equations, two unknowns.
+    rms_adu = math.sqrt(_level_rss(centred, design, amplitude) / (count - 1))
+    without_rms_adu = np.empty(count)
+    for left_out in range(count):
+        kept = np.arange(count) != left_out
+        rss = _level_rss(centred[kept], design[kept], amplitude)
+        without_rms_adu[left_out] = math.sqrt(rss / (count - 2))
+
     residual = centred - design @ np.linalg.pinv(design) @ centred
-    return Closure(rms, np.sqrt(np.mean(residual**2, axis=1)), np.array(without))
+    frame_rms_adu = np.sqrt(np.mean(residual**2, axis=1))
+    return Closure(rms_adu, frame_rms_adu, without_rms_adu)
 
 
 def _level_rss(centred: FloatArray, design: FloatArray, amplitude: FloatArray) -> float:
-    """Mean over pixels of the residual squares, that of the phasor's length in units of its
-    variance along itself.
+    """Mean over pixels of the sum of squared residuals, with that of the phasor's length.
+
+    The latter is in units of the phasor's variance along itself. `centred` (N, pixels) are the
+    intensities less the known mean.
     """
-    covariance = np.linalg.inv(design.T @ design)
+    covariance = np.linalg.inv(design.T @ design)  # of the phasor, for noise of 1
     phasor = covariance @ design.T @ centred
     length = np.linalg.norm(phasor, axis=0)
-    along = phasor / np.maximum(length, _TINY)
-    variance = np.einsum("ip,ij,jp->p", along, covariance, along)
-    variance = np.maximum(
-        variance, np.linalg.eigvalsh(covariance)[0]
-    )  # a phasor of 0 points nowhere
+    direction = phasor / np.maximum(length, _TINY)
+    variance = np.einsum("ip,ij,jp->p", direction, covariance, direction)
+    least_variance = np.linalg.eigvalsh(covariance)[0]  # a phasor of 0 has no direction
+    variance = np.maximum(variance, least_variance)
     rss = np.sum((centred - design @ phasor) ** 2, axis=0)
     return float(np.mean(rss + (length - amplitude) ** 2 / variance))
 
@@ -142,7 +203,7 @@ def _level_rss(centred: FloatArray, design: FloatArray, amplitude: FloatArray) -
 def _check_frames(
     frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Frames as (N, pixels) and shifts; four frames at least, as three always agree."""
+    """Frames as (N, pixels) and shifts (N,); refuses fewer than four, which always agree."""
     shifts = np.asarray(shifts_rad, float)
     stack = np.asarray(frames, float).reshape(len(shifts), -1)
     if len(shifts) < 4:
@@ -154,15 +215,25 @@ def _check_frames(
 
 
 def _summarise_residual(residual: FloatArray, free: FloatArray, freedom: int) -> Closure:
-    """From the residual (N, pixels), the diagonal of P there, and the degrees of freedom of a
-    pixel.
+    """The closure from each pixel's residual.
+
+    Parameters
+    ----------
+    residual : (N, pixels) array
+        r = P I.
+    free : (N, pixels) array
+        Diagonal of P.
+    freedom : int
+        Degrees of freedom of a pixel: the trace of P.
     """
     rss = np.sum(residual**2, axis=0)
-    rms = math.sqrt(float(rss.mean()) / freedom)
-    # a frame that the model explains in any case cannot be tested by omission: its pixel keeps its
-    # sum
-    drop = np.where(free > _TINY, residual**2 / np.maximum(free, _TINY), 0.0)
-    without = np.full(len(residual), math.nan)
+    rms_adu = math.sqrt(float(rss.mean()) / freedom)
+    frame_rms_adu = np.sqrt(np.mean(residual**2, axis=1))
+    without_rms_adu = np.full(len(residual), math.nan)
     if freedom > 1:
-        without = np.sqrt(np.maximum(np.mean(rss - drop, axis=1), 0.0) / (freedom - 1))
-    return Closure(rms, np.sqrt(np.mean(residual**2, axis=1)), without)
+        # Omission of frame k lowers the sum by r_k^2 / P_kk. A frame that the model explains in
+        # any case (P_kk = 0) cannot be tested by omission: its pixel keeps its sum.
+        drop = np.where(free > _TINY, residual**2 / np.maximum(free, _TINY), 0.0)
+        left = np.maximum(np.mean(rss - drop, axis=1), 0.0)
+        without_rms_adu = np.sqrt(left / (freedom - 1))
+    return Closure(rms_adu, frame_rms_adu, without_rms_adu)

@@ -22,75 +22,130 @@ from membrane_ctrl.metrology.phase.gray_code import gray_bit
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
-_SAMPLE = 6_000
-# For the film's places, whose noise would be taken for motion: as many pixels, whatever the size of
-# the bins
+_SAMPLE = 6_000  # bins that are compared
+# Pixels that are used to find the film's positions, whose noise would be taken for motion: a fixed
+# number, whatever the size of the bins.
 _SAMPLED_PX = 96_000
-# standard deviation of the phases: fewer fringes cannot be told from a contrast that differs
+# Standard deviation of the phases, rad: fewer fringes cannot be distinguished from a contrast that
+# differs over the mirror.
 _SEVERAL_RAD = 6.0
+_SMOOTH_ORDER = 4  # powers of the smooth deviations over the mirror with several fringes
+_FLAT_ORDER = 1  # with fewer: a constant alone
 # Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred µm, stay
-# inside
+# inside.
 _EDGE_RAD = 0.5
+_HARMONICS = (2, 3, 4)  # of a sinusoid: the display's response
+# Least correlation with a pattern, to look like it: a sinusoid and its square wave have 0.9.
+_LEAST_LIKENESS = 0.7
+_CLEARLY_MORE = 1e-3  # another pattern must be more like a frame than its own by this much
+_FLAT_PICTURE = 0.02  # standard deviation over mean of a picture without any pattern
+_TINY = 1e-9  # instead of a division by zero
 
 
 @dataclass(frozen=True)
 class SampledBins:
-    """What is known of the sampled bins: (n,) and (2, n) arrays."""
+    """What is known of n sampled bins.
 
-    index: IntArray  # (n,): bins
-    light: FloatArray  # (n,): brightness, see `view`
-    phase_rad: FloatArray  # (2, n): predicted absolute phase, film at its mean displacement
-    sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per µm of displacement
+    Attributes
+    ----------
+    index : (n,) int array
+        Numbers of the bins.
+    light : (n,) array
+        Brightness, as in `bin_view.BinView`.
+    phase_rad : (2, n) array
+        Predicted absolute phases of x and y, with the film at its mean displacement.
+    sensitivity_rad_per_um : (2, n) array
+        Change of the phases per µm of displacement.
+    """
+
+    index: IntArray
+    light: FloatArray
+    phase_rad: FloatArray
+    sensitivity_rad_per_um: FloatArray
 
     def thinned(self, enough: int = _SAMPLE) -> "SampledBins":
-        """Enough of the bins."""
+        """Return every k-th bin, so that at least `enough` of them stay."""
         return self.part(slice(None, None, max(1, self.index.size // enough)))
 
     def part(self, which: slice | BoolArray) -> "SampledBins":
-        """Some of the bins."""
-        of_axes = self.phase_rad[:, which], self.sensitivity_rad_per_um[:, which]
-        return SampledBins(self.index[which], self.light[which], *of_axes)
+        """Return some of the bins."""
+        return SampledBins(
+            self.index[which],
+            self.light[which],
+            self.phase_rad[:, which],
+            self.sensitivity_rad_per_um[:, which],
+        )
 
 
 @dataclass(frozen=True)
 class FrameEvidence:
-    """One frame; units of light are those of `SampledBins.light`."""
+    """What one frame shows; units of light are those of `SampledBins.light`.
 
-    level: float  # m of a sinusoid, hi of a Gray frame, the level of white and black
-    swing: float  # b of a sinusoid, hi - lo of a Gray frame, 0 else
-    step_rad: float  # delta of a sinusoid: how far its phase step is from the stated one
-    moved_um: float  # e of a sinusoid: how far the film is from where the laser says
-    moved_sigma_um: float  # its noise, if what is left over is noise
-    rest: float  # RMS of what is left over, as a share of the light
-    saturated: float  # share of bins with a saturated pixel
-    shows: int  # frame whose pattern this one fits best
-    # Share of the bins where a Gray frame is predicted bright: 0 or 1 where the mirror shows no
-    # edge of that bit
+    Attributes
+    ----------
+    level : float
+        m of a sinusoid, hi of a Gray frame, the level of white and black.
+    swing : float
+        b of a sinusoid, hi - lo of a Gray frame, else 0.
+    step_rad : float
+        delta of a sinusoid: its phase step less the stated one.
+    moved_um, moved_sigma_um : float
+        e of a sinusoid: the film's displacement less the laser's reading; its noise, if the rest is
+        noise.
+    rest : float
+        RMS of what the model leaves, as a share of the light.
+    saturated : float
+        Share of bins with a saturated pixel.
+    shows : int
+        The frame whose pattern this one fits best.
+    lit : float
+        Share of the bins where a Gray frame is predicted bright: 0 or 1 where the mirror shows no
+        edge of that bit.
+    """
+
+    level: float
+    swing: float
+    step_rad: float
+    moved_um: float
+    moved_sigma_um: float
+    rest: float
+    saturated: float
+    shows: int
     lit: float = 1.0
 
 
 def measure_frames(
     stack: FrameStack, binned: Binned, scene: SampledBins, readable: list[int]
 ) -> dict[int, FrameEvidence]:
-    """Evidence of all readable frames."""
+    """Measure what each readable frame shows.
+
+    Parameters
+    ----------
+    stack, binned : FrameStack, Binned
+        The set, and its frames as means over bins.
+    scene : SampledBins
+        The mirror's bins, with the phases that the fitted surface predicts.
+    readable : list of int
+        Frames that hold a picture.
+
+    Returns
+    -------
+    dict
+        The evidence by frame.
+    """
     scene = scene.thinned()
-    readings = np.nan_to_num(stack.displacement_um - np.nan_to_num(stack.mean_reading_um))
-    templates = [
-        _make_template(stack, scene, k, float(reading)) for k, reading in enumerate(readings)
+    readings_um = np.nan_to_num(stack.displacement_um - np.nan_to_num(stack.mean_reading_um))
+    models = [
+        _make_model(stack, scene, k, float(reading_um)) for k, reading_um in enumerate(readings_um)
     ]
-    waves = [template.wave() for template in templates]
-    out = {}
+    waves = [model.wave() for model in models]
+    evidence = {}
     for k in readable:
         seen = binned.means[k].reshape(-1)[scene.index].astype(float)
         saturated = float(np.mean(binned.saturated[k].reshape(-1)[scene.index]))
-        out[k] = _make_evidence(
-            seen,
-            templates[k],
-            scene.light,
-            saturated,
-            _find_best_pattern(seen, waves, scene.light, k),
-        )
-    return out
+        shows = _find_best_pattern(seen, waves, scene.light, k)
+        evidence[k] = _make_evidence(seen, models[k], scene.light, saturated, shows)
+    return evidence
 
 
 def estimate_light_and_film(
@@ -100,45 +155,76 @@ def estimate_light_and_film(
     used: tuple[list[int], list[int]],
     phase_rad: FloatArray,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Level and swing (2, frames) of the used sinusoids about the mean of their axis; the film's
-    places, 1 sigma, µm.
+    """Estimate the light of each used sinusoid, and where the film was during it.
 
-    Places are those of the used sinusoids of x and then of y. Each frame is compared with the light
-    that the other axis saw: in that of its own axis it leaves waves, which would hide a tenth of
-    what differs. Phases `phase_rad` (2, bins) that differ smoothly from the surface's (a film that
-    moved between the axes, a wrong geometry) and a contrast that differs over the mirror (blur)
-    would be taken for both.
+    Each frame is compared with the light that the other axis saw: in that of its own axis it leaves
+    waves, which would hide 10 % of what differs. Phases that differ smoothly from the surface's (a
+    film that moved between the axes, a wrong geometry) and a contrast that differs over the mirror
+    (blur) would be taken for both light and motion, so the model has them, too.
+
+    Parameters
+    ----------
+    stack, binned, scene : FrameStack, Binned, SampledBins
+        As in `measure_frames`.
+    used : two lists of int
+        The used sinusoids of x and of y.
+    phase_rad : (2, bins) array
+        Measured absolute phases.
+
+    Returns
+    -------
+    light : (2, frames) array
+        Level and swing of the used sinusoids about the mean of their axis; 1 for other frames.
+    film_um : (used,) array
+        Displacement of the film during the used sinusoids of x, and then of y.
+    sigma_um : float
+        Its standard uncertainty, RMS over the frames.
     """
-    scene, light = scene.thinned(_SAMPLED_PX // binned.bin_px**2), np.ones((2, len(stack.patterns)))
-    film_um, sigma_um = np.empty(0), np.empty(0)
-    told_um = np.nan_to_num(stack.displacement_um - stack.mean_reading_um)
+    scene = scene.thinned(_SAMPLED_PX // binned.bin_px**2)
+    readings_um = np.nan_to_num(stack.displacement_um - stack.mean_reading_um)
+
+    # Smooth functions of the place on the mirror, which the phases stand for.
     spread_rad = scene.phase_rad.std(axis=1)
     u, v = (scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]) / spread_rad[:, None]
-    order = 4 if spread_rad.min() > _SEVERAL_RAD else 1
+    order = _SMOOTH_ORDER if spread_rad.min() > _SEVERAL_RAD else _FLAT_ORDER
     smooth = np.stack([u**p * v**q for p in range(order) for q in range(order - p)])
-    left = (phase_rad[:, scene.index] - scene.phase_rad) @ np.linalg.pinv(smooth)
-    scene = replace(scene, phase_rad=scene.phase_rad + left @ smooth)
+
+    # The phases follow the measured ones smoothly.
+    deviation = (phase_rad[:, scene.index] - scene.phase_rad) @ np.linalg.pinv(smooth)
+    scene = replace(scene, phase_rad=scene.phase_rad + deviation @ smooth)
     contrast = smooth[1:] - smooth[1:].mean(axis=1, keepdims=True)
+
     means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
+    light = np.ones((2, len(stack.patterns)))
+    film_um = np.empty(0)
+    sigma_um = np.empty(0)
     for own, others in (used, used[::-1]):
-        aside, found = stack.weights(others)[0] @ means[others], []
+        light_of_others = stack.weights(others)[0] @ means[others]
+        found = []
         for k in own:
-            template = _make_template(stack, scene, k, float(told_um[k]))
-            columns = np.vstack([template.columns, template.columns[1] * contrast])
-            found.append(
-                _make_evidence(means[k], replace(template, columns=columns), aside, 0.0, k)
-            )
-        seen = np.array([[each.level, each.swing] for each in found]).T
-        light[:, own] = seen / seen.mean(axis=1, keepdims=True)
-        film_um = np.append(film_um, told_um[own] + [each.moved_um for each in found])
+            model = _make_model(stack, scene, k, float(readings_um[k]))
+            columns = np.vstack([model.columns, model.columns[1] * contrast])
+            model = replace(model, columns=columns)
+            found.append(_make_evidence(means[k], model, light_of_others, 0.0, k))
+        level_and_swing = np.array([[each.level, each.swing] for each in found]).T
+        light[:, own] = level_and_swing / level_and_swing.mean(axis=1, keepdims=True)
+        film_um = np.append(film_um, readings_um[own] + [each.moved_um for each in found])
         sigma_um = np.append(sigma_um, [each.moved_sigma_um for each in found])
     return light, film_um, float(np.sqrt(np.mean(sigma_um**2)))
 
 
 @dataclass(frozen=True)
-class _Template:
-    """Columns (p, n) that a frame is a sum of, in units of the light; `sure` are the bins to
-    compare on.
+class _FrameModel:
+    """What a frame is a sum of: the equations of the module's docstring, as columns.
+
+    Attributes
+    ----------
+    role : str
+        "sin", "gray", "white" or "black".
+    columns : (p, n) array
+        In units of the light. Of a sinusoid: 1, cos psi, -sin psi, -(q - <q>) sin psi, harmonics.
+    sure : (n,) bool array
+        Bins to compare on.
     """
 
     role: str
@@ -146,93 +232,97 @@ class _Template:
     sure: BoolArray
 
     def wave(self) -> tuple[BoolArray, FloatArray]:
-        """The sure bins, and the pattern there: times a picture of deviation 1 it is their
-        correlation.
+        """The sure bins, and the pattern there, scaled so that its product with a picture of
+        standard deviation 1 is their correlation.
         """
-        wave = self.columns[:2][-1][self.sure]
-        return self.sure, (wave - wave.mean()) / (wave.size * max(wave.std(), 1e-6))
+        pattern = self.columns[:2][-1][self.sure]
+        return self.sure, (pattern - pattern.mean()) / (pattern.size * max(pattern.std(), 1e-6))
 
 
-def _make_template(
+def _make_model(
     stack: FrameStack, scene: SampledBins, frame: int, reading_um: float
-) -> _Template:
+) -> _FrameModel:
+    """The model of a frame during which the laser read `reading_um` more than in the mean."""
     pattern = stack.patterns[frame]
     ones = np.ones(scene.index.size)
+    every_bin = ones.astype(bool)
     if pattern.role in ("white", "black"):
-        return _Template(pattern.role, ones[None], ones.astype(bool))
+        return _FrameModel(pattern.role, ones[None], every_bin)
     axis = AXES.index(pattern.axis)
-    slope = scene.sensitivity_rad_per_um[axis]
-    phase = scene.phase_rad[axis] + slope * reading_um
+    sensitivity = scene.sensitivity_rad_per_um[axis]
+    phase_rad = scene.phase_rad[axis] + sensitivity * reading_um
     if pattern.role == "gray":
-        shown, from_edge = gray_bit(phase, pattern.index)
-        sure = from_edge > _EDGE_RAD
-        # where edges are everywhere (a nonsense prediction) all bins are used
-        return _Template(
-            "gray", np.stack([ones, shown.astype(float)]), sure if sure.any() else ones.astype(bool)
-        )
-    psi = phase + pattern.shift_rad
-    sine = np.sin(psi)
-    columns = [
-        ones,
-        np.cos(psi),
-        -sine,
-        -(slope - slope.mean()) * sine,
-        *(np.cos(k * psi) for k in (2, 3, 4)),
-    ]
-    return _Template("sin", np.stack(columns), ones.astype(bool))
+        shown, from_edge_rad = gray_bit(phase_rad, pattern.index)
+        sure = from_edge_rad > _EDGE_RAD
+        if not sure.any():  # edges everywhere: the prediction is nonsense, and all bins are used
+            sure = every_bin
+        return _FrameModel("gray", np.stack([ones, shown.astype(float)]), sure)
+    psi_rad = phase_rad + pattern.shift_rad
+    sine = np.sin(psi_rad)
+    motion = -(sensitivity - sensitivity.mean()) * sine
+    harmonics = [np.cos(k * psi_rad) for k in _HARMONICS]
+    columns = np.stack([ones, np.cos(psi_rad), -sine, motion, *harmonics])
+    return _FrameModel("sin", columns, every_bin)
 
 
 def _solve_coefficients(
-    seen: FloatArray, template: _Template, light: FloatArray
+    seen: FloatArray, model: _FrameModel, light: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
     """Coefficients, their noise if the rest is noise, and the RMS of the rest over the light."""
-    sure = template.sure
-    columns = (template.columns * light)[:, sure]
+    sure = model.sure
+    columns = (model.columns * light)[:, sure]
     normal = columns @ columns.T
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))  # columns of very different size
     inverse = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
     solved = inverse @ (columns @ seen[sure])
     rest = float(np.sqrt(np.mean((seen[sure] - solved @ columns) ** 2)))
-    return (
-        solved,
-        rest * np.sqrt(np.maximum(np.diag(inverse), 0.0)),
-        rest / float(np.mean(light[sure])),
-    )
+    sigma = rest * np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    return solved, sigma, rest / float(np.mean(light[sure]))
 
 
 def _make_evidence(
-    seen: FloatArray, template: _Template, light: FloatArray, saturated: float, shows: int
+    seen: FloatArray, model: _FrameModel, light: FloatArray, saturated: float, shows: int
 ) -> FrameEvidence:
-    solved, sigma, rest = _solve_coefficients(seen, template, light)
-    if template.role == "sin":
-        swing = float(np.hypot(solved[1], solved[2]))
-        step = float(np.arctan2(solved[2], solved[1]))
-        moved_um, sigma_um = (float(each[3]) / max(swing, 1e-9) for each in (solved, sigma))
+    """The evidence of one frame, whose bins have the light `seen` (n,)."""
+    solved, sigma, rest = _solve_coefficients(seen, model, light)
+    if model.role == "sin":
+        swing = float(np.hypot(solved[1], solved[2]))  # b cos delta and b sin delta
         return FrameEvidence(
-            float(solved[0]), swing, step, moved_um, sigma_um, rest, saturated, shows
+            level=float(solved[0]),
+            swing=swing,
+            step_rad=float(np.arctan2(solved[2], solved[1])),
+            moved_um=float(solved[3]) / max(swing, _TINY),
+            moved_sigma_um=float(sigma[3]) / max(swing, _TINY),
+            rest=rest,
+            saturated=saturated,
+            shows=shows,
         )
-    if template.role == "gray":
-        lit = float(np.mean(template.columns[1][template.sure]))
-        return FrameEvidence(
-            float(solved.sum()), float(solved[1]), 0.0, 0.0, 0.0, rest, saturated, shows, lit
-        )
+    if model.role == "gray":
+        lit = float(np.mean(model.columns[1][model.sure]))
+        level = float(solved.sum())
+        swing = float(solved[1])
+        return FrameEvidence(level, swing, 0.0, 0.0, 0.0, rest, saturated, shows, lit)
     return FrameEvidence(float(solved[0]), 0.0, 0.0, 0.0, 0.0, rest, saturated, shows)
 
 
 def _find_best_pattern(
     seen: FloatArray, waves: list[tuple[BoolArray, FloatArray]], light: FloatArray, own: int
 ) -> int:
-    """The pattern that the frame looks like most: largest correlation of the picture over the
-    light.
+    """The frame whose pattern a picture looks like most: the largest correlation over the light.
 
-    A flat picture, white or black, correlates with nothing and is taken for its own.
+    A flat picture, white or black, correlates with no pattern; the answer is then its own frame.
     """
-    picture = seen / np.maximum(light, 1e-9)
-    flat = max(float(np.mean(picture)), 1e-9)
-    best, where = 0.7, own  # less than 0.7 is no likeness: a sinusoid and its square wave have 0.9
+    picture = seen / np.maximum(light, _TINY)
+    mean = max(float(np.mean(picture)), _TINY)
+    best_likeness = _LEAST_LIKENESS
+    best = own
     for frame, (sure, wave) in enumerate(waves):
         deviation = float(np.std(picture[sure]))
-        likeness = float(picture[sure] @ wave) / deviation if deviation >= 0.02 * flat else 0.0
-        if likeness > best + (0.0 if frame == own else 1e-3):
-            best, where = likeness, frame
-    return where
+        if deviation < _FLAT_PICTURE * mean:
+            continue
+        likeness = float(picture[sure] @ wave) / deviation
+        margin = 0.0 if frame == own else _CLEARLY_MORE
+        if likeness > best_likeness + margin:
+            best_likeness = likeness
+            best = frame
+    return best

@@ -22,25 +22,39 @@ from membrane_ctrl.metrology.phase.gray_code import gray_bit
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
 
-# From a Gray bit's edge, rad: beyond blur, and beyond the turn of the phases by a large share
+# Bins nearer than this to the edge of a Gray bit are not used, rad: blur, and the turn of the
+# phases by a large share, stay inside.
 _EDGE_RAD = 0.7
 _HARMONICS = range(2, 7)  # of a sinusoid: the response of panel and camera
 _SMOOTH_ORDER = 2  # of the polynomials by which light and contrast may differ over the mirror
-_LEAST_DETERMINED = 0.05  # of the change from the previous frame, beyond its own pattern
-_LEAST_BINS = 300
+# Least power of the change from the previous frame that the frame's own pattern does not explain,
+# over the whole power of that change.
+_LEAST_DETERMINED = 0.05
+_LEAST_BINS = 300  # of one frame
 _LIVE_BINS = 2500  # of a live cycle: a share is known to 2e-4
-# What no frame measures: over the share, since sinusoids change between greys; over the difference
-# of rise and fall; over the share's square, since a panel relaxes from its last picture or state
+# Errors of the shares that no frame shows: relative to the share, because sinusoids change between
+# greys and Gray frames between black and white; relative to the difference of rise and fall;
+# relative to the share's square, because a panel relaxes from its last picture or from its state.
 _TRANSITIONS = 0.01
 _ASYMMETRY = 0.03
 _SECOND_ORDER = 0.1
-_SURE_SIGMAS = 3.0
-_FLOOR = 3e-5
-# Each round finds nine tenths of the rest, since the light that it compares with has its share, too
+_SURE_SIGMAS = 3.0  # a share is removed if it exceeds so many of its sigmas
+_FLOOR_SIGMA = 3e-5  # least standard uncertainty of a share
+# Rounds of estimate and correction. Each finds 90 % of the rest, because the light that it compares
+# with has its share, too.
 ROUNDS = 5
-_KNOWN = 2e-5
-_UNKNOWN_SIGMA = 0.03  # a share that is not better known is no estimate
-_GREAT_SHARE = 0.05  # beyond, what the correction leaves is no longer small
+_NEGLIGIBLE_SHARE = 2e-5  # a smaller rest needs no further round
+_UNKNOWN_SIGMA = 0.03  # a share that is less well known is no estimate
+_GREAT_SHARE = 0.05  # from here on, the rest after the correction is not small
+_LEAST_AMPLITUDE = 1e-9  # instead of a division by zero
+# Robust statistics: standard deviation over the median absolute deviation of normal numbers, and
+# standard error of a median over that of a mean.
+_SIGMA_OVER_MAD = 1.4826
+_MEDIAN_OVER_MEAN = 1.25
+_SCATTER_OF_ONE = 0.1  # assumed relative scatter of the shares if only one frame shows them
+
+# Share of the previous picture and its standard uncertainty, as one frame shows them.
+ShareOfFrame = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -71,34 +85,55 @@ def estimate_held_light(
 ) -> HeldLight:
     """Estimate the shares from all frames that can show them.
 
-    `scene` has the phases by the fitted surface; frames in `excluded` are neither used nor taken
-    for a previous picture.
+    Derivation: section 10 of docs/explanation/metrology.md.
+
+    Parameters
+    ----------
+    stack, binned : FrameStack, Binned
+        The set, and its frames as means over bins.
+    scene : SampledBins
+        The mirror's bins, with the phases that the fitted surface predicts.
+    excluded : collection of int
+        Frames that do not belong to the set: neither used nor compared with.
+
+    Returns
+    -------
+    HeldLight
+        `UNKNOWN` if no frame shows both shares, or only with an uncertainty above 3 %.
     """
     scene = scene.thinned()
     means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
     clipped = binned.saturated.reshape(len(stack.patterns), -1)[:, scene.index]
     smooth = _smooth_columns(scene)
-    found: tuple[list[tuple[float, float]], ...] = ([], [])
+
+    # The shares that each frame shows.
+    rises: list[ShareOfFrame] = []
+    falls: list[ShareOfFrame] = []
     for frame in range(len(stack.patterns)):
         previous = stack.before_of(frame)
         if previous < 0 or {frame, previous} & set(excluded):
             continue
         if stack.patterns[previous].role not in ("sin", "gray"):
-            continue  # without a pattern: it is like a change of the light
+            continue  # a picture without a pattern acts as a change of the light
         columns, sure = _own_columns(stack, scene, frame, smooth)
-        sure = sure & ~clipped[frame] & ~clipped[previous]
-        of_frame = _fit_previous(means[frame], means[previous], columns * scene.light, sure)
-        for way, one in zip(found, of_frame, strict=True):
-            way += one
-    if not all(found):
+        usable = sure & ~clipped[frame] & ~clipped[previous]
+        rises_of_frame, falls_of_frame = _fit_previous(
+            means[frame], means[previous], columns * scene.light, usable
+        )
+        rises += rises_of_frame
+        falls += falls_of_frame
+    if not rises or not falls:
         return UNKNOWN
-    (rise, rise_sigma), (fall, fall_sigma) = (_middle(way) for way in found)
+
+    # Their medians over the frames.
+    rise, rise_sigma = _combine_frames(rises)
+    fall, fall_sigma = _combine_frames(falls)
     sigma = math.hypot(rise_sigma, fall_sigma) / math.sqrt(2)
-    if len(found[0]) == 1:  # no scatter: only their difference shows whether they are true
+    if len(rises) == 1:  # one frame has no scatter: only the difference of the shares is evidence
         sigma = math.hypot(sigma, rise - fall)
     if sigma > _UNKNOWN_SIGMA:
         return UNKNOWN
-    return HeldLight(rise, fall, math.hypot(sigma, _FLOOR))
+    return HeldLight(rise, fall, math.hypot(sigma, _FLOOR_SIGMA))
 
 
 def is_worth_removing(held: HeldLight) -> bool:
@@ -107,14 +142,30 @@ def is_worth_removing(held: HeldLight) -> bool:
 
 
 def add_held_light(removed: HeldLight, found: HeldLight) -> HeldLight:
-    """Return the shares in the frames, of which one part was removed before the other was found."""
+    """Return the shares in the frames, of which one part was removed before the other was found.
+
+    Parameters
+    ----------
+    removed : HeldLight
+        Sum of the shares that earlier rounds removed.
+    found : HeldLight
+        Shares that the corrected frames still show.
+
+    Returns
+    -------
+    HeldLight
+        `found` itself if nothing was removed and nothing is worth it; else the sum, whose sigma
+        contains what no frame shows.
+    """
     if not removed.corrected and not is_worth_removing(found):
         return found
     rise = removed.rise + found.rise * (1 - removed.rise)
     fall = removed.fall + found.fall * (1 - removed.fall)
     share = (rise + fall) / 2
-    model = math.hypot(_TRANSITIONS * share, _ASYMMETRY * (rise - fall), _SECOND_ORDER * share**2)
-    return HeldLight(rise, fall, math.hypot(found.sigma, model), corrected=True)
+    model_sigma = math.hypot(
+        _TRANSITIONS * share, _ASYMMETRY * (rise - fall), _SECOND_ORDER * share**2
+    )
+    return HeldLight(rise, fall, math.hypot(found.sigma, model_sigma), corrected=True)
 
 
 def remove_held_light(stack: FrameStack, binned: Binned, held: HeldLight) -> Binned:
@@ -128,9 +179,23 @@ def remove_held_light(stack: FrameStack, binned: Binned, held: HeldLight) -> Bin
 
 
 def held_change(seen: Singles, previous: Singles, held: HeldLight) -> Singles:
-    """Return what a picture would show more at rest, from it and the one before."""
+    """Return the correction f / (1 - f) (I - I_before) that a picture at rest shows in addition.
+
+    Parameters
+    ----------
+    seen, previous : array of one shape
+        The picture I, and the one before it as it was seen.
+    held : HeldLight
+        The shares f.
+
+    Returns
+    -------
+    array
+        P - I in the units of the pictures.
+    """
     more = seen - previous
-    rise, fall = (np.float32(f / (1 - f)) for f in (held.rise, held.fall))
+    rise = np.float32(held.rise / (1 - held.rise))
+    fall = np.float32(held.fall / (1 - held.fall))
     return np.asarray(np.where(more > 0, rise, fall) * more)
 
 
@@ -153,23 +218,26 @@ def find_held_light(
     """
     few = slice(None, None, max(1, index.size // _LIVE_BINS))
     index, phase_rad = index[few], phase_rad[:, few]
-    held, without = UNKNOWN, binned
-    x_weights = stack.weights(stack.sinusoids(AXES[0]))[0]
+    x_frames = stack.sinusoids(AXES[0])
+    mean_of_steps = stack.weights(x_frames)[0]
+    held = UNKNOWN
+    corrected = binned
     for _ in range(ROUNDS):
-        x_means = without.means[stack.sinusoids(AXES[0])]
-        light = np.tensordot(x_weights, x_means.reshape(len(x_weights), -1)[:, index], axes=1)
+        # The light is the mean of the x steps, in the frames as corrected so far.
+        x_means = corrected.means[x_frames].reshape(len(x_frames), -1)[:, index]
+        light = np.tensordot(mean_of_steps, x_means, axes=1)
         scene = SampledBins(index, light, phase_rad, np.zeros_like(phase_rad))
-        found = estimate_held_light(stack, without, scene, ())
+        found = estimate_held_light(stack, corrected, scene, ())
         held = add_held_light(held, found)
         if not held.corrected or not is_worth_another_round(found):
             break
-        without = remove_held_light(stack, binned, held)
-    return held, without
+        corrected = remove_held_light(stack, binned, held)
+    return held, corrected
 
 
 def is_worth_another_round(found: HeldLight) -> bool:
-    """Whether what the last round found is worth a correction."""
-    return max(abs(found.rise), abs(found.fall)) > _KNOWN
+    """Whether the shares that the last round found are worth a correction."""
+    return max(abs(found.rise), abs(found.fall)) > _NEGLIGIBLE_SHARE
 
 
 def add_first_predecessor(
@@ -177,35 +245,55 @@ def add_first_predecessor(
 ) -> FrameStack:
     """Return the stack with the last frame as the first one's predecessor, if that fits better.
 
-    Sets are often taken one after the other, and then the first picture follows the last one. If it
-    does, the first sinusoid swings less than the others of its axis, by the share.
+    Sets are often taken one after the other, and then the first picture follows the last one (white
+    or black). If it does, the first sinusoid swings less than the others of its axis, by the share.
+
+    Parameters
+    ----------
+    stack, binned, scene
+        As in `estimate_held_light`.
+    held : HeldLight
+        The shares, as the other frames show them.
+
+    Returns
+    -------
+    FrameStack
+        The given one, or one whose first frame has a predecessor.
     """
     share = held.share
-    first = [k for k in stack.sinusoids(AXES[0]) if stack.before_of(k) < 0]
-    if len(first) != 1 or share <= 0:
+    x_frames = stack.sinusoids(AXES[0])
+    without_predecessor = [frame for frame in x_frames if stack.before_of(frame) < 0]
+    if len(without_predecessor) != 1 or share <= 0:
         return stack
+    first = without_predecessor[0]
+
+    # Swing of each sinusoid of x.
     scene = scene.thinned()
+    constant = np.ones((1, scene.index.size))
     swings = {}
-    for frame in stack.sinusoids(AXES[0]):
+    for frame in x_frames:
         seen = binned.means[frame].reshape(-1)[scene.index].astype(float)
-        columns, _ = _own_columns(stack, scene, frame, np.ones((1, scene.index.size)))
+        columns, _ = _own_columns(stack, scene, frame, constant)
         solved = np.linalg.lstsq((columns * scene.light).T, seen, rcond=None)[0]
         swings[frame] = float(np.hypot(solved[1], solved[2]))
-    # The others contain a step of the same fringes, which leaves |1 - f + f exp(-i step)|
-    others = float(np.median([swing for frame, swing in swings.items() if frame != first[0]]))
-    steps = stack.shifts_rad(stack.sinusoids(AXES[0]))
-    turn = float(np.median(np.diff(steps)))
-    others /= abs(1 - share + share * np.exp(-1j * turn))
-    ratio = swings[first[0]] / max(others, 1e-9)
+
+    # Swing without held light: the other frames contain the share f of a step of the same fringes,
+    # which leaves |1 - f + f exp(-i step)| of it.
+    others = float(np.median([swing for frame, swing in swings.items() if frame != first]))
+    step_rad = float(np.median(np.diff(stack.shifts_rad(x_frames))))
+    others /= abs(1 - share + share * np.exp(-1j * step_rad))
+
+    # 1 - f of it is left in the first frame if it follows a picture without fringes, else all.
+    ratio = swings[first] / max(others, _LEAST_AMPLITUDE)
     if abs(ratio - (1 - share)) >= abs(ratio - 1):
         return stack
     before = [stack.before_of(frame) for frame in range(len(stack.patterns))]
-    before[first[0]] = stack.last_taken
+    before[first] = stack.last_taken
     return replace(stack, before=tuple(before))
 
 
 def describe_held_light(held: HeldLight) -> str:
-    """Why a set is degraded by what its frames hold of the previous ones; empty if it is not."""
+    """Why a set is degraded by light of the previous pictures; empty if it is not."""
     if not held.corrected or abs(held.share) < _GREAT_SHARE:
         return ""
     return (
@@ -215,9 +303,12 @@ def describe_held_light(held: HeldLight) -> str:
 
 
 def _smooth_columns(scene: SampledBins) -> FloatArray:
-    """Polynomials (k, n) over the mirror, the constant first."""
-    spread = np.maximum(scene.phase_rad.std(axis=1), 1e-9)
-    u, v = (scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]) / spread[:, None]
+    """Polynomials (k, n) in the phases, which are about the place on the mirror; the constant
+    first.
+    """
+    spread_rad = np.maximum(scene.phase_rad.std(axis=1), _LEAST_AMPLITUDE)
+    centred_rad = scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]
+    u, v = centred_rad / spread_rad[:, None]
     powers = [(p, q) for p in range(_SMOOTH_ORDER + 1) for q in range(_SMOOTH_ORDER + 1 - p)]
     return np.stack([u**p * v**q for p, q in powers])
 
@@ -225,61 +316,92 @@ def _smooth_columns(scene: SampledBins) -> FloatArray:
 def _own_columns(
     stack: FrameStack, scene: SampledBins, frame: int, smooth: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Columns (p, n) of a frame's own pattern, over the light, and the bins to fit."""
+    """Columns (p, n) of a frame's own pattern, in units of the light, and the bins (n,) to fit.
+
+    Of a sinusoid, the first three columns are level, cosine and sine.
+    """
     pattern = stack.patterns[frame]
-    every = np.ones(scene.index.size, bool)
+    every_bin = np.ones(scene.index.size, bool)
     if pattern.role in ("white", "black"):
-        return smooth, every
-    phase = scene.phase_rad[AXES.index(pattern.axis)]
+        return smooth, every_bin
+    phase_rad = scene.phase_rad[AXES.index(pattern.axis)]
     if pattern.role == "gray":
-        shown, from_edge = gray_bit(phase, pattern.index)
-        return np.concatenate([smooth, smooth * shown]), from_edge > _EDGE_RAD
-    if pattern.period_mm:  # of another period: not among the phases
-        return smooth, ~every
-    psi = phase + pattern.shift_rad
-    waves = [np.cos(psi), np.sin(psi), *(np.cos(n * psi) for n in _HARMONICS)]
-    waves += [np.sin(n * psi) for n in _HARMONICS]
-    return np.concatenate([smooth[:1], np.stack(waves[:2]), smooth[1:], np.stack(waves[2:])]), every
+        shown, from_edge_rad = gray_bit(phase_rad, pattern.index)
+        return np.concatenate([smooth, smooth * shown]), from_edge_rad > _EDGE_RAD
+    if pattern.period_mm:  # another period: its phase is not among those of the scene
+        return smooth, ~every_bin
+    psi_rad = phase_rad + pattern.shift_rad
+    fundamental = np.stack([np.cos(psi_rad), np.sin(psi_rad)])
+    cosines = np.stack([np.cos(n * psi_rad) for n in _HARMONICS])
+    sines = np.stack([np.sin(n * psi_rad) for n in _HARMONICS])
+    columns = np.concatenate([smooth[:1], fundamental, smooth[1:], cosines, sines])
+    return columns, every_bin
 
 
 def _fit_previous(
-    seen: FloatArray, previous: FloatArray, columns: FloatArray, sure: BoolArray
-) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
-    """Share and noise where a frame rises, and where it falls; empty if it cannot show them."""
-    rises: list[tuple[float, float]] = []
-    falls: list[tuple[float, float]] = []
-    if np.count_nonzero(sure) < _LEAST_BINS:
+    seen: FloatArray, previous: FloatArray, columns: FloatArray, usable: BoolArray
+) -> tuple[list[ShareOfFrame], list[ShareOfFrame]]:
+    """Fit one frame by its own pattern, and by the change from the previous frame.
+
+    Parameters
+    ----------
+    seen, previous : (n,) array
+        Light of the bins in this frame, and in the one before.
+    columns : (p, n) array
+        The frame's own pattern.
+    usable : (n,) bool array
+        The bins to fit.
+
+    Returns
+    -------
+    rises, falls : lists of (share, sigma)
+        One entry each where the frame rises, and where it falls; empty if it cannot show that.
+    """
+    rises: list[ShareOfFrame] = []
+    falls: list[ShareOfFrame] = []
+    if np.count_nonzero(usable) < _LEAST_BINS:
         return rises, falls
-    columns, seen = columns[:, sure], seen[sure]
+    columns, seen = columns[:, usable], seen[usable]
+
+    # The frame's own pattern alone. Normal equations: the columns have length 1 and are far from
+    # dependent.
     columns = columns / np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), 1e-30)
-    # Normal equations: the columns have length 1 and are far from dependent
     solve = np.linalg.pinv(columns @ columns.T) @ columns
     own = (solve @ seen) @ columns
-    change = previous[sure] - own
+
+    # The change from the previous frame, where this frame is brighter, and where it is darker; each
+    # less what the own pattern explains of it.
+    change = previous[usable] - own
     ways = np.stack([np.minimum(change, 0.0), np.maximum(change, 0.0)])
     free = ways - (ways @ solve.T) @ columns
     power = np.sum(free**2, axis=1)
-    determined = power > _LEAST_DETERMINED * np.sum(ways**2, axis=1) + 1e-12 * float(own @ own)
-    if not determined.any():
+    least_power = _LEAST_DETERMINED * np.sum(ways**2, axis=1) + 1e-12 * float(own @ own)
+    is_determined = power > least_power
+    if not is_determined.any():
         return rises, falls
-    inverse = np.linalg.inv(free[determined] @ free[determined].T)
-    shares = inverse @ (free[determined] @ (seen - own))
-    rest = seen - own - shares @ free[determined]
+
+    # Least squares for the shares; the rest gives their noise.
+    free = free[is_determined]
+    inverse = np.linalg.inv(free @ free.T)
+    shares = inverse @ (free @ (seen - own))
+    rest = seen - own - shares @ free
     sigmas = np.sqrt(np.mean(rest**2) * np.diag(inverse))
-    found = iter(zip(shares.tolist(), sigmas.tolist(), strict=True))
-    for way, is_determined in zip((rises, falls), determined, strict=True):
-        if is_determined:
-            way.append(next(found))
+    determined = list(zip(shares.tolist(), sigmas.tolist(), strict=True))
+    rise_is_determined, fall_is_determined = is_determined
+    if rise_is_determined:
+        rises = determined[:1]
+    if fall_is_determined:
+        falls = determined[-1:]
     return rises, falls
 
 
-def _middle(found: list[tuple[float, float]]) -> tuple[float, float]:
-    """Median of the shares, and its uncertainty by noise and scatter."""
+def _combine_frames(found: list[ShareOfFrame]) -> ShareOfFrame:
+    """Median of the frames' shares, and its uncertainty from their noise and scatter."""
     shares, sigmas = np.array(found).T
     share = float(np.median(shares))
     count = math.sqrt(len(found))
-    # The median of few is 1.25 times as uncertain as their mean; one alone has no scatter
-    scatter = 0.1 * abs(share)
+    scatter = _SCATTER_OF_ONE * abs(share)
     if len(found) > 1:
-        scatter = 1.25 * 1.4826 * float(np.median(np.abs(shares - share))) / count
+        deviation = float(np.median(np.abs(shares - share)))
+        scatter = _MEDIAN_OVER_MEAN * _SIGMA_OVER_MAD * deviation / count
     return share, math.hypot(float(np.median(sigmas)) / count, scatter)

@@ -19,18 +19,28 @@ import numpy as np
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
-_EXPONENTS = np.geomspace(0.15, 6.0, 200)
-_LEAST_EXPONENT = 0.88  # below, a linear panel's light is not what the camera counts
+_EXPONENTS = np.geomspace(0.15, 6.0, 200)  # that are tabulated
+_LEAST_EXPONENT = 0.88  # below it, the camera's counts are not proportional to the light
 _LEAST_BINS = 300
 
 
 @dataclass(frozen=True)
 class LightResponse:
-    """What the frames show of the light."""
+    """What the frames show of the light.
 
-    exponent: float  # counts rise as level^exponent; NaN if the set cannot show it
-    edge_loss: float  # share of the light that is lost from the mirror's middle to its edge
-    side_loss: float  # and from its brightest side to the opposite one
+    Attributes
+    ----------
+    exponent : float
+        Counts rise as level^exponent; NaN if the set cannot show it.
+    edge_loss : float
+        Share of the light that is lost from the mirror's middle to its edge.
+    side_loss : float
+        Share of the light that is lost from the mirror's brightest side to the opposite one.
+    """
+
+    exponent: float
+    edge_loss: float
+    side_loss: float
 
 
 UNKNOWN = LightResponse(math.nan, math.nan, math.nan)
@@ -40,33 +50,42 @@ def estimate_response(
     stack: FrameStack,
     binned: Binned,
     index: IntArray,
-    place_mm: FloatArray,
+    position: FloatArray,
     excluded: Collection[int],
     used: tuple[list[int], list[int]],
 ) -> LightResponse:
-    """Estimate it from some bins.
+    """Estimate response and losses of the light.
 
     Parameters
     ----------
+    stack, binned : FrameStack, Binned
+        The set, and its frames as means over bins.
     index : (n,) int array
         Bins that see the pattern in the mirror.
-    place_mm : (2, n) array
-        Where on the mirror, over its radius.
-    excluded : frames
-        Those that do not belong.
-    used : two lists
-        Sinusoids of x and y.
+    position : (2, n) array
+        Position on the mirror, over its radius.
+    excluded : collection of int
+        Frames that do not belong to the set.
+    used : two lists of int
+        The used sinusoids of x and y.
+
+    Returns
+    -------
+    LightResponse
+        `UNKNOWN` with fewer than 300 bins.
     """
     if index.size < _LEAST_BINS:
         return UNKNOWN
     means = binned.means.reshape(len(stack.patterns), -1)[:, index].astype(float)
-    middle = np.mean([stack.weights(frames)[0] @ means[frames] for frames in used], axis=0)
-    edge_loss, side_loss = _find_losses(middle, place_mm)
-    white, black = stack.single("white"), stack.single("black")
+    mean_of_axes = [stack.weights(frames)[0] @ means[frames] for frames in used]
+    mean_of_fringes = np.mean(mean_of_axes, axis=0)
+    edge_loss, side_loss = _find_losses(mean_of_fringes, position)
+    white = stack.single("white")
+    black = stack.single("black")
     if white is None or black is None or {white, black} & set(excluded):
         return LightResponse(math.nan, edge_loss, side_loss)
     span = np.maximum(means[white] - means[black], 1e-9)
-    share = float(np.median((middle - means[black]) / span))
+    share = float(np.median((mean_of_fringes - means[black]) / span))
     return LightResponse(_invert_share(share), edge_loss, side_loss)
 
 
@@ -89,9 +108,9 @@ def _invert_share(share: float) -> float:
     return float(np.interp(-share, -np.array(shares), _EXPONENTS))
 
 
-def _find_losses(light: FloatArray, place: FloatArray) -> tuple[float, float]:
-    """Losses to the edge and from side to side, by a plane and a bowl of the light."""
-    x, y = place
+def _find_losses(light: FloatArray, position: FloatArray) -> tuple[float, float]:
+    """Losses to the edge and from side to side: a plane and a bowl fitted to the light."""
+    x, y = position
     columns = np.stack([np.ones_like(x), x, y, x**2 + y**2])
     level, along_x, along_y, bowl = np.linalg.lstsq(columns.T, light, rcond=None)[0]
     level = max(float(level), 1e-9)

@@ -22,20 +22,20 @@ from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, make_parabo
 from membrane_ctrl.metrology.reconstruction import surface_fit
 from membrane_ctrl.model.arrays import FloatArray
 
-# A sound film leaves 2 to 5 µrad, wrinkles and gamma tens, a wrong orientation hundreds.
+# RMS of the slopes that a fit leaves: 2 to 5 µrad of a sound film, tens of µrad of wrinkles and
+# gamma, hundreds of a wrong orientation.
 SUSPICIOUS_URAD = 20.0
-# how much less an orientation must leave than the stated one; within how much two are equal
-_BETTER = 4.0
-_EQUAL = 2.0
-# bins that are fitted: the slopes left need no more, and 15 fits of them take 0.1 s
-_BINS = 1500
-_LEAST_BINS = 200  # of the surface's 37 parameters' points; fewer would be fitted by anything
+_BETTER = 4.0  # the stated orientation must leave more than another one by this factor
+_EQUAL = 2.0  # orientations within this factor of the best one explain the slopes equally well
+_BINS = 1500  # that are fitted: more change nothing, and 15 fits of them take 0.1 s
+_LEAST_BINS = 200  # for the surface's parameters; any surface would fit fewer
 _TOLERANCE_MM = 1e-3  # of the height: slopes are then known to a microradian
-# of the bins that see the stated mirror; a picture turned by 90 degrees keeps the middle
+# Least bins on the mirror in another orientation, over those in the stated one; a picture turned by
+# 90 degrees keeps the middle.
 _LEAST_SEEN = 0.5
 
-# How pictures, and the pattern, may be turned; and the matrix that turns columns and rows (or x and
-# y of the pattern) about the middle back.
+# How pictures and the pattern may be turned (what to print of each), and the matrix that turns
+# columns and rows, or x and y of the pattern, back about the middle.
 _TURNS = (
     ("rotated by 180 degrees", "rotated by 180 degrees", ((-1, 0), (0, -1))),
     ("mirrored left to right", "mirrored left to right", ((-1, 0), (0, 1))),
@@ -101,23 +101,29 @@ def find_orientation(
     known = known[:: max(1, known.size // _BINS)]
     places_px = places_px[:, known]
     screen_mm = screen_scale.screen_mm(phase_rad[:, known], optics.pattern)
+
+    # The stated orientation.
     tracer = Tracer(Geometry.from_config(optics), optics.mirror.radius_mm, vertex_z_mm)
-    stated_urad, seen = _residual_urad(optics, tracer, places_px, screen_mm)
+    stated_urad, stated_count = _residual_urad(optics, tracer, places_px, screen_mm)
     if stated_urad <= SUSPICIOUS_URAD:
         return None
+
+    # All others: first pictures turned back, then the pattern turned back.
     camera = optics.camera
     middle_px = np.array([[camera.width_px - 1], [camera.height_px - 1]]) / 2
-    residuals_urad: dict[str, float] = {}
+    tried: list[tuple[str, FloatArray, FloatArray]] = []
     for of_pictures, of_pattern, turn in _TURNS:
         turned_px = middle_px + np.array(turn) @ (places_px - middle_px)
         turned_mm = np.array(turn) @ screen_mm
-        for name, places, points in (
-            (f"the pictures are {of_pictures}", turned_px, screen_mm),
-            (f"the pattern on the screen is {of_pattern}", places_px, turned_mm),
-        ):
-            residual_urad, count = _residual_urad(optics, tracer, places, points)
-            if count >= _LEAST_SEEN * seen:
-                residuals_urad[name] = residual_urad
+        tried.append((f"the pictures are {of_pictures}", turned_px, screen_mm))
+        tried.append((f"the pattern on the screen is {of_pattern}", places_px, turned_mm))
+    residuals_urad: dict[str, float] = {}
+    for name, places, points in tried:
+        residual_urad, count = _residual_urad(optics, tracer, places, points)
+        if count >= _LEAST_SEEN * stated_count:
+            residuals_urad[name] = residual_urad
+
+    # The best one counts if it is much better than the stated one.
     best_urad = min(residuals_urad.values(), default=math.inf)
     if not best_urad * _BETTER < stated_urad:
         return None
@@ -128,7 +134,12 @@ def find_orientation(
 def _residual_urad(
     optics: OpticsConfig, tracer: Tracer, places_px: FloatArray, screen_mm: FloatArray
 ) -> tuple[float, int]:
-    """RMS of measured minus fitted slopes, µrad (infinite without a fit), and the bins used."""
+    """RMS of measured minus fitted slopes, µrad (infinite without a fit), and the number of bins
+    on the mirror.
+
+    `places_px` (2, n) are columns and rows of the bins, `screen_mm` (2, n) their screen points.
+    """
+    # Bins whose rays meet the plane through the vertex inside the analysed radius.
     rays = tracer.geometry.rays(*places_px)
     path_mm = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / rays[2]
     x_mm, y_mm = (tracer.geometry.pinhole_mm[:, None] + path_mm * rays)[:2]

@@ -13,7 +13,7 @@ a second image: it moves no phase.
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,33 +25,53 @@ from membrane_ctrl.metrology.phase.gray_code import gray_bit
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
-_BINS = 800
+_BINS = 800  # that are compared
+_LEAST_SURE = 0.2  # share of the bins that a Gray frame must show
 HIDDEN_RAD = 0.4  # from a Gray bit's edge: blur and the size of a bin
+_SMOOTH_ORDER = 3  # powers by which light and contrast may differ over the mirror
+
+# The places that are searched: scales a, and shifts d in steps.
 _SCALES = (1.0, 0.95, 1.05, 0.9, 1.1, 0.75, 1.25, 0.5, 1.5, -0.5, -0.75, -1.0, -1.3)
-_SAME_SCALE = 0.06
+_SAME_SCALE = 0.06  # scales as near to 1 as this may show the first image itself
 _STEP_RAD = 0.4
-_EVERY = 7  # of the places show what chance explains
+_SHIFT_RANGE = 1.5  # shifts go this far, over half the pattern's phase
+_EVERY = 7  # steps between the places that show what chance explains
+_CELL_RAD = 0.05  # of the table of bits, and the step of the finer search
+
+# Least power of a second image that a frame's own pattern does not explain, over its whole power.
 _LEAST_DETERMINED = 0.02
-_CELL_RAD = 0.05  # of the table of bits
-_SMOOTH = 3  # of the polynomials' powers
-# Explained power of the best place over that of the median place (0.455 of a chance's mean): chance
-# reaches 15 in 5000 places
+# Explained power of the best place over the mean of what chance explains, whose median is 0.455 of
+# its mean (chi square with one degree of freedom): chance reaches 15 in 5000 places.
 _CLEAR = 100.0
 _CHANCE_MEDIAN = 0.455
-_LEAST_SHARE = 5e-4
+_LEAST_SHARE = 5e-4  # of the light, to count as a second image
 _STRAY_SHARE = 0.5  # of a second image's share that its mirror image may have
+_TINY = 1e-30  # instead of a division by zero
 
 
 @dataclass(frozen=True)
 class SecondReflection:
-    """A second image of the screen, or by how much one may hide."""
+    """A second image of the screen, or by how much one may hide.
 
-    share: float  # of the first image's light; 0 if none was found
-    sigma: float  # NaN if the set cannot show it
-    scale: tuple[float, float] = (1.0, 1.0)  # of x and y, over the first image
-    # of x and y, in the middle of the pattern; NaN: not seen along that axis
+    Attributes
+    ----------
+    share : float
+        Of the first image's light; 0 if none was found.
+    sigma : float
+        Standard uncertainty of the share; NaN if the set cannot show it.
+    scale : (float, float)
+        Of x and y, over the first image.
+    shift_rad : (float, float)
+        Of x and y, in the middle of the pattern; NaN: not seen along that axis.
+    mm_per_rad : float
+        Of the fringes on the screen.
+    """
+
+    share: float
+    sigma: float
+    scale: tuple[float, float] = (1.0, 1.0)
     shift_rad: tuple[float, float] = (math.nan, math.nan)
-    mm_per_rad: float = math.nan  # of the fringes on the screen
+    mm_per_rad: float = math.nan
 
     @property
     def found(self) -> bool:
@@ -73,6 +93,35 @@ class _Place:
     shift_rad: float
 
 
+@dataclass(frozen=True)
+class _GrayFrame:
+    """One Gray frame in n bins, and what its own pattern leaves of it.
+
+    Attributes
+    ----------
+    bit : int
+        Number of its bit.
+    sure : (n,) bool array
+        Bins to compare on.
+    columns : (p, n) array
+        The frame's own pattern, of unit length.
+    solve : (p, n) array
+        From a picture to the coefficients of the columns.
+    left : (n,) array
+        What the columns leave of the picture.
+    """
+
+    bit: int
+    sure: BoolArray
+    columns: FloatArray
+    solve: FloatArray
+    left: FloatArray
+
+    def free_of_own(self, image: FloatArray) -> FloatArray:
+        """An image (n,) without what the frame's own pattern explains of it."""
+        return image - (self.solve @ image) @ self.columns
+
+
 def find_second_reflection(
     stack: FrameStack,
     binned: Binned,
@@ -80,7 +129,26 @@ def find_second_reflection(
     excluded: Collection[int],
     pattern: PatternConfig,
 ) -> SecondReflection:
-    """Search the Gray frames of a fitted set."""
+    """Search the Gray frames of a fitted set for a second image.
+
+    Derivation: section 11 of docs/explanation/metrology.md.
+
+    Parameters
+    ----------
+    stack, binned : FrameStack, Binned
+        The set, and its frames as means over bins.
+    scene : SampledBins
+        The mirror's bins, with the phases that the fitted surface predicts.
+    excluded : collection of int
+        Frames that do not belong to the set.
+    pattern : PatternConfig
+        The pattern on the screen.
+
+    Returns
+    -------
+    SecondReflection
+        `UNKNOWN` without usable Gray frames.
+    """
     centre_rad = screen_scale.centre_phase_rad(pattern)
     scene = scene.thinned(_BINS)
     places = [
@@ -94,15 +162,17 @@ def find_second_reflection(
     if not seen:
         return SecondReflection(0.0, sigma)
     best = max(seen, key=lambda place: place.clear)
-    scales, shifts = [1.0, 1.0], [math.nan, math.nan]
+    scales = [1.0, 1.0]
+    shifts_rad = [math.nan, math.nan]
     for axis, place in enumerate(places):
-        if place in seen and place is not None:
-            scales[axis], shifts[axis] = place.scale, place.shift_rad
+        if place is not None and place in seen:
+            scales[axis] = place.scale
+            shifts_rad[axis] = place.shift_rad
     return SecondReflection(
         best.share,
         sigma,
         (scales[0], scales[1]),
-        (shifts[0], shifts[1]),
+        (shifts_rad[0], shifts_rad[1]),
         screen_scale.mm_per_rad(pattern),
     )
 
@@ -131,92 +201,104 @@ def _search_axis(
     centre_rad: float,
 ) -> _Place | None:
     """The place that explains the Gray frames of an axis best; None without usable frames."""
-    phase = scene.phase_rad[axis]
+    phase_rad = scene.phase_rad[axis]
     smooth = _smooth_columns(scene)
-    bits, lefts, bases, sures = [], [], [], []
-    for frame in stack.gray(AXES[axis]):
-        if frame in excluded:
+    frames = []
+    for k in stack.gray(AXES[axis]):
+        if k in excluded:
             continue
-        bit = stack.patterns[frame].index
-        shown, from_edge = gray_bit(phase, bit)
-        sure = (from_edge > HIDDEN_RAD) & ~binned.saturated[frame].reshape(-1)[scene.index]
-        if np.count_nonzero(sure) < _BINS // 5:
+        bit = stack.patterns[k].index
+        shown, from_edge_rad = gray_bit(phase_rad, bit)
+        saturated = binned.saturated[k].reshape(-1)[scene.index]
+        sure = (from_edge_rad > HIDDEN_RAD) & ~saturated
+        if np.count_nonzero(sure) < _LEAST_SURE * _BINS:
             continue
-        seen = binned.means[frame].reshape(-1)[scene.index].astype(float)
+        # The frame's own pattern: level and contrast, which vary smoothly over the mirror.
+        seen = binned.means[k].reshape(-1)[scene.index].astype(float)
         columns = np.concatenate([smooth, smooth * shown]) * (scene.light * sure)
-        columns /= np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), 1e-30)
+        columns /= np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), _TINY)
         solve = np.linalg.pinv(columns @ columns.T) @ columns
-        bits.append(bit)
-        lefts.append(seen * sure - (solve @ (seen * sure)) @ columns)
-        bases.append((columns, solve))
-        sures.append(sure)
-    if not bits:
+        left = seen * sure - (solve @ (seen * sure)) @ columns
+        frames.append(_GrayFrame(bit, sure, columns, solve, left))
+    if not frames:
         return None
     bright = _white_light(stack, binned, scene, excluded)
-    return _compare_places(phase - centre_rad, bits, lefts, bases, sures, bright, centre_rad)
+    return _compare_places(phase_rad - centre_rad, frames, bright, centre_rad)
 
 
 def _compare_places(
-    phase: FloatArray,
-    bits: list[int],
-    lefts: list[FloatArray],
-    bases: list[tuple[FloatArray, FloatArray]],
-    sures: list[BoolArray],
-    bright: FloatArray,
-    centre_rad: float,
+    phase_rad: FloatArray, frames: list[_GrayFrame], bright: FloatArray, centre_rad: float
 ) -> _Place | None:
     """The best of all places of a second image.
 
-    `phase` (n,) is counted from the pattern's middle; of each Gray frame there are its bit, what
-    its own pattern leaves (n,), that pattern's columns with their solution, and the bins (n,);
-    `bright` (n,) is the light of white over that of black.
+    Parameters
+    ----------
+    phase_rad : (n,) array
+        From the pattern's middle.
+    frames : list of _GrayFrame
+        The Gray frames of the axis.
+    bright : (n,) array
+        Light of white less that of black.
+    centre_rad : float
+        Absolute phase of the pattern's middle.
     """
-    images = _Images(phase, bits, sures, bright, centre_rad)
-    found = _score_places(images, _coarse_places(centre_rad), lefts, bases)
-    if not found.size:
+    images = _Images(phase_rad, frames, bright, centre_rad)
+
+    # A coarse search, and a finer one around its best place.
+    coarse = _score_places(images, _coarse_places(centre_rad), frames)
+    if not coarse.power.size:
         return None
-    _, _, _, scale, shift = found[np.argmax(found[:, 0])]
-    near = [(scale, shift + np.arange(-_STEP_RAD, _STEP_RAD, _CELL_RAD))]
-    fine = _score_places(images, near, lefts, bases)
-    _, share, power, scale, shift = fine[np.argmax(fine[:, 0])]
-    best = images.at(scale, np.array([shift]))
-    # what is left without the best image shows how much chance explains
+    best = int(np.argmax(coarse.score))
+    scale = coarse.scale[best]
+    shifts_rad = coarse.shift_rad[best] + np.arange(-_STEP_RAD, _STEP_RAD, _CELL_RAD)
+    fine = _score_places(images, [(scale, shifts_rad)], frames)
+    best = int(np.argmax(fine.score))
+    share = fine.share[best]
+    power = fine.power[best]
+    shift_rad = fine.shift_rad[best]
+
+    # What the other places explain of the rest shows how much chance explains.
+    image = images.at(scale, np.array([shift_rad]))[:, 0]
     without = [
-        left - share * _free_of_own(one, basis)
-        for left, one, basis in zip(lefts, best[:, 0], bases, strict=True)
+        replace(frame, left=frame.left - share * frame.free_of_own(of_frame))
+        for frame, of_frame in zip(frames, image, strict=True)
     ]
-    others = _score_places(images, _coarse_places(centre_rad, _EVERY), without, bases)
-    chance = float(np.median(np.abs(others[:, 0]))) / _CHANCE_MEDIAN
-    sigma = math.sqrt(chance / float(np.median(others[:, 2])))
-    mirrored = _score_places(images, [(2 - scale, np.array([-shift]))], lefts, bases)
-    stray = bool(mirrored.size) and float(mirrored[0, 1]) > _STRAY_SHARE * float(share)
-    clear = 0.0 if stray or share < 0 else float(share**2 * power) / max(chance, 1e-30)
-    return _Place(float(share), sigma, clear, float(scale), float(shift))
+    others = _score_places(images, _coarse_places(centre_rad, _EVERY), without)
+    chance = float(np.median(np.abs(others.score))) / _CHANCE_MEDIAN
+    sigma = math.sqrt(chance / float(np.median(others.power)))
+
+    # Stray light around an edge has a mirror image of about the same share.
+    mirrored = _score_places(images, [(2 - scale, np.array([-shift_rad]))], frames)
+    is_stray = bool(mirrored.share.size) and float(mirrored.share[0]) > _STRAY_SHARE * float(share)
+    clear = 0.0
+    if not is_stray and share >= 0:
+        clear = float(share**2 * power) / max(chance, _TINY)
+    return _Place(float(share), sigma, clear, float(scale), float(shift_rad))
 
 
 class _Images:
-    """Second images of the Gray frames of an axis, for any place."""
+    """Second images of the Gray frames of an axis, for any place.
+
+    The bits of the pattern are tabulated by phase, from far beyond one edge to far beyond the
+    other, where the pattern is dark.
+    """
 
     def __init__(
-        self,
-        phase: FloatArray,
-        bits: list[int],
-        sures: list[BoolArray],
-        bright: FloatArray,
-        centre_rad: float,
+        self, phase_rad: FloatArray, frames: list[_GrayFrame], bright: FloatArray, centre_rad: float
     ) -> None:
-        self._phase = phase
-        self._reach_rad = 3 * (float(np.max(np.abs(phase))) + 1.5 * centre_rad)
-        cells = np.arange(-self._reach_rad, self._reach_rad, _CELL_RAD)
-        inside = np.abs(cells) < centre_rad + np.pi
-        shown = [gray_bit(cells + centre_rad, bit)[0] & inside for bit in bits]
+        self._phase_rad = phase_rad
+        largest_rad = float(np.max(np.abs(phase_rad))) + _SHIFT_RANGE * centre_rad
+        self._reach_rad = 3 * largest_rad
+        cells_rad = np.arange(-self._reach_rad, self._reach_rad, _CELL_RAD)
+        inside = np.abs(cells_rad) < centre_rad + np.pi
+        shown = [gray_bit(cells_rad + centre_rad, frame.bit)[0] & inside for frame in frames]
         self._table = np.stack(shown)
-        self._bright = bright * np.stack(sures)
+        self._bright = bright * np.stack([frame.sure for frame in frames])
 
     def at(self, scale: float, shifts_rad: FloatArray) -> FloatArray:
         """Light (frames, shifts, n) of images of the same brightness as the first."""
-        place = scale * self._phase + shifts_rad[:, None] + self._reach_rad
-        cell = np.rint(place / _CELL_RAD).astype(np.int32)
+        place_rad = scale * self._phase_rad + shifts_rad[:, None] + self._reach_rad
+        cell = np.rint(place_rad / _CELL_RAD).astype(np.int32)
         shown = self._table[:, np.clip(cell, 0, self._table.shape[1] - 1)]
         return np.asarray(shown * self._bright[:, None])
 
@@ -225,7 +307,8 @@ def _white_light(
     stack: FrameStack, binned: Binned, scene: SampledBins, excluded: Collection[int]
 ) -> FloatArray:
     """Light (n,) of a white screen less that of a black one."""
-    white, black = stack.single("white"), stack.single("black")
+    white = stack.single("white")
+    black = stack.single("black")
     if white is None or black is None or {white, black} & set(excluded):
         return 2 * scene.light  # of fringes with full contrast
     more = binned.means[white].astype(float) - binned.means[black]
@@ -234,42 +317,66 @@ def _white_light(
 
 def _coarse_places(centre_rad: float, every: int = 1) -> list[tuple[float, FloatArray]]:
     """Scales with their shifts, without those of the first image itself."""
-    shifts = np.arange(-1.5 * centre_rad, 1.5 * centre_rad, every * _STEP_RAD)
-    apart = shifts[np.abs(shifts) > HIDDEN_RAD]
-    return [(scale, shifts if abs(scale - 1) > _SAME_SCALE else apart) for scale in _SCALES]
+    reach_rad = _SHIFT_RANGE * centre_rad
+    shifts_rad = np.arange(-reach_rad, reach_rad, every * _STEP_RAD)
+    of_other_images = shifts_rad[np.abs(shifts_rad) > HIDDEN_RAD]
+    places = []
+    for scale in _SCALES:
+        has_first_image = abs(scale - 1) <= _SAME_SCALE
+        places.append((scale, of_other_images if has_first_image else shifts_rad))
+    return places
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """How well k places explain what the frames' own patterns leave: arrays (k,).
+
+    Attributes
+    ----------
+    score : (k,) array
+        Explained power, with the sign of the share.
+    share : (k,) array
+        Least squares for the share of a second image there.
+    power : (k,) array
+        Power of the image that the own patterns do not explain.
+    scale, shift_rad : (k,) arrays
+        The place.
+    """
+
+    score: FloatArray
+    share: FloatArray
+    power: FloatArray
+    scale: FloatArray
+    shift_rad: FloatArray
 
 
 def _score_places(
-    images: _Images,
-    places: list[tuple[float, FloatArray]],
-    lefts: list[FloatArray],
-    bases: list[tuple[FloatArray, FloatArray]],
-) -> FloatArray:
-    """Rows (k, 5) of explained power with the share's sign, share, power, scale and shift."""
-    scores = [np.zeros((0, 5))]
-    for scale, shifts in places:
-        image = images.at(scale, shifts)
-        whole = np.sum(image**2, axis=(0, 2))
-        power, along = whole.copy(), np.zeros(shifts.size)
-        for one, left, (columns, solve) in zip(image, lefts, bases, strict=True):
-            power -= np.sum((one @ solve.T) * (one @ columns.T), axis=1)
-            along += one @ left
-        seen = power > _LEAST_DETERMINED * whole + 1e-9
-        power, along, shifts = power[seen], along[seen], shifts[seen]
-        scales = np.full(shifts.size, scale)
-        rows = (along * np.abs(along) / power, along / power, power, scales, shifts)
-        scores.append(np.stack(rows, axis=1))
-    return np.concatenate(scores)
-
-
-def _free_of_own(image: FloatArray, basis: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """An image (n,) without what the frame's own pattern explains of it."""
-    columns, solve = basis
-    return image - (solve @ image) @ columns
+    images: _Images, places: list[tuple[float, FloatArray]], frames: list[_GrayFrame]
+) -> _Scores:
+    """Score the places at which the frames determine a second image."""
+    rows = [np.zeros((5, 0))]
+    for scale, shifts_rad in places:
+        image = images.at(scale, shifts_rad)
+        whole_power = np.sum(image**2, axis=(0, 2))
+        power = whole_power.copy()
+        product = np.zeros(shifts_rad.size)  # of the image with what is left
+        for of_frame, frame in zip(image, frames, strict=True):
+            power -= np.sum((of_frame @ frame.solve.T) * (of_frame @ frame.columns.T), axis=1)
+            product += of_frame @ frame.left
+        determined = power > _LEAST_DETERMINED * whole_power + 1e-9
+        power = power[determined]
+        product = product[determined]
+        shifts_rad = shifts_rad[determined]
+        score = product * np.abs(product) / power
+        scales = np.full(shifts_rad.size, scale)
+        rows.append(np.stack([score, product / power, power, scales, shifts_rad]))
+    return _Scores(*np.concatenate(rows, axis=1))
 
 
 def _smooth_columns(scene: SampledBins) -> FloatArray:
-    """Polynomials (k, n) over the mirror."""
-    spread = np.maximum(scene.phase_rad.std(axis=1), 1e-9)
-    u, v = (scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]) / spread[:, None]
-    return np.stack([u**p * v**q for p in range(_SMOOTH) for q in range(_SMOOTH - p)])
+    """Polynomials (k, n) in the phases, which are about the place on the mirror."""
+    spread_rad = np.maximum(scene.phase_rad.std(axis=1), 1e-9)
+    centred_rad = scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]
+    u, v = centred_rad / spread_rad[:, None]
+    powers = [(p, q) for p in range(_SMOOTH_ORDER) for q in range(_SMOOTH_ORDER - p)]
+    return np.stack([u**p * v**q for p, q in powers])

@@ -1,12 +1,15 @@
-"""The full result of a capture set: frames checked, every pixel's phase and slopes, the fit, and
-the zonal map.
+"""Checks the frames of a capture set against each other, and fits a surface to its bins.
 
-Bins come first: they give the fringe orders, a surface, and what each frame should have shown.
-Frames that do not belong are left out, one at a time since one bad frame spoils the prediction of
-the others, until the rest agree. Then every pixel is measured, its period taken from its bin.
+Bins of pixels give the fringe orders, a surface, and what each frame should have shown. Frames that
+do not belong are left out, one at a time since one bad frame spoils the prediction of the others,
+until the rest agree. A set whose frames give no figure is rejected here, with `RejectedSetError`;
+verdicts on the figure itself follow from its quality (`model.shape_estimate.judge_quality`).
+
+`figure.pixel_figure` then measures every pixel, its period taken from its bin.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -41,29 +44,55 @@ from membrane_ctrl.metrology.reconstruction import bin_grid, tracked_points
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD
 
-_ROUNDS = 8
-_MANY_BLAMED = 3
-# Below, the light is called even: it leaves 0.02 µm in the figure, and a blurred set seems to
-# differ by as much.
+_ROUNDS = 8  # of fit and inspection; each leaves out one frame or more
+_EXCHANGE_ROUNDS = 2  # of a set with two frames exchanged
+_MANY_BLAMED = (
+    3  # sinusoids that differ from the prediction: it may be the prediction that is wrong
+)
+# Steps of an axis up to which an exchanged pair cannot be named by what its frames show.
+_FEW_STEPS = 3
+# Largest difference of light that is called even: it leaves 0.02 µm in the figure, and a blurred
+# set seems to differ by as much.
 _UNEVEN = 2e-3
-# from the pattern's edge: a blurred picture of it says nothing of a frame's light
+_LIGHT_KNOWN = 3e-4  # the same, once the light of the frames is part of the fit
+# Bins nearer than this to the pattern's edge are not used to find a frame's light: the edge is
+# blurred there.
 _BLURRED_RAD = 2.0
-_LIGHT_KNOWN = 3e-4  # what another round would change, once it is not even
-# the ring's plane is crossed this far at most from where the ray meets the film
+_LEAST_INNER = 1 / 2  # share of the bins that must be far enough from the edge
+# A ray meets the film this far at most from where it crosses the ring's plane.
 _FILM_BESIDE_PLANE_MM = 25.0
 
 
 def check_set(
     stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | None = None
 ) -> Checked:
-    """Check the frames and fit the bins. Raises RejectedSetError if the frames do not give a
-    figure.
+    """Check the frames of a set and fit a surface to its bins.
 
-    `anchor` gives a set without Gray code its fringe orders; `camera.bits` of the optics sets
-    saturation.
+    Derivation: section 12 of docs/explanation/metrology.md.
+
+    Parameters
+    ----------
+    stack : FrameStack
+        The set.
+    optics : OpticsConfig
+        The bench; `camera.bits` sets saturation.
+    anchor : Anchor, optional
+        Gives a set without Gray code its fringe orders.
+
+    Returns
+    -------
+    Checked
+        The set without the frames that do not belong, and with swapped ones put back.
+
+    Raises
+    ------
+    RejectedSetError
+        The frames give no figure: too few of them agree, they are clipped, or pictures or pattern
+        are turned or mirrored.
     """
+    full_scale_adu = 2**optics.camera.bits - 1
     stack, binned, _ = band_removal.remove_bands(
-        stack, frame_stack.bin_frames(stack, 2**optics.camera.bits - 1)
+        stack, frame_stack.bin_frames(stack, full_scale_adu)
     )
     try:
         found = _check_rounds(stack, binned, optics, anchor)
@@ -75,7 +104,7 @@ def check_set(
             reason = str(error) + _find_doubt(stack, error.flags)
             raise RejectedSetError(reason, error.flags, error.saturated_fraction) from None
         found = put_back
-    if not _believable_surface(found):
+    if not _is_one_surface(found):
         found = _put_back(stack, binned, optics, anchor) or found
     _require_stated_orientation(optics, stack, found.phase_rad, binned.bin_px)
     return found
@@ -118,26 +147,30 @@ def _require_stated_orientation(
 
 
 def _find_doubt(stack: frame_stack.FrameStack, flags: tuple[frame_faults.Flag, ...]) -> str:
-    """Where many frames differ from the prediction, the doubt that the prediction, that is the
-    geometry, is wrong.
+    """The doubt that the geometry is wrong, if many frames differ from what it predicts; else "".
 
     Pictures that are the same, unreadable or dark need no prediction.
     """
-    sinusoids = [flag for flag in flags if stack.patterns[flag.frame].role == "sin"]
-    blamed = [flag for flag in sinusoids if flag.defect in frame_faults.FOUND_BY_PREDICTION]
+    blamed = [
+        flag
+        for flag in _of_sinusoids(stack, flags)
+        if flag.defect in frame_faults.FOUND_BY_PREDICTION
+    ]
     if len(blamed) < _MANY_BLAMED:
         return ""
     return "; with this many frames blamed, check the geometry and the axes of these pictures"
 
 
-def _believable_surface(checked: Checked) -> bool:
-    """Whether the slopes are those of one surface: steps that run backwards agree with every frame,
-    not with it.
+def _is_one_surface(checked: Checked) -> bool:
+    """Whether the slopes are those of one surface.
+
+    Phase steps that run backwards agree with each other, but their slopes fit no surface.
     """
     field = checked.tracer.slope_field(checked.state.points, checked.state.surface)
-    return (
-        1e6 * float(np.sqrt(np.mean(np.square(field[2:4] - field[4:6])))) <= RESIDUAL_REJECTED_URAD
-    )
+    measured = field[2:4]
+    fitted = field[4:6]
+    residual_urad = 1e6 * float(np.sqrt(np.mean(np.square(measured - fitted))))
+    return residual_urad <= RESIDUAL_REJECTED_URAD
 
 
 def _put_back(
@@ -151,28 +184,35 @@ def _put_back(
 
     Three steps that run backwards predict every frame wrongly, so no frame can be blamed for what
     it shows. The Gray code and the surface decide: of all exchanges only the right one leaves no
-    frame to be flagged.
+    frame to be flagged. Of four steps, the good ones show which two are swapped.
     """
-    if (
-        stack.unusable or len(stack.sinusoids(AXES[0])) > 3
-    ):  # the good ones of four steps name a swapped pair
+    if stack.unusable or len(stack.sinusoids(AXES[0])) > _FEW_STEPS:
         return None
     found: list[Checked] = []
-    for axis in AXES:
-        for a, b in combinations(stack.sinusoids(axis), 2):
-            order = list(range(len(stack.patterns)))
-            order[a], order[b] = b, a
-            try:
-                checked = _check_rounds(
-                    stack.reordered(order), binned.reordered(order), optics, anchor, rounds=2
-                )
-            except RejectedSetError:
-                continue
-            if not checked.flags and _believable_surface(checked):
-                pair = ((a, b), (b, a))
-                flags = tuple(_flag_swapped(k, stack.patterns[j].name, j) for k, j in pair)
-                found.append(replace(checked, flags=flags))
+    pairs = [pair for axis in AXES for pair in combinations(stack.sinusoids(axis), 2)]
+    for a, b in pairs:
+        order = _exchange(len(stack.patterns), a, b)
+        try:
+            checked = _check_rounds(
+                stack.reordered(order), binned.reordered(order), optics, anchor, _EXCHANGE_ROUNDS
+            )
+        except RejectedSetError:
+            continue
+        if not checked.flags and _is_one_surface(checked):
+            flags = (
+                _flag_swapped(a, stack.patterns[b].name, b),
+                _flag_swapped(b, stack.patterns[a].name, a),
+            )
+            found.append(replace(checked, flags=flags))
     return found[0] if len(found) == 1 else None
+
+
+def _exchange(count: int, a: int, b: int) -> list[int]:
+    """The order of so many frames with two of them exchanged."""
+    order = list(range(count))
+    order[a] = b
+    order[b] = a
+    return order
 
 
 def _flag_swapped(frame: int, shown: str, swapped_with: int) -> frame_faults.Flag:
@@ -188,114 +228,164 @@ def _check_rounds(
     anchor: Anchor | None,
     rounds: int = _ROUNDS,
 ) -> Checked:
-    """The set as it is, without frames that do not belong, in a limited number of rounds. Raises
-    RejectedSetError.
+    """Fit, inspect and leave out in a limited number of rounds. Raises RejectedSetError.
+
+    A round ends in one of four ways: it leaves out frames, it exchanges two, it repeats the fit
+    with the light that each frame had, or it accepts the set.
     """
-    geometry = Geometry.from_config(optics)
-    grid = bin_grid.BinGrid(geometry, optics.camera, binned.bin_px)
-    near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
+    bench = _Bench.of(optics, binned.bin_px, anchor)
+    taken = binned  # as the camera took them
+
+    # Frames that are bad without any prediction.
     known = {
         frame: frame_faults.flag_unreadable(frame, reason)
         for frame, reason in stack.unusable.items()
     }
     known |= {flag.frame: flag for flag in frame_inspection.find_obvious_faults(stack, binned)}
     excluded = set(known)
+
     flags: list[frame_faults.Flag] = []
-    taken = binned  # as the camera took them
     for done in range(rounds + 1):
+        # Fit the surface without the excluded frames.
         try:
-            bench = _Bench(optics, geometry, grid, near, anchor)
             stack, binned, attempt, held = _attempt_without_held(stack, taken, bench, excluded)
         except (bin_view.NoFigureError, ValueError) as error:
-            used = [k for axis in AXES for k in stack.sinusoids(axis) if k not in excluded]
-            clipped = clipping.clipped_shares_of_lit(
-                binned, used, near.reshape(binned.means[0].shape)
-            )
             named = _merge_flags(_keep_believable(stack, flags), known)
-            raise RejectedSetError(clipped.cause or str(error), named, clipped.white) from None
+            raise _explain_no_figure(stack, binned, bench, excluded, named, error) from None
+
+        # Compare every frame with what that surface predicts.
         readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
-        seen = frame_evidence.measure_frames(stack, binned, attempt.scene, readable)
-        flags = frame_inspection.inspect_frames(stack, seen, excluded)
+        evidence = frame_evidence.measure_frames(stack, binned, attempt.scene, readable)
+        flags = frame_inspection.inspect_frames(stack, evidence, excluded)
         fresh = [flag for flag in flags if flag.frame not in excluded]
+
         if not fresh:
-            inner = np.all(
-                inside_pattern(attempt.scene.phase_rad, optics.pattern, _BLURRED_RAD), axis=0
-            )
-            scene = attempt.scene.part(inner) if np.mean(inner) > 1 / 2 else attempt.scene
-            flat = attempt.phase_rad.reshape(2, -1)
-            light, film_um, noise_um = frame_evidence.estimate_light_and_film(
-                stack, binned, scene, attempt.view.used, flat
-            )
-            left = light - (1.0 if stack.light is None else stack.light)
-            if (
-                np.abs(left).max() > (_UNEVEN if stack.light is None else _LIGHT_KNOWN)
-                and done < rounds
-            ):
-                stack = replace(stack, light=light)  # a round with the light that each frame had
+            # All frames agree. If their light differs, repeat the fit with the light of each.
+            light, film_um, film_noise_um = _estimate_light_and_film(stack, binned, attempt, optics)
+            light_error = light - (1.0 if stack.light is None else stack.light)
+            allowed = _UNEVEN if stack.light is None else _LIGHT_KNOWN
+            if np.abs(light_error).max() > allowed and done < rounds:
+                stack = replace(stack, light=light)
                 continue
-            confirm_orders(
-                stack, attempt.phase_rad, binned, attempt.view, excluded, _merge_flags(flags, known)
-            )
-            shape = attempt.view.mask.shape
-            fitted = (
+            named = _merge_flags(flags, known)
+            confirm_orders(stack, attempt.phase_rad, binned, attempt.view, excluded, named)
+            used = [k for frames in attempt.view.used for k in frames]
+            checked = Checked(
+                stack,
+                binned,
                 attempt.view,
                 attempt.phase_rad,
-                near.reshape(shape),
+                bench.near.reshape(attempt.view.mask.shape),
                 attempt.tracer,
                 attempt.state,
-            )
-            light_left = float(
-                np.sqrt(
-                    np.mean(np.square(left[:, [k for axis in attempt.view.used for k in axis]]))
-                )
-            )
-            second = second_reflection.find_second_reflection(
-                stack, binned, attempt.scene, excluded, optics.pattern
-            )
-            place = np.array(attempt.tracer.position_mm(attempt.state.points))
-            response = light_response.estimate_response(
-                stack,
-                binned,
-                attempt.state.index,
-                place / optics.mirror.radius_mm,
-                excluded,
-                attempt.view.used,
-            )
-            return Checked(
-                stack,
-                binned,
-                *fitted,
-                _merge_flags(flags, known),
+                named,
                 film_um,
-                noise_um,
-                light_left,
-                held,
-                second,
-                response,
+                film_noise_um,
+                light_left=float(np.sqrt(np.mean(np.square(light_error[:, used])))),
+                held=held,
             )
-        pair = next((flag for flag in fresh if flag.swapped_with is not None), None)
-        if (
-            pair is not None
-            and pair.swapped_with is not None
-            and not {pair.frame, pair.swapped_with} & set(known)
-        ):
-            order = list(range(len(stack.patterns)))
-            order[pair.frame], order[pair.swapped_with] = pair.swapped_with, pair.frame
-            stack, taken = stack.reordered(order), taken.reordered(order)
-            known |= {
-                flag.frame: flag for flag in flags if flag.frame in (pair.frame, pair.swapped_with)
-            }
+            return _measure_light_path(checked, attempt.scene, excluded, optics)
+
+        pair = _find_swapped_pair(fresh, known)
+        if pair is not None:
+            order = _exchange(len(stack.patterns), *pair)
+            stack = stack.reordered(order)
+            taken = taken.reordered(order)
+            known |= {flag.frame: flag for flag in flags if flag.frame in pair}
             continue
-        # the worst sinusoid alone may spoil the predictions of the others
-        chosen = {flag.frame: flag for flag in _of_sinusoids(stack, fresh)[:1] or fresh}
+
+        # The worst sinusoid alone may spoil the predictions of the others.
+        worst = _of_sinusoids(stack, fresh)[:1]
+        chosen = {flag.frame: flag for flag in worst or fresh}
         known |= chosen
         excluded |= set(chosen)
     reason = "the frames do not agree, whichever are left out"
     raise RejectedSetError(reason, _merge_flags(_keep_believable(stack, flags), known))
 
 
+def _explain_no_figure(
+    stack: frame_stack.FrameStack,
+    binned: frame_stack.Binned,
+    bench: "_Bench",
+    excluded: set[int],
+    flags: tuple[frame_faults.Flag, ...],
+    error: Exception,
+) -> RejectedSetError:
+    """The rejection of a set that has no fit: clipped bins are the cause if there are many."""
+    used = [k for axis in AXES for k in stack.sinusoids(axis) if k not in excluded]
+    near = bench.near.reshape(binned.means[0].shape)
+    clipped = clipping.clipped_shares_of_lit(binned, used, near)
+    return RejectedSetError(clipped.cause or str(error), flags, clipped.white)
+
+
+def _estimate_light_and_film(
+    stack: frame_stack.FrameStack,
+    binned: frame_stack.Binned,
+    attempt: "_Attempt",
+    optics: OpticsConfig,
+) -> tuple[FloatArray, FloatArray, float]:
+    """As `frame_evidence.estimate_light_and_film`, away from the pattern's edge where possible."""
+    scene = attempt.scene
+    is_inner = np.all(inside_pattern(scene.phase_rad, optics.pattern, _BLURRED_RAD), axis=0)
+    if np.mean(is_inner) > _LEAST_INNER:
+        scene = scene.part(is_inner)
+    phase_rad = attempt.phase_rad.reshape(2, -1)
+    return frame_evidence.estimate_light_and_film(
+        stack, binned, scene, attempt.view.used, phase_rad
+    )
+
+
+def _measure_light_path(
+    checked: Checked,
+    scene: frame_evidence.SampledBins,
+    excluded: set[int],
+    optics: OpticsConfig,
+) -> Checked:
+    """The set with what its frames show of second images, and of the response to light."""
+    second = second_reflection.find_second_reflection(
+        checked.stack, checked.binned, scene, excluded, optics.pattern
+    )
+    position_mm = np.array(checked.tracer.position_mm(checked.state.points))
+    response = light_response.estimate_response(
+        checked.stack,
+        checked.binned,
+        checked.state.index,
+        position_mm / optics.mirror.radius_mm,
+        excluded,
+        checked.view.used,
+    )
+    return replace(checked, second=second, response=response)
+
+
+def _find_swapped_pair(
+    fresh: list[frame_faults.Flag], known: dict[int, frame_faults.Flag]
+) -> tuple[int, int] | None:
+    """The first two frames that show each other's pictures, unless one has been flagged before."""
+    for flag in fresh:
+        if flag.swapped_with is not None:
+            pair = (flag.frame, flag.swapped_with)
+            return None if set(pair) & set(known) else pair
+    return None
+
+
 @dataclass(frozen=True)
 class _Attempt:
+    """One fit of the bins.
+
+    Attributes
+    ----------
+    view : BinView
+        What the usable frames show of each bin.
+    phase_rad : (2, rows, columns) array
+        Absolute phases of the bins.
+    tracer : Tracer
+        The bench.
+    state : TrackedPoints
+        The bins on the mirror, and their surface.
+    scene : SampledBins
+        The same bins, with the phases that this surface predicts.
+    """
+
     view: bin_view.BinView
     phase_rad: FloatArray
     tracer: ray_tracing.Tracer
@@ -305,13 +395,27 @@ class _Attempt:
 
 @dataclass(frozen=True)
 class _Bench:
-    """What all attempts to fit a set share."""
+    """What all attempts to fit a set share.
+
+    Attributes
+    ----------
+    near : (bins,) bool array
+        Bins whose rays may meet the mirror.
+    """
 
     optics: OpticsConfig
     geometry: Geometry
     grid: bin_grid.BinGrid
     near: BoolArray
     anchor: Anchor | None
+
+    @classmethod
+    def of(cls, optics: OpticsConfig, bin_px: int, anchor: Anchor | None) -> "_Bench":
+        """The bench of sets with bins of this side."""
+        geometry = Geometry.from_config(optics)
+        grid = bin_grid.BinGrid(geometry, optics.camera, bin_px)
+        near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
+        return cls(optics, geometry, grid, near, anchor)
 
 
 def _attempt_without_held(
@@ -326,7 +430,8 @@ def _attempt_without_held(
     Raises NoFigureError or ValueError if there is no fit.
     """
     stack = replace(stack, held_shares=(0.0, 0.0))
-    binned, held = taken, held_light.UNKNOWN
+    binned = taken
+    held = held_light.UNKNOWN
     attempt = _attempt_fit(stack, binned, bench, excluded)
     for _ in range(held_light.ROUNDS):
         found = held_light.estimate_held_light(stack, binned, attempt.scene, excluded)
@@ -347,32 +452,45 @@ def _attempt_fit(
     bench: _Bench,
     excluded: set[int],
 ) -> _Attempt:
-    """Fit the bins without the excluded frames. Raises NoFigureError
-    or ValueError if that fails.
+    """Fit the bins without the excluded frames. Raises NoFigureError or ValueError if that
+    fails.
     """
-    optics, anchor = bench.optics, bench.anchor
-    tracer = ray_tracing.Tracer(
-        bench.geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um)
-    )
-    view = bin_view.combine_frames(
-        stack, binned, excluded, None if anchor is None else anchor.light
-    )
-    phase = absolute_phases_of_bins(stack, binned, view, anchor, optics)
+    optics = bench.optics
+    anchor = bench.anchor
+    vertex_mm = vertex_z_mm(optics, stack.mean_reading_um)
+    tracer = ray_tracing.Tracer(bench.geometry, optics.mirror.radius_mm, vertex_mm)
+
+    # Light, wrapped and absolute phases of the bins.
+    light_of_anchor = None if anchor is None else anchor.light
+    view = bin_view.combine_frames(stack, binned, excluded, light_of_anchor)
+    phase_rad = absolute_phases_of_bins(stack, binned, view, anchor, optics)
+
+    # The surface that explains them.
     candidates = np.flatnonzero(bench.near)
-    flat = phase.reshape(2, -1)[:, candidates]
+    phase_of_candidates_rad = phase_rad.reshape(2, -1)[:, candidates]
     state = tracked_points.select_points(
-        bench.grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm
+        bench.grid,
+        tracer,
+        candidates,
+        phase_of_candidates_rad,
+        optics.pattern,
+        optics.mirror.analysis_radius_mm,
     )
-    predicted = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)
+
+    # What it predicts.
+    screen_mm = tracer.predict_screen(state.points, state.surface)
+    predicted_rad = screen_mm / mm_per_rad(optics.pattern) + centre_phase_rad(optics.pattern)
     light = view.light.reshape(-1)[state.index]
-    at = predicted + centre_phase_rad(optics.pattern)
-    scene = frame_evidence.SampledBins(state.index, light, at, state.sensitivity_rad_per_um)
-    return _Attempt(view, phase, tracer, state, scene)
+    scene = frame_evidence.SampledBins(
+        state.index, light, predicted_rad, state.sensitivity_rad_per_um
+    )
+    return _Attempt(view, phase_rad, tracer, state, scene)
 
 
 def _of_sinusoids(
-    stack: frame_stack.FrameStack, flags: list[frame_faults.Flag]
+    stack: frame_stack.FrameStack, flags: Iterable[frame_faults.Flag]
 ) -> list[frame_faults.Flag]:
+    """The flags of sinusoids."""
     return [flag for flag in flags if stack.patterns[flag.frame].role == "sin"]
 
 
@@ -386,11 +504,13 @@ def _keep_believable(
 def _merge_flags(
     flags: list[frame_faults.Flag], known: dict[int, frame_faults.Flag]
 ) -> tuple[frame_faults.Flag, ...]:
-    """All flags in the order of the frames; the latest inspection takes precedence, earlier
-    findings remain.
+    """All flags in the order of the frames.
+
+    The latest inspection takes precedence, except over frames that were exchanged; earlier findings
+    remain.
     """
-    named = {
-        **known,
-        **{flag.frame: flag for flag in flags if known.get(flag.frame, flag).swapped_with is None},
-    }
+    named = dict(known)
+    for flag in flags:
+        if known.get(flag.frame, flag).swapped_with is None:
+            named[flag.frame] = flag
     return tuple(named[frame] for frame in sorted(named))
