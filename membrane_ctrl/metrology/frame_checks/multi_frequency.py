@@ -2,9 +2,9 @@
 measured.
 
 The periods may have any ratio. Each bin votes for the place on the screen that explains all its
-phases (`phase.places_mm`), and continuity of the finest phase decides (`orders.by_votes`). What
-follows measures the finest fringes like any set that refers to a full one, so that its noise is
-theirs.
+phases (`multi_period.places_mm`), and continuity of the finest phase decides
+(`fringe_orders.resolve_orders_by_votes`). The finest fringes are then measured as a set that refers
+to a full one, so that the noise of the figure is theirs.
 """
 
 from collections.abc import Collection, Iterator
@@ -29,88 +29,129 @@ from membrane_ctrl.metrology.phase import (
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack, bin_frames
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
-# 1 sigma of a phase, noise and harmonics together: the largest with which most bins know their
-# place
+# Standard deviations of a phase that are tried, of noise and harmonics together: the largest with
+# which most bins have one place.
 _SIGMAS_RAD = (0.2, 0.1, 0.05, 0.02)
-_MOST = 0.5
-_LEAST_KNOWN = 0.02  # of the bins with fringes: fewer places are chance
+_MOST = 0.5  # share of the bins
+_LEAST_KNOWN = 0.02  # share of the bins with fringes: fewer places are chance
+_BRIGHTEST_PERCENTILE = 95  # the swing that `CONTRAST_SHARE` refers to
 
 
 @dataclass(frozen=True)
 class _Series:
-    """The steps of one axis and period."""
+    """The N usable steps of one axis and period.
+
+    Attributes
+    ----------
+    axis : int
+        0: x, 1: y.
+    period_mm : float
+        Period on the screen.
+    frames : list of int
+        The usable steps.
+    shifts_rad : (N,) array
+        Phase steps.
+    seen : (N, bins) array
+        Intensities of the bins with fringes.
+    """
 
     axis: int
     period_mm: float
-    frames: list[int]  # those that are usable
+    frames: list[int]
     shifts_rad: FloatArray
-    seen: FloatArray  # (N, bins): where there are fringes
+    seen: FloatArray
 
     @property
     def phasor(self) -> FloatArray:
-        """(bins,), complex."""
+        """Complex phasor of the fringes in each bin (bins,)."""
         return np.asarray(phase_steps.compute_phasors(self.seen, self.shifts_rad))
 
-    def share(self) -> float:
+    def closure_share(self) -> float:
         """What a sinusoid leaves of the frames, over its amplitude; NaN for three steps, which
         always agree.
         """
-        return (
-            self._over_amplitude(closure.compute_closure(self.seen, self.shifts_rad).rms_adu)
-            if len(self.frames) > 3
-            else np.nan
-        )
+        if len(self.frames) <= 3:
+            return np.nan
+        rms_adu = closure.compute_closure(self.seen, self.shifts_rad).rms_adu
+        amplitude_adu = float(np.median(np.abs(self.phasor)))
+        return rms_adu / max(amplitude_adu, 1e-9)
 
-    def _over_amplitude(self, rms_adu: float) -> float:
-        return rms_adu / max(float(np.median(np.abs(self.phasor))), 1e-9)
+    def compute_naming_closure(self, place_mm: FloatArray) -> closure.Closure:
+        """The closure that can name a frame: of five steps, or of four with a known phase.
 
-    def blamed(self, place_mm: FloatArray) -> closure.Closure:
-        """The closure that can name a frame: of five steps, or with the phase by the other periods'
-        place.
+        That phase follows from the places (bins,) that all periods together give.
         """
         if len(self.frames) > 4:
             return closure.compute_closure(self.seen, self.shifts_rad)
         known = np.isfinite(place_mm)
-        expected = 2 * np.pi * place_mm[known] / self.period_mm - np.pi
-        return closure.closure_with_phase(self.seen[:, known], self.shifts_rad, expected)
+        expected_rad = 2 * np.pi * place_mm[known] / self.period_mm - np.pi
+        return closure.closure_with_phase(self.seen[:, known], self.shifts_rad, expected_rad)
 
 
 def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
     """Check a set of several periods, the finest first, and fit its bins.
-    Raises RejectedSetError.
+
+    Parameters
+    ----------
+    stack : FrameStack
+        The set; patterns of the coarser periods state theirs.
+    optics : OpticsConfig
+        The bench.
+
+    Returns
+    -------
+    Checked
+        The frames of the finest period, with the flags of all.
+
+    Raises
+    ------
+    RejectedSetError
+        The frames give no figure.
     """
-    binned, flags = bin_frames(stack, 2**optics.camera.bits - 1), dict[int, Flag]()
+    binned = bin_frames(stack, 2**optics.camera.bits - 1)
     finest = [k for k, pattern in enumerate(stack.patterns) if not pattern.period_mm]
     count = len(finest)
-    coarser = {k: reason for k, reason in stack.unusable.items() if k >= count}
-    flags |= {k: frame_faults.flag_unreadable(k, reason) for k, reason in coarser.items()}
+    flags: dict[int, Flag] = {}
+    for k, reason in stack.unusable.items():
+        if k >= count:
+            flags[k] = frame_faults.flag_unreadable(k, reason)
+
+    # Places on the screen, without the frames of coarser periods that disagree, one after the
+    # other.
     mask = _find_fringes(stack, binned)
     while True:
         series = list(_all_series(stack, binned, optics, mask, flags))
         places = [_locate_bins(series, axis, optics) for axis in range(2)]
-        bad = _bad_frame(stack, series, places)
+        bad = _find_bad_frame(stack, series, places)
         if bad is None:
             break
         flags[bad.frame] = bad
     named = tuple(flags[k] for k in sorted(flags))
-    absolute = np.stack(
+
+    # They give the orders of the finest fringes, which are then checked as a set with an anchor.
+    absolute_rad = np.stack(
         [_unwrap_finest(series, axis, places[axis], optics, mask, named) for axis in range(2)]
     )
     light = binned.means[finest].mean(axis=0).astype(float)
-    former = [stack.before_of(frame) for frame in range(count)]
-    fine = FrameStack(
-        stack.frames[:count],
-        stack.patterns[:count],
-        stack.displacement_um[:count],
-        {k: reason for k, reason in stack.unusable.items() if k < count},
-        before=tuple(before if before < count else -1 for before in former),
-    )
+    fine = _take_finest(stack, count)
     try:
-        checked = check_set(fine, optics, Anchor(absolute, light))
+        checked = check_set(fine, optics, Anchor(absolute_rad, light))
     except RejectedSetError as error:
         flagged = error.flags + named
         raise RejectedSetError(str(error), flagged, error.saturated_fraction) from None
     return replace(checked, flags=checked.flags + named)
+
+
+def _take_finest(stack: FrameStack, count: int) -> FrameStack:
+    """The set of the first `count` frames alone."""
+    before = [stack.before_of(frame) for frame in range(count)]
+    return FrameStack(
+        stack.frames[:count],
+        stack.patterns[:count],
+        stack.displacement_um[:count],
+        {k: reason for k, reason in stack.unusable.items() if k < count},
+        before=tuple(frame if frame < count else -1 for frame in before),
+    )
 
 
 def _find_fringes(stack: FrameStack, binned: Binned) -> BoolArray:
@@ -122,15 +163,14 @@ def _find_fringes(stack: FrameStack, binned: Binned) -> BoolArray:
             shifts = stack.shifts_rad(frames)
             swings.append(np.abs(phase_steps.compute_phasors(binned.means[frames], shifts)))
     swing = np.median(swings, axis=0)
-    return np.asarray(
-        (swing > full_decoder.CONTRAST_SHARE * np.percentile(swing, 95))
-        & ~binned.saturated.any(axis=0)
-    )
+    least_swing = full_decoder.CONTRAST_SHARE * np.percentile(swing, _BRIGHTEST_PERCENTILE)
+    return np.asarray((swing > least_swing) & ~binned.saturated.any(axis=0))
 
 
 def _make_series(
     stack: FrameStack, axis: str, period_mm: float, left_out: Collection[int]
 ) -> list[int]:
+    """The frames of an axis and period; 0: the finest."""
     return [
         k
         for k, p in enumerate(stack.patterns)
@@ -151,63 +191,72 @@ def _all_series(
     for k, axis in enumerate(pattern_sequence.AXES):
         for period in sorted({pattern.period_mm for pattern in stack.patterns}):
             frames = _make_series(stack, axis, period, left_out)
-            shifts, period_mm = stack.shifts_rad(frames), period or optics.pattern.period_mm
+            shifts = stack.shifts_rad(frames)
+            period_mm = period or optics.pattern.period_mm
             try:
                 phase_steps.step_weights(shifts)
             except ValueError:
-                said = (
+                reason = (
                     f"{len(frames)} {axis} phase steps of {period_mm:g} mm are usable: too few "
                     "for a phase"
                 )
                 named = tuple(Flag(n, FrameDefect.LEFT_OUT, "left out", np.inf) for n in left_out)
-                raise RejectedSetError(said, named) from None
-            yield _Series(k, period_mm, frames, shifts, binned.means[frames][:, mask].astype(float))
+                raise RejectedSetError(reason, named) from None
+            seen = binned.means[frames][:, mask].astype(float)
+            yield _Series(k, period_mm, frames, shifts, seen)
 
 
 def _locate_bins(series: list[_Series], axis: int, optics: OpticsConfig) -> FloatArray:
-    """Places (bins,) from the pattern's low edge; NaN where the periods do not tell."""
-    own = [one for one in series if one.axis == axis]
-    wrapped = np.stack([np.angle(one.phasor) + np.pi for one in own])
-    periods_mm, side_mm = (
-        [one.period_mm for one in own],
-        optics.pattern.periods * optics.pattern.period_mm,
-    )
-    found = []
-    for sigma_rad in _SIGMAS_RAD:
-        found.append(
-            multi_period.places_mm(wrapped, periods_mm, (0.0, side_mm), sigma_rad).place_mm
-        )
-        if np.mean(np.isfinite(found[-1])) > _MOST:
-            break
-    return max(found, key=lambda place_mm: np.count_nonzero(np.isfinite(place_mm)))
-
-
-def _bad_frame(stack: FrameStack, series: list[_Series], places: list[FloatArray]) -> Flag | None:
-    """The frame of the coarser periods that disagrees most, if one does.
-    `check` judges the finest.
+    """Places (bins,) from the pattern's low edge, mm; NaN where the periods do not determine
+    them.
     """
-    shares = [one.share() for one in series]
-    found = []
-    for k, one in enumerate(series):
+    own = [each for each in series if each.axis == axis]
+    wrapped_rad = np.stack([np.angle(each.phasor) + np.pi for each in own])
+    periods_mm = [each.period_mm for each in own]
+    side_mm = optics.pattern.periods * optics.pattern.period_mm
+    best_mm = np.full(wrapped_rad.shape[1], np.nan)
+    for sigma_rad in _SIGMAS_RAD:
+        places = multi_period.places_mm(wrapped_rad, periods_mm, (0.0, side_mm), sigma_rad)
+        if np.isfinite(places.place_mm).sum() > np.isfinite(best_mm).sum():
+            best_mm = places.place_mm
+        if np.mean(np.isfinite(places.place_mm)) > _MOST:
+            break
+    return best_mm
+
+
+def _find_bad_frame(
+    stack: FrameStack, series: list[_Series], places: list[FloatArray]
+) -> Flag | None:
+    """The frame of the coarser periods that disagrees most, if one does.
+
+    `check_set` judges the finest.
+    """
+    shares = [each.closure_share() for each in series]
+    flags = []
+    for k, each in enumerate(series):
+        if not stack.patterns[each.frames[0]].period_mm:
+            continue  # the finest
+        # A series disagrees if it closes much worse than the others.
         others = [share for j, share in enumerate(shares) if j != k and np.isfinite(share)]
-        limit = (
-            max(CLOSURE_SHARE, CLOSURE_TIMES * float(np.median(others)))
-            if others
-            else CLOSURE_SHARE
+        limit = CLOSURE_SHARE
+        if others:
+            limit = max(CLOSURE_SHARE, CLOSURE_TIMES * float(np.median(others)))
+        if not shares[k] > limit:
+            continue
+        # The frame without which the rest agrees.
+        place_mm = places[each.axis]
+        if not np.isfinite(place_mm).any():
+            continue
+        found = each.compute_naming_closure(place_mm)
+        if found.suspect is None or found.gain <= GAIN:
+            continue
+        reason = (
+            f"does not agree with the other steps: {shares[k]:.0%} of the fringes' amplitude is "
+            "left"
         )
-        if not stack.patterns[one.frames[0]].period_mm or not shares[k] > limit:
-            continue
-        if not np.isfinite(places[one.axis]).any():
-            continue
-        blamed = one.blamed(places[one.axis])
-        if blamed.suspect is not None and blamed.gain > GAIN:
-            said = (
-                f"does not agree with the other steps: {shares[k]:.0%} of the fringes' amplitude "
-                "is left"
-            )
-            frame = one.frames[blamed.suspect]
-            found.append(Flag(frame, FrameDefect.INCONSISTENT, said, shares[k] / limit))
-    return max(found, key=lambda flag: flag.severity, default=None)
+        frame = each.frames[found.suspect]
+        flags.append(Flag(frame, FrameDefect.INCONSISTENT, reason, shares[k] / limit))
+    return max(flags, key=lambda flag: flag.severity, default=None)
 
 
 def _unwrap_finest(
@@ -221,18 +270,21 @@ def _unwrap_finest(
     """Absolute phase (rows, columns) of the finest fringes; NaN where not known. Raises
     RejectedSetError.
     """
-    finest = next(one for one in series if one.axis == axis)
-    wrapped, coded = np.full((2, *mask.shape), np.nan)
-    wrapped[mask] = np.angle(finest.phasor)
-    coarse = 2 * np.pi * place_mm / finest.period_mm - np.pi
-    coded[mask] = wrapped[mask] + 2 * np.pi * np.rint((coarse - wrapped[mask]) / (2 * np.pi))
-    found = fringe_orders.resolve_orders_by_votes(np.nan_to_num(wrapped), coded, mask)
+    finest = next(each for each in series if each.axis == axis)
+    wrapped_rad = np.full(mask.shape, np.nan)
+    wrapped_rad[mask] = np.angle(finest.phasor)
+
+    # Each bin votes for the order that is next to its place by all periods.
+    coarse_rad = 2 * np.pi * place_mm / finest.period_mm - np.pi
+    orders = np.rint((coarse_rad - wrapped_rad[mask]) / (2 * np.pi))
+    voted_rad = np.full(mask.shape, np.nan)
+    voted_rad[mask] = wrapped_rad[mask] + 2 * np.pi * orders
+    found = fringe_orders.resolve_orders_by_votes(np.nan_to_num(wrapped_rad), voted_rad, mask)
     if found.torn or not np.mean(np.isfinite(place_mm)) > _LEAST_KNOWN:
         raise RejectedSetError(
             f"the phases of the {pattern_sequence.AXES[axis]} periods do not agree on the fringe "
             "orders: check period_mm, axis and index of these frames",
             flags,
         )
-    return np.where(
-        screen_scale.inside_pattern(found.phase_rad, optics.pattern), found.phase_rad, np.nan
-    )
+    inside = screen_scale.inside_pattern(found.phase_rad, optics.pattern)
+    return np.where(inside, found.phase_rad, np.nan)

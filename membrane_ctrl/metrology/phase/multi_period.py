@@ -8,17 +8,22 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import FloatArray
 
-_FIVE_SIGMA = 25.0
+_FIVE_SIGMA = 25.0  # of chi-square
 
 
 @dataclass(frozen=True)
 class Places:
-    """Places on the screen from phases of several periods."""
+    """Places on the screen from phases of several periods.
 
-    place_mm: (
-        FloatArray  # (...): NaN where the phases contradict each other, or fit two places alike
-    )
-    # (...): chi-square of the phases there, a number near F - 1 if `sigma_rad` is right
+    Attributes
+    ----------
+    place_mm : (...) array
+        NaN where the phases contradict each other, or fit two places equally well.
+    misfit : (...) array
+        Chi-square of the phases there, a number near F - 1 if `sigma_rad` is right.
+    """
+
+    place_mm: FloatArray
     misfit: FloatArray
 
 
@@ -46,38 +51,53 @@ def places_mm(
     sigma_rad : float
         1 sigma of a phase, noise and the display's harmonics together.
 
-    Raises ValueError for fewer than two periods, periods that do not match the phases, or an empty
-    range.
+    Returns
+    -------
+    Places
+
+    Raises
+    ------
+    ValueError
+        Fewer than two periods, periods that do not match the phases, or an empty range.
     """
     periods = np.asarray(periods_mm, float)
     low, high = range_mm
-    if (
-        periods.shape != (len(wrapped_rad),)
-        or periods.size < 2
-        or not (periods > 0).all()
-        or not high > low
-    ):
+    is_valid = periods.shape == (len(wrapped_rad),) and periods.size >= 2 and (periods > 0).all()
+    if not is_valid or not high > low:
         raise ValueError(
             f"{len(wrapped_rad)} phases need as many periods, at least two, all above zero, "
             "and a range"
         )
     turns = np.asarray(wrapped_rad, float) / (2 * math.pi)
-    fine, pitch = int(np.argmin(periods)), float(periods.min())
-    first = np.mod(turns[fine] - low / pitch, 1.0) * pitch + low
-    rates = (1 / periods).reshape(-1, *[1] * first.ndim)
-    best, second = np.full((2, *first.shape), np.inf)
-    place = np.full(first.shape, np.nan)
-    for order in range(math.ceil((high - low) / pitch)):
-        tried = first + order * pitch
-        left = turns - tried * rates
-        left -= np.rint(left)
-        tried = tried + np.sum(left * rates, axis=0) / np.sum(rates**2)
-        left = turns - tried * rates
-        left -= np.rint(left)
-        cost = np.where((tried >= low) & (tried <= high), np.sum(left**2, axis=0), np.inf)
-        second = np.minimum(second, np.maximum(cost, best))
-        place = np.where(cost < best, tried, place)
-        best = np.minimum(cost, best)
-    scale = (2 * math.pi / sigma_rad) ** 2
-    sure = (scale * best < periods.size - 1 + _FIVE_SIGMA) & (scale * (second - best) > _FIVE_SIGMA)
-    return Places(np.where(sure, place, np.nan), scale * best)
+
+    # The lowest place in the range that the shortest period allows.
+    shortest = int(np.argmin(periods))
+    pitch_mm = float(periods.min())
+    first_mm = np.mod(turns[shortest] - low / pitch_mm, 1.0) * pitch_mm + low
+
+    turns_per_mm = (1 / periods).reshape(-1, *[1] * first_mm.ndim)
+    best = np.full(first_mm.shape, np.inf)
+    second = np.full(first_mm.shape, np.inf)
+    place_mm = np.full(first_mm.shape, np.nan)
+    for order in range(math.ceil((high - low) / pitch_mm)):
+        # Least squares of all phases near the place of this order.
+        tried_mm = first_mm + order * pitch_mm
+        residual = turns - tried_mm * turns_per_mm
+        residual -= np.rint(residual)
+        tried_mm = tried_mm + np.sum(residual * turns_per_mm, axis=0) / np.sum(turns_per_mm**2)
+        residual = turns - tried_mm * turns_per_mm
+        residual -= np.rint(residual)
+        in_range = (tried_mm >= low) & (tried_mm <= high)
+        squares = np.where(in_range, np.sum(residual**2, axis=0), np.inf)
+
+        # The best and the second best place so far.
+        second = np.minimum(second, np.maximum(squares, best))
+        place_mm = np.where(squares < best, tried_mm, place_mm)
+        best = np.minimum(squares, best)
+
+    # Accepted if the chi-square is believable, and far better than that of any other place.
+    chi_square_per_square = (2 * math.pi / sigma_rad) ** 2
+    misfit = chi_square_per_square * best
+    fits = misfit < periods.size - 1 + _FIVE_SIGMA
+    is_only_one = chi_square_per_square * (second - best) > _FIVE_SIGMA
+    return Places(np.where(fits & is_only_one, place_mm, np.nan), misfit)

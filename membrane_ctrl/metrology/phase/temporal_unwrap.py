@@ -19,22 +19,25 @@ CONSISTENT_PERIODS = 0.25
 
 @dataclass(frozen=True)
 class Unwrapped:
-    """Positions on the screen from all frequencies."""
+    """Positions on the screen from all frequencies.
 
-    screens: (
-        FloatArray  # (...): position along the axis, 0 to 1 over the screen, from the finest fringe
-    )
-    step_periods: (
-        FloatArray  # (F - 1, ...): e of each step, in periods of the finer fringe, within +-1/2
-    )
-    consistent: (
-        BoolArray  # (...): all |e| below `CONSISTENT_PERIODS` and the position on the screen
-    )
+    Attributes
+    ----------
+    screens : (...) array
+        Position along the axis from the finest fringe, 0 to 1 over the screen.
+    step_periods : (F - 1, ...) array
+        e of each step, in periods of the finer fringe, within +-1/2.
+    consistent : (...) bool array
+        All |e| are below `CONSISTENT_PERIODS`, and the position is on the screen.
+    """
+
+    screens: FloatArray
+    step_periods: FloatArray
+    consistent: BoolArray
 
 
 def unwrap_in_time(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Unwrapped:
-    """Unwrap in time. Raises ValueError if the periods are not rising from at most one, or do not
-    match the phases.
+    """Unwrap each pixel by its phases of rising frequency.
 
     Parameters
     ----------
@@ -42,6 +45,15 @@ def unwrap_in_time(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArra
         Phase of each frequency, any branch; zero where position 0 is.
     periods : (F,) array
         Periods a screen, rising; the first at most 1.
+
+    Returns
+    -------
+    Unwrapped
+
+    Raises
+    ------
+    ValueError
+        The periods do not rise from at most one, or do not match the phases.
     """
     counts = np.asarray(periods, float)
     if counts.ndim != 1 or len(counts) != len(wrapped_rad):
@@ -51,6 +63,7 @@ def unwrap_in_time(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArra
     position = np.mod(wrapped_rad[0], 2 * math.pi) / (2 * math.pi * counts[0])
     steps = np.empty((len(counts) - 1, *position.shape))
     for k in range(1, len(counts)):
+        # Among the positions that the finer phase allows, the one nearest to the coarser position.
         fine = wrapped_rad[k] / (2 * math.pi * counts[k])
         fine = fine + np.rint((position - fine) * counts[k]) / counts[k]
         steps[k - 1] = (fine - position) * counts[k]
@@ -62,12 +75,23 @@ def unwrap_in_time(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArra
 def predict_phase(
     wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray, index: int
 ) -> FloatArray:
-    """Phase that the other frequencies expect of frequency `index`, (...), not wrapped.
+    """Phase of one frequency as the others predict it.
 
     The chain always needs the coarsest; in the coarsest's own prediction it only chooses the order.
+
+    Parameters
+    ----------
+    wrapped_rad, periods
+        As in `unwrap_in_time`.
+    index : int
+        The frequency.
+
+    Returns
+    -------
+    (...) array
+        Phase in rad, not wrapped.
     """
     counts = np.asarray(periods, float)
-    keep = np.array([k for k in range(len(counts)) if k != index or k == 0])
-    return np.asarray(
-        2 * math.pi * counts[index] * unwrap_in_time(wrapped_rad[keep], counts[keep]).screens
-    )
+    kept = np.array([k for k in range(len(counts)) if k != index or k == 0])
+    position = unwrap_in_time(wrapped_rad[kept], counts[kept]).screens
+    return np.asarray(2 * math.pi * counts[index] * position)
