@@ -13,14 +13,27 @@ from membrane_ctrl.processes import frame_address, ring
 
 @dataclass(frozen=True, slots=True)
 class AcquisitionSpec:
-    """What the acquisition needs to know about the run."""
+    """The run, as the acquisition process gets it.
+
+    Attributes
+    ----------
+    config : Config
+    clock : RunClock
+    telemetry : ring.RingAddress
+        Source of the laser readings.
+    shapes : ring.RingAddress
+        Destination of the estimates (`shape_estimate.pack_estimate`).
+    truth : ring.RingAddress, optional
+        The twin's truth, which its camera renders; None on a real bench.
+    frames : frame_address.FrameAddress
+    run_dir : Path, optional
+        Folder of the run, for kept frames.
+    """
 
     config: Config
     clock: RunClock
-    telemetry: ring.RingAddress  # source of the laser readings
-    shapes: ring.RingAddress  # destination of the estimates (`estimate.pack_estimate`)
-    truth: (
-        ring.RingAddress | None
-    )  # the twin's truth, which its camera renders; None on a real bench
+    telemetry: ring.RingAddress
+    shapes: ring.RingAddress
+    truth: ring.RingAddress | None
     frames: frame_address.FrameAddress
-    run_dir: Path | None = None  # folder of the run, for kept frames
+    run_dir: Path | None = None

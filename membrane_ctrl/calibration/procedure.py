@@ -19,11 +19,21 @@ from membrane_ctrl.sessions.live_hold import HoldError, Progress
 
 @dataclass(frozen=True, slots=True)
 class Procedure:
-    """Moves the mirror for a calibration."""
+    """Moves the mirror for a calibration.
+
+    Attributes
+    ----------
+    link : CaptureLink
+    sweep : Sweep
+        The hold under control.
+    held : HeldMirror
+        The mirror before the first move.
+    progress : Progress
+    """
 
     link: CaptureLink
-    sweep: Sweep  # the hold under control
-    held: HeldMirror  # the mirror before the first move
+    sweep: Sweep
+    held: HeldMirror
     progress: Progress
 
     def times_s(self, head: CalibrationHead, missing: tuple[int, ...]) -> list[float]:

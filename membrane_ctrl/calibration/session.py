@@ -13,14 +13,26 @@ SCHEMA = "membrane-live-calibration/1"
 
 @dataclass(frozen=True, slots=True)
 class CalibrationHead:
-    """`session.json`."""
+    """`session.json`.
 
-    source: str  # the run it started on
+    Attributes
+    ----------
+    source : str
+        The run on which the session began.
+    created_utc : str
+    start_um : float
+        Setpoint to return to; the measurements by hand are assumed valid there.
+    shape_on : bool
+        Whether the shape loop was on.
+    setpoints_um : tuple of float
+        Setpoints of the sets, in their order.
+    """
+
+    source: str
     created_utc: str
-    # Setpoint to return to; the measurements by hand are assumed valid there
     start_um: float
-    shape_on: bool  # whether the shape loop was on
-    setpoints_um: tuple[float, ...]  # of the sets, in their order
+    shape_on: bool
+    setpoints_um: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,14 +23,30 @@ _PIECES = 8  # to integrate a move's duration: the leak grows with the cube of t
 
 @dataclass(frozen=True, slots=True)
 class HeldMirror:
-    """The held mirror before any move."""
+    """The held mirror before any move.
 
-    setpoint_um: float  # without the trim
-    sag_mm: float  # seen by the camera with the geometry in force
-    pressure_pa: float  # gauge reading
-    leak_um_per_s: float  # speed at which the centre sinks without the pump
-    swing_adu: float  # amplitude of the fringes
-    shape_on: bool  # whether the shape loop is on
+    Attributes
+    ----------
+    setpoint_um : float
+        Setpoint without the trim.
+    sag_mm : float
+        As the camera sees it with the present geometry.
+    pressure_pa : float
+        Gauge reading.
+    leak_um_per_s : float
+        Speed at which the centre sinks without the pump.
+    swing_adu : float
+        Amplitude of the fringes.
+    shape_on : bool
+        Whether the shape loop is on.
+    """
+
+    setpoint_um: float
+    sag_mm: float
+    pressure_pa: float
+    leak_um_per_s: float
+    swing_adu: float
+    shape_on: bool
 
     def sag_at_mm(self, setpoint_um: float) -> float:
         """Sag at another setpoint; the ring does not move."""

@@ -94,21 +94,44 @@ def edges_of(figure: SetFigure) -> FloatArray | None:
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """Options of the command."""
+    """Options of the command.
 
-    folders: Sequence[Path]  # capture sets
-    geometry: Path | None  # geometry measured by hand, replacing the sets'
-    out: Path  # the new `geometry.toml`
-    free: Sequence[str]  # NAME or NAME=SIGMA
-    laser_sigma_um: float  # sigma of a set's mean reading
+    Attributes
+    ----------
+    folders : Sequence[Path]
+        Capture sets.
+    geometry : Path, optional
+        Geometry measured by hand, replacing the sets'.
+    out : Path
+        The new `geometry.toml`.
+    free : Sequence[str]
+        Free parameters, each as NAME or NAME=SIGMA.
+    laser_sigma_um : float
+        Standard uncertainty of a set's mean reading.
+    as_json : bool
+    pictures : bool
+        Draw the residuals of the screen points next to the geometry.
+    reference_um : float, optional
+        Laser reading at which the manual measurements hold, if the sets do not state it; None: the
+        first set's.
+    priors : Sequence[Path]
+        Results of auxiliary calibrations; the last one wins.
+    film : set_state.FilmModel
+    radius_sigma_mm : float
+        Standard uncertainty of the radius of the ring, whose edge is seen.
+    """
+
+    folders: Sequence[Path]
+    geometry: Path | None
+    out: Path
+    free: Sequence[str]
+    laser_sigma_um: float
     as_json: bool
-    pictures: bool = True  # draw the residuals of the screen points next to the geometry
-    # Laser reading at which the manual measurements hold, if the sets do not state it; None: the
-    # first set's
+    pictures: bool = True
     reference_um: float | None = None
-    priors: Sequence[Path] = ()  # results of auxiliary calibrations; the last one wins
+    priors: Sequence[Path] = ()
     film: set_state.FilmModel = "free"
-    radius_sigma_mm: float = RADIUS_SIGMA_MM  # of the ring, whose edge is seen
+    radius_sigma_mm: float = RADIUS_SIGMA_MM
 
 
 @dataclass(frozen=True)

@@ -58,11 +58,21 @@ class CalibrationTable(Section):
 
 @dataclass(frozen=True)
 class GeometryOrigin:
-    """Origin of the geometry used for a result."""
+    """Origin of the geometry used for a result.
 
-    hash: str  # hash of its numbers, from the file or from the set's own statement
-    file: str = ""  # path; empty for the set's own
-    calibrated_utc: str = ""  # date; empty if not calibrated
+    Attributes
+    ----------
+    hash : str
+        Hash of its numbers, from the file or from the set's own statement.
+    file : str
+        Path; empty for the set's own.
+    calibrated_utc : str
+        Date; empty if not calibrated.
+    """
+
+    hash: str
+    file: str = ""
+    calibrated_utc: str = ""
 
     def make_table(self) -> dict[str, str | None]:
         """The origin as a table for JSON."""
@@ -75,15 +85,30 @@ class GeometryOrigin:
 
 @dataclass(frozen=True)
 class GeometryFile:
-    """A geometry read from a file."""
+    """A geometry read from a file.
+
+    Attributes
+    ----------
+    path : Path
+    geometry : GeometryConfig
+        Poses.
+    lens : LensTable, optional
+        None unless calibrated.
+    pitch : PitchTable, optional
+    calibration : CalibrationTable, optional
+        None for a file written by hand.
+    origin : GeometryOrigin
+    text : str
+        Content of the file, with the screen's height map included.
+    """
 
     path: Path
-    geometry: GeometryConfig  # poses
-    lens: LensTable | None  # None unless calibrated
+    geometry: GeometryConfig
+    lens: LensTable | None
     pitch: PitchTable | None
-    calibration: CalibrationTable | None  # None for a file written by hand
+    calibration: CalibrationTable | None
     origin: GeometryOrigin
-    text: str  # content of the file, with the screen's height map included
+    text: str
 
     def apply_to_optics(self, optics: OpticsConfig) -> OpticsConfig:
         """The bench with this geometry instead of its own. Raises InputError for a different

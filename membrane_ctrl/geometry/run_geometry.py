@@ -18,13 +18,27 @@ GEOMETRY_COPY = "geometry.toml"  # in the run's folder
 
 @dataclass(frozen=True)
 class RunGeometry:
-    """The geometry used by the cycles of a run."""
+    """The geometry used by the cycles of a run.
 
-    optics: OpticsConfig  # the configuration's, with the calibrated geometry if there is one
-    origin: GeometryOrigin  # its origin
-    calibration: CalibrationTable | None = None  # reference for drift
-    text: str = ""  # content of the file; empty without one
-    note: str = ""  # why the stated geometry is used although the configuration names a file
+    Attributes
+    ----------
+    optics : OpticsConfig
+        The configuration's, with the calibrated geometry if there is one.
+    origin : GeometryOrigin
+        Its origin.
+    calibration : CalibrationTable, optional
+        Reference for drift.
+    text : str
+        Content of the file; empty without one.
+    note : str
+        Why the stated geometry is used although the configuration names a file.
+    """
+
+    optics: OpticsConfig
+    origin: GeometryOrigin
+    calibration: CalibrationTable | None = None
+    text: str = ""
+    note: str = ""
 
     def copy_to_run(self, run_dir: Path) -> None:
         """Copy the file to the run's folder, for its cycles and later reviews.

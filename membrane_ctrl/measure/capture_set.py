@@ -69,28 +69,56 @@ class CaptureFile(OriginSection):
 
 @dataclass(frozen=True)
 class CaptureHead:
-    """Content of `capture.toml`, checked and in order."""
+    """Content of `capture.toml`, checked and in order.
 
-    folder: Path  # of the set
+    Attributes
+    ----------
+    folder : Path
+        Folder of the set.
+    kind : "full" or "fringes" or "frequencies"
+    reference : Path, optional
+        The full set that anchors a fringes set.
+    optics : schema.OpticsConfig
+        Geometry, camera, pattern and mirror; `camera.bits` is valid only if `bits_stated`.
+    bits_stated : bool
+        Whether the set states its bit depth.
+    files : tuple of str
+        File names, in the order of the patterns.
+    patterns : tuple of Pattern
+        The x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set).
+    time_s : (frames,) array
+        Time of each frame; NaN where not stated.
+    displacement_um : (frames,) array
+        Laser reading of each frame; NaN where not stated.
+    pressure_pa : float
+        Gauge pressure during the set; NaN where not stated.
+    ignored : tuple of str
+        Unknown keys of the file.
+    geometry : GeometryOrigin
+        Origin of the geometry in `optics`.
+    artefact : Artefact | Literal['screen'], optional
+        The object that is seen instead of the film.
+    screen_moved : ScreenMovedTable, optional
+        Move of the screen from its usual place; `optics` has it after the move.
+    before_move : schema.GeometryConfig, optional
+        The geometry before the move.
+    """
+
+    folder: Path
     kind: Literal["full", "fringes", "frequencies"]
-    reference: Path | None  # of a fringes set: the full set that anchors it
-    optics: (
-        schema.OpticsConfig
-    )  # geometry, camera, pattern and mirror; `camera.bits` is valid only if `bits_stated`
-    bits_stated: bool  # whether the set states its bit depth
-    files: tuple[str, ...]  # in the order of the patterns
-    patterns: tuple[
-        Pattern, ...
-    ]  # x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set)
-    time_s: FloatArray  # (frames,): NaN where not stated
-    displacement_um: FloatArray  # (frames,)
-    pressure_pa: float  # gauge pressure during the set; NaN where not stated
-    ignored: tuple[str, ...]  # unknown keys of the file
-    geometry: GeometryOrigin  # origin of the geometry in `optics`
-    artefact: Artefact | Literal["screen"] | None = None  # what is seen instead of the film
-    # by how much the screen stood elsewhere; `optics` has it there
+    reference: Path | None
+    optics: schema.OpticsConfig
+    bits_stated: bool
+    files: tuple[str, ...]
+    patterns: tuple[Pattern, ...]
+    time_s: FloatArray
+    displacement_um: FloatArray
+    pressure_pa: float
+    ignored: tuple[str, ...]
+    geometry: GeometryOrigin
+    artefact: Artefact | Literal["screen"] | None = None
     screen_moved: ScreenMovedTable | None = None
-    before_move: schema.GeometryConfig | None = None  # the geometry without that
+    before_move: schema.GeometryConfig | None = None
 
     @property
     def finest_frames(self) -> list[int]:

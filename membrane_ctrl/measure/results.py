@@ -31,15 +31,28 @@ from membrane_ctrl.model.files import make_folder
 class ErrorBars:
     """The budget of a measurement; covariances (parameters, parameters) of the fit's parameters,
     mm^2.
+
+    Attributes
+    ----------
+    budget : Budget
+    statement : GeometryStatement
+        How well the geometry is known, and by what.
+    doubts : tuple of str
+        Checks of the set that failed, and what to do.
+    grid : height_map.HeightMap
+        Grid of `maps_um`.
+    cell_slope : float
+        1 sigma of the mean slope of a cell of the height map, from pixel noise.
+    zonal_um : float
+        Standard uncertainty of the map's height over the fit.
     """
 
     budget: Budget
-    statement: GeometryStatement  # how well the geometry is known, and by what
-    doubts: tuple[str, ...]  # what the set says of its own errors, and what to do
-    grid: height_map.HeightMap  # grid of `maps_um`
-    # 1 sigma of the mean slope of a cell of the height map, from pixel noise
+    statement: GeometryStatement
+    doubts: tuple[str, ...]
+    grid: height_map.HeightMap
     cell_slope: float = 0.0
-    zonal_um: float = 0.0  # and of the map's height over the fit
+    zonal_um: float = 0.0
 
     @property
     def noise(self) -> FloatArray:

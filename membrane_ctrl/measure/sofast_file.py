@@ -24,16 +24,26 @@ _LIT_SHARE = 0.3  # of the bright pixels' swing
 
 @dataclass(frozen=True)
 class SofastMeasurement:
-    """Frames of a measurement."""
+    """Frames of a measurement.
 
-    # (F, 4, H, W): fringes that vary along the screen's x and y: frequency, step, row, column
+    Attributes
+    ----------
+    frames_x, frames_y : (F, 4, H, W) arrays
+        Fringes that vary along the screen's x and y: frequency, step, row, column.
+    periods_x, periods_y : (F,) arrays
+        Periods per screen.
+    black, white : (H, W) arrays
+    distance_mm : float
+        Facet's measure point to the screen's origin.
+    """
+
     frames_x: FloatArray
-    frames_y: FloatArray  # (F, 4, H, W)
-    periods_x: FloatArray  # (F,): periods per screen
-    periods_y: FloatArray  # (F,)
-    black: FloatArray  # (H, W)
-    white: FloatArray  # (H, W)
-    distance_mm: float  # facet's measure point to the screen's origin
+    frames_y: FloatArray
+    periods_x: FloatArray
+    periods_y: FloatArray
+    black: FloatArray
+    white: FloatArray
+    distance_mm: float
 
 
 def read_sofast_file(path: Path) -> SofastMeasurement:

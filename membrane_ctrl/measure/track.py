@@ -75,13 +75,20 @@ class TrackFile(OriginSection):
 
 @dataclass(frozen=True)
 class Track:
-    """What a tracking set gave."""
+    """Result of a tracking set.
+
+    Attributes
+    ----------
+    frames : tuple of TrackedFrame
+    stepped : bool
+        Whether it began with five usable steps.
+    residual_adu : (rows, columns) array
+        Mean of what the fits left, over the bins; NaN outside.
+    """
 
     frames: tuple[TrackedFrame, ...]
-    stepped: bool  # whether it began with five steps that could be used
-    residual_adu: (
-        FloatArray  # (rows, columns): mean of what the fits left, over the bins; NaN outside
-    )
+    stepped: bool
+    residual_adu: FloatArray
 
     def make_columns(self) -> dict[str, Any]:
         """The arrays of `track.npz`."""

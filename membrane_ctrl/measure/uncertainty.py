@@ -86,14 +86,24 @@ class UncertaintyOptions:
 
 @dataclass(frozen=True)
 class Spread:
-    """Spread of the height of a set, or of its change since another."""
+    """Spread of the height of a set, or of its change since another.
 
-    # (parameters, parameters) each, of the parameters in mm^2: over the trials, from the Jacobian
-    # and the noise, from the noise alone
+    Attributes
+    ----------
+    covariance : (parameters, parameters) array
+        Of the parameters over the trials, mm^2.
+    linear : (parameters, parameters) array
+        The same from the Jacobian and the noise.
+    noise : (parameters, parameters) array
+        The same from the noise alone.
+    budget : (parameters, parameters) array
+        The same from the budgets of `measure`, with film, light, blur and the remaining slopes of
+        each set.
+    """
+
     covariance: FloatArray
     linear: FloatArray
     noise: FloatArray
-    # of the budgets of `measure`: with film, light, blur and the slopes left of each set
     budget: FloatArray
 
 

@@ -17,12 +17,21 @@ _SPHERE_POINTS = 20_000  # enough to come close; the last step takes all
 
 @dataclass(frozen=True)
 class Sphere:
-    """Sphere through (0, 0, `vertex_mm`)."""
+    """Sphere through (0, 0, `vertex_mm`).
+
+    Attributes
+    ----------
+    vertex_mm : float
+    tilt_x, tilt_y : float
+        Slopes there.
+    curvature_per_mm : float
+        Positive: concave, the centre on the side of +z.
+    """
 
     vertex_mm: float
-    tilt_x: float  # its slopes there
+    tilt_x: float
     tilt_y: float
-    curvature_per_mm: float  # positive: concave, the centre on the side of +z
+    curvature_per_mm: float
 
     @property
     def normal(self) -> FloatArray:

@@ -25,13 +25,27 @@ from membrane_ctrl.model.shape_estimate import Quality
 
 @dataclass(frozen=True)
 class BinFigure:
-    """Surface through the bins of one set."""
+    """Surface through the bins of one set.
 
-    fit: surface_fit.Fit  # Hencky excess and Zernike terms
-    points: ray_tracing.Points  # the bins' rays and screen points, standing on the surface
-    index: IntArray  # (n,): their bins
-    sigma_mm: FloatArray  # (2, n): 1 sigma of the screen points from the noise of the pixels
-    quality: Quality  # for the verdict
+    Attributes
+    ----------
+    fit : surface_fit.Fit
+        Hencky excess and Zernike terms.
+    points : ray_tracing.Points
+        The bins' rays and screen points, followed to the surface.
+    index : (n,) int array
+        Numbers of the bins.
+    sigma_mm : (2, n) array
+        Standard uncertainty of the screen points from the noise of the pixels.
+    quality : Quality
+        Quality of the fit, for the verdict.
+    """
+
+    fit: surface_fit.Fit
+    points: ray_tracing.Points
+    index: IntArray
+    sigma_mm: FloatArray
+    quality: Quality
 
 
 def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None = None) -> BinFigure:

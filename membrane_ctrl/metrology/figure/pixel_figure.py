@@ -40,22 +40,42 @@ _NO_SLOPE = 4e-3
 
 @dataclass(frozen=True)
 class FullResult:
-    """Everything of one set."""
+    """The figure of one set, from all of its pixels.
 
-    # the surface: Hencky excess and Zernike terms; `changes_mm` of all iterations from the start
+    Attributes
+    ----------
+    fit : surface_fit.Fit
+        The surface: Hencky excess and Zernike terms; `changes_mm` of all iterations from the start.
+    index : (n,) int array
+        Pixels inside the analysis radius that gave slopes, counted row by row.
+    weights : (n,) array
+        Weight in the fit.
+    swing_adu : (n,) array
+        The smaller of the two fringe amplitudes.
+    rest_adu : (n,) array
+        Residual of the frames after the sinusoids: noise, motion, the display's harmonics.
+    grid : zonal_map.ResidualGrid
+        Mean slope residuals in cells.
+    fit_grid : zonal_map.ResidualGrid
+        The same, each pixel with its weight in the fit.
+    residual_mm : (m, m) array
+        Height over the fit, 0 at the vertex; NaN where nothing was measured.
+    quality : Quality
+        Quality of the fit, for the verdict.
+    moved : bool
+        Whether the film's motion was corrected.
+    """
+
     fit: surface_fit.Fit
-    index: IntArray  # (n,): pixels inside the analysis radius that gave slopes, counted row by row
-    weights: FloatArray  # (n,): weight in the fit
-    swing_adu: Singles  # (n,): the smaller of the two fringe amplitudes
-    # (n,): residual of the frames after the sinusoids: noise, motion, the display's harmonics
+    index: IntArray
+    weights: FloatArray
+    swing_adu: Singles
     rest_adu: Singles
-    grid: zonal_map.ResidualGrid  # mean slope residuals in cells
-    fit_grid: zonal_map.ResidualGrid  # the same, each pixel with its weight in the fit
-    residual_mm: (
-        FloatArray  # (m, m): height over the fit, 0 at the vertex; NaN where nothing was measured
-    )
-    quality: Quality  # for the verdict
-    moved: bool  # whether the film's motion was corrected
+    grid: zonal_map.ResidualGrid
+    fit_grid: zonal_map.ResidualGrid
+    residual_mm: FloatArray
+    quality: Quality
+    moved: bool
 
     @property
     def surface(self) -> Surface:

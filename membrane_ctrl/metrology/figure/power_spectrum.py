@@ -12,11 +12,18 @@ from membrane_ctrl.model.arrays import FloatArray
 class PowerSpectrum:
     """Power spectral density of a deviation, mean over the directions; its sum over the plane is
     the mean square.
+
+    Attributes
+    ----------
+    frequency_per_mm : (m,) array
+    density_um2_mm2 : (m,) array
+    sigma_um2_mm2 : (m,) array
+        1 sigma as an estimate of a random surface's density.
     """
 
-    frequency_per_mm: FloatArray  # (m,)
-    density_um2_mm2: FloatArray  # (m,)
-    sigma_um2_mm2: FloatArray  # (m,): 1 sigma as an estimate of a random surface's density
+    frequency_per_mm: FloatArray
+    density_um2_mm2: FloatArray
+    sigma_um2_mm2: FloatArray
 
 
 def power_spectrum(found: Figure, axis_mm: FloatArray, aperture_mm: float) -> PowerSpectrum:

@@ -49,19 +49,31 @@ class Quantities:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure: its numbers, and what they were taken from."""
+    """Numbers of a figure, and the maps that they are computed from.
+
+    Attributes
+    ----------
+    numbers : Quantities
+    sphere : best_sphere.Sphere
+    deviation_um : (n, n) array
+        Deviation from the best sphere, along its normal; NaN where not measured.
+    rotational_um : (n, n) array
+        Rotationally invariant part of the deviation.
+    smooth_um : (n, n) array
+        Fit of 36 Fringe terms to the deviation, everywhere.
+    fringe_um : (37,) array
+        Fringe terms of the height, peak 1 on the rim of the aperture.
+    spot_mm : (rays,) array
+        Distance of the reflected rays from their middle in the best focus.
+    """
 
     numbers: Quantities
     sphere: best_sphere.Sphere
-    deviation_um: (
-        FloatArray  # (n, n): from the best sphere, along its normal; NaN where not measured
-    )
-    rotational_um: FloatArray  # (n, n): its rotationally invariant part
-    smooth_um: FloatArray  # (n, n): its fit of 36 Fringe terms, everywhere
-    fringe_um: FloatArray  # (37,): Fringe terms of the height, peak 1 on the rim of the aperture
-    spot_mm: (
-        FloatArray  # (rays,): distance of the reflected rays from their middle in the best focus
-    )
+    deviation_um: FloatArray
+    rotational_um: FloatArray
+    smooth_um: FloatArray
+    fringe_um: FloatArray
+    spot_mm: FloatArray
 
 
 class FigureOf:

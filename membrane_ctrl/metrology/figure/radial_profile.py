@@ -16,15 +16,31 @@ _RINGS = 48
 
 @dataclass(frozen=True)
 class RadialProfile:
-    """Height over radius."""
+    """Height over radius.
 
-    radius_mm: FloatArray  # (n,): middle of the rings
-    mean_mm: FloatArray  # (n,): mean over azimuth
-    low_mm: FloatArray  # (n,): ends of the band that holds 95 % of the ring
-    high_mm: FloatArray  # (n,)
-    hencky_mm: FloatArray  # (n,): Hencky's bowl of the sag that fits best
-    sag_mm: float  # that sag, at the rim
-    pressure_pa: float  # gauge pressure that bends the paper's film to that sag
+    Attributes
+    ----------
+    radius_mm : (n,) array
+        Middle of the rings.
+    mean_mm : (n,) array
+        Mean over azimuth.
+    low_mm, high_mm : (n,) arrays
+        Ends of the band that contains 95 % of the ring.
+    hencky_mm : (n,) array
+        Hencky's bowl of the sag that fits best.
+    sag_mm : float
+        That sag.
+    pressure_pa : float
+        Gauge pressure that bends the paper's film to that sag.
+    """
+
+    radius_mm: FloatArray
+    mean_mm: FloatArray
+    low_mm: FloatArray
+    high_mm: FloatArray
+    hencky_mm: FloatArray
+    sag_mm: float
+    pressure_pa: float
 
 
 def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) -> RadialProfile:

@@ -30,15 +30,21 @@ def motion_share(within_um: float, noise_um: float) -> float:
 
 @dataclass(frozen=True)
 class FilmMotion:
-    """The film during a set, as laser and fringes tell it."""
+    """Motion of the film during a set, from laser and fringes.
 
-    told_um: tuple[
-        FloatArray, FloatArray
-    ]  # at the used sinusoids of x and of y, about the mean of both
-    x_to_y_sigma_um: (
-        float  # 1 sigma of the difference between the means of x and of y; NaN without a laser
-    )
-    noise_um: float  # 1 sigma of the fringes' part in each of these places
+    Attributes
+    ----------
+    told_um : two (N,) arrays
+        Displacement at the used sinusoids of x and of y, about the mean of both.
+    x_to_y_sigma_um : float
+        Standard uncertainty of the mean of x less that of y; NaN without a laser.
+    noise_um : float
+        Standard uncertainty of the fringes' part in each of these displacements.
+    """
+
+    told_um: tuple[FloatArray, FloatArray]
+    x_to_y_sigma_um: float
+    noise_um: float
 
     @classmethod
     def of(cls, checked: Checked) -> "FilmMotion":

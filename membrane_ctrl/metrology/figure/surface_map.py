@@ -9,12 +9,22 @@ from membrane_ctrl.model.arrays import FloatArray
 
 @dataclass(frozen=True)
 class SurfaceMap:
-    """A surface on a square grid."""
+    """A surface on a square grid.
 
-    axis_mm: FloatArray  # (n,): middle of the cells, along x and along y alike
-    height_mm: FloatArray  # (n, n): rows along y; NaN where not measured
-    slope_x: FloatArray  # (n, n): read where there is a height
-    slope_y: FloatArray  # (n, n)
+    Attributes
+    ----------
+    axis_mm : (n,) array
+        Middle of the cells, along x as along y.
+    height_mm : (n, n) array
+        Rows along y; NaN where not measured.
+    slope_x, slope_y : (n, n) arrays
+        Slopes; used where there is a height.
+    """
+
+    axis_mm: FloatArray
+    height_mm: FloatArray
+    slope_x: FloatArray
+    slope_y: FloatArray
 
     def part(self, stride: int) -> "SurfaceMap":
         """Every `stride`-th cell along both axes."""

@@ -23,10 +23,18 @@ from membrane_ctrl.model.shape_estimate import Verdict
 
 @dataclass(frozen=True)
 class Anchor:
-    """What a full set passes on to the fringes sets that refer to it."""
+    """What a full set passes on to the fringes sets that refer to it.
 
-    phase_rad: FloatArray  # (2, rows, columns): absolute phases of the bins; NaN where unknown
-    light: FloatArray  # (rows, columns): of the bins
+    Attributes
+    ----------
+    phase_rad : (2, rows, columns) array
+        Absolute phases of the bins; NaN where unknown.
+    light : (rows, columns) array
+        Light of the bins.
+    """
+
+    phase_rad: FloatArray
+    light: FloatArray
 
 
 @dataclass(frozen=True)

@@ -31,13 +31,24 @@ FOUND_BY_PREDICTION = frozenset(
 
 @dataclass(frozen=True)
 class Flag:
-    """A frame that does not belong."""
+    """A frame that does not belong.
+
+    Attributes
+    ----------
+    frame : int
+    defect : FrameDefect
+    reason : str
+        Sentence for people.
+    severity : float
+        Deviation in units of its limit.
+    swapped_with : int, optional
+        The frame that shows this one's pattern, while this one shows the pattern of that one.
+    """
 
     frame: int
     defect: FrameDefect
-    reason: str  # for people
-    severity: float  # times the limit
-    # the frame that shows this one's pattern while this one shows its
+    reason: str
+    severity: float
     swapped_with: int | None = None
 
 

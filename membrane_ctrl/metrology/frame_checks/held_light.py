@@ -59,12 +59,24 @@ ShareOfFrame = tuple[float, float]
 
 @dataclass(frozen=True)
 class HeldLight:
-    """Share of the previous picture in each frame."""
+    """Share of the previous picture in each frame.
 
-    rise: float  # where a frame is brighter than the previous one
-    fall: float  # where it is darker
-    sigma: float  # of their mean; NaN if the set cannot show it
-    corrected: bool = False  # whether it was taken out of the frames
+    Attributes
+    ----------
+    rise : float
+        Share where a frame is brighter than the previous one.
+    fall : float
+        Share where it is darker.
+    sigma : float
+        Standard uncertainty of their mean; NaN if the set cannot show it.
+    corrected : bool
+        Whether the frames were corrected for it.
+    """
+
+    rise: float
+    fall: float
+    sigma: float
+    corrected: bool = False
 
     @property
     def share(self) -> float:

@@ -29,10 +29,18 @@ _LIT_SHARE = 0.5  # of the brightest pixels: what sees the panel
 
 @dataclass(frozen=True)
 class ClipLevels:
-    """Levels at which pixels are clipped, ADU."""
+    """Levels at which pixels are clipped, ADU.
 
-    white_adu: int  # and above
-    black_adu: int = -1  # and below; -1: no clipping at black
+    Attributes
+    ----------
+    white_adu : int
+        Pixels at this level and above are clipped at white.
+    black_adu : int
+        Pixels at this level and below are clipped at black; -1: none are.
+    """
+
+    white_adu: int
+    black_adu: int = -1
 
 
 def find_clip_levels(frames: Sequence[Image], full_scale_adu: int) -> ClipLevels:

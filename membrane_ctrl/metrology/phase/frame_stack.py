@@ -17,21 +17,38 @@ _LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer sma
 
 @dataclass(frozen=True)
 class FrameStack:
-    """Frames of a capture set in the order of their patterns."""
+    """Frames of a capture set in the order of their patterns.
 
-    frames: Image  # (frames, height, width): uint8 or uint16
-    patterns: tuple[Pattern, ...]  # what each frame should show; sinusoids with their phase step
-    displacement_um: FloatArray  # (frames,): laser reading at each, NaN without
-    unusable: dict[int, str]  # frames that hold no picture
-    # (2, frames): level and swing of the light of each sinusoid about 1, where the frames' light is
-    # known to differ
+    Attributes
+    ----------
+    frames : (frames, height, width) array
+        Pictures, uint8 or uint16.
+    patterns : tuple of Pattern
+        The pattern that each frame should show; sinusoids with their phase step.
+    displacement_um : (frames,) array
+        Laser reading at each, NaN without.
+    unusable : dict[int, str]
+        Frames that hold no picture.
+    light : (2, frames) array, optional
+        Level and swing of the light of each sinusoid about 1, where the frames' light is known to
+        differ.
+    gain : (frames, height) array, optional
+        Factor of the light of each row, where bands of a backlight are known.
+    before : tuple of int, optional
+        The frame that was taken before each; -1: none of the set. None: the patterns were taken in
+        their order.
+    held_shares : tuple[float, float]
+        Shares of the previous frame's picture that each one still shows: where it is brighter than
+        that one, and where it is darker.
+    """
+
+    frames: Image
+    patterns: tuple[Pattern, ...]
+    displacement_um: FloatArray
+    unusable: dict[int, str]
     light: FloatArray | None = None
-    # (frames, height): of the light of each row, where bands of a backlight are known
     gain: FloatArray | None = None
-    # (frames,): the frame that was taken before each; -1: none of the set. None: the patterns were
-    # taken in their order
     before: tuple[int, ...] | None = None
-    # of that frame's picture which each one still shows, where it is brighter, where darker
     held_shares: tuple[float, float] = (0.0, 0.0)
 
     def sinusoids(self, axis: str) -> list[int]:
@@ -113,14 +130,25 @@ def find_frames_before(time_s: FloatArray) -> tuple[int, ...] | None:
 
 @dataclass(frozen=True)
 class Binned:
-    """Frames as means over bins."""
+    """Frames as means over bins.
 
-    bin_px: int  # side of a bin
-    means: Singles  # (frames, rows, columns): in the frames' units
-    saturated: BoolArray  # (frames, rows, columns): bins with a pixel clipped at white or black
+    Attributes
+    ----------
+    bin_px : int
+        Side of a bin.
+    means : (frames, rows, columns) array
+        Mean of each bin, in the frames' units.
+    saturated : (frames, rows, columns) bool array
+        Bins with a pixel clipped at white or black.
+    clip : ClipLevels
+    black : (frames, rows, columns) bool array, optional
+        Bins with a pixel clipped at black; None: the camera does not clip there.
+    """
+
+    bin_px: int
+    means: Singles
+    saturated: BoolArray
     clip: ClipLevels
-    # (frames, rows, columns): bins with a pixel clipped at black; None: the camera does not clip
-    # there
     black: BoolArray | None = None
 
     def reordered(self, order: list[int]) -> "Binned":

@@ -24,12 +24,21 @@ _LEAST_VOTES = 30  # a smaller island cannot outvote its own noise
 
 @dataclass(frozen=True)
 class Orders:
-    """Absolute phase of one axis."""
+    """Absolute phase of one axis.
 
-    phase_rad: FloatArray  # (H, W): counted from the low edge's -pi; NaN where not known
-    agreement: float  # share of the pixels whose own Gray bits give the same order
-    # the phase is not continuous, or hardly any code agrees with it: the orders are the Gray code's
-    # alone
+    Attributes
+    ----------
+    phase_rad : (H, W) array
+        Absolute phase, counted from the low edge's -pi; NaN where not known.
+    agreement : float
+        Share of the pixels whose own Gray bits give the same order.
+    torn : bool
+        Whether the phase is not continuous, or hardly any code agrees with it: the orders are the
+        Gray code's alone.
+    """
+
+    phase_rad: FloatArray
+    agreement: float
     torn: bool
 
 

@@ -16,12 +16,20 @@ _BLOCK = 512
 
 @dataclass(frozen=True)
 class StepCombination:
-    """How the frames of one axis become a phasor."""
+    """How the frames of one axis become a phasor.
 
-    # (N,): weights of the frames' bin sums for C and S (per pixel: divided by the bin's area)
+    Attributes
+    ----------
+    cosine : (N,) array
+        Weights of the frames' bin sums for C, over the pixels of a bin.
+    sine : (N,) array
+        The same for S.
+    turn, mirror : (2,) complex arrays
+        First and second moments of the film's motion (`reconstruction.film_motion`); 0 without.
+    """
+
     cosine: FloatArray
-    sine: FloatArray  # (N,)
-    # (2,) first and second moment of the film's motion (see `motion`); 0 without
+    sine: FloatArray
     turn: ComplexArray = field(default_factory=lambda: np.zeros(2, complex))
     mirror: ComplexArray = field(default_factory=lambda: np.zeros(2, complex))
 

@@ -15,14 +15,24 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, S
 
 @dataclass(frozen=True)
 class PixelPhases:
-    """One axis at n pixels."""
+    """One axis at n pixels.
 
-    phase_rad: FloatArray  # (n,): absolute phase, the period nearest to the reference
-    swing_adu: Singles  # (n,): fringe amplitude
-    rest_adu: (
-        Singles  # (n,): root of the sum of squares that the sinusoid leaves; 0 for three frames
-    )
-    saturated: BoolArray  # (n,): whether a frame is clipped there, at white or at black
+    Attributes
+    ----------
+    phase_rad : (n,) array
+        Absolute phase, the period nearest to the reference.
+    swing_adu : (n,) array
+        Fringe amplitude.
+    rest_adu : (n,) array
+        Root of the sum of squares that the sinusoid leaves; 0 for three frames.
+    saturated : (n,) bool array
+        Whether a frame is clipped there, at white or at black.
+    """
+
+    phase_rad: FloatArray
+    swing_adu: Singles
+    rest_adu: Singles
+    saturated: BoolArray
 
 
 @compile_kernel

@@ -32,14 +32,28 @@ def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Artefact:
-    """A surface of known form that stands in the mirror's place: a flat, or a concave sphere."""
+    """A surface of known form that stands in the mirror's place: a flat, or a concave sphere.
 
-    curvature_per_mm: float  # 0: flat
+    Attributes
+    ----------
+    curvature_per_mm : float
+        Curvature at the vertex; 0: flat.
+    curvature_sigma_per_mm : float
+    form_sigma_mm : float
+        Standard uncertainty of each Zernike term of its form.
+    vertex_mm : float
+        Height of its vertex in world.
+    vertex_sigma_mm : float
+    radius_mm : float
+        Radius of its disc.
+    """
+
+    curvature_per_mm: float
     curvature_sigma_per_mm: float
-    form_sigma_mm: float  # of each of its terms
-    vertex_mm: float  # height of its vertex in world
+    form_sigma_mm: float
+    vertex_mm: float
     vertex_sigma_mm: float
-    radius_mm: float  # of its disc
+    radius_mm: float
 
     @property
     def name(self) -> str:
@@ -92,9 +106,17 @@ class Artefact:
 
 @dataclass(frozen=True)
 class SeenScreen:
-    """The screen itself, seen without the mirror, anywhere: it shows lens and bow."""
+    """The screen itself, seen without the mirror, anywhere: it shows lens and bow.
 
-    origin_mm: FloatArray  # (3,): O' in the camera's frame, about
-    axes: FloatArray  # (3, 3): rows s_x, s_y and normal there
+    Attributes
+    ----------
+    origin_mm : (3,) array
+        Approximate O' in the camera's frame.
+    axes : (3, 3) array
+        Rows: s_x, s_y and the normal in the camera's frame.
+    """
+
+    origin_mm: FloatArray
+    axes: FloatArray
     name = "screen"
     doubt = "it shows another lens, another screen, or it was out of focus"

@@ -24,10 +24,18 @@ _BY_HAND |= SigmasConfig().model_dump()
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that may be wrong."""
+    """One number that may be wrong.
 
-    name: str  # ends in the unit
-    says: str  # for a person
+    Attributes
+    ----------
+    name : str
+        Name, which ends in the unit.
+    says : str
+        Description for people.
+    """
+
+    name: str
+    says: str
 
     @property
     def sigma(self) -> float:

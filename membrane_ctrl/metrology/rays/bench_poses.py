@@ -36,10 +36,18 @@ SCREEN_MOVE = 6
 
 @dataclass(frozen=True)
 class BenchGeometry:
-    """A geometry with what `Geometry` does not hold."""
+    """A geometry, and the scale of its screen.
 
-    geometry: Geometry  # camera and screen
-    pitch: float = 1.0  # true length of the screen's nominal millimetre
+    Attributes
+    ----------
+    geometry : Geometry
+        Camera and screen.
+    pitch : float
+        True length of the screen's nominal millimetre.
+    """
+
+    geometry: Geometry
+    pitch: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -62,12 +62,21 @@ _GLASS_INDEX = 1.52
 
 @dataclass(frozen=True)
 class Chunk:
-    """Residuals and derivatives of some points."""
+    """Residuals and derivatives of some points.
 
-    place: slice  # which points
-    residual_mm: FloatArray  # (2, m): seen minus predicted
-    # (2, COLUMNS + further poses, m), of the prediction by: the set's own unknowns, mm; the optical
-    # parameters
+    Attributes
+    ----------
+    place : slice
+        The points among all of the set.
+    residual_mm : (2, m) array
+        Seen minus predicted screen points.
+    derivatives : (2, COLUMNS + further poses, m) array
+        Of the predicted screen points by the set's own unknowns in mm, by the optical parameters,
+        and by further poses.
+    """
+
+    place: slice
+    residual_mm: FloatArray
     derivatives: FloatArray
 
 

@@ -19,21 +19,37 @@ from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 @dataclass(frozen=True)
 class Geometry:
-    """Poses of camera and screen, and the lens."""
+    """Poses of camera and screen, and the lens.
 
-    pinhole_mm: FloatArray  # (3,): camera pinhole F in world
-    rotation: (
-        FloatArray  # (3, 3): rows are the camera's x (right), y (down) and z (forward) in world
-    )
+    Attributes
+    ----------
+    pinhole_mm : (3,) array
+        Camera pinhole F in world.
+    rotation : (3, 3) array
+        Rows are the camera's x (right), y (down) and z (forward) in world.
+    focal_px : float
+        Focal length over the pixels' pitch.
+    principal_px : tuple[float, float]
+        Column and row of the principal point.
+    distortion : tuple of float
+        OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole.
+    screen_origin_mm : (3,) array
+        O' in world.
+    screen_s_x, screen_s_y : (3,) arrays
+        Unit vectors of s_x and s_y in world.
+    face : Face
+        Deviation of the screen from the plane of s_x and s_y.
+    """
+
+    pinhole_mm: FloatArray
+    rotation: FloatArray
     focal_px: float
-    principal_px: tuple[float, float]  # column, row
-    distortion: tuple[
-        float, ...
-    ]  # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole
-    screen_origin_mm: FloatArray  # (3,): O' in world
-    screen_s_x: FloatArray  # (3,): unit vectors of s_x and s_y in world
-    screen_s_y: FloatArray  # (3,)
-    face: Face  # how the screen deviates from the plane of s_x and s_y
+    principal_px: tuple[float, float]
+    distortion: tuple[float, ...]
+    screen_origin_mm: FloatArray
+    screen_s_x: FloatArray
+    screen_s_y: FloatArray
+    face: Face
 
     @classmethod
     def from_config(cls, optics: OpticsConfig) -> "Geometry":

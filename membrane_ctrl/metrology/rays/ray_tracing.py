@@ -18,12 +18,23 @@ _EXCESS = hencky_bowl.excess_series() / hencky_bowl.excess_rms()
 
 @dataclass
 class Points:
-    """What was measured, on any set of points: binned or every pixel."""
+    """Measured points, of bins or of all pixels.
 
-    rays: FloatArray  # (3, n): unit vectors in world, from the pinhole
-    screen_mm: FloatArray  # (2, n): s_x, s_y seen there, from O'
-    weights: FloatArray  # (n,): of both slopes of a point; 0 leaves it out
-    # (n,): length of each ray to the surface; kept between solutions as the start of the next
+    Attributes
+    ----------
+    rays : (3, n) array
+        Unit vectors in world, from the pinhole.
+    screen_mm : (2, n) array
+        s_x and s_y seen there, from O'.
+    weights : (n,) array
+        Weight of both slopes of a point; 0 leaves it out.
+    t_mm : (n,) array
+        Length of each ray to the surface; kept between solutions as the start of the next.
+    """
+
+    rays: FloatArray
+    screen_mm: FloatArray
+    weights: FloatArray
     t_mm: FloatArray
 
     @classmethod

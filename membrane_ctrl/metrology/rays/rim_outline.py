@@ -21,13 +21,27 @@ _LEAST_FOUND = 0.4
 
 @dataclass(frozen=True)
 class Outline:
-    """The rim as seen and as expected."""
+    """The rim as seen and as expected.
 
-    rim_px: FloatArray  # (2, n): column and row of the rim's points that were found
-    centre_px: tuple[float, float]  # centre of the ellipse that fits them
-    expected_px: tuple[float, float]  # that of the ellipse which the pose predicts
-    offset_mm: float  # distance of the two, on the mirror
-    size_ratio: float  # seen over expected, mean radius
+    Attributes
+    ----------
+    rim_px : (2, n) array
+        Column and row of the rim's points that were found.
+    centre_px : tuple[float, float]
+        Centre of the ellipse that fits them.
+    expected_px : tuple[float, float]
+        Centre of the ellipse that the pose predicts.
+    offset_mm : float
+        Distance of the two, on the mirror.
+    size_ratio : float
+        Seen over expected, mean radius.
+    """
+
+    rim_px: FloatArray
+    centre_px: tuple[float, float]
+    expected_px: tuple[float, float]
+    offset_mm: float
+    size_ratio: float
 
 
 def light_at(light: FloatArray, places_px: FloatArray) -> FloatArray:

@@ -20,14 +20,24 @@ _ORDER = 4  # coefficients of a cubic
 
 
 class Face(NamedTuple):
-    """A face; a named tuple, since compiled loops take one as it is."""
+    """A face; a named tuple, since compiled loops take one as it is.
 
-    bow_per_mm: float  # c, in 1/mm
-    # (rows, columns, 4, 4): polynomials of the map's cells, along s_y and s_x; without cells there
-    # is no map
+    Attributes
+    ----------
+    bow_per_mm : float
+        Coefficient c of the bow, 1/mm.
+    cells_mm : (rows, columns, 4, 4) array
+        Polynomials of the map's cells, along s_y and s_x; no cells: no map.
+    low_mm : (2,) array
+        First node along s_x and s_y.
+    pitch_mm : (2,) array
+        Distance of the nodes.
+    """
+
+    bow_per_mm: float
     cells_mm: FloatArray
-    low_mm: FloatArray  # (2,): first node along s_x and s_y
-    pitch_mm: FloatArray  # (2,): distance of the nodes
+    low_mm: FloatArray
+    pitch_mm: FloatArray
 
     @classmethod
     def of(cls, screen: ScreenPoseConfig | None) -> "Face":

@@ -20,15 +20,32 @@ _PER_POINT = ("column_px", "row_px", "screen_mm", "sigma_mm")  # the last axis: 
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """What is known, besides the fringes, of the same film seen with the screen put elsewhere."""
+    """What is known, besides the fringes, of the same film seen with the screen put elsewhere.
 
-    shift_mm: tuple[float, float, float]  # of the screen along s_x, s_y and towards the mirror
-    shift_sigma_mm: float  # of its length
-    turn_sigma_deg: float  # of its direction, and of the screen's turns
-    deeper_um: float  # by how much the film was deeper then, by the laser
-    motion_um: float  # in the x frames than in the y frames
+    Attributes
+    ----------
+    shift_mm : tuple[float, float, float]
+        Shift of the screen along s_x, s_y and towards the mirror.
+    shift_sigma_mm : float
+        Standard uncertainty of the shift's length.
+    turn_sigma_deg : float
+        Standard uncertainty of the shift's direction, and of the screen's turns.
+    deeper_um : float
+        Additional depth of the film then, according to the laser.
+    motion_um : float
+        Additional depth of the film in the x frames over the y frames.
+    motion_sigma_um : float
+    glass_sigma_mm : float
+        Standard uncertainty of the glass over a screen that is seen directly.
+    """
+
+    shift_mm: tuple[float, float, float]
+    shift_sigma_mm: float
+    turn_sigma_deg: float
+    deeper_um: float
+    motion_um: float
     motion_sigma_um: float
-    glass_sigma_mm: float = 0.0  # of a screen seen directly, in place of a film that is deeper
+    glass_sigma_mm: float = 0.0
 
     def known(self, laser_sigma_um: float) -> FloatArray:
         """Values and sigmas (2, MOVED), in mm and degrees: the move, the film deeper, deeper in x
@@ -57,25 +74,46 @@ ANYWHERE = Elsewhere((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0, glass_sigma_mm=3.
 class SetPhases:
     """One capture set as screen points of bins, and those of the same film with the screen put
     elsewhere.
+
+    Attributes
+    ----------
+    name : str
+    column_px : (n,) array
+        Centres of the bins.
+    row_px : (n,) array
+    screen_mm : (2, n) array
+        s_x and s_y seen there.
+    sigma_mm : (n,) array
+        Expected noise of each of the two coordinates.
+    displacement_um : float
+        Mean laser reading of the set; NaN without.
+    motion_um : float
+        Additional depth of the film in the x frames over the y frames; with a sigma of 0 it is 0.
+    motion_sigma_um : float
+    moved_um : float
+        RMS motion of the film during the set; that from frame to frame of an axis is corrected.
+    artefact : Artefact | SeenScreen, optional
+        What is seen instead of the film.
+    elsewhere : tuple of Elsewhere
+    screen : (n,) int array, optional
+        Place of the screen (from 1, in `elsewhere`) with which a point was seen; 0 or None: its
+        own place.
+    period_mm : float
+        Period of the fringes; 0: unknown, and no waves that repeat with them are removed.
     """
 
     name: str
-    column_px: FloatArray  # (n,): centres of the bins
-    row_px: FloatArray  # (n,)
-    screen_mm: FloatArray  # (2, n): s_x, s_y seen there
-    sigma_mm: FloatArray  # (n,): expected noise of each of the two
-    displacement_um: float  # mean laser reading of the set; NaN without
-    # by how much deeper the film was in the x frames than in the y frames, as told; a sigma of 0:
-    # not at all
+    column_px: FloatArray
+    row_px: FloatArray
+    screen_mm: FloatArray
+    sigma_mm: FloatArray
+    displacement_um: float
     motion_um: float = 0.0
     motion_sigma_um: float = 0.0
-    # RMS motion of the film during the set; that from frame to frame of an axis is corrected
     moved_um: float = 0.0
-    artefact: Artefact | SeenScreen | None = None  # what is seen instead of the film
+    artefact: Artefact | SeenScreen | None = None
     elsewhere: tuple[Elsewhere, ...] = ()
-    # (n,): with which of them a point was seen, from 1; 0, or None, in its place
     screen: IntArray | None = None
-    # of the fringes; 0: unknown, and nothing that repeats with them is taken out
     period_mm: float = 0.0
 
     def seen_with(self, screen: int) -> BoolArray:

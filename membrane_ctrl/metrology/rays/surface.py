@@ -21,13 +21,23 @@ PARAMETERS = ZERNIKE_TERMS  # all but piston, which follows from h(0) = 0, and t
 
 @dataclass(frozen=True)
 class Surface:
-    """Height above the vertex, h(0, 0) = 0, over a disc."""
+    """Height above the vertex, h(0, 0) = 0, over a disc.
 
-    # (terms,): in Noll's order, orthonormal; piston is whatever makes h(0, 0) = 0
+    Attributes
+    ----------
+    coeffs_mm : (terms,) array
+        Orthonormal Zernike terms in Noll's order; piston makes h(0, 0) = 0.
+    hencky_mm : float
+        Amplitude of the excess, as the sag of the Hencky bowl it belongs to.
+    radius_mm : float
+        Radius of the Zernike disc.
+    beyond_mm : tuple of float
+        The `BEYOND_TERMS` terms of `terms_beyond_fit`, of a calibration; a measurement has none.
+    """
+
     coeffs_mm: FloatArray
-    hencky_mm: float  # amplitude of the excess, as the sag of the Hencky bowl it belongs to
-    radius_mm: float  # radius of the Zernike disc
-    # of `terms_beyond_fit`, (BEYOND_TERMS,): a calibration's; a measurement has none
+    hencky_mm: float
+    radius_mm: float
     beyond_mm: tuple[float, ...] = ()
 
     @classmethod

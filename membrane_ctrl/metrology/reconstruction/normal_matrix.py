@@ -49,13 +49,19 @@ def _product_index() -> IntArray:
 
 @dataclass(frozen=True)
 class NormalMatrix:
-    """D^T W D, separately for x and y slopes, and the inverse of their sum."""
+    """D^T W D, separately for x and y slopes, and the inverse of their sum.
 
-    # (parameters, parameters): shares of the x and of the y slopes, in 1/mm^2 times weight
+    Attributes
+    ----------
+    x, y : (parameters, parameters) arrays
+        Shares of the x and of the y slopes, in 1/mm^2 times weight.
+    inverse : (parameters, parameters) array
+        Inverse of their sum. The condition number is below 1000, and the next step corrects what
+        rounding leaves.
+    """
+
     x: FloatArray
-    y: FloatArray  # (parameters, parameters)
-    # (parameters, parameters), of their sum; the condition number is below 1000, and the next step
-    # corrects what rounding leaves
+    y: FloatArray
     inverse: FloatArray
 
     @classmethod

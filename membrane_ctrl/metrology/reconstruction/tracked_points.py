@@ -21,19 +21,38 @@ _MIN_POINTS = 1000  # far more than the unknowns, far fewer than any real view o
 
 @dataclass
 class TrackedPoints:
-    """Points inside the analysis radius, with the last accepted phase of each."""
+    """Points inside the analysis radius, with the last accepted phase of each.
 
-    index: IntArray  # (n,): bin of each point
-    points: ray_tracing.Points  # rays, screen points, weights
-    # (2, n): subtracted from T phi / (2 pi): the phase at O', and what averaging over a bin adds
+    Attributes
+    ----------
+    index : (n,) int array
+        Bin of each point.
+    points : ray_tracing.Points
+        Rays, screen points, weights.
+    offset_mm : (2, n) array
+        Subtracted from T phi / (2 pi): the phase at O', and what averaging over a bin adds.
+    sensitivity_rad_per_um : (2, n) array
+        Change of phase per µm of displacement.
+    area_mm2 : (n,) array
+        Area of the mirror that a bin sees.
+    surface : Surface
+        Last solution.
+    normal : normal_matrix.NormalMatrix
+    accepted : (2, FOLLOWED_ROWS, n) array
+        Rows of `phase_change.update_phases` for x and y, of the last accepted cycle.
+    fresh : (2, FOLLOWED_ROWS, n) array
+        The same of the next cycle.
+    """
+
+    index: IntArray
+    points: ray_tracing.Points
     offset_mm: FloatArray
-    sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per µm of displacement
-    area_mm2: FloatArray  # (n,): area of the mirror that a bin sees
-    surface: Surface  # last solution
+    sensitivity_rad_per_um: FloatArray
+    area_mm2: FloatArray
+    surface: Surface
     normal: normal_matrix.NormalMatrix
-    # (2, FOLLOWED_ROWS, n): rows of `phasor.track` for x and y of the last accepted cycle
     accepted: FloatArray
-    fresh: FloatArray  # memory for the next
+    fresh: FloatArray
 
     def accept(self, surface: Surface, usable: BoolArray) -> None:
         """Make the fresh phases the reference; points that gave none keep theirs."""

@@ -24,12 +24,22 @@ _PIXELS_A_CELL = 1.5  # with fewer, cells would be empty between pixels
 
 @dataclass(frozen=True)
 class ResidualGrid:
-    """Mean slope residual on a square grid of cells with the vertex in the middle one."""
+    """Mean slope residual on a square grid of cells with the vertex in the middle one.
 
-    axis_mm: FloatArray  # (n,): middle of the cells, along x and along y alike
-    slope_x: FloatArray  # (n, n): rows along y; 0 where there is none
-    slope_y: FloatArray  # (n, n)
-    count: FloatArray  # (n, n): weight of the pixels in each cell
+    Attributes
+    ----------
+    axis_mm : (n,) array
+        Middle of the cells, along x as along y.
+    slope_x, slope_y : (n, n) arrays
+        Mean residual; rows along y; 0 where nothing was measured.
+    count : (n, n) array
+        Weight of the pixels in each cell.
+    """
+
+    axis_mm: FloatArray
+    slope_x: FloatArray
+    slope_y: FloatArray
+    count: FloatArray
 
     @property
     def step_mm(self) -> float:

@@ -145,15 +145,25 @@ class Stethoscope:
 
 @dataclass
 class HeardMode(StateNode):
-    """A mode over the searches; times are UTC in seconds."""
+    """A mode over the searches; times are UTC in seconds.
+
+    Attributes
+    ----------
+    last : VibrationMode
+    line : VibrationMode, optional
+        The line of the last search; None where it was not found.
+    missed : Count
+        Searches since it was found.
+    recent_hz : list[float]
+    past : list[tuple[float, float]]
+        Time and frequency, some a day, of a week.
+    """
 
     last: VibrationMode
-    line: VibrationMode | None = None  # of the last search; None where it was not heard
-    missed: Count = 0  # searches since it was heard
+    line: VibrationMode | None = None
+    missed: Count = 0
     recent_hz: list[float] = field(default_factory=list)
-    past: list[tuple[float, float]] = field(
-        default_factory=list
-    )  # time and frequency, some a day, of a week
+    past: list[tuple[float, float]] = field(default_factory=list)
 
     @property
     def gone(self) -> bool:
@@ -186,7 +196,15 @@ class HeardMode(StateNode):
 
 @dataclass
 class Heard(StateNode):
-    """What a listener knows, for the next one."""
+    """What one follower passes on to the next.
 
-    modes: list[HeardMode] = field(default_factory=list)  # each keeps its place
-    said: list[str] = field(default_factory=list)  # notices that stand
+    Attributes
+    ----------
+    modes : list[HeardMode]
+        Each keeps its place.
+    said : list[str]
+        Codes of the notices that are active.
+    """
+
+    modes: list[HeardMode] = field(default_factory=list)
+    said: list[str] = field(default_factory=list)

@@ -71,16 +71,28 @@ _GAUSSIAN_QUANTILE = 1.2816  # distance of the 10 % quantile from the median, in
 
 @dataclass(frozen=True)
 class VibrationMode(StateNode):
-    """One vibration."""
+    """One vibration.
+
+    Attributes
+    ----------
+    frequency_hz : float
+    sigma_hz : float
+    amplitude_nm : float
+        Amplitude of the oscillation, RMS over the mirror, with the ring at rest.
+    shape : (terms,) array
+        Zernike terms of unit RMS; the largest is positive.
+    evidence : float
+        T less that of noise.
+    aliases_hz : tuple of float
+        Frequencies that explain the frames equally well: aliases that one frame rate cannot
+        distinguish. `frequency_hz` is the lowest.
+    """
 
     frequency_hz: float
     sigma_hz: float
-    amplitude_nm: float  # of the oscillation, RMS over the mirror, whose ring rests
-    # (terms,): terms, unit RMS; the largest is positive
+    amplitude_nm: float
     shape: Annotated[FloatArray, ArrayShape((ZERNIKE_TERMS,))]
-    evidence: float  # T less that of noise
-    # Frequencies that explain the frames as well: aliases that one frame rate cannot tell apart.
-    # The lowest is given.
+    evidence: float
     aliases_hz: tuple[float, ...] = ()
 
     def is_like(self, other: "VibrationMode") -> bool:
@@ -96,14 +108,25 @@ class VibrationMode(StateNode):
 
 @dataclass(frozen=True)
 class _Piece:
-    """Some seconds of frames."""
+    """Some seconds of frames, and how they see each frequency of the search.
 
-    time_s: FloatArray  # (n,)
+    Attributes
+    ----------
+    time_s : (n,) array
+    rate_hz : float
+    window : (n,) array
+    waves : (frequencies, n) complex array
+    alias_hz : (frequencies,) array
+        Aliases of the searched frequencies below half the frame rate.
+    blind : (frequencies,) bool array
+        Frequencies with an alias in the drift, or at half the frame rate, where X is real.
+    """
+
+    time_s: FloatArray
     rate_hz: float
-    window: FloatArray  # (n,)
-    waves: ComplexArray  # (frequencies, n)
-    alias_hz: FloatArray  # (frequencies,): their aliases below half its frame rate
-    # (frequencies,): those with the alias of drift, or of half the frame rate, where X is real
+    window: FloatArray
+    waves: ComplexArray
+    alias_hz: FloatArray
     blind: BoolArray
 
     def projected(self, terms_um: FloatArray) -> ComplexArray:

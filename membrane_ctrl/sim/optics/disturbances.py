@@ -39,17 +39,33 @@ _SWING_S = 120.0
 
 @dataclass(frozen=True)
 class Nodes:
-    """Where the nodes of a picture are, on a bench at rest; maps are (rows, columns)."""
+    """Where the nodes of a picture are, on a bench at rest; maps are (rows, columns).
 
-    s_x_mm: FloatArray  # on the screen, from the low edge of the pattern's region
+    Attributes
+    ----------
+    s_x_mm, s_y_mm : (rows, columns) arrays
+        On the screen, from the low edge of the pattern's region.
+    x_mm, y_mm : (rows, columns) arrays
+        On the mirror.
+    row_share : (rows,) array
+        Row, as a share of the picture's height from its middle.
+    side_mm : float
+        Side of the pattern's region.
+    radius_mm : float
+    full_adu : float
+    grown : (3, rows, columns) array
+        Change of the renderer's maps by 1 mm of the stand.
+    """
+
+    s_x_mm: FloatArray
     s_y_mm: FloatArray
-    x_mm: FloatArray  # on the mirror
+    x_mm: FloatArray
     y_mm: FloatArray
-    row_share: FloatArray  # (rows,): of the picture's height, from its middle
-    side_mm: float  # of the pattern's region
+    row_share: FloatArray
+    side_mm: float
     radius_mm: float
     full_adu: float
-    grown: FloatArray  # (3, rows, columns): change of the renderer's maps by 1 mm of the stand
+    grown: FloatArray
 
 
 class Disturber:

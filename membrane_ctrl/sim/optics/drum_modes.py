@@ -14,12 +14,23 @@ _SERIES = 12  # powers of (r / radius)^2: J_0 and J_2 to 1e-6 beyond their secon
 
 @dataclass(frozen=True, slots=True)
 class DrumMode:
-    """A vibration: J_m(z r / radius) cos(m theta), z the n-th zero of J_m."""
+    """A vibration: J_m(z r / radius) cos(m theta), z the n-th zero of J_m.
+
+    Attributes
+    ----------
+    frequency_hz : float
+    lobes : int
+        m.
+    circles : int
+        n.
+    amplitude_nm : float
+        Amplitude, RMS over the mirror.
+    """
 
     frequency_hz: float
-    lobes: int  # m
-    circles: int  # n
-    amplitude_nm: float = 1.0  # RMS over the mirror
+    lobes: int
+    circles: int
+    amplitude_nm: float = 1.0
 
     def swing_um(self, time_s: FloatArray) -> FloatArray:
         """RMS over the mirror at a time, or at each of an array."""

@@ -23,14 +23,26 @@ class Light:
     """Conversion of the pattern's level to the camera's counts.
 
     Raises ValueError naming the field and a valid value.
+
+    Attributes
+    ----------
+    dark_fraction : float
+        Counts without light, of full scale.
+    white_fraction : float
+        Counts of a white screen in the middle of the picture, of full scale.
+    leak : float
+        Light of a black screen, of a white one.
+    gamma : float
+        The screen's light is level**gamma; 1 is a linear screen.
+    vignetting : float
+        Loss of light at the picture's corner, growing with the square of the distance from its
+        middle.
     """
 
-    dark_fraction: float = 0.02  # counts without light, of full scale
-    # counts of a white screen in the middle of the picture, of full scale
+    dark_fraction: float = 0.02
     white_fraction: float = 0.80
-    leak: float = 0.02  # light of a black screen, of a white one
-    gamma: float = 1.0  # the screen's light is level**gamma; 1 is a linear screen
-    # loss of light at the picture's corner, growing with the square of the distance from its middle
+    leak: float = 0.02
+    gamma: float = 1.0
     vignetting: float = 0.15
 
     def __post_init__(self) -> None:

@@ -42,16 +42,24 @@ _LEANING_TERMS = 36
 
 @dataclass(frozen=True, slots=True)
 class FrameFault:
-    """One fault of one frame."""
+    """One fault of one frame.
 
-    # "stale" (the picture of the frame before, byte for byte), "swapped" (with the frame after),
-    # "missing" (listed but not written), "saturated", "dark", "flicker" (wrong exposure), "moved"
-    # (the film moved unnoticed by the laser), "wrong_size" (one row short), "wrong_depth" (8 for 16
-    # bit or the
-    # reverse)
+    Attributes
+    ----------
+    kind : FaultKind
+        "stale" (the picture of the frame before, byte for byte), "swapped" (with the frame after),
+        "missing" (listed but not written), "saturated", "dark", "flicker" (wrong exposure), "moved"
+        (the film moved unnoticed by the laser), "wrong_size" (one row short), "wrong_depth" (8 for
+        16 bit or the reverse).
+    frame : str
+        The frame's name, as `x_sin_2`.
+    amount : float, optional
+        Relative exposure, or µm for "moved"; None: a typical one.
+    """
+
     kind: FaultKind
-    frame: str  # the frame's name, as `x_sin_2`
-    amount: float | None = None  # relative exposure, or µm for "moved"; None: a typical one
+    frame: str
+    amount: float | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(FaultKind):
@@ -135,43 +143,75 @@ def make_artefact_shape(
 
 @dataclass(frozen=True, slots=True)
 class SimulationSpec:
-    """One simulated capture set. Raises ValueError naming the field and a valid value."""
+    """One simulated capture set. Raises ValueError naming the field and a valid value.
 
-    # the bench as it truly is, with the camera's depth (`bits`) and noise and the pattern's steps
+    Attributes
+    ----------
+    optics : OpticsConfig
+        The bench as it truly is, with the camera's depth (`bits`) and noise and the pattern's
+        steps.
+    film : film_shape.FilmShape
+        Its sag belongs to displacement 0.
+    kind : "full" or "fringes" or "frequencies"
+        18 frames (for four steps), the sinusoids alone, or the sinusoids of several periods.
+    reference : str
+        The full set whose fringe orders anchor a fringes set, as `../0000`.
+    shifts_rad : tuple of float
+        One phase shift a step, written into each frame; empty: 2 pi k / N, not written.
+    coarser_mm : tuple of float
+        Further periods of a set of kind "frequencies", longer than the pattern's.
+    motion : Motion
+        Motion of the film on the run's clock.
+    displacements_um : tuple of float
+        Displacements instead of `motion`: one a frame, in the order of `patterns`.
+    start_s : float
+        Start of the first exposure on the run's clock.
+    frame_interval_s : float
+    laser : bool
+        Whether the frames carry the laser's reading.
+    laser_noise_um : float
+        Standard deviation of that reading.
+    stated_geometry : GeometryConfig, optional
+        Geometry in `capture.toml` if not the true one.
+    light : pattern_levels.Light
+    screen_error : bench_poses.ScreenError, optional
+    disturbances : DisturbancesConfig
+    drum_nm : float
+        Amplitude of each of the film's vibrations.
+    exact : bool
+    seed : int
+    artefact : Mapping[str, str | float]
+        `[artefact]` of a set that shows one.
+    screen_moved : Mapping[str, Any]
+        `[screen_moved]`, if the true one is elsewhere.
+    faults : tuple of FrameFault
+        Faults of single frames.
+    stiffness_n_per_m : float
+        Modulus times thickness, for the gauge's reading.
+    """
+
     optics: OpticsConfig
-    film: film_shape.FilmShape  # its sag belongs to displacement 0
-    # 18 frames (for four steps), the sinusoids alone, or the sinusoids of several periods
+    film: film_shape.FilmShape
     kind: Literal["full", "fringes", "frequencies"] = "full"
-    # of a fringes set: the full set whose fringe orders anchor it, as `../0000`
     reference: str = ""
-    # one phase shift a step, written into each frame; empty: 2 pi k / N, not written
     shifts_rad: tuple[float, ...] = ()
-    coarser_mm: tuple[
-        float, ...
-    ] = ()  # further periods of a set of kind "frequencies", longer than the pattern's
-    motion: Motion = Motion()  # of the film on the run's clock
-    displacements_um: tuple[
-        float, ...
-    ] = ()  # instead of `motion`: one a frame, in the order of `patterns`
-    start_s: float = 0.0  # start of the first exposure on the run's clock
+    coarser_mm: tuple[float, ...] = ()
+    motion: Motion = Motion()
+    displacements_um: tuple[float, ...] = ()
+    start_s: float = 0.0
     frame_interval_s: float = 0.1
-    laser: bool = True  # whether the frames carry the laser's reading
-    laser_noise_um: float = 0.0  # standard deviation of that reading
-    stated_geometry: GeometryConfig | None = None  # geometry in `capture.toml` if not the true one
+    laser: bool = True
+    laser_noise_um: float = 0.0
+    stated_geometry: GeometryConfig | None = None
     light: pattern_levels.Light = field(default_factory=pattern_levels.Light)
     screen_error: bench_poses.ScreenError | None = None
     disturbances: DisturbancesConfig = field(default_factory=DisturbancesConfig)
-    drum_nm: float = 0.0  # amplitude of each of the film's vibrations
+    drum_nm: float = 0.0
     exact: bool = False
     seed: int = 1
-    artefact: Mapping[str, str | float] = field(
-        default_factory=dict
-    )  # `[artefact]` of a set that shows one
-    screen_moved: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # `[screen_moved]`, if the true one is elsewhere
-    faults: tuple[FrameFault, ...] = ()  # faults of single frames
-    # modulus times thickness, for the gauge's reading
+    artefact: Mapping[str, str | float] = field(default_factory=dict)
+    screen_moved: Mapping[str, Any] = field(default_factory=dict)
+    faults: tuple[FrameFault, ...] = ()
     stiffness_n_per_m: float = gas_film.MODULUS_PA * gas_film.MIRROR_FILM.thickness_um * 1e-6
 
     def __post_init__(self) -> None:
