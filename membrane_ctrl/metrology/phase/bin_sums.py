@@ -18,11 +18,13 @@ from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.model.arrays import Image
 
 _NEVER = np.uint32(2**32 - 1)  # above any pixel
-FOLLOWED_ROWS = 5  # of `track`: absolute phase, its cosine and sine, change (rad), modulation (ADU)
+FOLLOWED_ROWS = 5  # of `phase_change.update_phases`
+_NARROW_BIN_PX = 16  # bins up to here: the sum of their 256 pixels of 8 bits fits 16 bits
 
 
 @compile_kernel
 def _add_lines(frame, first, last, line):  # type: ignore[no-untyped-def]
+    """Sum of the rows [first, last) into `line`."""
     for c in range(line.size):
         line[c] = frame[first, c]
     for row in range(first + 1, last):
@@ -32,6 +34,7 @@ def _add_lines(frame, first, last, line):  # type: ignore[no-untyped-def]
 
 @compile_kernel
 def _find_peak(frame, first, last, width):  # type: ignore[no-untyped-def]
+    """Largest pixel of these rows."""
     top = frame[first, 0]
     for row in range(first, last):
         for c in range(width):
@@ -42,12 +45,14 @@ def _find_peak(frame, first, last, width):  # type: ignore[no-untyped-def]
 
 @compile_kernel
 def _halve_line(line, out):  # type: ignore[no-untyped-def]
+    """Sums of pairs."""
     for b in range(out.size):
         out[b] = line[2 * b] + line[2 * b + 1]
 
 
 @compile_kernel
 def _fold_line(line, bin_px, out):  # type: ignore[no-untyped-def]
+    """Sums of `bin_px` neighbours."""
     for b in range(out.size):
         total = np.uint32(0)
         for c in range(b * bin_px, b * bin_px + bin_px):
@@ -57,6 +62,7 @@ def _fold_line(line, bin_px, out):  # type: ignore[no-untyped-def]
 
 @compile_kernel
 def _count_saturated(frame, first, last, bin_px, full_scale, out):  # type: ignore[no-untyped-def]
+    """Add the saturated pixels of each bin to `out`."""
     for row in range(first, last):
         for b in range(out.size):
             for c in range(b * bin_px, b * bin_px + bin_px):
@@ -73,9 +79,13 @@ def _bin_rows(frame, bin_px, full_scale, line, sums, saturated, start, stop):  #
     """
     width = line.shape[1]
     for row in range(start, stop):
-        first, last = row * bin_px, row * bin_px + bin_px
+        # The bin's rows first, then its columns, by halves as long as possible.
+        first = row * bin_px
+        last = first + bin_px
         _add_lines(frame, first, last, line[0])
-        here, there, side = line[0], line[1], bin_px
+        here = line[0]
+        there = line[1]
+        side = bin_px
         while side % 2 == 0 and side > 2:
             side //= 2
             _halve_line(here, there[: sums.shape[1] * side])
@@ -84,6 +94,7 @@ def _bin_rows(frame, bin_px, full_scale, line, sums, saturated, start, stop):  #
             _halve_line(here, sums[row])
         else:
             _fold_line(here, side, sums[row])
+        # Most rows have no saturated pixel.
         if _find_peak(frame, first, last, width) >= full_scale:
             _count_saturated(frame, first, last, bin_px, full_scale, saturated[row])
 
@@ -131,9 +142,19 @@ class Binner:
     ) -> None:
         """Sum frames into slots.
 
-        Raises ValueError for a frame of wrong size or type of pixel; nothing is summed then. Frame
-        k goes to slots[k]. Only `watched` slots, by default all, are checked for saturation: it
-        does not harm white or Gray.
+        Parameters
+        ----------
+        frames : sequence of (height, width) arrays
+            uint8 or uint16.
+        slots : sequence of int
+            Where each frame goes.
+        watched : container of int, optional
+            Slots that are checked for saturation, by default all: it does not harm white or Gray.
+
+        Raises
+        ------
+        ValueError
+            A frame has another size or type of pixel; nothing is summed then.
         """
         for frame in frames:
             if frame.shape != self._size:
@@ -148,14 +169,13 @@ class Binner:
 
         def run(start: int, stop: int) -> None:
             for frame, slot, limit in zip(frames, slots, limits, strict=True):
-                fits = (
-                    frame.dtype == np.uint8 and self.bin_px <= 16
-                )  # 256 pixels of 8 bits fit 16 bits
-                line = np.empty((2, width), np.uint16 if fits else np.uint32)
+                fits_16_bits = frame.dtype == np.uint8 and self.bin_px <= _NARROW_BIN_PX
+                line = np.empty((2, width), np.uint16 if fits_16_bits else np.uint32)
                 pixels = np.ascontiguousarray(frame)
                 _bin_rows(
                     pixels, self.bin_px, limit, line, self.sums[slot], self.saturated, start, stop
                 )
 
-        # waking a thread costs more than half a frame
-        split_over_threads(run, self.sums.shape[1], self._size[0] + 1 if len(frames) == 1 else 0)
+        # A single frame is not split: waking a thread costs more than half a frame.
+        least_rows = self._size[0] + 1 if len(frames) == 1 else 0
+        split_over_threads(run, self.sums.shape[1], least_rows)

@@ -13,18 +13,16 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import AnyArray, Image, IntArray
 
-# Samples are enough for shares of 1e-4
-_SAMPLES = 300_000
-# Of the sampled pixels: hot and dead ones lie beyond the extreme level
-_STRAY_SHARE = 1e-4
-# Of the sampled pixels at the extreme level; fewer do no harm
-_LEAST_SHARE = 1e-3
-_NEIGHBOURS = 4
-# Times the mean of the next levels that hold pixels. Without noise and with even light, sinusoids
-# reach 2 at the bright end. At the dark end, a panel's gamma of 2.2 makes that 6.
+_SAMPLES = 300_000  # pixels, enough for shares of 1e-4
+_STRAY_SHARE = 1e-4  # hot and dead pixels, which may lie beyond the extreme level
+_LEAST_SHARE = 1e-3  # of the pixels at the extreme level; fewer do no harm
+_NEIGHBOURS = 4  # levels beside the extreme one that it is compared with
+# Pixels at the extreme level over the mean of its neighbours. Without noise and with even light,
+# sinusoids reach 2 at the bright end. At the dark end, a panel's gamma of 2.2 makes that 6.
 _PILE_WHITE = 6.0
 _PILE_BLACK = 12.0
-_LIT_SHARE = 0.5  # of the brightest pixels: what sees the panel
+_LIT_SHARE = 0.5  # of the brightest pixels: pixels above it see the panel
+_BRIGHTEST_QUANTILE = 0.99
 
 
 @dataclass(frozen=True)
@@ -64,18 +62,19 @@ def find_clip_levels(frames: Sequence[Image], full_scale_adu: int) -> ClipLevels
         return unclipped
     thinned = _thin(frames)
     brightest = thinned.max(axis=0)
-    lit = brightest > _LIT_SHARE * float(np.quantile(brightest, 0.99))
+    lit = brightest > _LIT_SHARE * float(np.quantile(brightest, _BRIGHTEST_QUANTILE))
     histogram = np.bincount(thinned[:, lit].ravel())
     levels = np.flatnonzero(histogram)
     counts = histogram[levels]
-    white = _piled_level(levels[::-1], counts[::-1], _PILE_WHITE)
-    black = _piled_level(levels, counts, _PILE_BLACK)
-    if white is not None and white == black:  # one level only: an empty picture
+    white_adu = _piled_level(levels[::-1], counts[::-1], _PILE_WHITE)
+    black_adu = _piled_level(levels, counts, _PILE_BLACK)
+    if white_adu is not None and white_adu == black_adu:  # one level only: an empty picture
         return unclipped
-    return ClipLevels(
-        full_scale_adu if white is None else min(white, full_scale_adu),
-        -1 if black is None else black,
-    )
+    if white_adu is None:
+        white_adu = full_scale_adu
+    if black_adu is None:
+        black_adu = unclipped.black_adu
+    return ClipLevels(min(white_adu, full_scale_adu), black_adu)
 
 
 def _thin(frames: Sequence[Image]) -> AnyArray:
@@ -94,4 +93,6 @@ def _piled_level(levels: IntArray, counts: IntArray, pile: float) -> int | None:
     beside = counts[extreme + 1 : extreme + 1 + _NEIGHBOURS]
     if len(beside) < _NEIGHBOURS or counts[extreme] < _LEAST_SHARE * total:
         return None
-    return int(levels[extreme]) if counts[extreme] > pile * float(beside.mean()) else None
+    if counts[extreme] <= pile * float(beside.mean()):
+        return None
+    return int(levels[extreme])

@@ -81,25 +81,25 @@ class FrameStack:
         return np.array([self.patterns[k].shift_rad for k in frames])
 
     def design(self, frames: list[int]) -> FloatArray:
-        """`phase.step_design` of sinusoids (N, 3)."""
-        return step_design(
-            self.shifts_rad(frames), None if self.light is None else self.light[:, frames]
-        )
+        """`phase_steps.step_design` (N, 3) of sinusoids, with their light."""
+        return step_design(self.shifts_rad(frames), self._light_of(frames))
 
     def weights(self, frames: list[int]) -> FloatArray:
-        """`phase.step_weights` of sinusoids (3, N). Raises ValueError if they do not determine a
-        phase.
+        """`phase_steps.step_weights` (3, N) of sinusoids, with their light.
+
+        Raises ValueError if they do not determine a phase.
         """
-        return step_weights(
-            self.shifts_rad(frames), None if self.light is None else self.light[:, frames]
-        )
+        return step_weights(self.shifts_rad(frames), self._light_of(frames))
+
+    def _light_of(self, frames: list[int]) -> FloatArray | None:
+        return None if self.light is None else self.light[:, frames]
 
     def reordered(self, order: list[int]) -> "FrameStack":
-        """The same with other pictures for the patterns: frame k shows what `order[k]` did."""
+        """Return the set with pictures exchanged: frame k shows what `order[k]` did."""
         gain = None if self.gain is None else self.gain[order]
-        place = {taken: frame for frame, taken in enumerate(order)}
-        former = [self.before_of(taken) for taken in order]
-        before = tuple(place[taken] if taken >= 0 else -1 for taken in former)
+        new_place = {taken: frame for frame, taken in enumerate(order)}
+        old_before = [self.before_of(taken) for taken in order]
+        before = tuple(new_place[taken] if taken >= 0 else -1 for taken in old_before)
         return replace(self, frames=self.frames[order], light=None, gain=gain, before=before)
 
     @property
@@ -166,7 +166,18 @@ def bin_side_px(size_px: tuple[int, int]) -> int:
 def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
     """Means of each frame over bins, and which bins are clipped.
 
-    The camera may clip below its full scale (`find_clip_levels`).
+    Parameters
+    ----------
+    stack : FrameStack
+        The frames.
+    full_scale_adu : int
+        Largest value of the camera's converter; the camera may clip below it
+        (`find_clip_levels`).
+
+    Returns
+    -------
+    Binned
+        Bins of up to 4 x 4 pixels, as large as enough of them allow.
     """
     bin_px = bin_side_px(stack.size_px)
     sinusoids = [k for axis in AXES for k in stack.sinusoids(axis) if k not in stack.unusable]

@@ -14,12 +14,14 @@ from membrane_ctrl.metrology.phase.gray_code import absolute_phase, code_orders
 from membrane_ctrl.metrology.phase.region_unwrap import tear_share, unwrap_regions
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
-# A good phase has no tears but for dust; one stale frame of three tears it at every quarter period.
+# Largest share of neighbours between which a good phase is torn, by dust. One stale frame of three
+# tears it at every quarter period.
 _TORN_SHARE = 0.003
-# One wrong Gray frame leaves half of the votes or more on the right order; fewer agree only if the
-# phase is wrong.
+# Least share of votes for the chosen order. One wrong Gray frame leaves 50 % or more on the right
+# order; fewer agree only if the phase is wrong.
 _LEAST_AGREEMENT = 0.35
-_LEAST_VOTES = 30  # a smaller island cannot outvote its own noise
+_LEAST_VOTES = 30  # of a region; a smaller one cannot outvote its own noise
+_MOST_ORDERS = 32  # by which the votes may differ from the continuous phase
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Orders:
 
 
 def resolve_orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
-    """Absolute phase of one axis.
+    """Absolute phase of one axis from its Gray code (eq. 2) and its continuity.
 
     Parameters
     ----------
@@ -53,33 +55,56 @@ def resolve_orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) ->
         Gray bits, most significant first.
     mask : (H, W) bool array
         Pixels that see the pattern.
+
+    Returns
+    -------
+    Orders
     """
-    return resolve_orders_by_votes(
-        wrapped_rad, absolute_phase(wrapped_rad, *code_orders(bits)), mask
-    )
+    k1, k2 = code_orders(bits)
+    return resolve_orders_by_votes(wrapped_rad, absolute_phase(wrapped_rad, k1, k2), mask)
 
 
-def resolve_orders_by_votes(wrapped_rad: FloatArray, coded: FloatArray, mask: BoolArray) -> Orders:
-    """As `orders`, from absolute phases (H, W) that each pixel has by itself; NaN where it has
-    none.
+def resolve_orders_by_votes(
+    wrapped_rad: FloatArray, voted_rad: FloatArray, mask: BoolArray
+) -> Orders:
+    """Absolute phase of one axis from a vote of each pixel and from its continuity.
+
+    Parameters
+    ----------
+    wrapped_rad : (H, W) array
+        Phase in (-pi, pi].
+    voted_rad : (H, W) array
+        Absolute phase that each pixel has by itself; NaN where it has none.
+    mask : (H, W) bool array
+        Pixels that see the pattern.
+
+    Returns
+    -------
+    Orders
     """
-    smooth, region = unwrap_regions(wrapped_rad, mask)
-    if tear_share(smooth) > _TORN_SHARE:
-        return Orders(np.where(mask, coded, np.nan), 1.0, torn=True)
-    offset = np.round((coded - smooth) / (2 * math.pi))
-    votes = np.zeros(
-        (region.max() + 1 if mask.any() else 0, 65), np.int64
-    )  # orders differ by 32 at most
-    voting = mask & np.isfinite(coded)
-    place = np.clip(offset[voting], -32, 32).astype(np.int64) + 32
-    np.add.at(votes, (region[voting], place), 1)
-    winner = np.argmax(votes, axis=1) - 32.0 if len(votes) else np.zeros(0)
-    small = votes.sum(axis=1) < _LEAST_VOTES
-    winner[small] = np.nan
+    smooth_rad, region = unwrap_regions(wrapped_rad, mask)
+    if tear_share(smooth_rad) > _TORN_SHARE:
+        return Orders(np.where(mask, voted_rad, np.nan), 1.0, torn=True)
+
+    # Each pixel votes for the number of periods that its region lacks.
+    lacking = np.round((voted_rad - smooth_rad) / (2 * math.pi))
+    is_voting = mask & np.isfinite(voted_rad)
+    regions = region.max() + 1 if mask.any() else 0
+    votes = np.zeros((regions, 2 * _MOST_ORDERS + 1), np.int64)
+    ballot = np.clip(lacking[is_voting], -_MOST_ORDERS, _MOST_ORDERS).astype(np.int64)
+    np.add.at(votes, (region[is_voting], ballot + _MOST_ORDERS), 1)
+    winner = np.zeros(0)
+    if regions:
+        winner = np.argmax(votes, axis=1) - float(_MOST_ORDERS)
+    winner[votes.sum(axis=1) < _LEAST_VOTES] = np.nan
+
+    # The winner holds for the whole region.
     shift = np.full(mask.shape, np.nan)
     shift[mask] = winner[region[mask]]
-    known = np.isfinite(shift) & voting
-    agreement = float(np.mean(offset[known] == shift[known])) if known.any() else 0.0
+    is_known = np.isfinite(shift) & is_voting
+    agreement = 0.0
+    if is_known.any():
+        agreement = float(np.mean(lacking[is_known] == shift[is_known]))
     if agreement < _LEAST_AGREEMENT:
-        return Orders(np.where(mask, coded, np.nan), 1.0, torn=True)
-    return Orders(smooth + 2 * math.pi * shift, agreement, torn=False)
+        return Orders(np.where(mask, voted_rad, np.nan), 1.0, torn=True)
+    return Orders(smooth_rad + 2 * math.pi * shift, agreement, torn=False)

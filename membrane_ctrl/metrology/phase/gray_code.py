@@ -34,32 +34,59 @@ def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[In
 
 
 def code_orders(bits: BoolArray) -> tuple[IntArray, IntArray]:
-    """The same from bits (n, ...) of any number, the last of them for half a period."""
-    binary = np.bitwise_xor.accumulate(
-        bits.astype(np.int64), axis=0
-    )  # each bit is the xor of all above it
+    """Fringe orders from Gray bits.
+
+    Parameters
+    ----------
+    bits : (n, ...) bool array
+        Of any number, most significant first; the last is for half a period.
+
+    Returns
+    -------
+    k1, k2 : (...) int arrays
+        As `gray_orders`.
+    """
+    # Each binary digit is the exclusive or of all Gray bits down to it.
+    binary = np.bitwise_xor.accumulate(bits.astype(np.int64), axis=0)
     half_periods = np.tensordot(1 << np.arange(len(binary))[::-1], binary, axes=1)
     return half_periods // 2, (half_periods + 1) // 2
 
 
 def absolute_phase(wrapped_rad: FloatArray, k1: IntArray, k2: IntArray) -> FloatArray:
-    """The paper's eq. 2: phase counted from the low edge's -pi."""
-    order = np.where(
-        wrapped_rad <= -math.pi / 2, k2, np.where(wrapped_rad >= math.pi / 2, k2 - 1, k1)
-    )
+    """Absolute phase (...) by the paper's eq. 2, counted from -pi at the low edge.
+
+    `wrapped_rad` (...) is in (-pi, pi], `k1` and `k2` (...) are the orders of `gray_orders`.
+    """
+    near_low_end = wrapped_rad <= -math.pi / 2
+    near_high_end = wrapped_rad >= math.pi / 2
+    order = np.where(near_low_end, k2, np.where(near_high_end, k2 - 1, k1))
     return wrapped_rad + 2 * math.pi * order
 
 
 def gray_bit(phase_rad: FloatArray, bit: int) -> tuple[BoolArray, FloatArray]:
-    """What Gray frame `bit` (1..4) shows at an absolute phase, and the distance in rad to where
-    that bit changes.
+    """What one Gray frame shows at an absolute phase, and how far that is from an edge.
 
-    V2 = floor(2 s / T) with s / T = (phase + pi) / (2 pi). Bit b of the code changes at V2 =
-    2^(4-b) (odd number).
+    With s / T = (phase + pi) / (2 pi) and V2 = floor(2 s / T), bit b of the code changes at V2 =
+    2^(4 - b) times an odd number.
+
+    Parameters
+    ----------
+    phase_rad : (...) array
+        Absolute phase.
+    bit : int
+        Number of the Gray frame, 1 to 4.
+
+    Returns
+    -------
+    shown : (...) bool array
+        Whether the frame is bright there.
+    from_edge_rad : (...) array
+        Distance to where the bit changes.
     """
     half_periods = (phase_rad + math.pi) / math.pi
     v2 = np.floor(np.nan_to_num(half_periods)).astype(np.int64)
-    shown = ((v2 ^ (v2 >> 1)) >> (4 - bit)) & 1
+    gray = v2 ^ (v2 >> 1)
+    shown = (gray >> (4 - bit)) & 1
     spacing = 2 ** (4 - bit)
     from_edge = np.abs(half_periods % (2 * spacing) - spacing)
     return shown.astype(bool), from_edge * math.pi

@@ -44,8 +44,10 @@ class FullSlots:
     """Positions of the images in the sequence of a full cycle."""
 
     def __init__(self, steps: int) -> None:
-        second = steps + GRAY_BITS
-        self.steps, self.count = steps, 2 * second + 2
+        second = steps + GRAY_BITS  # where the y frames begin
+        self.steps = steps
+        self.count = 2 * second + 2
         self.sinusoids = slice(0, steps), slice(second, second + steps)  # of x and y
         self.gray = slice(steps, second), slice(second + steps, 2 * second)
-        self.white, self.black = 2 * second, 2 * second + 1  # highest and lowest level
+        self.white = 2 * second
+        self.black = 2 * second + 1

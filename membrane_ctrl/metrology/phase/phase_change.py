@@ -11,7 +11,7 @@ from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.metrology.phase.phasor_kernels import branchless_arctan2, remove_phasor_motion
 from membrane_ctrl.model.arrays import AnyArray, ComplexArray, FloatArray, IntArray
 
-_BLOCK = 512
+_BLOCK = 512  # points whose intermediate values stay in the first-level cache
 
 
 @dataclass(frozen=True)
@@ -47,22 +47,25 @@ def _combine_sums(sums, index, weights, first, out):  # type: ignore[no-untyped-
 
 @compile_kernel
 def _remove_motion(c, s, slope, turn, mirror):  # type: ignore[no-untyped-def]
+    """`remove_phasor_motion` of phasors c + i s, in place; `slope` is q of each point."""
     for p in range(c.size):
         c[p], s[p] = remove_phasor_motion(c[p], s[p], slope[p], turn, mirror)
 
 
 @compile_kernel
 def _relative_angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-untyped-def]
-    """Angle of c + i s relative to the last phase, and its length;
-    normalises c + i s to length 1.
+    """Angle of c + i s relative to the last phase into `change`, its length into `size`; c + i s
+    becomes a unit vector.
     """
     for p in range(c.size):
         length = math.sqrt(c[p] * c[p] + s[p] * s[p])
         scale = 1 / (length + 1e-300)
-        x, y = c[p] * scale, s[p] * scale
-        change[p] = branchless_arctan2(
-            y * last_cos[p] - x * last_sin[p], x * last_cos[p] + y * last_sin[p]
-        )
+        x = c[p] * scale
+        y = s[p] * scale
+        # arg(z conj z_last), section 6 of docs/explanation/metrology.md
+        sine = y * last_cos[p] - x * last_sin[p]
+        cosine = x * last_cos[p] + y * last_sin[p]
+        change[p] = branchless_arctan2(sine, cosine)
         size[p] = length
         c[p] = x
         s[p] = y
@@ -70,12 +73,13 @@ def _relative_angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-
 
 @compile_kernel
 def _track_phases(sums, index, cosine, sine, turn, mirror, slope, last, out, start, stop):  # type: ignore[no-untyped-def]
-    """Phase of each point, counted from the last one, in blocks that
-    stay in the first-level cache.
+    """Phase of each point, counted from the last one; rows of `last` and `out` as in
+    `update_phases`.
     """
     for first in range(start, stop, _BLOCK):
         end = min(first + _BLOCK, stop)
-        c, s = out[1, first:end], out[2, first:end]
+        c = out[1, first:end]
+        s = out[2, first:end]
         _combine_sums(sums, index, cosine, first, c)
         _combine_sums(sums, index, sine, first, s)
         if turn[1] != 0:
@@ -95,7 +99,9 @@ def update_phases(
     last: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Phases of the points against the last ones, for x and y.
+    """Phases of the points against the last ones, for x and y, into `out`.
+
+    Derivation: section 6 of docs/explanation/metrology.md.
 
     Parameters
     ----------
@@ -109,7 +115,7 @@ def update_phases(
         Change of phase per µm of displacement.
     last, out : (2, FOLLOWED_ROWS, n) arrays
         Rows of the cycle before, from which the change is counted (unambiguous below pi), and of
-        this one.
+        this one: absolute phase (rad), its cosine and sine, change (rad), amplitude (ADU).
     """
 
     def run(start: int, stop: int) -> None:

@@ -17,13 +17,24 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import ArrayLike, ComplexArray, FloatArray
 
+_LARGEST_CONDITION = 100  # a larger one multiplies the noise of the phase a hundredfold
+
 
 def step_design(
     shifts_rad: Sequence[float] | FloatArray, light: FloatArray | None = None
 ) -> FloatArray:
-    """Rows (N, 3) that turn A, C and S of a pixel into its intensities: [l, b cos d, -b sin d].
+    """Matrix from A, C and S of a pixel to its intensities: rows [l, b cos d, -b sin d].
 
-    `light` (2, N) has the level l and the swing b of each frame; 1 by default.
+    Parameters
+    ----------
+    shifts_rad : (N,) array
+        Phase steps d.
+    light : (2, N) array, optional
+        Level l and swing b of each frame; 1 by default.
+
+    Returns
+    -------
+    (N, 3) array
     """
     shifts = np.asarray(shifts_rad, float)
     level, swing = np.ones((2, shifts.size)) if light is None else light
@@ -33,15 +44,26 @@ def step_design(
 def step_weights(
     shifts_rad: Sequence[float] | FloatArray, light: FloatArray | None = None
 ) -> FloatArray:
-    """Rows (3, N) that turn the N intensities of a pixel into A, C and S: pseudo-inverse of
-    `step_design`.
+    """Matrix from the N intensities of a pixel to A, C and S: pseudo-inverse of `step_design`.
 
-    The phase steps (N,) may have any order and spacing. Raises ValueError if they do not determine
-    a phase (fewer than three different ones on the circle).
+    Parameters
+    ----------
+    shifts_rad : (N,) array
+        Phase steps, in any order and spacing.
+    light : (2, N) array, optional
+        As in `step_design`.
+
+    Returns
+    -------
+    (3, N) array
+
+    Raises
+    ------
+    ValueError
+        The steps do not determine a phase: fewer than three are different on the circle.
     """
     design = step_design(shifts_rad, light)
-    # a condition number beyond this multiplies the noise of the phase a hundredfold
-    if len(design) < 3 or np.linalg.cond(design) > 100:
+    if len(design) < 3 or np.linalg.cond(design) > _LARGEST_CONDITION:
         raise ValueError(
             f"phase steps {np.round(shifts_rad, 3).tolist()} rad do not determine a phase"
         )
@@ -54,8 +76,23 @@ def equal_shifts(steps: int) -> FloatArray:
 
 
 def compute_phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> ComplexArray:
-    """Phasor C + iS per pixel from a stack of frames (N, ...): its angle is the phase, its length
-    the amplitude B.
+    """Phasor C + iS of each pixel: its angle is the phase (eq. 1), its length the amplitude B.
+
+    Parameters
+    ----------
+    frames : (N, ...) array
+        Intensities.
+    shifts_rad : (N,) array
+        Phase steps.
+
+    Returns
+    -------
+    (...) complex array
+
+    Raises
+    ------
+    ValueError
+        As `step_weights`.
     """
     stack = np.asarray(frames, float)
     _, cosine, sine = step_weights(shifts_rad)
@@ -66,8 +103,9 @@ def compute_phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray)
 
 
 def step_residual(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
-    """Residual of each frame after the model A + B cos(phi + d_k), (N, ...): zero but for noise if
-    all is well.
+    """What the model A + B cos(phi + d_k) leaves of each frame (N, ...): noise, if all is well.
+
+    Arguments and errors as in `compute_phasors`.
     """
     stack = np.asarray(frames, float)
     projector = np.eye(len(stack)) - step_design(shifts_rad) @ step_weights(shifts_rad)
@@ -80,7 +118,23 @@ def phase_sigma_rad(
     """Standard deviation of the phase for white noise in the frames; mean over the phase.
 
     The phasor's components have the variances sigma^2 sum w^2; across the phasor, averaged over its
-    direction, half their sum is left. For N equal steps: sigma sqrt(2 / N) / B.
+    direction, half their sum is left. For N equal steps: sigma sqrt(2 / N) / B
+    (docs/explanation/metrology.md, section 1).
+
+    Parameters
+    ----------
+    shifts_rad : (N,) array
+        Phase steps.
+    noise_adu : float
+        Standard deviation sigma of a pixel (or of a bin's mean) in one frame.
+    modulation_adu : float
+        Amplitude B of the fringes.
+
+    Returns
+    -------
+    float
+        In rad.
     """
     _, cosine, sine = step_weights(shifts_rad)
-    return noise_adu * math.sqrt(float(cosine @ cosine + sine @ sine) / 2) / modulation_adu
+    variance_across = float(cosine @ cosine + sine @ sine) / 2  # of the phasor, for noise of 1
+    return noise_adu * math.sqrt(variance_across) / modulation_adu

@@ -9,13 +9,13 @@ from membrane_ctrl.metrology.numerics.compiled import compile_step
 def branchless_arctan2(y, x):  # type: ignore[no-untyped-def]
     """Angle in [-pi, pi] without a branch, so that loops over it use vector units; (0, 0) gives 0.
 
-    The ratio of the smaller to the larger is halved in angle once, tan(a/2) = t / (1 + sqrt(1 +
-    t^2)), which leaves
-    |t| <= tan(pi/8), where 15 terms of the series of arctan leave less than 1e-13.
+    The angle of the smaller over the larger coordinate is halved, tan(a/2) = t / (1 + sqrt(1 +
+    t^2)), which leaves t <= tan(pi/8), where 16 terms of the series of arctan leave less than
+    1e-13. Then follow the octant, the half plane x < 0 and the half plane y < 0.
     """
-    ax, ay = abs(x), abs(y)
-    low, high = min(ax, ay), max(ax, ay)
-    ratio = low / (high + 1e-300)
+    ax = abs(x)
+    ay = abs(y)
+    ratio = min(ax, ay) / (max(ax, ay) + 1e-300)
     t = ratio / (1 + math.sqrt(1 + ratio * ratio))
     square = t * t
     series = 0.0
@@ -29,14 +29,19 @@ def branchless_arctan2(y, x):  # type: ignore[no-untyped-def]
 
 @compile_step
 def remove_phasor_motion(c, s, q, turn, mirror):  # type: ignore[no-untyped-def]
-    """The phasor c + i s without the film's motion, to second order (see `motion`)."""
+    """The phasor c + i s without the film's motion, to second order.
+
+    Solves z' = T z + M conj z for z (`reconstruction.film_motion`), with the point's change of
+    phase per µm, `q`, and the moments `turn` and `mirror` (2,) of the motion.
+    """
+    # T = 1 + i q turn_1 - q^2 turn_2 / 2, M = -i q mirror_1 - q^2 mirror_2 / 2
     half = q * q / 2
-    t_re, t_im = 1 - q * turn[0].imag - half * turn[1].real, q * turn[0].real - half * turn[1].imag
-    m_re, m_im = (
-        q * mirror[0].imag - half * mirror[1].real,
-        -q * mirror[0].real - half * mirror[1].imag,
-    )
+    t_re = 1 - q * turn[0].imag - half * turn[1].real
+    t_im = q * turn[0].real - half * turn[1].imag
+    m_re = q * mirror[0].imag - half * mirror[1].real
+    m_im = -q * mirror[0].real - half * mirror[1].imag
+    # z = (conj T z' - M conj z') / (|T|^2 - |M|^2)
     scale = 1 / (t_re * t_re + t_im * t_im - m_re * m_re - m_im * m_im)
-    return scale * ((t_re - m_re) * c + (t_im - m_im) * s), scale * (
-        (t_re + m_re) * s - (t_im + m_im) * c
-    )
+    real = scale * ((t_re - m_re) * c + (t_im - m_im) * s)
+    imaginary = scale * ((t_re + m_re) * s - (t_im + m_im) * c)
+    return real, imaginary

@@ -15,7 +15,7 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, S
 
 @dataclass(frozen=True)
 class PixelPhases:
-    """One axis at n pixels.
+    """Phases of one axis at n pixels.
 
     Attributes
     ----------
@@ -55,13 +55,18 @@ def _compute_phases(  # type: ignore[no-untyped-def]
     start,
     stop,
 ):
-    """Rows of `out` (2, n): swing (negative where saturated) and rest; `reference` (n,) is replaced
-    by the phase.
+    """Rows of `out` (2, n): swing (negative where clipped) and rest; the phase in place of
+    `reference` (n,).
+
+    `fade` (N, height) is 1 / gain of the rows; other arguments are those of `pixel_phases`.
     """
     steps, height = fade.shape
     for p in range(start, stop):
         place = index[p]
         row = place // (frames.shape[1] // height)
+
+        # Mean and phasor c + i s by least squares, of the light without that of the previous
+        # picture and without bands; and the extreme values, which may be clipped.
         mean = 0.0
         c = 0.0
         s = 0.0
@@ -77,6 +82,8 @@ def _compute_phases(  # type: ignore[no-untyped-def]
             mean += weights[0, k] * value
             c += weights[1, k] * value
             s += weights[2, k] * value
+
+        # What they leave: sum of squares over the steps.
         rest = 0.0
         for k in range(steps):
             value = float(frames[k, place])
@@ -84,11 +91,12 @@ def _compute_phases(  # type: ignore[no-untyped-def]
             value += (rise if more > 0 else fall) * more
             left = value * fade[k, row] - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
             rest += left * left
+
+        # The phase without the film's motion, in the period nearest to the reference.
         c, s = remove_phasor_motion(c, s, slope[p], turn, mirror)
         wrapped = branchless_arctan2(s, c)
-        reference[p] = wrapped + 2 * math.pi * math.floor(
-            (reference[p] - wrapped) / (2 * math.pi) + 0.5
-        )
+        period = math.floor((reference[p] - wrapped) / (2 * math.pi) + 0.5)
+        reference[p] = wrapped + 2 * math.pi * period
         swing = math.sqrt(c * c + s * s)
         out[0, p] = -swing if top >= white or bottom <= black else swing
         out[1, p] = math.sqrt(rest)
@@ -106,16 +114,16 @@ def pixel_phases(
     previous: Image | None = None,
     held_shares: tuple[float, float] = (0.0, 0.0),
 ) -> PixelPhases:
-    """Phases of one axis.
+    """Phases of one axis at n pixels (eq. 1, by least squares).
 
     Parameters
     ----------
     frames : (N, height, width) array
         The axis' usable sinusoids.
     design : (N, 3) array
-        Their steps and light (`phase.step_design`).
+        Their steps and light (`phase_steps.step_design`).
     combined : StepCombination
-        Motion of the film between them (`motion.combine_steps` for bins of one pixel).
+        Motion of the film between them (`film_motion.combine_steps`, for bins of one pixel).
     index : (n,) int array
         Pixels, counted row by row.
     sensitivity_rad_per_um : (n,) array
@@ -130,6 +138,10 @@ def pixel_phases(
         The frames taken before each.
     held_shares : two floats
         Shares of those that the frames still show, where they are brighter and where darker.
+
+    Returns
+    -------
+    PixelPhases
     """
     flat = frames.reshape(len(frames), -1)
     phase = reference_rad.copy()
