@@ -12,38 +12,81 @@ import numpy as np
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.model.arrays import FloatArray
 
-_LEAST, _GOOD = 0.5, 0.9  # shares of the mirror: from less than half, the terms are not determined
-_RINGS, _SPOKES = 20, 36
-_FOLD_RANGE, _FOLD_STEPS = 4.0, 4001  # of the picture's corner, to look for a fold of the lens
+# Shares of the mirror that must be measured: with less than half, the terms are not determined.
+_LEAST = 0.5
+_GOOD = 0.9
+_RINGS = 20  # of points on the mirror
+_SPOKES = 36
+_FOLD_RANGE = 4.0  # search for a fold of the lens up to here, over the picture's corner
+_FOLD_STEPS = 4001
 _DEPTHS = np.linspace(0.0, 0.5, 26)  # of any bowl, over its radius
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """Shares of the analysed part of the mirror, 0 to 1."""
+    """What a camera sees of a mirror.
 
-    shown: float  # within the camera's image
-    measured: float  # shown, with the camera's ray reflected onto the pattern
-    # from O' to where the ray by the vertex meets the screen's plane; infinite if it never does
+    Attributes
+    ----------
+    shown : float
+        Share of the analysed part of the mirror that is in the camera's image.
+    measured : float
+        Share that is shown, with the camera's ray reflected onto the pattern.
+    centre_off_mm : float
+        Distance from O' to where the ray by the vertex meets the screen's plane; infinite if it
+        never does.
+    """
+
+    shown: float
+    measured: float
     centre_off_mm: float
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Why a geometry is not plausible, and what to check."""
+    """Why a geometry is not plausible, and what to check.
 
-    hopeless: bool  # less than half of the mirror can be measured, or it is seen twice
-    key: str  # of the table
+    Attributes
+    ----------
+    hopeless : bool
+        Less than half of the mirror can be measured, or it is seen twice.
+    key : str
+        Key of the configuration that is probably wrong.
+    why, remedy : str
+        For people.
+    table : str
+        Table of the key, in `optics`.
+    """
+
+    hopeless: bool
+    key: str
     why: str
     remedy: str
-    table: str = "geometry"  # of the optics
+    table: str = "geometry"
 
 
 def compute_poses(
     geometry: GeometryConfig,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Pinhole (3,), rotation (3, 3), O', s_x and s_y (3,) in world, from either form
-    (docs/reference/interfaces.md).
+    """Poses of camera and screen in world, from either form of a geometry.
+
+    Source: docs/reference/interfaces.md.
+
+    Returns
+    -------
+    pinhole_mm : (3,) array
+        F.
+    rotation : (3, 3) array
+        Rows: the camera's x (right), y (down) and z (forward).
+    origin_mm : (3,) array
+        O'.
+    s_x, s_y : (3,) arrays
+        Unit vectors on the screen.
+
+    Raises
+    ------
+    ValueError
+        Neither form is complete.
     """
     screen = None if geometry.screen is None else geometry.screen.pose
     if geometry.camera is not None and screen is not None:
@@ -52,52 +95,69 @@ def compute_poses(
         return pinhole, rotation, origin, s_x, s_y
     if geometry.a_mm is None or geometry.b_mm is None or geometry.alpha_deg is None:
         raise ValueError("geometry has neither a_mm, b_mm, alpha_deg nor both poses")
-    cosine, sine = (
-        math.cos(math.radians(geometry.alpha_deg)),
-        math.sin(math.radians(geometry.alpha_deg)),
-    )
-    return (
-        geometry.a_mm * np.array([cosine, 0.0, sine]),
-        np.array([[sine, 0.0, -cosine], [0.0, -1.0, 0.0], [-cosine, 0.0, -sine]]),
-        geometry.b_mm * np.array([-cosine, 0.0, sine]),
-        np.array([-sine, 0.0, -cosine]),
-        np.array([0.0, 1.0, 0.0]),
-    )
+    # The short form: F = a (cos alpha, 0, sin alpha) looking at O, O' = b (-cos alpha, 0, sin
+    # alpha) and the screen perpendicular to O O'.
+    cosine = math.cos(math.radians(geometry.alpha_deg))
+    sine = math.sin(math.radians(geometry.alpha_deg))
+    pinhole = geometry.a_mm * np.array([cosine, 0.0, sine])
+    rotation = np.array([[sine, 0.0, -cosine], [0.0, -1.0, 0.0], [-cosine, 0.0, -sine]])
+    origin = geometry.b_mm * np.array([-cosine, 0.0, sine])
+    return pinhole, rotation, origin, np.array([-sine, 0.0, -cosine]), np.array([0.0, 1.0, 0.0])
 
 
 def trace_view(optics: OpticsConfig, sag_mm: float) -> Sight:
-    """Follow the camera's rays to a bowl of this depth and on to the screen's plane."""
+    """Follow the camera's rays to a bowl of this depth and on to the screen's plane.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench.
+    sag_mm : float
+        Depth of the paraboloid.
+
+    Returns
+    -------
+    Sight
+    """
     pinhole, rotation, origin, s_x, s_y = compute_poses(optics.geometry)
-    camera, pattern, mirror = optics.camera, optics.pattern, optics.mirror
-    radius = (
-        np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS) * mirror.analysis_radius_mm
-    )  # rings of equal area
+    camera = optics.camera
+    pattern = optics.pattern
+    mirror = optics.mirror
+
+    # Points (n, 3) on the bowl, the vertex and then rings of equal area, and their normals.
+    radius = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS) * mirror.analysis_radius_mm
     spoke = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
-    x, y = (
-        np.append(0.0, np.outer(radius, np.cos(spoke))),
-        np.append(0.0, np.outer(radius, np.sin(spoke))),
-    )
+    x = np.append(0.0, np.outer(radius, np.cos(spoke)))
+    y = np.append(0.0, np.outer(radius, np.sin(spoke)))
     bend = sag_mm / mirror.radius_mm**2
     point = np.stack([x, y, bend * (x**2 + y**2)], axis=1)
     normal = np.stack([-2 * bend * x, -2 * bend * y, np.ones_like(x)], axis=1)
+
+    # The camera's rays: their pixels, and their reflections.
     ray = point - pinhole
+    in_camera = ray @ rotation.T
     towards = np.sum(ray * normal, axis=1)
-    seen = ray @ rotation.T
     reflected = ray - (2 * towards / np.sum(normal**2, axis=1))[:, None] * normal
-    face = np.cross(s_x, s_y)  # points at the mirror
+    face = np.cross(s_x, s_y)  # the screen's normal, which points at the mirror
+    focal_px = camera.focal_mm / (1e-3 * camera.pixel_um)
     with np.errstate(divide="ignore", invalid="ignore"):
-        pixel = (
-            camera.focal_mm / (1e-3 * camera.pixel_um) * seen[:, :2] / seen[:, 2:]
-            + camera.principal
-        )
-        place = point + ((origin - point) @ face / (reflected @ face))[:, None] * reflected - origin
-    inside = (pixel >= -0.5) & (pixel <= np.array([camera.width_px, camera.height_px]) - 0.5)
-    shown = (seen[:, 2] > 0) & inside.all(axis=1)
+        pixel = focal_px * in_camera[:, :2] / in_camera[:, 2:] + camera.principal
+        reach = (origin - point) @ face / (reflected @ face)
+        from_origin = point + reach[:, None] * reflected - origin
+
+    # Which points are in the image, and which reflections meet the pattern from the front.
+    size_px = np.array([camera.width_px, camera.height_px])
+    inside = (pixel >= -0.5) & (pixel <= size_px - 0.5)
+    shown = (in_camera[:, 2] > 0) & inside.all(axis=1)
     arrives = (towards < 0) & (reflected @ face < 0) & ((origin - point) @ face < 0)
-    on_screen = np.abs(place @ np.stack([s_x, s_y], axis=1))
-    lit = arrives & (on_screen <= pattern.periods * pattern.period_mm / 2).all(axis=1)
-    centre_off_mm = float(np.hypot(*on_screen[0])) if arrives[0] else math.inf
-    return Sight(float(shown[1:].mean()), float((shown & lit)[1:].mean()), centre_off_mm)
+    on_screen_mm = np.abs(from_origin @ np.stack([s_x, s_y], axis=1))
+    half_side_mm = pattern.periods * pattern.period_mm / 2
+    measured = shown & arrives & (on_screen_mm <= half_side_mm).all(axis=1)
+
+    centre_off_mm = math.inf
+    if arrives[0]:
+        centre_off_mm = float(np.hypot(*on_screen_mm[0]))
+    return Sight(float(shown[1:].mean()), float(measured[1:].mean()), centre_off_mm)
 
 
 def find_lens_fold_px(camera: CameraConfig) -> float:
@@ -131,19 +191,23 @@ def _distort_radius(tangent: FloatArray, distortion: tuple[float, ...]) -> Float
 
 
 def find_lens_doubt(optics: OpticsConfig) -> Doubt | None:
-    """A lens model that folds within the picture: hopeless if within that of the mirror."""
-    camera, mirror = optics.camera, optics.mirror
+    """The doubt about a lens model that folds within the picture, if it does.
+
+    It is hopeless if the fold is within the picture of the mirror.
+    """
+    camera = optics.camera
+    mirror = optics.mirror
     fold_px = find_lens_fold_px(camera)
     if math.isinf(fold_px):
         return None
     pinhole, rotation, *_ = compute_poses(optics.geometry)
     spoke = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
     rim = mirror.analysis_radius_mm * np.stack([np.cos(spoke), np.sin(spoke), 0 * spoke], axis=1)
-    seen = (rim - pinhole) @ rotation.T
-    # before the lens, to compare with where the fold begins
-    tangent = np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]
-    nearer = np.linspace(0.0, float(tangent.max()), _FOLD_STEPS)
-    in_mirror = bool((np.diff(_distort_radius(nearer, camera.distortion)) <= 0).any())
+    in_camera = (rim - pinhole) @ rotation.T
+    # Tangents of the angles to the axis, before the lens, up to that of the rim.
+    tangent = np.hypot(in_camera[:, 0], in_camera[:, 1]) / in_camera[:, 2]
+    up_to_rim = np.linspace(0.0, float(tangent.max()), _FOLD_STEPS)
+    in_mirror = bool((np.diff(_distort_radius(up_to_rim, camera.distortion)) <= 0).any())
     where = "within the mirror's picture" if in_mirror else "within the picture, beside the mirror"
     why = (
         f"the lens model folds {fold_px:.0f} px from the principal point, {where}: farther points "
@@ -159,27 +223,39 @@ def find_lens_doubt(optics: OpticsConfig) -> Doubt | None:
 def find_doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
     """What is not plausible about a geometry, if anything.
 
-    If the film's depth is not known, the geometry has the benefit of the doubt: that of the depth
-    that suits it best.
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench.
+    depth_known : bool
+        Whether `mirror.sag_mm` is the film's depth. If not, the geometry is judged with the depth
+        that suits it best.
+
+    Returns
+    -------
+    Doubt or None
     """
     fold = find_lens_doubt(optics)
     if fold is not None:
         return fold
-    depths_mm = (
-        [optics.mirror.sag_mm] if depth_known else (_DEPTHS * optics.mirror.radius_mm).tolist()
-    )
-    best = max(
-        (trace_view(optics, depth_mm) for depth_mm in depths_mm), key=lambda found: found.measured
-    )
+    depths_mm = [optics.mirror.sag_mm]
+    if not depth_known:
+        depths_mm = (_DEPTHS * optics.mirror.radius_mm).tolist()
+    views = [trace_view(optics, depth_mm) for depth_mm in depths_mm]
+    best = max(views, key=lambda view: view.measured)
     if best.measured >= _GOOD:
         return None
-    hopeless, geometry = best.measured < _LEAST, optics.geometry
+    hopeless = best.measured < _LEAST
+    geometry = optics.geometry
+
+    # The mirror is not in the picture: the camera's pose.
     if best.shown < _GOOD:
         key = "a_mm" if geometry.camera is None else "camera.position_mm"
         why = f"{best.shown:.0%} of the mirror is in the camera's image"
-        return Doubt(
-            hopeless, key, why, "check the camera's pose, focal_mm, pixel_um and principal_px"
-        )
+        remedy = "check the camera's pose, focal_mm, pixel_um and principal_px"
+        return Doubt(hopeless, key, why, remedy)
+
+    # The mirror does not show the pattern: the angle, or the screen's pose.
     half_mm = optics.pattern.periods * optics.pattern.period_mm / 2
     why = (
         f"the pattern ({half_mm:.0f} mm each way from O') is seen in {best.measured:.0%} of the "
@@ -187,25 +263,27 @@ def find_doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
     )
     if geometry.alpha_deg is not None:
         return Doubt(hopeless, "alpha_deg", why, _angle_hint(optics, geometry.alpha_deg, depths_mm))
-    if best.centre_off_mm > half_mm:
-        where = (
-            f"{best.centre_off_mm:.0f} mm from O'" if math.isfinite(best.centre_off_mm) else "never"
-        )
-        why += f": the camera's ray by the vertex meets the screen {where}"
+    if math.isinf(best.centre_off_mm):
+        why += ": the camera's ray by the vertex meets the screen never"
+    elif best.centre_off_mm > half_mm:
+        place = f"{best.centre_off_mm:.0f} mm from O'"
+        why += f": the camera's ray by the vertex meets the screen {place}"
     return Doubt(hopeless, "screen.origin_mm", why, "check the poses, [pattern] and mirror.sag_mm")
 
 
 def _angle_hint(optics: OpticsConfig, alpha_deg: float, depths_mm: list[float]) -> str:
     """What the angle may be instead, if the bench is plausible with that."""
-    for word, meant_deg in (
+    alternatives = (
         ("as radians", math.degrees(alpha_deg)),
         ("from the mirror's axis", 90.0 - alpha_deg),
-    ):
-        if 0.0 < meant_deg < 180.0:
-            geometry = optics.geometry.model_copy(update={"alpha_deg": meant_deg})
-            meant = optics.model_copy(update={"geometry": geometry})
-            if max(trace_view(meant, depth_mm).measured for depth_mm in depths_mm) >= _GOOD:
-                return f"{word} it is {meant_deg:.1f} deg"
+    )
+    for reading, meant_deg in alternatives:
+        if not 0.0 < meant_deg < 180.0:
+            continue
+        geometry = optics.geometry.model_copy(update={"alpha_deg": meant_deg})
+        meant = optics.model_copy(update={"geometry": geometry})
+        if max(trace_view(meant, depth_mm).measured for depth_mm in depths_mm) >= _GOOD:
+            return f"{reading} it is {meant_deg:.1f} deg"
     return (
         "measure alpha_deg from the mirror's plane; check a_mm, b_mm, [pattern] and mirror.sag_mm"
     )

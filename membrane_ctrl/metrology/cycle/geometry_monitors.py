@@ -17,11 +17,13 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction.slope_noise import slope_per_screen
 from membrane_ctrl.model.arrays import FloatArray
 
-CYCLES = 60  # two minutes of cycles
-GROWN = 1.25  # times the expected residual: 0.75 of it more, added in squares
-FINE = 1.1  # times the expected residual: a warning ends here
-# The required accuracy. A camera turned by 0.02 degrees moves the ring by 5.6 µm and bends the
-# figure by 4
+CYCLES = 60  # of which the median is taken: two minutes
+# Residual over the expected one at which a warning begins (75 % of it in addition, added in
+# squares), and ends.
+GROWN = 1.25
+FINE = 1.1
+# Motion of the ring at which a warning begins (the required accuracy), and ends. A camera turned by
+# 0.02 degrees moves the ring by 5.6 µm and bends the figure by 4 µm.
 RING_MOVED_UM = 5.0
 RING_BACK_UM = 3.0
 
@@ -89,7 +91,6 @@ class RingMonitor:
             self.says = ""
         elif moved_um > RING_MOVED_UM and not self.says:
             self.says = (
-                f"calibrate again: the ring is seen {moved_um:.1f} µm RMS from where it was "
-                "when the geometry was "
-                "calibrated; camera or screen has moved"
+                f"calibrate again: the ring is seen {moved_um:.1f} µm RMS from where it was when "
+                "the geometry was calibrated; camera or screen has moved"
             )

@@ -1,10 +1,13 @@
-"""The live cycle: frames in memory to the figure with its covariance, the last cycle's solution as
-the start.
+"""The live cycle: from frames in memory to the figure with its covariance.
 
 A full cycle finds the fringe orders and the points that see the pattern. A fringes-only cycle
 follows each point's phase from the last accepted one, which is unambiguous while no phase moved by
 half a period (4.34 mrad of slope), and needs one or two Gauss-Newton steps with the normal matrix
-of the full cycle.
+of the full cycle. Derivation: sections 6 to 8 of docs/explanation/metrology.md.
+
+The error bars are made in `LiveReconstructor._estimate`: white noise by `phase_sigma_rad` and
+`parameter_covariance`, all other errors by `uncertainty.cycle_errors.ErrorWatch`. The verdict is
+`judge_quality`'s, unless a doubt about the cycle's light or about the bench degrades it.
 """
 
 import math
@@ -51,17 +54,20 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 # half a period, so that a field which passes half a period anywhere shows points in the band before
 # it.
 GUARD_RAD = 0.9 * math.pi
-LOST_SHARE = 0.002  # more points than dust and glints beyond the guard
+LOST_SHARE = 0.002  # share of points beyond the guard; dust and glints are fewer
 # A film that changes its shape moves as many phases up as down. If all of them move one way, the
-# mount was knocked, perhaps by a whole period: phase alone cannot tell a tilt of 7 mrad from one of
-# -1.7.
+# mount was knocked, perhaps by a whole period: phase alone cannot distinguish a tilt of 7 mrad from
+# one of -1.7.
 TILT_GUARD_RAD = 0.3 * math.pi
 NOTHING_TO_FOLLOW = "tracking lost: no accepted full cycle to follow"
 # With this share of its points the full cycle's normal matrix still contracts a hundredfold a step.
 MATRIX_KEPT_SHARE = 0.99
-# the plane z = 0 is crossed this far at most from where a ray meets the film
+# A ray meets the film this far at most from where it crosses the plane z = 0.
 _FILM_BESIDE_PLANE_MM = 25.0
-_SURELY = 1.2  # times the expected variance of the phases' change: more than they scatter by chance
+# Variance of the phases' change that is called noise, over the expected one: their scatter by
+# chance is smaller.
+_SURELY = 1.2
+_EVERY = 16  # points between those of which medians are taken: a median costs more than the fit
 
 
 class LiveReconstructor:
@@ -101,20 +107,22 @@ class LiveReconstructor:
         self._geometry = geometry.Geometry.from_config(optics)
         self._bin_px = bin_px
         self._laser_noise_um = laser_noise_um
-        given = (
-            phase_steps.equal_shifts(optics.pattern.steps)
-            if shifts_rad is None
-            else np.asarray(shifts_rad, float)
-        )
-        self._shifts_rad = np.broadcast_to(given, (2, optics.pattern.steps))
+        steps = optics.pattern.steps
+        if shifts_rad is None:
+            shifts_rad = phase_steps.equal_shifts(steps)
+        self._shifts_rad = np.broadcast_to(np.asarray(shifts_rad, float), (2, steps))
         self._weights = [phase_steps.step_weights(shifts) for shifts in self._shifts_rad]
-        self._slots = pattern_sequence.FullSlots(optics.pattern.steps)
-        told = zip(
-            pattern_sequence.fringe_sequence(optics.pattern), self._shifts_rad.ravel(), strict=True
+        self._slots = pattern_sequence.FullSlots(steps)
+        fringes = pattern_sequence.fringe_sequence(optics.pattern)
+        self._patterns = tuple(
+            replace(pattern, shift_rad=float(shift))
+            for pattern, shift in zip(fringes, self._shifts_rad.ravel(), strict=True)
         )
-        self._patterns = tuple(replace(pattern, shift_rad=float(shift)) for pattern, shift in told)
-        self._bands_rad, self._doubt = np.zeros(0), ""
+        # What the last full cycle found of the light: frequencies of backlight bands, the share of
+        # the previous picture, and why a cycle is degraded by either.
+        self._bands_rad = np.zeros(0)
         self._held = held_light.UNKNOWN
+        self._doubt = ""
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
         self._binner = bin_sums.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
@@ -138,7 +146,7 @@ class LiveReconstructor:
         Parameters
         ----------
         frames : sequence of (height, width) uint8 or uint16 arrays
-            In the order of `phase.full_sequence`.
+            In the order of `pattern_sequence.full_sequence`.
         time_s, displacement_um : (frames,) arrays
             Of each exposure; NaN where there is no laser reading.
 
@@ -147,33 +155,44 @@ class LiveReconstructor:
         ShapeEstimate
             Verdict "rejected" with the reason when the images give no figure.
         """
+        optics = self._optics
         times, readings = _per_frame(frames, time_s, displacement_um, self._slots.count, "full")
         sinusoids = np.r_[self._slots.sinusoids].tolist()
         if self._reference_um is None and np.isfinite(readings).any():
             self._reference_um = float(readings[np.isfinite(readings)][0])
+
+        # Sums over the bins, without bands of the backlight.
         self._binner.clear()
         shown = [frames[k] for k in sinusoids]
         self._binner.white_adu = find_clip_levels(shown, self._full_scale_adu).white_adu
         self._binner.add(frames, range(len(frames)), watched=sinusoids)
         self._take_bands(np.zeros(0))
-        optics = self._optics
+
+        # Absolute phases of the bins near the mirror.
         images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
         phase_rad = full_decoder.decode_full(images, optics.pattern, self._shifts_rad)
-        phase_rad[:, self._binner.saturated.ravel()[self._near] > 0] = np.nan
+        is_saturated = self._binner.saturated.ravel()[self._near] > 0
+        phase_rad[:, is_saturated] = np.nan
+
+        # The points to follow, and their surface.
         times, readings = times[sinusoids], readings[sinusoids]
         self._tracked = None  # until this cycle is accepted
-        tracer, analysis_mm = self._make_tracer(readings), optics.mirror.analysis_radius_mm
+        tracer = self._make_tracer(readings)
+        analysis_mm = optics.mirror.analysis_radius_mm
         try:
             state = tracked_points.select_points(
                 self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm
             )
         except ValueError as error:
-            saturated = float(np.mean(self._binner.saturated.ravel()[self._near] > 0))
-            cause = ClippedShares(saturated, 0.0).cause
+            cause = ClippedShares(float(np.mean(is_saturated)), 0.0).cause
             return make_rejected_cycle("full", times, readings, cause or str(error))
+
+        # The figure, without light of previous pictures.
         self._remove_held_of_full(state)
         self._watch.begin(state, self._held)
         estimate = self._follow("full", state, times, readings)
+
+        # If no surface explains the slopes, pictures or pattern may be turned.
         if estimate.slope_residual_urad <= picture_orientation.SUSPICIOUS_URAD:
             return estimate
         near_px = np.stack([self._grid.column_px, self._grid.row_px])[:, self._near]
@@ -188,10 +207,19 @@ class LiveReconstructor:
     def fringes(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
     ) -> ShapeEstimate:
-        """One fringes-only cycle of 2 N frames, in the order of `phase.fringe_sequence`; else as
-        `full`.
+        """One fringes-only cycle. Raises ValueError for a wrong number, size or type of frames.
 
-        An estimate with `tracking_lost` asks for a full cycle.
+        Parameters
+        ----------
+        frames : sequence of 2 N (height, width) uint8 or uint16 arrays
+            In the order of `pattern_sequence.fringe_sequence`.
+        time_s, displacement_um : (2 N,) arrays
+            Of each exposure; NaN where there is no laser reading.
+
+        Returns
+        -------
+        ShapeEstimate
+            With `tracking_lost` if a full cycle must follow.
         """
         times, readings = _per_frame(
             frames, time_s, displacement_um, 2 * self._slots.steps, "fringes"
@@ -208,7 +236,7 @@ class LiveReconstructor:
         return self._follow("fringes", self._tracked, times, readings)
 
     def prepare(self) -> None:
-        """A cycle needs nothing ahead."""
+        """Nothing: a cycle needs no preparation (`LiveTracker.prepare` does)."""
 
     def height_map(
         self, coeffs_um: FloatArray, hencky_um: float, n: int = 256
@@ -219,9 +247,8 @@ class LiveReconstructor:
         mirror = self._optics.mirror
         axis = np.linspace(-mirror.radius_mm, mirror.radius_mm, n)
         x, y = np.meshgrid(axis, axis)
-        h = surface.Surface(np.asarray(coeffs_um) / 1e3, hencky_um / 1e3, mirror.radius_mm).height(
-            x, y
-        )
+        shape = surface.Surface(np.asarray(coeffs_um) / 1e3, hencky_um / 1e3, mirror.radius_mm)
+        h = shape.height(x, y)
         h[x**2 + y**2 > mirror.analysis_radius_mm**2] = np.nan
         return axis, axis.copy(), h
 
@@ -242,10 +269,11 @@ class LiveReconstructor:
 
     def _make_tracer(self, readings_um: FloatArray) -> ray_tracing.Tracer:
         """The bench with the vertex where the laser saw it, on average over the frames."""
-        mean = _finite_mean(readings_um)
-        known = self._reference_um is not None and math.isfinite(mean)
-        z = -(mean - self._reference_um) * 1e-3 if known and self._reference_um is not None else 0.0
-        return ray_tracing.Tracer(self._geometry, self._optics.mirror.radius_mm, z)
+        mean_um = _finite_mean(readings_um)
+        vertex_z_mm = 0.0
+        if self._reference_um is not None and math.isfinite(mean_um):
+            vertex_z_mm = -(mean_um - self._reference_um) * 1e-3
+        return ray_tracing.Tracer(self._geometry, self._optics.mirror.radius_mm, vertex_z_mm)
 
     def _follow(
         self,
@@ -255,50 +283,54 @@ class LiveReconstructor:
         readings: FloatArray,
     ) -> ShapeEstimate:
         """Phases of the points against the last accepted ones, and the figure from them."""
+        # Phases, and the points that can be used: fringes with contrast, and no saturated pixel.
         self._track_phases(state, readings)
-        # every 16th point: the median costs more than the fit
-        modulation_adu = float(np.median(state.fresh[:, 4, ::16]))
+        change_rad = state.fresh[:, 3]
+        swing_adu = state.fresh[:, 4]
+        modulation_adu = float(np.median(swing_adu[:, ::_EVERY]))
         saturated = self._binner.saturated.ravel()[state.index] > 0
-        usable = ~saturated & (
-            state.fresh[:, 4].min(axis=0) > full_decoder.FRINGE_SHARE * modulation_adu
-        )
-        if reason := _find_loss_reason(state.fresh[:, 3], usable):
+        has_fringes = swing_adu.min(axis=0) > full_decoder.FRINGE_SHARE * modulation_adu
+        usable = ~saturated & has_fringes
+        if reason := _find_loss_reason(change_rad, usable):
             return make_rejected_cycle(kind, times, readings, reason, tracking_lost=True)
+
+        # The surface, without the effect of what the frames show of their own light and motion.
         fit = self._fit(state, usable, readings)
         cycle = cycle_errors.Cycle(self._make_tracer(readings), state, fit, self._sums(), readings)
         errors = self._watch.look(cycle)
-        exact = fit.surface.parameters - errors.correction_mm
-        fit = replace(fit, surface=surface.Surface.from_parameters(exact, fit.surface.radius_mm))
-        area = math.pi * self._optics.mirror.analysis_radius_mm**2
+        corrected = fit.surface.parameters - errors.correction_mm
+        corrected_surface = surface.Surface.from_parameters(corrected, fit.surface.radius_mm)
+        fit = replace(fit, surface=corrected_surface)
+
+        # Its quality, error bars and verdict.
+        area_mm2 = math.pi * self._optics.mirror.analysis_radius_mm**2
         quality = Quality(
             modulation_share=modulation_adu / self._full_scale_adu,
             saturated_fraction=float(np.mean(saturated)),
-            valid_fraction=min(1.0, float(np.sum(state.area_mm2[usable])) / area),
+            valid_fraction=min(1.0, float(np.sum(state.area_mm2[usable])) / area_mm2),
             residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
             converged=fit.converged,
         )
         estimate = self._estimate(kind, state, fit, errors, quality, times, readings)
         if estimate.verdict == "rejected":
-            self._make_tracer(readings).start(
-                state.points, state.surface.height
-            )  # back onto the last good surface
+            # The points go back onto the last good surface.
+            self._make_tracer(readings).start(state.points, state.surface.height)
         else:
             state.accept(fit.surface, usable)
             self._tracked = state
         return estimate
 
     def _take_bands(self, known: FloatArray) -> None:
-        """Take bands of the backlight out of the sums; fringes-only cycles have those of the full
-        one.
+        """Remove bands of the backlight from the sums.
+
+        `known` are the frequencies that the last full cycle found; empty in a full cycle.
         """
         slots = np.r_[self._slots.sinusoids]
         binned = self._binned(self._binner.sums[slots])
         stack = self._stack_without_frames(self._patterns)
         stack, binned, found = band_removal.remove_bands(stack, binned, known)
-        self._bands_rad, self._doubt = (
-            found if not known.size else known,
-            band_removal.describe_bands(stack.gain),
-        )
+        self._bands_rad = known if known.size else found
+        self._doubt = band_removal.describe_bands(stack.gain)
         if known.size and not found.size:
             self._doubt = (
                 "bands of the backlight could not be told from what else changed in this cycle"
@@ -307,9 +339,10 @@ class LiveReconstructor:
             self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
 
     def _remove_held_of_full(self, state: tracked_points.TrackedPoints) -> None:
-        """Find what each frame of a full cycle shows of the previous one, and take it out.
+        """Find the share of the previous picture in the frames of a full cycle, and remove it.
 
-        The first frame has none: its pattern is shown ahead, while the former cycle is computed.
+        The first frame has no previous picture: its pattern is on the screen while the former cycle
+        is computed.
         """
         patterns = list(pattern_sequence.full_sequence(self._optics.pattern))
         for slots, shifts in zip(self._slots.sinusoids, self._shifts_rad, strict=True):
@@ -317,26 +350,26 @@ class LiveReconstructor:
                 patterns[slot] = replace(patterns[slot], shift_rad=float(shift))
         stack = self._stack_without_frames(tuple(patterns))
         binned = self._binned(self._binner.sums[: self._slots.count])
-        # The saturated bins of a sinusoid are known; those of other frames need not be
+        # Saturated bins are known of the sinusoids; other frames do not need them.
         phase_rad = state.accepted[:, 0]
-        self._held, without = held_light.find_held_light(stack, binned, state.index, phase_rad)
+        self._held, corrected = held_light.find_held_light(stack, binned, state.index, phase_rad)
         if self._held.corrected:
             slots = np.r_[self._slots.sinusoids]
-            self._binner.sums[slots] = np.rint(without.means[slots] * self._bin_px**2)
+            self._binner.sums[slots] = np.rint(corrected.means[slots] * self._bin_px**2)
         self._doubt = self._doubt or held_light.describe_held_light(self._held)
 
     def _remove_held_of_fringes(self) -> None:
-        """Take out of a fringes-only cycle what the last full cycle found."""
+        """Remove the share of the previous picture that the last full cycle found."""
         if not self._held.corrected:
             return
         slots = np.r_[self._slots.sinusoids]
         stack = self._stack_without_frames(self._patterns)
         binned = self._binned(self._binner.sums[slots])
-        without = held_light.remove_held_light(stack, binned, self._held)
-        self._binner.sums[slots] = np.rint(without.means * self._bin_px**2)
+        corrected = held_light.remove_held_light(stack, binned, self._held)
+        self._binner.sums[slots] = np.rint(corrected.means * self._bin_px**2)
 
     def _stack_without_frames(self, patterns: tuple[Pattern, ...]) -> FrameStack:
-        """The patterns of a cycle whose bins are enough."""
+        """The patterns of a cycle, of which only the bins are needed."""
         none = np.empty((len(patterns), self._optics.camera.height_px, 0), np.uint8)
         return FrameStack(none, patterns, np.full(len(patterns), math.nan), {})
 
@@ -399,40 +432,56 @@ class LiveReconstructor:
         times: FloatArray,
         readings: FloatArray,
     ) -> ShapeEstimate:
-        """The result in micrometres, with its covariance and verdict."""
+        """The result in micrometres, with its covariance and verdict.
+
+        Error bars: section 8 of docs/explanation/metrology.md.
+        """
+        # Variance (2,) of the phase of a bin from the noise of its pixels.
         modulation_adu = quality.modulation_share * self._full_scale_adu
         sigmas_rad = [
-            phase_steps.phase_sigma_rad(d, self._pixel_sigma_adu, modulation_adu)
-            for d in self._shifts_rad
+            phase_steps.phase_sigma_rad(shifts, self._pixel_sigma_adu, modulation_adu)
+            for shifts in self._shifts_rad
         ]
         noise_rad2 = np.square(sigmas_rad) / self._bin_px**2
-        # slopes that changed by more than noise: one error for each point that was asked
+
+        # Phases that changed by more than noise since the reference: an independent error of each
+        # of the points that were asked.
         changed_rad2 = np.maximum(errors.changed_rad2 - _SURELY * 2 * noise_rad2, 0.0)
         changed_rad2 *= fit.weight_sum / max(errors.asked, 1)
+
+        # Both as slopes, and as a covariance of the parameters; with the cycle's other errors.
         gain = slope_noise.slope_per_screen(
             self._geometry, fit.surface.radius_mm, fit.surface.sag_mm
         )
         slope_variance = gain @ (self._mm_per_rad**2 * (noise_rad2 + changed_rad2))
-        covariance = slope_noise.parameter_covariance(fit.normal, slope_variance) + errors.own_mm2
-        motion, moved = self._find_motion(state, fit, errors, covariance, readings)
-        steady = covariance if motion is None else covariance + motion.found_mm2
-        covariance = steady if motion is None else steady + motion.allowed_mm2
+        noise_mm2 = slope_noise.parameter_covariance(fit.normal, slope_variance)
+        own_mm2 = noise_mm2 + errors.own_mm2
+
+        # Motions of the bench: found ones count in the sag, too small ones in the figure alone.
+        motion, motion_doubt = self._find_motion(state, fit, errors, own_mm2, readings)
+        sag_covariance_mm2 = own_mm2
+        covariance_mm2 = own_mm2
+        if motion is not None:
+            sag_covariance_mm2 = own_mm2 + motion.found_mm2
+            covariance_mm2 = sag_covariance_mm2 + motion.allowed_mm2
         to_coeffs = surface.parameter_to_coeffs()
         gradient = surface.sag_gradient()
+        sag_sigma_mm = math.sqrt(gradient @ sag_covariance_mm2 @ gradient)
+        geometry_sag_sigma_mm = math.sqrt(gradient @ self._watch.common_mm2 @ gradient)
+
         verdict, reason = judge_quality(quality)
-        if verdict == "ok" and self._doubt:
-            verdict, reason = "degraded", self._doubt
-        if verdict == "ok" and moved:
-            verdict, reason = "degraded", moved
+        doubt = self._doubt or motion_doubt
+        if verdict == "ok" and doubt:
+            verdict, reason = "degraded", doubt
         return ShapeEstimate(
             time_s=_finite_mean(times),
             kind=kind,
             coeffs_um=1e3 * fit.surface.coeffs_mm,
             hencky_um=1e3 * fit.surface.hencky_mm,
-            covariance_um2=1e6 * to_coeffs @ covariance @ to_coeffs.T,
+            covariance_um2=1e6 * to_coeffs @ covariance_mm2 @ to_coeffs.T,
             sag_um=1e3 * fit.surface.sag_mm,
-            sag_sigma_um=1e3 * math.sqrt(gradient @ steady @ gradient),
-            geometry_sag_sigma_um=1e3 * math.sqrt(gradient @ self._watch.common_mm2 @ gradient),
+            sag_sigma_um=1e3 * sag_sigma_mm,
+            geometry_sag_sigma_um=1e3 * geometry_sag_sigma_mm,
             displacement_um=_finite_mean(readings),
             slope_residual_urad=quality.residual_urad,
             valid_fraction=quality.valid_fraction,
@@ -456,7 +505,7 @@ class LiveReconstructor:
         After a motion the next cycle is the reference: what has moved stays there.
         """
         if self._doubt or not np.isfinite(covariance_mm2).all():
-            if errors.is_reference:  # a disturbed cycle is none
+            if errors.is_reference:  # a disturbed cycle cannot be the reference
                 self._motion = None
             return None, ""
         index = state.index[errors.points]
@@ -481,7 +530,8 @@ def _per_frame(
     """Times and readings as arrays. Raises ValueError unless there is one of each for each of
     `count` frames.
     """
-    times, readings = np.asarray(time_s, float), np.asarray(displacement_um, float)
+    times = np.asarray(time_s, float)
+    readings = np.asarray(displacement_um, float)
     if not len(frames) == times.size == readings.size == count:
         found = f"{len(frames)} frames, {times.size} times and {readings.size} displacements"
         raise ValueError(
@@ -493,17 +543,19 @@ def _per_frame(
 def _find_loss_reason(change_rad: FloatArray, usable: BoolArray) -> str:
     """Why the phases (2, n) cannot be followed; empty if they can."""
     seen = max(1, int(np.count_nonzero(usable)))
-    beyond = int(np.count_nonzero(usable & (np.abs(change_rad).max(axis=0) > GUARD_RAD)))
+    is_beyond = np.abs(change_rad).max(axis=0) > GUARD_RAD
+    beyond = int(np.count_nonzero(usable & is_beyond))
     if beyond > LOST_SHARE * seen:
-        return (
-            f"tracking lost: the phase moved by half a period at {beyond / seen:.1%} of the points"
-        )
-    if np.abs(np.median(change_rad[:, ::16], axis=1)).max() > TILT_GUARD_RAD:
+        share = beyond / seen
+        return f"tracking lost: the phase moved by half a period at {share:.1%} of the points"
+    common_change_rad = np.median(change_rad[:, ::_EVERY], axis=1)
+    if np.abs(common_change_rad).max() > TILT_GUARD_RAD:
         return "tracking lost: the whole mirror tilted"
     return ""
 
 
 def _finite_mean(values: FloatArray) -> float:
+    """Mean of the finite values; NaN if there are none."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if finite.size else float("nan")
 

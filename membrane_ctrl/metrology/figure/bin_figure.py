@@ -49,27 +49,49 @@ class BinFigure:
 
 
 def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None = None) -> BinFigure:
-    """Phases of the bins, corrected for the film's motion, and the surface fitted to them."""
-    stack, state, film = checked.stack, checked.state, film or FilmMotion.of(checked)
-    sums = [checked.binned.means[used].reshape(len(used), -1) for used in checked.view.used]
+    """Phases of the bins, corrected for the film's motion, and the surface fitted to them.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench.
+    checked : Checked
+        The set.
+    film : FilmMotion, optional
+        Motion of the film, by default from laser and fringes.
+
+    Returns
+    -------
+    BinFigure
+    """
+    state = checked.state
+    film = film or FilmMotion.of(checked)
+
+    # Phases of the bins. The loop takes any numbers: here means over the bins instead of sums,
+    # hence bins of one pixel in the combinations of the steps.
+    means = [checked.binned.means[used].reshape(len(used), -1) for used in checked.view.used]
     told_um = film.told_um if film.worth_correcting else (None, None)
     steps = [combine_axis_steps(checked, axis, told) for axis, told in enumerate(told_um)]
     followed = np.empty_like(state.accepted)
-    # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the
-    # combinations
     phase_change.update_phases(
-        sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed
+        means, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed
     )
-    scale = screen_scale.mm_per_rad(optics.pattern)
+
+    # Their surface.
+    mm_per_rad = screen_scale.mm_per_rad(optics.pattern)
     points = state.points.subset(np.ones(state.index.size, bool))
-    points.screen_mm[:] = followed[:, 0] * scale - state.offset_mm
+    points.screen_mm[:] = followed[:, 0] * mm_per_rad - state.offset_mm
     fit = surface_fit.fit_surface(checked.tracer, points, state.surface)
     checked.tracer.intersect(points, fit.surface)
-    swing = followed[:, 4]
-    noise = slope_noise.pixel_sigma_adu(optics.camera.noise_adu) / checked.binned.bin_px
-    shifts = [stack.shifts_rad(used) for used in checked.view.used]
-    sigma = np.stack(
-        [phase_steps.phase_sigma_rad(d, noise, 1.0) / b for d, b in zip(shifts, swing, strict=True)]
-    )
-    quality = set_quality(optics, checked, fit, float(np.median(swing.min(axis=0))))
-    return BinFigure(fit, points, state.index, scale * sigma, quality)
+
+    # Standard uncertainty of the screen points from the noise of the pixels.
+    swing_adu = followed[:, 4]
+    noise_adu = slope_noise.pixel_sigma_adu(optics.camera.noise_adu) / checked.binned.bin_px
+    sigma_rad = np.empty_like(swing_adu)
+    for axis, used in enumerate(checked.view.used):
+        shifts_rad = checked.stack.shifts_rad(used)
+        # of fringes of amplitude 1
+        unit_sigma_rad = phase_steps.phase_sigma_rad(shifts_rad, noise_adu, 1.0)
+        sigma_rad[axis] = unit_sigma_rad / swing_adu[axis]
+    quality = set_quality(optics, checked, fit, float(np.median(swing_adu.min(axis=0))))
+    return BinFigure(fit, points, state.index, mm_per_rad * sigma_rad, quality)

@@ -19,11 +19,13 @@ from membrane_ctrl.metrology.reconstruction import zonal_map
 from membrane_ctrl.model.arrays import FloatArray
 
 LEAST_CELLS = 4 * zernike.FRINGE_TERMS  # fewer give no figure
-_TRIALS = 32  # 1 sigma to 12 %
-_TRIAL_CELLS = 96  # a side, at least
-_WHITE_TRIALS = 4  # on every cell: a mean over thinned cells would be too noisy; to 35 %
-_TILE = 256  # cells
-_EDGE = 0.03  # of the rays, on either side
+_TRIALS = 32  # give 1 sigma to 12 %
+_TRIAL_CELLS = 96  # cells a side of a trial, at least
+# Trials of the cells' own noise, on all cells: a mean over thinned cells would be too noisy. They
+# give 1 sigma to 35 %.
+_WHITE_TRIALS = 4
+_TILE = 256  # cells a side of the noise that is drawn
+_NEIGHBOURS = 0.03  # share of the rays, on either side, over which an encircled share is averaged
 
 
 @dataclass(frozen=True)
@@ -42,44 +44,61 @@ def figure_bars(
     covariance_mm2: FloatArray,
     cell_slope: float = 0.0,
 ) -> FigureBars:
-    """1 sigma of a figure `found` = `evaluate(seen)`.
+    """Error bars of a figure.
 
     Parameters
     ----------
+    evaluate : FigureOf
+        Evaluates figures on the grid of `seen`.
+    seen : SurfaceMap
+        The measured surface.
+    found : Figure
+        Its figure, `evaluate(seen)`.
     disc_mm : float
         Radius of the fit's Zernike disc.
     covariance_mm2 : (parameters, parameters) array
         Covariance of the fit's parameters, in mm^2. Not finite: no error bar, all NaN.
     cell_slope : float
         1 sigma of the mean slope of a cell by white noise.
+
+    Returns
+    -------
+    FigureBars
+        1 sigma of each number.
     """
-    thin = seen.part(max(1, seen.axis_mm.size // _TRIAL_CELLS))
-    if (
-        np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS
-    ):  # a map with few cells, here and there
-        thin = seen
     if not np.isfinite(covariance_mm2).all():
         nothing = Quantities(*[np.nan] * len(fields(Quantities)))
         return FigureBars(nothing, np.full(zernike.FRINGE_TERMS, np.nan))
+
+    # Trials on a thinned grid, unless few cells of a sparse map would be left.
+    thin = seen.part(max(1, seen.axis_mm.size // _TRIAL_CELLS))
+    if np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS:
+        thin = seen
     rough = FigureOf(thin, evaluate.aperture_mm)
-    random = np.random.default_rng(1)  # the same set has the same error bars
+    nominal = rough(thin)
+
+    # Independent modes of the parameters' errors, each of 1 sigma, as surfaces on that grid.
     values, vectors = np.linalg.eigh(covariance_mm2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     modes = np.stack(
-        [surface.Surface.from_parameters(k, disc_mm).on_grid(thin.axis_mm) for k in root.T]
+        [
+            surface.Surface.from_parameters(parameters, disc_mm).on_grid(thin.axis_mm)
+            for parameters in root.T
+        ]
     )
-    nominal = rough(thin)
+
+    # Mean squares of the changes by random sums of them, then by the cells' own noise.
+    random = np.random.default_rng(1)  # the same set has the same error bars
     squares = np.zeros(len(fields(Quantities)))
     for _ in range(_TRIALS):
         change = np.tensordot(random.normal(size=len(root)), modes, axes=1)
         squares += _compute_change(nominal, rough(thin.plus(change))) ** 2 / _TRIALS
-    for change in (
-        _propagate_white_noise(seen, evaluate.aperture_mm, cell_slope, random)
-        if cell_slope > 0
-        else ()
-    ):
-        moved = np.array(astuple(evaluate(seen.plus(change)).numbers))
-        squares += (moved - astuple(found.numbers)) ** 2 / _WHITE_TRIALS
+    if cell_slope > 0:
+        for change in _propagate_white_noise(seen, evaluate.aperture_mm, cell_slope, random):
+            moved = np.array(astuple(evaluate(seen.plus(change)).numbers))
+            squares += (moved - astuple(found.numbers)) ** 2 / _WHITE_TRIALS
+
+    # The Fringe terms are linear in the parameters.
     terms = np.stack([1e3 * rough.fringe.coefficients(mode[0]) for mode in modes])
     return FigureBars(Quantities(*np.sqrt(squares)), np.sqrt(np.sum(terms**2, axis=0)))
 
@@ -89,32 +108,35 @@ def _compute_change(nominal: Figure, moved: Figure) -> FloatArray:
     make it jump.
     """
     change = np.subtract(astuple(moved.numbers), astuple(nominal.numbers))
-    farther = np.sort(moved.spot_mm) - np.sort(nominal.spot_mm)
+    farther_mm = np.sort(moved.spot_mm) - np.sort(nominal.spot_mm)
     for place, share in zip(range(-len(ENERGY_SHARES), 0), ENERGY_SHARES, strict=True):
-        change[place] = farther[
-            int((share - _EDGE) * farther.size) : int((share + _EDGE) * farther.size) + 1
-        ].mean()
+        first = int((share - _NEIGHBOURS) * farther_mm.size)
+        last = int((share + _NEIGHBOURS) * farther_mm.size)
+        change[place] = farther_mm[first : last + 1].mean()
     return np.asarray(change)
 
 
 def _propagate_white_noise(
     seen: SurfaceMap, aperture_mm: float, cell_slope: float, random: np.random.Generator
 ) -> Iterator[FloatArray]:
-    """What white noise of the cells' slopes does to height and slopes, (3, n, n).
+    """Yield errors of height and slopes (3, n, n) by white noise of the cells' slopes.
 
-    Integrated once on a periodic tile of cells, of which each draw takes another place.
+    The noise is integrated once on a periodic tile of cells, of which each draw takes another
+    place.
     """
-    step = float(seen.axis_mm[1] - seen.axis_mm[0])
-    k = 2 * np.pi * np.fft.fftfreq(_TILE, step)
+    step_mm = float(seen.axis_mm[1] - seen.axis_mm[0])
+    slopes = random.normal(0, cell_slope, (2, _TILE, _TILE))
+
+    # Least squares for the height of waves k: -i k (slopes) / k^2; slower waves belong to the fit.
+    k = 2 * np.pi * np.fft.fftfreq(_TILE, step_mm)
     k_x, k_y = np.meshgrid(k, k)
     square = k_x**2 + k_y**2
-    slopes = random.normal(0, cell_slope, (2, _TILE, _TILE))
     spectrum = np.fft.fft2(slopes)
-    fast = square > (np.pi * zonal_map.FIT_CYCLES / aperture_mm) ** 2
-    height = np.where(
-        fast, -1j * (k_x * spectrum[0] + k_y * spectrum[1]) / np.where(fast, square, 1.0), 0
-    )
-    tiles = np.stack([np.fft.ifft2(height).real, *slopes])
+    is_fast = square > (np.pi * zonal_map.FIT_CYCLES / aperture_mm) ** 2
+    integrated = -1j * (k_x * spectrum[0] + k_y * spectrum[1]) / np.where(is_fast, square, 1.0)
+    height = np.fft.ifft2(np.where(is_fast, integrated, 0)).real
+
+    tiles = np.stack([height, *slopes])
     for _ in range(_WHITE_TRIALS):
         down, right = np.arange(seen.axis_mm.size) + random.integers(_TILE, size=(2, 1))
         yield tiles[:, (down % _TILE)[:, None], right % _TILE]

@@ -31,10 +31,14 @@ _START_SAG_MM = 40.0  # the paper's starting parabola
 # Solutions from different starts agree to a hundredth of the last change: 1e-9 mm
 _LAST_CHANGE_MM = 1e-7
 # Tukey's weight reaches 0 here: noise (5 sigma in millions of pixels) keeps its weight, dust and
-# glints have none
+# glints have none.
 _TUKEY_SIGMAS = 8.0
+_EVERY = 7  # residuals between those of which the median is taken
+_RAYLEIGH_MEDIAN = 1.177  # median of a Rayleigh distribution, in sigmas
+_LEAST_SLOPE = 1e-9  # floor of the residual's scatter: the rounding of a noise-free set
 _PART = 1 << 18  # pixels worked on at a time where memory would grow with them
-# A slope this far off is not the film's but a wrong fringe order (4.3 mrad) or a glint
+# A slope that is further off than this is not the film's: a wrong fringe order (4.3 mrad), or a
+# glint.
 _NO_SLOPE = 4e-3
 
 
@@ -85,14 +89,22 @@ class FullResult:
     def slope_variance(
         self, optics: OpticsConfig, shifts_rad: list[FloatArray], noise_adu: float
     ) -> FloatArray:
-        """(2,) variance of an x and of a y slope of one pixel, from the noise of a pixel in a
-        frame.
+        """Variance (2,) of an x and of a y slope of one pixel.
+
+        Parameters
+        ----------
+        optics : OpticsConfig
+            The bench.
+        shifts_rad : two (N,) arrays
+            Phase steps of the used frames of x and of y.
+        noise_adu : float
+            Standard deviation of a pixel in one frame.
         """
-        swing = self.quality.modulation_share * (2**optics.camera.bits - 1)
+        swing_adu = self.quality.modulation_share * (2**optics.camera.bits - 1)
+        mm_per_rad = screen_scale.mm_per_rad(optics.pattern)
         sigma_mm = [
-            screen_scale.mm_per_rad(optics.pattern)
-            * phase_steps.phase_sigma_rad(d, noise_adu, swing)
-            for d in shifts_rad
+            mm_per_rad * phase_steps.phase_sigma_rad(steps_rad, noise_adu, swing_adu)
+            for steps_rad in shifts_rad
         ]
         gain = slope_noise.slope_per_screen(
             Geometry.from_config(optics), self.surface.radius_mm, self.surface.sag_mm
@@ -116,7 +128,21 @@ class FullResult:
 
 @dataclass(frozen=True)
 class PixelPoints:
-    """Pixels that see the pattern, with their screen points."""
+    """Pixels that see the pattern, with their screen points.
+
+    Attributes
+    ----------
+    index : (n,) int array
+        Pixels, counted row by row.
+    points : Points
+        Their rays and screen points.
+    swing_adu : (n,) array
+        The smaller of the two fringe amplitudes.
+    rest_adu : (n,) array
+        Residual of the frames after the sinusoids.
+    moved : bool
+        Whether the film's motion was corrected.
+    """
 
     index: IntArray
     points: ray_tracing.Points
@@ -126,52 +152,68 @@ class PixelPoints:
 
 
 def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
-    """Phases of all pixels in bins that have one, corrected for the film's motion between the
-    frames.
+    """Phases and screen points of all pixels in bins that have a phase.
+
+    The film's motion between the frames is corrected if it is worth it.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench.
+    checked : Checked
+        The set.
+
+    Returns
+    -------
+    PixelPoints
     """
     stack = checked.stack
-    bin_px, columns = checked.binned.bin_px, checked.phase_rad.shape[2]
+    tracer = checked.tracer
+    surface = checked.state.surface
+
+    # The pixels of bins that have a phase, and the bin of each.
+    bin_px = checked.binned.bin_px
+    columns = checked.phase_rad.shape[2]
     known = np.isfinite(checked.phase_rad).all(axis=0) & checked.near
     row, column = np.nonzero(np.repeat(np.repeat(known, bin_px, axis=0), bin_px, axis=1))
     index = row * stack.size_px[1] + column
     in_bin = row // bin_px * columns + column // bin_px
-    tracer, surface = checked.tracer, checked.state.surface
-    points = ray_tracing.Points.of(
-        _trace_pixel_rays(tracer.geometry, column, row), np.empty((2, index.size))
-    )
-    del row, column
+
+    # Their rays, followed to the surface of the bins.
+    rays = _trace_pixel_rays(tracer.geometry, column, row)
+    points = ray_tracing.Points.of(rays, np.empty((2, index.size)))
+    del row, column, rays
     points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
     tracer.intersect(points, surface, newton=4)
+
+    # Their phases, in the period of their bin.
     film = FilmMotion.of(checked)
-    moved, sensitivity = film.worth_correcting, np.zeros((2, index.size))
-    if moved:
-        sensitivity = film_motion.sensitivity_mm_per_um(
-            tracer, points, surface
-        ) / screen_scale.mm_per_rad(optics.pattern)
+    moved = film.worth_correcting
     told_um = film.told_um if moved else (None, None)
-    axes = [
-        _axis_phases(optics, checked, k, index, in_bin, sensitivity[k], told_um[k])
+    sensitivity_rad_per_um = np.zeros((2, index.size))
+    if moved:
+        sensitivity_mm_per_um = film_motion.sensitivity_mm_per_um(tracer, points, surface)
+        sensitivity_rad_per_um = sensitivity_mm_per_um / screen_scale.mm_per_rad(optics.pattern)
+    x_phases, y_phases = axes = [
+        _axis_phases(checked, k, index, in_bin, sensitivity_rad_per_um[k], told_um[k])
         for k in range(2)
     ]
-    points.screen_mm[:] = screen_scale.screen_mm(
-        np.stack([a.phase_rad for a in axes]), optics.pattern
-    )
-    swing = np.minimum(axes[0].swing_adu, axes[1].swing_adu)
-    x, y = tracer.position_mm(points)
-    keep = (x**2 + y**2 <= optics.mirror.analysis_radius_mm**2) & ~(
-        axes[0].saturated | axes[1].saturated
-    )
-    keep &= swing > full_decoder.FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
-    rest = np.hypot(axes[0].rest_adu, axes[1].rest_adu)[keep]
-    index, swing = index[keep], swing[keep]
-    del (
-        axes,
-        x,
-        y,
-        in_bin,
-        sensitivity,
-    )  # the copies of the points follow, the most memory of a measurement
-    return PixelPoints(index, points.subset(keep), swing, rest, moved)
+    phase_rad = np.stack([each.phase_rad for each in axes])
+    points.screen_mm[:] = screen_scale.screen_mm(phase_rad, optics.pattern)
+
+    # Without pixels beyond the analysed radius, with a clipped frame or with too weak fringes.
+    x_mm, y_mm = tracer.position_mm(points)
+    keep = x_mm**2 + y_mm**2 <= optics.mirror.analysis_radius_mm**2
+    keep &= ~(x_phases.saturated | y_phases.saturated)
+    swing_adu = np.minimum(x_phases.swing_adu, y_phases.swing_adu)
+    keep &= swing_adu > full_decoder.FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
+    rest_adu = np.hypot(x_phases.rest_adu, y_phases.rest_adu)[keep]
+    index = index[keep]
+    swing_adu = swing_adu[keep]
+
+    # The copies of the points take the most memory of a measurement: free what is not needed.
+    del axes, x_phases, y_phases, phase_rad, x_mm, y_mm, in_bin, sensitivity_rad_per_um
+    return PixelPoints(index, points.subset(keep), swing_adu, rest_adu, moved)
 
 
 def _trace_pixel_rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
@@ -184,28 +226,31 @@ def _trace_pixel_rays(geometry: Geometry, column: IntArray, row: IntArray) -> Fl
 
 
 def _axis_phases(
-    optics: OpticsConfig,
     checked: Checked,
     axis: int,
     index: IntArray,
     in_bin: IntArray,
-    sensitivity: FloatArray,
+    sensitivity_rad_per_um: FloatArray,
     told_um: FloatArray | None,
 ) -> PixelPhases:
-    stack, used = checked.stack, checked.view.used[axis]
+    """Phases of one axis at the pixels `index` (n,), which are in the bins `in_bin` (n,)."""
+    stack = checked.stack
+    used = checked.view.used[axis]
     combined = combine_axis_steps(checked, axis, told_um)
     every = stack.sinusoids(pattern_sequence.AXES[axis])
-    # a slice does not copy the frames; a list does
-    frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
-    reference = checked.phase_rad[axis].reshape(-1)[in_bin]
+    chosen: slice | list[int] = used
+    if used == every:
+        chosen = slice(every[0], every[-1] + 1)  # a slice does not copy the frames
+    frames = stack.frames[chosen]
+    reference_rad = checked.phase_rad[axis].reshape(-1)[in_bin]
     gain = None if stack.gain is None else stack.gain[used]
     return pixel_phases(
         frames,
         stack.design(used),
         combined,
         index,
-        sensitivity,
-        reference,
+        sensitivity_rad_per_um,
+        reference_rad,
         checked.binned.clip,
         gain,
         _gather_previous(stack, used),
@@ -214,13 +259,16 @@ def _axis_phases(
 
 
 def _gather_previous(stack: FrameStack, used: list[int]) -> Image | None:
-    """The frame before each of these, itself without one; None if they hold nothing of it."""
+    """The frame before each of these, or itself if there is none; None if they show no light of
+    it.
+    """
     if not any(stack.held_shares):
         return None
-    previous = [stack.before_of(frame) for frame in used]
-    gathered: Image = stack.frames[
-        [frame if before < 0 else before for frame, before in zip(used, previous, strict=True)]
-    ]
+    previous = []
+    for frame in used:
+        before = stack.before_of(frame)
+        previous.append(frame if before < 0 else before)
+    gathered: Image = stack.frames[previous]
     return gathered
 
 
@@ -232,29 +280,48 @@ def reconstruct_full(
 ) -> FullResult:
     """Fit the pixels and integrate the residual.
 
-    `start` is the starting shape, by default the paper's parabola of 40 mm.
+    Derivation: sections 4, 5 and 12 of docs/explanation/metrology.md.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench.
+    checked : Checked
+        The set.
+    pixels : PixelPoints
+        Its pixels; their weights are replaced.
+    start : height function, optional
+        The starting shape, by default the paper's parabola of 40 mm.
+
+    Returns
+    -------
+    FullResult
     """
-    tracer, points = checked.tracer, pixels.points
-    # the bins solve from the start; the pixels continue where that has nearly converged
-    rough_points = checked.state.points.subset(np.ones(checked.state.index.size, bool))
-    tolerance = _LAST_CHANGE_MM * surface_fit.CONTRACTION
+    tracer = checked.tracer
+    points = pixels.points
+    radius_mm = optics.mirror.analysis_radius_mm
+    tolerance_mm = _LAST_CHANGE_MM * surface_fit.CONTRACTION
+
+    # The bins solve from the start; the pixels continue where that has nearly converged.
+    bins = checked.state.points.subset(np.ones(checked.state.index.size, bool))
     begin = start or ray_tracing.make_parabola(_START_SAG_MM, tracer.radius_mm)
-    rough = surface_fit.fit_surface(tracer, rough_points, begin, tolerance_mm=tolerance)
+    rough = surface_fit.fit_surface(tracer, bins, begin, tolerance_mm=tolerance_mm)
+
+    # Weights by the residual to that surface, then the fit.
     tracer.intersect(points, rough.surface, newton=2)
-    points.weights[:] = tukey_weights(_slopes_left(tracer, points, rough.surface)[1])
+    _, residual = _slope_residual(tracer, points, rough.surface)
+    points.weights[:] = tukey_weights(residual)
+    normal = NormalMatrix.from_points(tracer, points)
     fit = surface_fit.fit_surface(
-        tracer,
-        points,
-        rough.surface,
-        normal=NormalMatrix.from_points(tracer, points),
-        tolerance_mm=tolerance,
+        tracer, points, rough.surface, normal=normal, tolerance_mm=tolerance_mm
     )
+
+    # What the terms leave, in cells, integrated.
     tracer.intersect(points, fit.surface)
-    field, left = _slopes_left(tracer, points, fit.surface)
-    grid = zonal_map.residual_grid(
-        field, (left < _NO_SLOPE).astype(float), optics.mirror.analysis_radius_mm
-    )
-    fit_grid = zonal_map.residual_grid(field, points.weights, optics.mirror.analysis_radius_mm)
+    field, residual = _slope_residual(tracer, points, fit.surface)
+    is_film = (residual < _NO_SLOPE).astype(float)
+    grid = zonal_map.residual_grid(field, is_film, radius_mm)
+    fit_grid = zonal_map.residual_grid(field, points.weights, radius_mm)
     return FullResult(
         fit=replace(fit, changes_mm=(*rough.changes_mm, *fit.changes_mm)),
         index=pixels.index,
@@ -269,10 +336,10 @@ def reconstruct_full(
     )
 
 
-def _slopes_left(
+def _slope_residual(
     tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface
 ) -> tuple[FloatArray, FloatArray]:
-    """Slopes (6, n) of `Tracer.slope_field`, and how far (n,) the measured ones are from the
+    """Slopes (6, n) of `Tracer.slope_field`, and the distance (n,) of the measured ones from the
     surface's.
     """
     field = tracer.slope_field(points, surface)
@@ -280,10 +347,8 @@ def _slopes_left(
 
 
 def tukey_weights(residual: FloatArray) -> FloatArray:
-    """Tukey's weights (1 - (r / c)^2)^2, with c in robust sigmas (median of a Rayleigh
-    distribution: 1.177 sigma).
-    """
-    # every 7th gives the median of millions well enough; the floor is the rounding of a noise-free
-    # set
-    reach = _TUKEY_SIGMAS * max(float(np.median(residual[::7])) / 1.177, 1e-9)
+    """Tukey's weights (1 - (r / c)^2)^2 of slope residuals r (n,), with c in robust sigmas."""
+    # A part of millions of residuals gives their median well enough.
+    sigma = float(np.median(residual[::_EVERY])) / _RAYLEIGH_MEDIAN
+    reach = _TUKEY_SIGMAS * max(sigma, _LEAST_SLOPE)
     return np.asarray(np.square(np.maximum(1 - np.square(residual / reach), 0.0)))

@@ -16,7 +16,7 @@ import numpy as np
 from membrane_ctrl.metrology.figure import best_sphere
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.numerics import grid_fit, zernike
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 _FRINGE = [zernike.fringe_set_orders(j) for j in range(1, zernike.FRINGE_TERMS + 1)]
 _PVR_TERMS = 36  # by definition, whatever the fit's own number
@@ -100,40 +100,63 @@ class FigureOf:
 
     def __call__(self, seen: SurfaceMap) -> Figure:
         """The figure of a surface."""
-        mask, points = self._mask, seen.points()
+        mask = self._mask
+        points = seen.points()
+
+        # Deviation from the best sphere, its rotationally invariant part, and its smooth part.
         sphere = best_sphere.best_sphere(points)
-        deviation, normals = sphere.deviation(points)
-        deviation = 1e3 * (deviation - deviation.mean())
-        rotational = self._rings.invariant(deviation)
-        whole, round_part = np.full(mask.shape, np.nan), np.full(mask.shape, np.nan)
-        whole[mask], round_part[mask] = deviation, rotational
-        fit = self._pvr.values(self._pvr.coefficients(whole))
-        smooth = fit[mask]
+        deviation_mm, sphere_normals = sphere.deviation(points)
+        deviation_um = 1e3 * (deviation_mm - deviation_mm.mean())
+        rotational_um = self._rings.invariant(deviation_um)
+        deviation_map_um = _place_values(deviation_um, mask)
+        smooth_map_um = self._pvr.values(self._pvr.coefficients(deviation_map_um))
+        smooth_um = smooth_map_um[mask]
+
+        # Normals of the surface, against those of the sphere, and the spot that they give.
         slopes = np.stack([seen.slope_x[mask], seen.slope_y[mask]])
-        found = np.stack([*-slopes, np.ones(slopes.shape[1])])
-        found /= np.linalg.norm(found, axis=0)
-        angle = np.linalg.norm(found - normals, axis=0)
-        focus_mm, spot = _compute_spot(sphere, points, found)
-        c = sphere.curvature_per_mm
-        radius_mm = 1 / c if c != 0 else np.nan
+        normals = np.stack([*-slopes, np.ones(slopes.shape[1])])
+        normals /= np.linalg.norm(normals, axis=0)
+        angle_rad = np.linalg.norm(normals - sphere_normals, axis=0)
+        focus_mm, spot_mm = _compute_spot(sphere, points, normals)
+        spot_50_mm, spot_80_mm, spot_95_mm = np.quantile(spot_mm, ENERGY_SHARES)
+
+        radius_mm = np.nan
+        if sphere.curvature_per_mm != 0:
+            radius_mm = 1 / sphere.curvature_per_mm
         numbers = Quantities(
-            radius_mm,
-            radius_mm / 2,
-            sphere.sag_mm(self.aperture_mm),
-            1e6 * sphere.tilt_x,
-            1e6 * sphere.tilt_y,
-            float(np.ptp(deviation)),
-            _compute_rms(deviation),
-            float(np.ptp(smooth)) + 3 * _compute_rms(deviation - smooth),
-            float(np.ptp(rotational)),
-            _compute_rms(deviation - rotational),
-            1e6 * _compute_rms(angle),
-            focus_mm,
-            _compute_rms(spot),
-            *(float(value) for value in np.quantile(spot, ENERGY_SHARES)),
+            radius_of_curvature_mm=radius_mm,
+            focal_length_mm=radius_mm / 2,
+            sphere_sag_mm=sphere.sag_mm(self.aperture_mm),
+            tilt_x_urad=1e6 * sphere.tilt_x,
+            tilt_y_urad=1e6 * sphere.tilt_y,
+            irregularity_pv_um=float(np.ptp(deviation_um)),
+            irregularity_rms_um=_compute_rms(deviation_um),
+            pvr_um=float(np.ptp(smooth_um)) + 3 * _compute_rms(deviation_um - smooth_um),
+            rotational_pv_um=float(np.ptp(rotational_um)),
+            asymmetry_rms_um=_compute_rms(deviation_um - rotational_um),
+            slope_rms_urad=1e6 * _compute_rms(angle_rad),
+            best_focus_mm=focus_mm,
+            spot_rms_mm=_compute_rms(spot_mm),
+            spot_50_mm=float(spot_50_mm),
+            spot_80_mm=float(spot_80_mm),
+            spot_95_mm=float(spot_95_mm),
         )
-        fringe_um = 1e3 * self.fringe.coefficients(seen.height_mm)
-        return Figure(numbers, sphere, whole, round_part, fit, fringe_um, spot)
+        return Figure(
+            numbers=numbers,
+            sphere=sphere,
+            deviation_um=deviation_map_um,
+            rotational_um=_place_values(rotational_um, mask),
+            smooth_um=smooth_map_um,
+            fringe_um=1e3 * self.fringe.coefficients(seen.height_mm),
+            spot_mm=spot_mm,
+        )
+
+
+def _place_values(values: FloatArray, mask: BoolArray) -> FloatArray:
+    """A map with values (cells,) in the cells of the mask, NaN elsewhere."""
+    out = np.full(mask.shape, np.nan)
+    out[mask] = values
+    return out
 
 
 def _compute_rms(values: FloatArray) -> float:
@@ -147,12 +170,16 @@ class _Rings:
 
     def __init__(self, r: FloatArray, knots: int) -> None:
         self._knots = knots
+        # Each cell lies between two knots: its share goes to the upper one, the rest to the lower.
         place = r / max(float(r.max()), 1e-12) * (knots - 1)
         self._low = np.minimum(place.astype(np.int64), knots - 2)
         self._share = place - self._low
-        a, b = self._sums((1 - self._share) ** 2), self._sums(self._share**2)
-        cross = self._sums(self._share * (1 - self._share))[:-1]
-        self._gram = np.diag(a + np.append(0.0, b[:-1])) + np.diag(cross, 1) + np.diag(cross, -1)
+        # The normal matrix of the least squares is tridiagonal.
+        by_lower = self._sums((1 - self._share) ** 2)
+        by_upper = self._sums(self._share**2)
+        diagonal = by_lower + np.append(0.0, by_upper[:-1])
+        beside = self._sums(self._share * (1 - self._share))[:-1]
+        self._normal = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
 
     def _sums(self, values: FloatArray) -> FloatArray:
         """Sum of values by their lower knot, (knots,)."""
@@ -162,7 +189,7 @@ class _Rings:
         """That part at the same cells."""
         right = self._sums((1 - self._share) * values)
         right[1:] += self._sums(self._share * values)[:-1]
-        knots = np.linalg.lstsq(self._gram, right, rcond=1e-10)[0]
+        knots = np.linalg.lstsq(self._normal, right, rcond=1e-10)[0]
         return np.asarray((1 - self._share) * knots[self._low] + self._share * knots[self._low + 1])
 
 
@@ -176,13 +203,18 @@ def _compute_spot(
     `normals` (3, n). Across that axis a ray is at A + B f in the plane at f; the best focus makes
     the sum of squares least.
     """
+    # Two directions across the axis.
     axis = sphere.normal
     aside = np.cross([0.0, 1.0, 0.0], axis)
     aside /= np.linalg.norm(aside)
     across = np.stack([aside, np.cross(axis, aside)])
-    along = axis @ normals  # a ray is 2 along n - axis
+
+    # A reflected ray is 2 (n axis) n - axis: its place A and its rate B of change along the axis.
+    along = axis @ normals
     rate = (across @ normals) * (2 * along / (2 * along * along - 1))
     start = across @ points_mm - rate * (axis @ points_mm)
+
+    # Both from the middle of the rays; the least sum of squares.
     rate -= rate.mean(axis=1, keepdims=True)
     start -= start.mean(axis=1, keepdims=True)
     focus_mm = -float(np.sum(start * rate) / max(np.sum(rate * rate), 1e-300))

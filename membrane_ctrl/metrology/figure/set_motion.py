@@ -6,26 +6,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
-from membrane_ctrl.metrology.phase import (
-    phase_change,
-)
+from membrane_ctrl.metrology.phase import phase_change
 from membrane_ctrl.metrology.reconstruction import film_motion
 from membrane_ctrl.model.arrays import FloatArray
 
 LASER_NOISE_UM = 1.0  # repeatability of the bench's laser
-# standard deviation of the film's place: less is hardly seen, and leaves 0.06 µm in the figure
+# RMS motion that is corrected: less is hardly seen, and leaves 0.06 µm in the figure.
 _STILL_UM = 0.2
 SEEN_BY_LASER = 2.0  # sigmas beyond which the laser's reading of a motion counts by itself
-# motion from x to y over its RMS among the frames of an axis: 3.3 for a random walk, 7.2 for a
-# drift, of four steps
+# Expected motion from x to y over the RMS motion among the frames of an axis. Of four steps it is
+# 3.3 for a random walk and 7.2 for a drift.
 X_TO_Y = 5.0
 
 
 def motion_share(within_um: float, noise_um: float) -> float:
-    """Share of what a laser tells of the motion from x to y that is motion, if it is so large
-    within an axis.
+    """Share of the laser's reading of the motion from x to y that is motion, the rest being noise.
+
+    `within_um` is the RMS motion within an axis, `noise_um` the noise of that reading.
     """
-    return (X_TO_Y * within_um) ** 2 / ((X_TO_Y * within_um) ** 2 + noise_um**2)
+    expected_um2 = (X_TO_Y * within_um) ** 2
+    return expected_um2 / (expected_um2 + noise_um**2)
 
 
 @dataclass(frozen=True)
@@ -48,41 +48,43 @@ class FilmMotion:
 
     @classmethod
     def of(cls, checked: Checked) -> "FilmMotion":
-        """Of a checked set.
+        """The motion during a checked set.
 
-        The fringes see the motion from frame to frame of one axis, to a tenth of a micrometre,
-        where the laser's noise is one. Of a difference between the axes they make a figure: there
-        the laser counts, as far as a film that moves so much from frame to frame moves from one
-        axis to the other. What the fringes tell is in part
-        noise: only what their scatter has beyond it is motion.
+        The fringes show the motion from frame to frame of one axis to 0.1 µm, where the laser's
+        noise is 1 µm. A difference between the axes becomes a figure to the fringes: there the
+        laser counts, to the extent to which a film that moves so much from frame to frame moves
+        from one axis to the other. The fringes' positions are partly noise: only the scatter beyond
+        it is motion.
         """
         x, y = checked.view.used
-        seen = [axis - axis.mean() for axis in np.split(checked.film_um, [len(x)])]
-        within_um2 = float(np.var(np.concatenate(seen)))
-        noise_um2 = checked.film_noise_um**2 * (
-            1 - 2 / (len(x) + len(y))
-        )  # the means of both axes are taken off
+        frames = len(x) + len(y)
+
+        # Motion within the axes, and the share of it that is not noise. The means of both axes are
+        # removed: two degrees of freedom less.
+        seen_x, seen_y = (part - part.mean() for part in np.split(checked.film_um, [len(x)]))
+        within_um2 = float(np.var(np.concatenate([seen_x, seen_y])))
+        noise_um2 = checked.film_noise_um**2 * (1 - 2 / frames)
         moving = max(1 - noise_um2 / max(within_um2, 1e-12), 0.0)
-        readings_um, laser_um = (
-            checked.stack.displacement_um,
-            LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y)),
-        )
+
+        # Motion from x to y according to the laser, and the least and the largest share of it that
+        # may be motion.
+        readings_um = checked.stack.displacement_um
         x_to_y_um = float(readings_um[x].mean() - readings_um[y].mean())
-        least, most = (
-            motion_share(math.sqrt(part * within_um2), laser_um) for part in (moving, 1.0)
-        )
-        # A film that rests within both axes may still step between them. Beyond 2 sigma of the
-        # laser that step is measured, however little the film moves from frame to frame.
+        laser_um = LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y))
+        least = motion_share(math.sqrt(moving * within_um2), laser_um)
+        most = motion_share(math.sqrt(within_um2), laser_um)
+        # A film at rest within both axes may still step between them. Beyond 2 sigma of the laser
+        # that step is measured, however little the film moves from frame to frame.
         beyond_noise = 1 - (SEEN_BY_LASER * laser_um) ** 2 / max(x_to_y_um**2, 1e-12)
         if beyond_noise > 0:
             most = 1.0
         share = max(least, beyond_noise)
-        # the figure is that of all readings' mean, also where a frame is left out
+
+        # The figure belongs to the mean of all readings, also where a frame is left out.
         about_um = readings_um[[*x, *y]].mean() - checked.stack.mean_reading_um
-        parts = np.nan_to_num(
-            about_um + share * x_to_y_um * np.array([len(y), -len(x)]) / (len(x) + len(y))
-        )
-        told_um = (moving * seen[0] + parts[0], moving * seen[1] + parts[1])
+        of_axes = np.array([len(y), -len(x)]) / frames
+        mean_x_um, mean_y_um = np.nan_to_num(about_um + share * x_to_y_um * of_axes)
+        told_um = (moving * seen_x + mean_x_um, moving * seen_y + mean_y_um)
         sigma_um = math.hypot(math.sqrt(most) * laser_um, (most - share) * x_to_y_um)
         return cls(told_um, sigma_um, checked.film_noise_um)
 

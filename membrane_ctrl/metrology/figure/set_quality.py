@@ -14,15 +14,33 @@ from membrane_ctrl.model.shape_estimate import Quality
 def set_quality(
     optics: OpticsConfig, checked: Checked, fit: surface_fit.Fit, swing_adu: float
 ) -> Quality:
-    area = math.pi * optics.mirror.analysis_radius_mm**2
-    used = [k for axis in checked.view.used for k in axis]
+    """Quality of a set's figure.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench.
+    checked : Checked
+        The set.
+    fit : Fit
+        The surface fitted to its bins or pixels.
+    swing_adu : float
+        Median fringe amplitude.
+
+    Returns
+    -------
+    Quality
+    """
+    area_mm2 = math.pi * optics.mirror.analysis_radius_mm**2
+    used = [k for frames in checked.view.used for k in frames]
     clipped = checked.binned.saturated[used].any(axis=0)
-    shares = clipped_shares(checked.binned, used, (checked.view.mask | clipped) & checked.near)
+    on_mirror = (checked.view.mask | clipped) & checked.near
+    shares = clipped_shares(checked.binned, used, on_mirror)
     return Quality(
         modulation_share=swing_adu / (2**optics.camera.bits - 1),
         saturated_fraction=shares.white,
         black_fraction=shares.black,
-        valid_fraction=min(1.0, float(np.sum(checked.state.area_mm2)) / area),
+        valid_fraction=min(1.0, float(np.sum(checked.state.area_mm2)) / area_mm2),
         residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
         converged=fit.converged,
     )

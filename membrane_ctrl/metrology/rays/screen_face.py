@@ -65,22 +65,24 @@ def _make_cells(config: HeightMapConfig | None) -> tuple[FloatArray, FloatArray,
     """Cells, first nodes and distances of the nodes of a map."""
     if config is None:
         return np.zeros((0, 0, _ORDER, _ORDER)), np.zeros(2), np.ones(2)
+    # The spline along s_y in each column of nodes: axes row, m, column; then of its coefficients
+    # along s_x: axes column, n, row, m.
     along_y = _spline_coefficients(np.array(config.heights_mm), np.array(config.s_y_mm))
-    both = _spline_coefficients(
-        along_y.transpose(2, 0, 1), np.array(config.s_x_mm)
-    )  # column, n, row, m
-    ends = np.array([(axis[0], axis[-1], len(axis) - 1) for axis in (config.s_x_mm, config.s_y_mm)])
+    both = _spline_coefficients(along_y.transpose(2, 0, 1), np.array(config.s_x_mm))
     cells = np.ascontiguousarray(both.transpose(2, 0, 3, 1))
-    return cells, ends[:, 0].copy(), (ends[:, 1] - ends[:, 0]) / ends[:, 2]
+
+    axes_mm = (config.s_x_mm, config.s_y_mm)
+    low_mm = np.array([axis[0] for axis in axes_mm], float)
+    pitch_mm = np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in axes_mm])
+    return cells, low_mm, pitch_mm
 
 
 def _spline_coefficients(values: FloatArray, nodes_mm: FloatArray) -> FloatArray:
     """Coefficients (cells, 4, ...) of the spline through values (nodes, ...), in powers of the
     share of a cell.
     """
-    from scipy.interpolate import (
-        make_interp_spline,
-    )  # loads for a third of a second; most screens have no map
+    # Loads for a third of a second, and most screens have no map.
+    from scipy.interpolate import make_interp_spline
 
     degree = min(_ORDER, nodes_mm.size) - 1
     spline = make_interp_spline(nodes_mm, values, k=degree)
@@ -103,15 +105,22 @@ def face_height(face, a, b):  # type: ignore[no-untyped-def]
     w = face.bow_per_mm * (a * a + b * b)
     wa = 2 * face.bow_per_mm * a
     wb = 2 * face.bow_per_mm * b
-    rows, columns = face.cells_mm.shape[0], face.cells_mm.shape[1]
+    rows = face.cells_mm.shape[0]
+    columns = face.cells_mm.shape[1]
     if rows > 0:
         u = (a - face.low_mm[0]) / face.pitch_mm[0]
         v = (b - face.low_mm[1]) / face.pitch_mm[1]
-        inside_u, inside_v = 0.0 <= u <= columns, 0.0 <= v <= rows
-        u, v = min(max(u, 0.0), float(columns)), min(max(v, 0.0), float(rows))
-        column, row = min(int(u), columns - 1), min(int(v), rows - 1)
+        # The cell, and the place in it; beyond the grid the height of its edge continues.
+        inside_u = 0.0 <= u <= columns
+        inside_v = 0.0 <= v <= rows
+        u = min(max(u, 0.0), float(columns))
+        v = min(max(v, 0.0), float(rows))
+        column = min(int(u), columns - 1)
+        row = min(int(v), rows - 1)
         u -= column
         v -= row
+
+        # Height and slopes of its polynomial, by Horner's rule in v and u.
         h = 0.0
         hu = 0.0
         hv = 0.0

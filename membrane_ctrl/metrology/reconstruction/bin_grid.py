@@ -29,9 +29,11 @@ class BinGrid:
         columns = np.arange(camera.width_px // bin_px) * bin_px + middle
         rows = np.arange(camera.height_px // bin_px) * bin_px + middle
         grid_columns, grid_rows = np.meshgrid(columns, rows)
-        self.column_px, self.row_px = grid_columns.ravel(), grid_rows.ravel()
+        self.column_px = grid_columns.ravel()
+        self.row_px = grid_rows.ravel()
         self.rays = geometry.rays(self.column_px, self.row_px)
-        h = math.sqrt((bin_px**2 - 1) / 6)  # see `averaging_bias_mm`
+        # Rays around the centres, for `averaging_bias_mm`; a bin of one pixel needs none.
+        h = math.sqrt((bin_px**2 - 1) / 6)
         offsets = ((h, 0.0), (-h, 0.0), (0.0, h), (0.0, -h)) if bin_px > 1 else ()
         self._around = [
             geometry.rays(self.column_px + right, self.row_px + down) for right, down in offsets
@@ -39,11 +41,11 @@ class BinGrid:
 
     def near_mirror(self, radius_mm: float) -> BoolArray:
         """Bins whose ray meets the plane z = 0 within a radius."""
-        f = self._geometry.pinhole_mm
-        t = -f[2] / self.rays[2]
-        return np.asarray(
-            (f[0] + t * self.rays[0]) ** 2 + (f[1] + t * self.rays[1]) ** 2 <= radius_mm**2
-        )
+        pinhole_mm = self._geometry.pinhole_mm
+        t = -pinhole_mm[2] / self.rays[2]
+        x_mm = pinhole_mm[0] + t * self.rays[0]
+        y_mm = pinhole_mm[1] + t * self.rays[1]
+        return np.asarray(x_mm**2 + y_mm**2 <= radius_mm**2)
 
     def solid_angle(self, index: IntArray) -> FloatArray:
         """Solid angle of bins: (side / focal length)^2 cos^3 of the angle to the axis."""

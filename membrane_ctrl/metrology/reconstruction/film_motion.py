@@ -30,18 +30,27 @@ def combine_steps(
     Parameters
     ----------
     weights : (3, N) array
-        `phase.step_weights(shifts_rad)`.
+        `phase_steps.step_weights(shifts_rad)`.
+    shifts_rad : (N,) array
+        Phase steps.
+    bin_px : int
+        Side of the bins over which the frames are summed.
     motion_um : (N,) array, optional
-        Displacement of each frame relative to one d0 for both axes.
+        Displacement e of each frame relative to one d0 for both axes.
+
+    Returns
+    -------
+    StepCombination
     """
     _, cosine, sine = weights / bin_px**2
     if motion_um is None:
         return phase_change.StepCombination(cosine, sine)
-    # of a phasor per pixel: the bin's area cancels
-    moved = (weights[1] + 1j * weights[2]) / 2 * motion_um ** np.array([[1], [2]])
-    return phase_change.StepCombination(
-        cosine, sine, *(moved @ np.exp(sign * 1j * shifts_rad) for sign in (1, -1))
-    )
+    # turn_n and mirror_n for n = 1 and 2. The phasors are per pixel: the bin's area cancels.
+    powers = motion_um ** np.array([[1], [2]])
+    moments = (weights[1] + 1j * weights[2]) / 2 * powers
+    turn = moments @ np.exp(1j * shifts_rad)
+    mirror = moments @ np.exp(-1j * shifts_rad)
+    return phase_change.StepCombination(cosine, sine, turn, mirror)
 
 
 def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:
@@ -57,11 +66,26 @@ def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:
 def sensitivity_mm_per_um(
     tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface, step_um: float = 10.0
 ) -> FloatArray:
-    """Change (2, n) of the screen points per µm of displacement, by a central difference of the
-    traced model.
+    """Change of the screen points per µm of displacement, by a central difference.
 
     The bowl's sag grows by the displacement and its vertex moves towards -z, so that the ring stays
     where it is.
+
+    Parameters
+    ----------
+    tracer : Tracer
+        The bench.
+    points : Points
+        Rays, on the surface.
+    surface : Surface
+        The present surface.
+    step_um : float
+        Displacement to either side.
+
+    Returns
+    -------
+    (2, n) array
+        In mm per µm.
     """
     traced = []
     for sign in (1.0, -1.0):

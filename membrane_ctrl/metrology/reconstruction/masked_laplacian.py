@@ -16,16 +16,19 @@ import numpy as np
 from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.model.arrays import FloatArray
 
-_COARSEST = 8
+_COARSEST = 8  # cells a side of the coarsest grid
+_COARSEST_SWEEPS = 2 * _COARSEST  # that solve it nearly exactly
 # Constants joined 2 x 2 interpolate a slope as a staircase, which makes the coarse correction too
-# small by about half
+# small by about half.
 _OVER_CORRECTION = 1.8
 
 
 @compile_kernel
 def _smooth_sweep(right, down, rhs, h, forward):  # type: ignore[no-untyped-def]
-    """One Gauss-Seidel sweep; `right[i, j]` links (i, j) to (i, j + 1), `down[i, j]` to (i + 1,
-    j).
+    """One Gauss-Seidel sweep, in either order of the cells.
+
+    `right[i, j]` is the weight of the link from (i, j) to (i, j + 1), `down[i, j]` to (i + 1, j).
+    Each cell gets the value that solves its own equation, sum of weight (h - h_neighbour) = rhs.
     """
     rows, columns = h.shape
     for a in range(rows):
@@ -52,7 +55,7 @@ def _smooth_sweep(right, down, rhs, h, forward):  # type: ignore[no-untyped-def]
 
 @compile_kernel
 def _apply_laplacian(right, down, h, out):  # type: ignore[no-untyped-def]
-    """The Laplacian of h."""
+    """The Laplacian of h into `out`: sum over the links of a cell of weight (h - h_neighbour)."""
     rows, columns = h.shape
     out[:, :] = 0.0
     for i in range(rows):
@@ -69,6 +72,7 @@ def _apply_laplacian(right, down, h, out):  # type: ignore[no-untyped-def]
 
 @compile_kernel
 def _restrict_to_coarse(fine, coarse):  # type: ignore[no-untyped-def]
+    """Sums over the joined cells."""
     coarse[:, :] = 0.0
     for i in range(fine.shape[0]):
         for j in range(fine.shape[1]):
@@ -77,6 +81,7 @@ def _restrict_to_coarse(fine, coarse):  # type: ignore[no-untyped-def]
 
 @compile_kernel
 def _prolong_to_fine(coarse, fine, scale):  # type: ignore[no-untyped-def]
+    """Add the value of each joined cell, times `scale`, to its cells."""
     for i in range(fine.shape[0]):
         for j in range(fine.shape[1]):
             fine[i, j] += scale * coarse[i // 2, j // 2]
@@ -116,36 +121,52 @@ class MaskedLaplacian:
     def solve(
         self, rhs: FloatArray, tolerance: float = 1e-4, max_iterations: int = 60
     ) -> FloatArray:
-        """h with Laplacian(h) = rhs; each connected part up to its own constant.
+        """Solve Laplacian(h) = rhs by preconditioned conjugate gradients.
 
-        Stops when the residual has fallen by `tolerance`.
+        Parameters
+        ----------
+        rhs : (rows, columns) array
+            0 outside the mask.
+        tolerance : float
+            Stop when the residual has fallen by this factor.
+        max_iterations : int
+            Stop after so many iterations in any case.
+
+        Returns
+        -------
+        (rows, columns) array
+            h; each connected part up to its own constant.
         """
-        h, residual = np.zeros_like(rhs), rhs.copy()
-        out = np.empty_like(rhs)
+        h = np.zeros_like(rhs)
+        residual = rhs.copy()
+        laplacian = np.empty_like(rhs)
         direction = np.zeros_like(rhs)
-        last, target = 1.0, tolerance * float(np.linalg.norm(rhs))
+        last_product = 1.0
+        target = tolerance * float(np.linalg.norm(rhs))
         for _ in range(max_iterations):
             if float(np.linalg.norm(residual)) <= target:
                 break
-            z = self._cycle(0, residual)
-            product = float(np.vdot(residual, z))
-            direction *= product / last
-            direction += z
-            last = product
-            _apply_laplacian(*self._links[0], direction, out)
-            step = product / float(np.vdot(direction, out))
+            # The next direction: the preconditioned residual, conjugate to the last direction.
+            preconditioned = self._cycle(0, residual)
+            product = float(np.vdot(residual, preconditioned))
+            direction *= product / last_product
+            direction += preconditioned
+            last_product = product
+            # The step along it that makes the residual least.
+            _apply_laplacian(*self._links[0], direction, laplacian)
+            step = product / float(np.vdot(direction, laplacian))
             h += step * direction
-            residual -= step * out
+            residual -= step * laplacian
         return h
 
     def _cycle(self, level: int, rhs: FloatArray) -> FloatArray:
-        """One symmetric V-cycle from zero."""
+        """One symmetric V-cycle from zero: smooth, correct by the coarser grid, smooth back."""
         right, down = self._links[level]
         h, residual, _ = self._memory[level]
         h[:] = 0.0
         _smooth_sweep(right, down, rhs, h, True)
         if level + 1 == len(self._links):
-            for _ in range(2 * _COARSEST):
+            for _ in range(_COARSEST_SWEEPS):
                 _smooth_sweep(right, down, rhs, h, False)
                 _smooth_sweep(right, down, rhs, h, True)
         else:

@@ -12,6 +12,8 @@ from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
 from membrane_ctrl.model.arrays import FloatArray
 
 QUANTISATION_VARIANCE_ADU2 = 1 / 12  # of a value rounded to an integer
+_POINTS_ACROSS = 15  # of the grid over the mirror
+_INSIDE = 0.95  # of the radius
 
 
 def pixel_sigma_adu(noise_adu: float) -> float:
@@ -20,37 +22,65 @@ def pixel_sigma_adu(noise_adu: float) -> float:
 
 
 def slope_per_screen(geometry: Geometry, radius_mm: float, sag_mm: float) -> FloatArray:
-    """Mean over the mirror of (d g_i / d s_k)^2 in 1/mm^2, (2, 2): rows the slopes x and y, columns
-    s_x and s_y.
+    """How a change of the screen points changes the slopes, as mean squares over the mirror.
 
     The normal is n = u - d with u the unit vector to the screen point, so d n = (e - u (u e)) / |q|
-    d s and g = -n_xy / n_z gives d g = -(d n_xy + g d n_z) / n_z. Taken on a bowl of the given sag,
-    each point towards the screen point that it really reflects (its normal is then the bowl's own).
+    d s with e the screen's axis and q the way to the screen, and g = -n_xy / n_z gives d g = -(d
+    n_xy + g d n_z) / n_z. It is computed on a bowl of the given sag, each point towards the screen
+    point that it really reflects (its normal is then the bowl's own).
+
+    Parameters
+    ----------
+    geometry : Geometry
+        The bench.
+    radius_mm, sag_mm : float
+        Radius and depth of the bowl.
+
+    Returns
+    -------
+    (2, 2) array
+        Mean of (d g_i / d s_k)^2 in 1/mm^2: rows are the slopes x and y, columns s_x and s_y.
     """
-    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.9, 0.9, 15) * radius_mm] * 2))
-    inside = np.hypot(x, y) <= 0.95 * radius_mm
-    x, y = x[inside], y[inside]
+    # Points on the bowl, and the normal there.
+    axis_mm = np.linspace(-0.9, 0.9, _POINTS_ACROSS) * radius_mm
+    grid_x, grid_y = np.meshgrid(axis_mm, axis_mm)
+    inside = np.hypot(grid_x, grid_y) <= _INSIDE * radius_mm
+    x, y = grid_x[inside], grid_y[inside]
     point = np.stack([x, y, sag_mm * (x**2 + y**2) / radius_mm**2])
+    n = np.stack([-2 * sag_mm * x / radius_mm**2, -2 * sag_mm * y / radius_mm**2, np.ones_like(x)])
+
+    # The camera's ray d, its reflection u, and the way to the screen.
     d = point - geometry.pinhole_mm[:, None]
     d /= np.linalg.norm(d, axis=0)
-    n = np.stack([-2 * sag_mm * x / radius_mm**2, -2 * sag_mm * y / radius_mm**2, np.ones_like(x)])
     u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
     face = np.cross(geometry.screen_s_x, geometry.screen_s_y)
-    reach = (face @ (geometry.screen_origin_mm[:, None] - point)) / (face @ u)
-    normal = u - d
+    reach_mm = (face @ (geometry.screen_origin_mm[:, None] - point)) / (face @ u)
+
+    # Change of the bisector and of its slopes per mm on the screen.
+    bisector = u - d
     squares = np.empty((2, 2))
     for k, axis in enumerate((geometry.screen_s_x, geometry.screen_s_y)):
-        turn = (axis[:, None] - u * (axis @ u)) / reach
-        slopes = -(turn[:2] - normal[:2] / normal[2] * turn[2]) / normal[2]
+        turn = (axis[:, None] - u * (axis @ u)) / reach_mm
+        slopes = -(turn[:2] - bisector[:2] / bisector[2] * turn[2]) / bisector[2]
         squares[:, k] = np.mean(slopes**2, axis=1)
     return squares
 
 
 def parameter_covariance(normal: NormalMatrix, slope_variance: FloatArray) -> FloatArray:
-    """Covariance (parameters, parameters) in mm^2 of the fit, for the variance (2,) of an x and of
-    a y slope.
+    """Covariance of the fit's parameters from white noise of the slopes.
+
+    Parameters
+    ----------
+    normal : NormalMatrix
+        Of the fit.
+    slope_variance : (2,) array
+        Variance of the x and of the y slope of a point.
+
+    Returns
+    -------
+    (parameters, parameters) array
+        M^-1 (var_x M_x + var_y M_y) M^-1, in mm^2.
     """
     variance_x, variance_y = slope_variance
-    return np.asarray(
-        normal.inverse @ (variance_x * normal.x + variance_y * normal.y) @ normal.inverse
-    )
+    noise = variance_x * normal.x + variance_y * normal.y
+    return np.asarray(normal.inverse @ noise @ normal.inverse)

@@ -16,6 +16,8 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _START_SAG_MM = 40.0  # the paper's starting parabola; any other leads to the same result
 _OUTLIER_SIGMAS = 8.0  # of the slopes' robust scatter: dust and glints, never noise
+_RAYLEIGH_MEDIAN = 1.177  # median of a Rayleigh distribution, in sigmas
+_LEAST_SLOPE = 1e-9  # floor of that scatter: the rounding of a noise-free set
 _MIN_POINTS = 1000  # far more than the unknowns, far fewer than any real view of the mirror
 
 
@@ -56,8 +58,8 @@ class TrackedPoints:
 
     def accept(self, surface: Surface, usable: BoolArray) -> None:
         """Make the fresh phases the reference; points that gave none keep theirs."""
-        blind = np.flatnonzero(~usable)
-        self.fresh[:, :, blind] = self.accepted[:, :, blind]
+        not_usable = np.flatnonzero(~usable)
+        self.fresh[:, :, not_usable] = self.accepted[:, :, not_usable]
         self.accepted, self.fresh = self.fresh, self.accepted
         self.surface = surface
 
@@ -72,15 +74,31 @@ def select_points(
 ) -> TrackedPoints:
     """Choose the points of a full cycle, fit their surface and compute the data of each.
 
-    Raises ValueError if too few bins see the pattern in the mirror to fit a surface.
-
     Parameters
     ----------
+    grid : BinGrid
+        The bins.
+    tracer : Tracer
+        The bench.
     candidates : (n,) int array
         Bins that may see the mirror.
     phase_rad : (2, n) array
         Their absolute phases; NaN where a bin is not usable.
+    pattern : PatternConfig
+        The pattern on the screen.
+    analysis_radius_mm : float
+        Points beyond it are left out.
+
+    Returns
+    -------
+    TrackedPoints
+
+    Raises
+    ------
+    ValueError
+        Too few bins see the pattern in the mirror to fit a surface.
     """
+    # All usable bins, and their surface.
     finite = np.isfinite(phase_rad).all(axis=0)
     index, phase_rad = candidates[finite], phase_rad[:, finite]
     if index.size < _MIN_POINTS:
@@ -89,28 +107,40 @@ def select_points(
     fit = surface_fit.fit_surface(
         tracer, points, ray_tracing.make_parabola(_START_SAG_MM, tracer.radius_mm)
     )
-    for wanted in (_inside_radius, _without_outliers):
-        keep = wanted(tracer, points, fit.surface, analysis_radius_mm)
-        points, index, phase_rad = points.subset(keep), index[keep], phase_rad[:, keep]
+
+    # Without bins outside the analysed radius, then without outliers.
+    for select in (_inside_radius, _without_outliers):
+        keep = select(tracer, points, fit.surface, analysis_radius_mm)
+        points = points.subset(keep)
+        index = index[keep]
+        phase_rad = phase_rad[:, keep]
         if index.size < _MIN_POINTS:
             raise ValueError(f"only {index.size} bins see the pattern inside the analysis radius")
         fit = surface_fit.fit_surface(tracer, points, fit.surface)
     tracer.intersect(points, fit.surface)
+
+    # Area of the mirror, seen from above, in a bundle of rays: solid angle t^2 / |d (-h_x, -h_y,
+    # 1)|.
     field = tracer.slope_field(points, fit.surface)
-    # area of the mirror, seen from above, in a bundle of rays: solid angle t^2 / |d . (-h_x, -h_y,
-    # 1)|
     facing = np.abs(points.rays[2] - field[4] * points.rays[0] - field[5] * points.rays[1])
-    scale = screen_scale.mm_per_rad(pattern)
+    area_mm2 = grid.solid_angle(index) * points.t_mm**2 / facing
+
+    # From phase to place on the screen, and the effect of the film's displacement.
+    mm_per_rad = screen_scale.mm_per_rad(pattern)
+    bias_mm = grid.averaging_bias_mm(tracer, points, fit.surface, index)
+    offset_mm = bias_mm + screen_scale.centre_phase_rad(pattern) * mm_per_rad
+    sensitivity_rad_per_um = sensitivity_mm_per_um(tracer, points, fit.surface) / mm_per_rad
+
     accepted = np.zeros((2, bin_sums.FOLLOWED_ROWS, index.size))
     accepted[:, 0] = phase_rad
-    accepted[:, 1], accepted[:, 2] = np.cos(accepted[:, 0]), np.sin(accepted[:, 0])
+    accepted[:, 1] = np.cos(phase_rad)
+    accepted[:, 2] = np.sin(phase_rad)
     return TrackedPoints(
         index=index,
         points=points,
-        offset_mm=grid.averaging_bias_mm(tracer, points, fit.surface, index)
-        + screen_scale.centre_phase_rad(pattern) * scale,
-        sensitivity_rad_per_um=sensitivity_mm_per_um(tracer, points, fit.surface) / scale,
-        area_mm2=grid.solid_angle(index) * points.t_mm**2 / facing,
+        offset_mm=offset_mm,
+        sensitivity_rad_per_um=sensitivity_rad_per_um,
+        area_mm2=area_mm2,
         surface=fit.surface,
         normal=fit.normal,
         accepted=accepted,
@@ -121,6 +151,7 @@ def select_points(
 def _inside_radius(
     tracer: ray_tracing.Tracer, points: ray_tracing.Points, _surface: Surface, radius_mm: float
 ) -> BoolArray:
+    """Points within a radius."""
     x, y = tracer.position_mm(points)
     return np.asarray(x**2 + y**2 <= radius_mm**2)
 
@@ -131,6 +162,5 @@ def _without_outliers(
     """Slopes within some robust sigmas of the fit, in both directions."""
     field = tracer.slope_field(points, surface)
     residual = np.hypot(field[2] - field[4], field[3] - field[5])
-    # median of a Rayleigh distribution: 1.177 sigma; the floor is the rounding of a noise-free set
-    sigma = max(float(np.median(residual)) / 1.177, 1e-9)
+    sigma = max(float(np.median(residual)) / _RAYLEIGH_MEDIAN, _LEAST_SLOPE)
     return np.asarray(residual <= _OUTLIER_SIGMAS * sigma)

@@ -60,6 +60,7 @@ class ResidualGrid:
 
 @compile_kernel
 def _scatter_samples(field, weights, first_mm, step_mm, sums, start, stop):  # type: ignore[no-untyped-def]
+    """Add weight and weighted residuals of pixels to the cells, `sums` (3, n, n)."""
     n = sums.shape[1]
     for p in range(start, stop):
         w = weights[p]

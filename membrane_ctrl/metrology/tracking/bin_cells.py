@@ -14,11 +14,10 @@ from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, IntArray, Singles
 
 _SIDE = 4  # bins along a cell's side: planes are 1 % off for the highest terms at the rim
-CELL_BINS, BLOCK_CELLS = (
-    _SIDE**2,
-    64,
-)  # a block of cells has 1024 bins: nine rows of them fit the first cache
-BLOCK_BINS = CELL_BINS * BLOCK_CELLS
+CELL_BINS = _SIDE**2
+BLOCK_CELLS = 64  # cells of a block
+BLOCK_BINS = CELL_BINS * BLOCK_CELLS  # 1024: nine rows of them fit the first cache
+_LEAST_SQUARE = np.float32(1e-3)  # of the offsets of a cell whose bins are in one row
 
 
 @dataclass(frozen=True)
@@ -27,52 +26,78 @@ class Cells:
 
     64 cells are a block: their first bins, then their second ones, and so on, so that loops over a
     block use vector units. A cell with fewer bins repeats one, as the last block repeats a cell;
-    what is repeated counts once, because its weight is 0 (`of`).
+    repeated bins have the weight 0 (`of`).
+
+    Attributes
+    ----------
+    offset : (N / 64, 2, 16, 64) array
+        Column and row of the bins, from the mean of their cell's.
     """
 
-    offset: Singles  # (N / 64, 2, 16, 64): of the bins, from the mean of their cell's
+    offset: Singles
 
     @staticmethod
     def of(index: IntArray, columns: int) -> "tuple[IntArray, BoolArray, Cells]":
-        """Bins (n,) in the order of the cells, whether each counts, and the cells."""
+        """Arrange bins in cells.
+
+        Parameters
+        ----------
+        index : (m,) int array
+            Numbers of the bins, row by row.
+        columns : int
+            Bins of a row.
+
+        Returns
+        -------
+        index : (n,) int array
+            The bins in the order of the cells, with repetitions.
+        counted : (n,) bool array
+            Whether each counts, or repeats another one.
+        cells : Cells
+        """
+        # Bins sorted by their square; where each square begins, and how many bins it has.
         square = index // columns // _SIDE * columns + index % columns // _SIDE
         order = np.argsort(square, kind="stable")
         _, starts, counts = np.unique(square[order], return_index=True, return_counts=True)
+
+        # The bins of each cell (cells, 16); missing ones repeat its first bin.
         counted = counts[:, None] > np.arange(CELL_BINS)
-        first = starts[:, None] + np.arange(CELL_BINS) * counted
-        more = (0, -len(starts) % BLOCK_CELLS), (0, 0)
-        padded = np.pad(first, more, "edge"), np.pad(counted, more)
-        blocks, counted = (
-            each.reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2) for each in padded
-        )
-        index = index[order][blocks]
-        at = np.stack([index % columns, index // columns], axis=1)
-        offset = (at - at.mean(axis=2, keepdims=True)).astype(np.float32, order="C")
+        bins = starts[:, None] + np.arange(CELL_BINS) * counted
+
+        # Whole blocks (blocks, 16, 64); missing cells repeat the last one.
+        missing = (0, -len(starts) % BLOCK_CELLS), (0, 0)
+        bins = np.pad(bins, missing, "edge")
+        counted = np.pad(counted, missing)
+        bins = bins.reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2)
+        counted = counted.reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2)
+        index = index[order][bins]
+
+        place = np.stack([index % columns, index // columns], axis=1)
+        middle = place.mean(axis=2, keepdims=True)
+        offset = (place - middle).astype(np.float32, order="C")
         return index.ravel(), counted.ravel(), Cells(offset)
 
     @cached_property
     def _offsets(self) -> Singles:
-        """(2, n)."""
+        """Offsets (2, n) of the bins."""
         return self.offset.swapaxes(0, 1).reshape(2, -1)
 
     def sums(self, values: AnyArray) -> AnyArray:
-        """Of the cells (..., N) of bins (..., n)."""
-        lead, blocks = values.shape[:-1], len(self.offset)
-        return np.asarray(
-            values.reshape(*lead, blocks, CELL_BINS, BLOCK_CELLS)
-            .sum(axis=-2)
-            .reshape(*lead, blocks * BLOCK_CELLS)
-        )
+        """Sums (..., N) over the cells, of values of bins (..., n)."""
+        lead = values.shape[:-1]
+        blocks = len(self.offset)
+        of_blocks = values.reshape(*lead, blocks, CELL_BINS, BLOCK_CELLS).sum(axis=-2)
+        return np.asarray(of_blocks.reshape(*lead, blocks * BLOCK_CELLS))
 
     def moments(self, values: AnyArray) -> AnyArray:
-        """Sums (..., 3, N) of values of bins (..., n) times 1 and their offsets."""
-        return np.stack(
-            [self.sums(values), *(self.sums(values * one) for one in self._offsets)], axis=-2
-        )
+        """Sums (..., 3, N) over the cells, of values of bins (..., n) times 1 and their offsets."""
+        by_offset = [self.sums(values * offset) for offset in self._offsets]
+        return np.stack([self.sums(values), *by_offset], axis=-2)
 
     def each(self, values: AnyArray) -> AnyArray:
-        """Of the bins (..., n) those of their cells (..., N)."""
-        lead, blocks = values.shape[:-1], len(self.offset)
+        """For each bin (..., n) the value of its cell (..., N)."""
+        lead = values.shape[:-1]
+        blocks = len(self.offset)
         repeated = np.repeat(values.reshape(*lead, blocks, 1, BLOCK_CELLS), CELL_BINS, axis=-2)
         return repeated.reshape(*lead, blocks * BLOCK_BINS)
 
@@ -84,19 +109,19 @@ class Cells:
 
     def planes(self, values: AnyArray) -> Singles:
         """The planes (..., 3, N) that fit values of bins (..., n) best."""
-        weights = self.moments(np.stack([np.ones_like(self._offsets[0]), *self._offsets]))
-        weights[[1, 2], [1, 2]] += np.float32(1e-3)  # bins in a row
-        inverse = np.linalg.inv(weights.transpose(2, 0, 1))
-        return np.asarray(
-            np.einsum("qij,...jq->...iq", inverse, self.moments(values)), np.float32, order="C"
-        )
+        basis = np.stack([np.ones_like(self._offsets[0]), *self._offsets])
+        normal = self.moments(basis)
+        normal[[1, 2], [1, 2]] += _LEAST_SQUARE
+        inverse = np.linalg.inv(normal.transpose(2, 0, 1))
+        fitted = np.einsum("qij,...jq->...iq", inverse, self.moments(values))
+        return np.asarray(fitted, np.float32, order="C")
 
     def blocks(self, *planes: Singles) -> Singles:
         """Planes, each (k, 3, N), block by block (N / 64, sum of k, 3 x 64)."""
-        every = np.concatenate(planes).reshape(-1, 3, len(self.offset), BLOCK_CELLS)
-        return np.ascontiguousarray(every.transpose(2, 0, 1, 3)).reshape(
-            len(self.offset), -1, 3 * BLOCK_CELLS
-        )
+        blocks = len(self.offset)
+        every = np.concatenate(planes).reshape(-1, 3, blocks, BLOCK_CELLS)
+        by_block = np.ascontiguousarray(every.transpose(2, 0, 1, 3))
+        return by_block.reshape(blocks, -1, 3 * BLOCK_CELLS)
 
 
 @compile_kernel
@@ -104,7 +129,8 @@ def combine_planes(slow, factors, start, planes):  # type: ignore[no-untyped-def
     """Planes (3 x 64) of a block's cells: of level `start`, plus (k, 3 x 64) times their factors
     (k,).
     """
-    planes[:BLOCK_CELLS], planes[BLOCK_CELLS:] = start, 0
+    planes[:BLOCK_CELLS] = start
+    planes[BLOCK_CELLS:] = 0
     for k in range(factors.size):
         for q in range(planes.size):
             planes[q] += factors[k] * slow[k, q]

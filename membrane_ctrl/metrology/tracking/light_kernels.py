@@ -15,23 +15,22 @@ from membrane_ctrl.metrology.tracking.bin_cells import (
     spread_planes,
 )
 
-_AT = (
-    0,
-    PARAMETERS,
-    2 * PARAMETERS,
-    2 * PARAMETERS,
-    2 * PARAMETERS,
-)  # in `Cells.blocks`: x, y, then the maps' terms
-# Share of the reach within which weights are 1. Where they fall from the start, as Tukey's do, they
-# differ between bright and dark fringes as soon as light wanders, and bend the figure: 20 nm of sag
-# at 0.5 %.
-_TRUSTED = np.float32(0.6)
+# Where the planes of phi_x, phi_y and of the three maps of light begin in `Cells.blocks`.
+_FIRST_PLANE = (0, PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS)
+# Share of the reach within which weights are 1. If they fall from 0 on, as Tukey's do, they differ
+# between bright and dark fringes as soon as the light changes slowly, and bend the figure: 20 nm of
+# sag at 0.5 %.
+_FULL_WEIGHT = np.float32(0.6)
+_RESPONSE_TERMS = 4  # of the response of panel and camera
 
 
 @compile_kernel
 def _compute_light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
-    """Derivatives of the light of a block's bins, as in `light_waves`, in place of the changes of
-    phases and maps.
+    """Light of a block's bins and its derivatives, as in `light_waves`, from changes of phases and
+    maps.
+
+    `rows` holds 5 rows of BLOCK_BINS: the changes of phi_x and phi_y, and the factors of A, B_x and
+    B_y. They are replaced by 6 rows of derivatives.
     """
     one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
     for k in range(BLOCK_BINS):
@@ -39,17 +38,23 @@ def _compute_light(rows, base, light, response, begin):  # type: ignore[no-untyp
         cx, sx = cos_sin(base[0, p] + rows[k])
         cy, sy = cos_sin(base[1, p] + rows[BLOCK_BINS + k])
         level = light[0, p] * rows[2 * BLOCK_BINS + k]
-        swing_x, swing_y = (
-            light[1, p] * rows[3 * BLOCK_BINS + k],
-            light[2, p] * rows[4 * BLOCK_BINS + k],
-        )
+        swing_x = light[1, p] * rows[3 * BLOCK_BINS + k]
+        swing_y = light[2, p] * rows[4 * BLOCK_BINS + k]
+
+        # What the response adds to the fringes, and the slope of that, with the shade u from 0 to
+        # 1: sum of r_j (u^(j + 2) - u), j from 0.
         shade = half + half * half * (cx + cy)
-        power, slope, bent = shade, np.float32(0), np.float32(0)
-        for j in range(4):
+        power = shade
+        slope = np.float32(0)
+        bent = np.float32(0)
+        for j in range(_RESPONSE_TERMS):
             slope += response[j] * (np.float32(j + 2) * power - one)
             power *= shade
             bent += response[j] * (power - shade)
-        cx, cy, steeper = cx + two * bent, cy + two * bent, half * (swing_x + swing_y) * slope
+        cx = cx + two * bent
+        cy = cy + two * bent
+        steeper = half * (swing_x + swing_y) * slope
+
         rows[k] = -(swing_x + steeper) * sx
         rows[BLOCK_BINS + k] = -(swing_y + steeper) * sy
         rows[2 * BLOCK_BINS + k] = light[0, p]
@@ -68,8 +73,12 @@ def _weigh_derivatives(rows, edge, gain, seen, reach, begin):  # type: ignore[no
         p = begin + k
         shown = rows[5 * BLOCK_BINS + k]
         r = seen[p] - gain[p] * shown
-        far = max(abs(r) / reach[p] - _TRUSTED, zero) / (one - _TRUSTED) if reach[p] > zero else one
+
+        # The weight: 1 up to a share of the reach, then falling to 0 at the reach.
+        far = max(abs(r) / reach[p] - _FULL_WEIGHT, zero) / (one - _FULL_WEIGHT)
+        far = far if reach[p] > zero else one
         w = (one - min(far, one) ** 2) ** 2
+
         left = w * r * edge[p] * gain[p]
         for j in range(5):
             rows[j * BLOCK_BINS + k] *= left
@@ -83,11 +92,13 @@ def _weigh_derivatives(rows, edge, gain, seen, reach, begin):  # type: ignore[no
 def _compute_block(b, base, light, slow, offset, response, changes, shifts, planes, rows):  # type: ignore[no-untyped-def]
     """`_compute_light` of block b."""
     squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)
+    # phi_x and phi_y share the surface's parameters, changes[0]; then follow the maps of A, B_x and
+    # B_y, whose factors begin at 1.
     for k in range(5):
-        at, factors = _AT[k], changes[max(k - 1, 0)]
-        combine_planes(
-            slow[b, at : at + factors.size], factors, shifts[k] if k < 2 else np.float32(1), planes
-        )
+        first = _FIRST_PLANE[k]
+        factors = changes[max(k - 1, 0)]
+        level = shifts[k] if k < 2 else np.float32(1)
+        combine_planes(slow[b, first : first + factors.size], factors, level, planes)
         spread_planes(planes, offset[b], squares[k])
     _compute_light(rows, base, light, response, b * BLOCK_BINS)
 
@@ -99,7 +110,8 @@ def light_waves(base, light, slow, offset, response, changes, shifts, out):  # t
 
     Arguments as in `light_left`.
     """
-    rows, planes = np.empty(6 * BLOCK_BINS, np.float32), np.empty(3 * BLOCK_CELLS, np.float32)
+    rows = np.empty(6 * BLOCK_BINS, np.float32)
+    planes = np.empty(3 * BLOCK_CELLS, np.float32)
     for b in range(offset.shape[0]):
         _compute_block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
         out[:, b * BLOCK_BINS : (b + 1) * BLOCK_BINS] = rows.reshape(6, BLOCK_BINS)
@@ -109,17 +121,40 @@ def light_waves(base, light, slow, offset, response, changes, shifts, out):  # t
 def light_left(  # type: ignore[no-untyped-def]
     base, light, slow, offset, response, changes, shifts, edge, gain, seen, reach, right, out
 ):
-    """Residual r and weight w of n bins in `out` (4, n), with e w r times the derivative by a
-    relative change of all light and e w times its square; and in `right` (4, parameters) the sums
-    of e w r times the derivatives by `changes`.
+    """Residual and weight of n bins, and the right-hand side of the least squares.
 
-    `base` (2, n) are phases and `light` (3, n) A, B_x, B_y. They change by `shifts` (2,) and by
-    `changes` (4, parameters), of the surface's parameters and of the maps of A, B_x, B_y, times
-    `slow`, as in `Cells.blocks`; `offset` as in `Cells`. `edge` (n,) is e, `gain` (n,) multiplies
-    all light, `reach` (n,) is where w ends; 0 leaves out. All but `right` are of single precision
-    and without gaps, or no vector units are used.
+    All arrays but `right` are of single precision and without gaps, or no vector units are used.
+
+    Parameters
+    ----------
+    base : (2, n) array
+        Phases of x and y.
+    light : (3, n) array
+        A, B_x and B_y.
+    slow, offset : arrays
+        As in `Cells.blocks` and `Cells`: what phases and light change by, a plane over each cell.
+    response : (4,) array
+        Response of panel and camera.
+    changes : (4, parameters) array
+        Of the surface's parameters, and of the maps of A, B_x and B_y; factors of `slow`.
+    shifts : (2,) array
+        Change of all phases of x and of y.
+    edge : (n,) array
+        Factor e of a bin's weight.
+    gain : (n,) array
+        Factor of all light.
+    seen : (n,) array
+        Light of the frame.
+    reach : (n,) array
+        Residual at which the weight w ends; 0 leaves the bin out.
+    right : (4, parameters) array
+        Gets the sums of e w r times the derivatives by `changes`.
+    out : (4, n) array
+        Gets r, w, e w r times the derivative by a relative change of all light, and e w times the
+        square of that derivative.
     """
-    rows, planes = np.empty(9 * BLOCK_BINS, np.float32), np.empty(3 * BLOCK_CELLS, np.float32)
+    rows = np.empty(9 * BLOCK_BINS, np.float32)
+    planes = np.empty(3 * BLOCK_CELLS, np.float32)
     squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)
     right[:] = 0
     for b in range(offset.shape[0]):
@@ -127,6 +162,7 @@ def light_left(  # type: ignore[no-untyped-def]
         _weigh_derivatives(rows, edge, gain, seen, reach, b * BLOCK_BINS)
         out[:, b * BLOCK_BINS : (b + 1) * BLOCK_BINS] = rows.reshape(9, BLOCK_BINS)[5:]
         for k in range(5):
-            at, sums = _AT[k], right[max(k - 1, 0)]
+            first = _FIRST_PLANE[k]
+            sums = right[max(k - 1, 0)]
             compute_moments(squares[k], offset[b], planes)
-            project_planes(slow[b, at : at + sums.size], planes, sums)
+            project_planes(slow[b, first : first + sums.size], planes, sums)

@@ -12,13 +12,11 @@ from membrane_ctrl.sim.optics.pixel_noise import GOLDEN, LOW_16, MIX_1, random_6
 def vignetting_loss(
     width_px: int, height_px: int, corner_loss: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Loss by column and by row; their sum is corner_loss (distance from the middle / distance of
-    the corner)^2.
+    """Loss by column (W,) and by row (H,); their sum is corner_loss (distance from the middle /
+    distance of the corner)^2.
     """
-    columns, rows = (
-        np.arange(width_px) - (width_px - 1) / 2.0,
-        np.arange(height_px) - (height_px - 1) / 2.0,
-    )
+    columns = np.arange(width_px) - (width_px - 1) / 2.0
+    rows = np.arange(height_px) - (height_px - 1) / 2.0
     per_px2 = corner_loss / (columns[0] ** 2 + rows[0] ** 2)
     return per_px2 * columns**2, per_px2 * rows**2
 
@@ -37,25 +35,48 @@ def _look_up_level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool
 
 @compile_loop(nogil=True)
 def shade_rows(
-    # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the
-    # vertex (mm^2); a disturbed bench has two more: factor of the screen's light, and counts of the
-    # room's
     nodes: FloatArray,
-    weights: FloatArray,  # (step, 4) of `cubic_weights`
-    axis: int,  # 0: the pattern runs along s_x, 1: along s_y
-    radius_mm: float,  # of the film's rim
-    side_mm: float,  # of the pattern region
-    table: tuple[FloatArray, float, bool],  # the fields of a `LevelTable`
-    scale: FloatArray,  # (4,): counts without light, counts of white above that, leak, full scale
-    loss: tuple[FloatArray, FloatArray],  # vignetting (W,), (H,): a column's part and a row's
-    noise: tuple[
-        Singles, float, int
-    ],  # `normal_quantiles()`, standard deviation in counts, seed of this picture
+    weights: FloatArray,
+    axis: int,
+    radius_mm: float,
+    side_mm: float,
+    table: tuple[FloatArray, float, bool],
+    scale: FloatArray,
+    loss: tuple[FloatArray, FloatArray],
+    noise: tuple[Singles, float, int],
     out: Pixels,
     start: int,
     stop: int,
 ) -> None:
-    """Fill rows start to stop of `out` (H, W) with the picture of one pattern."""
+    """Fill rows of the picture of one pattern.
+
+    Parameters
+    ----------
+    nodes : (3 or 5, rows, columns) array
+        At nodes, `step` pixels apart: s_x and s_y from the low edges of the region in mm, squared
+        distance from the vertex in mm^2. A disturbed bench has two more: factor of the screen's
+        light, and counts of the room's light.
+    weights : (step, 4) array
+        Of `node_interpolation.cubic_weights`.
+    axis : int
+        0: the pattern runs along s_x, 1: along s_y.
+    radius_mm : float
+        Radius of the film's rim.
+    side_mm : float
+        Side of the pattern region.
+    table : array, float, bool
+        The fields of a `LevelTable`.
+    scale : (4,) array
+        Counts without light, counts of white above that, leak, full scale.
+    loss : (W,) and (H,) arrays
+        Vignetting: a column's part and a row's.
+    noise : array, float, int
+        `pixel_noise.normal_quantiles()`, standard deviation in counts, seed of this picture.
+    out : (H, W) array
+        The picture.
+    start, stop : int
+        Rows to fill.
+    """
     step = weights.shape[0]
     width = out.shape[1]
     values, cell_mm, smooth = table
@@ -63,17 +84,16 @@ def shade_rows(
     column_loss, row_loss = loss
     quantiles, sigma, seed = noise
     radius2_mm2 = radius_mm * radius_mm
-    # three arrays, not rows of one: a view taken per pixel costs more than the pixel
-    line_x, line_y, line_r2 = (
-        np.empty(nodes.shape[2]),
-        np.empty(nodes.shape[2]),
-        np.empty(nodes.shape[2]),
-    )
-    line_factor, line_room = np.ones(nodes.shape[2]), np.zeros(nodes.shape[2])
+    # An array for each quantity, not rows of one: a view taken per pixel costs more than the pixel.
+    line_x = np.empty(nodes.shape[2])
+    line_y = np.empty(nodes.shape[2])
+    line_r2 = np.empty(nodes.shape[2])
+    line_factor = np.ones(nodes.shape[2])
+    line_room = np.zeros(nodes.shape[2])
     disturbed = nodes.shape[0] > 3
     bits = np.uint64(0)
     for row in range(start, stop):
-        # as if all rows before it had been shaded by the same hand
+        # The random numbers do not depend on how rows are shared between threads.
         state = np.uint64(seed) * MIX_1 + np.uint64(row) * np.uint64((width + 3) // 4) * GOLDEN
         interpolate_row(nodes, 0, row // step, weights[row % step], line_x)
         interpolate_row(nodes, 1, row // step, weights[row % step], line_y)
@@ -85,14 +105,13 @@ def shade_rows(
             for k in range(min(step, width - cell * step)):
                 column = cell * step + k
                 counts = dark
-                if interpolate_cubic(line_r2, cell, weights, k) <= radius2_mm2:
+                if interpolate_cubic(line_r2, cell, weights, k) <= radius2_mm2:  # on the film
                     s_x_mm = interpolate_cubic(line_x, cell, weights, k)
                     s_y_mm = interpolate_cubic(line_y, cell, weights, k)
                     light = leak
-                    if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:
-                        light = _look_up_level(
-                            s_y_mm if axis == 1 else s_x_mm, values, cell_mm, smooth
-                        )
+                    if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:  # on the pattern
+                        s_mm = s_y_mm if axis == 1 else s_x_mm
+                        light = _look_up_level(s_mm, values, cell_mm, smooth)
                     if disturbed:
                         light *= interpolate_cubic(line_factor, cell, weights, k)
                         counts += interpolate_cubic(line_room, cell, weights, k)

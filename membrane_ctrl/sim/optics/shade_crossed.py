@@ -1,6 +1,7 @@
 """Turns traced nodes into a picture of crossed fringes, in single precision.
 
-The order lets the processor compute many pixels at a time: first all pixels that are k beyond their
+Between nodes, `step` pixels apart, all quantities are interpolated by a cubic, as in `shade`. The
+order lets the processor compute many pixels at a time: first all pixels that are k beyond their
 node, then those at k + 1. A hold that tracks takes twenty such pictures a second.
 """
 
@@ -17,7 +18,7 @@ _FLOAT = np.float32
 
 @compile_loop(fastmath=True)
 def _cosine_of_turns(turns: float) -> float:
-    """Cosine of an angle in turns, to 2e-6."""
+    """Cosine of an angle in turns, to 2e-6: a polynomial about the nearest whole turn."""
     t = turns - np.floor(turns + _FLOAT(0.5))
     u = t * t
     high = _FLOAT(60.1762543) + u * (_FLOAT(-26.0006905) + u * _FLOAT(6.57564783))
@@ -26,45 +27,50 @@ def _cosine_of_turns(turns: float) -> float:
 
 
 @compile_loop(fastmath=True)
+def _interpolate(line, c, weights):  # type: ignore[no-untyped-def]
+    """The cubic through four neighbouring nodes of a row, from node c on."""
+    w0, w1, w2, w3 = weights
+    return w0 * line[c] + w1 * line[c + 1] + w2 * line[c + 2] + w3 * line[c + 3]
+
+
+@compile_loop(fastmath=True)
 def _crossed_pixels(  # type: ignore[no-untyped-def]
     lines, weights, loss, noise, pattern, scale, levels, rooms, counts
 ):
-    """Levels, room light and counts of the pixels (cells,) at one place between their nodes,
-    `lines`, of a row.
+    """Counts of the pixels (cells,) at one place between their nodes, of a row.
+
+    `lines` (3 or 5, nodes) are the quantities of `shade` at the row's nodes, `weights` (4) those of
+    the place. `levels` and `rooms` (cells,) are memory for the screen's level and the room's light.
     """
-    w0, w1, w2, w3 = weights
     rate, first_x, first_y, half_mm, radius2_mm2 = pattern
     dark, white, leak, gamma, sigma, full, row_loss = scale
     one, none = _FLOAT(1.0), _FLOAT(0.0)
+
+    # The screen's level where the ray meets it, 0 beside the pattern; white on the film, else 0.
     for c in range(counts.size):
-        x = w0 * lines[0, c] + w1 * lines[0, c + 1] + w2 * lines[0, c + 2] + w3 * lines[0, c + 3]
-        y = w0 * lines[1, c] + w1 * lines[1, c + 1] + w2 * lines[1, c + 2] + w3 * lines[1, c + 3]
-        r2 = w0 * lines[2, c] + w1 * lines[2, c + 1] + w2 * lines[2, c + 2] + w3 * lines[2, c + 3]
-        level = _FLOAT(0.5) + _FLOAT(0.25) * (
-            _cosine_of_turns(x * rate + first_x) + _cosine_of_turns(y * rate + first_y)
-        )
+        x = _interpolate(lines[0], c, weights)
+        y = _interpolate(lines[1], c, weights)
+        r2 = _interpolate(lines[2], c, weights)
+        fringes = _cosine_of_turns(x * rate + first_x) + _cosine_of_turns(y * rate + first_y)
+        level = _FLOAT(0.5) + _FLOAT(0.25) * fringes
         inside = (abs(x - half_mm) < half_mm) & (abs(y - half_mm) < half_mm)
         levels[c] = level if inside else none
         counts[c] = white if r2 <= radius2_mm2 else none
+
+    # A disturbed bench: factor of the screen's light, and the room's light on the film.
     if lines.shape[0] > 3:
         for c in range(counts.size):
-            factor = (
-                w0 * lines[3, c]
-                + w1 * lines[3, c + 1]
-                + w2 * lines[3, c + 2]
-                + w3 * lines[3, c + 3]
-            )
-            room = (
-                w0 * lines[4, c]
-                + w1 * lines[4, c + 1]
-                + w2 * lines[4, c + 2]
-                + w3 * lines[4, c + 3]
-            )
+            factor = _interpolate(lines[3], c, weights)
+            room = _interpolate(lines[4], c, weights)
             rooms[c] = room if counts[c] > none else none
             counts[c] *= factor
-    if gamma != one:  # a power costs ten times the rest, and does not go many at a time
+
+    # The screen's gamma: a power costs ten times the rest, and uses no vector units.
+    if gamma != one:
         for c in range(counts.size):
             levels[c] = max(levels[c], none) ** gamma
+
+    # Light, noise and the converter's range.
     for c in range(counts.size):
         light = (leak + (one - leak) * levels[c]) * (one - loss[c] - row_loss)
         seen = dark + rooms[c] + counts[c] * light + sigma * noise[c] + _FLOAT(0.5)
@@ -74,47 +80,64 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
 
 @compile_loop(nogil=True)
 def shade_crossed_rows(
-    nodes: FloatArray,  # as in `shade`
-    weights: Singles,  # (4, step): of `cubic_weights`, transposed
-    # periods per mm, phases of x and y at the low edge in turns, half a side of the region (mm),
-    # the rim's radius^2
+    nodes: FloatArray,
+    weights: Singles,
     pattern: tuple[float, ...],
-    # counts without light, of white above that, leak, gamma, sigma of the noise, full scale
     scale: tuple[float, ...],
-    loss: tuple[
-        Singles, Singles
-    ],  # vignetting (step, cells) of columns k + step * cell, and (H,) of rows
-    noise: tuple[Singles, int],  # `noise_bank()`, seed of this picture
+    loss: tuple[Singles, Singles],
+    noise: tuple[Singles, int],
     out: Pixels,
     start: int,
     stop: int,
 ) -> None:
-    """Fill rows start to stop of `out` (H, W) with the picture of crossed fringes; its tuples hold
-    single floats.
+    """Fill rows of a picture of crossed fringes.
+
+    Parameters
+    ----------
+    nodes : (3 or 5, rows, columns) array
+        As in `shade.shade_rows`.
+    weights : (4, step) array
+        Of `node_interpolation.cubic_weights`, transposed.
+    pattern : tuple of single floats
+        Periods per mm, phases of x and y at the low edge in turns, half a side of the region in mm,
+        square of the rim's radius.
+    scale : tuple of single floats
+        Counts without light, counts of white above that, leak, gamma, standard deviation of the
+        noise in counts, full scale.
+    loss : (step, cells) and (H,) arrays
+        Vignetting of the columns k + step * cell, and of the rows.
+    noise : array, int
+        `pixel_noise.noise_bank()`, and the seed of this picture.
+    out : (H, W) array
+        The picture.
+    start, stop : int
+        Rows to fill.
     """
-    step, width = weights.shape[1], out.shape[1]
+    step = weights.shape[1]
+    width = out.shape[1]
     column_loss, row_loss = loss
     cells = column_loss.shape[1]
     bank, seed = noise
     lines = np.empty((nodes.shape[0], nodes.shape[2]), np.float32)
-    levels, rooms, counts = (
-        np.empty(cells, np.float32),
-        np.zeros(cells, np.float32),
-        np.empty(cells, np.float32),
-    )
+    levels = np.empty(cells, np.float32)
+    rooms = np.zeros(cells, np.float32)
+    counts = np.empty(cells, np.float32)
     for row in range(start, stop):
+        # The quantities at the row's nodes.
         for k in range(nodes.shape[0]):
             interpolate_row(nodes, k, row // step, weights[:, row % step], lines[k])
+        # Noise from a random place of the bank.
         bits = random_64_bits(np.uint64(seed) * MIX_1 + np.uint64(row) * GOLDEN)
         first = int(bits % np.uint64(bank.size - step * cells))
+        # All pixels that are k beyond their node.
         for k in range(step):
-            own = weights[0, k], weights[1, k], weights[2, k], weights[3, k]
-            some = bank[first + k * cells : first + (k + 1) * cells]
+            own_weights = weights[0, k], weights[1, k], weights[2, k], weights[3, k]
+            own_noise = bank[first + k * cells : first + (k + 1) * cells]
             _crossed_pixels(
                 lines,
-                own,
+                own_weights,
                 column_loss[k],
-                some,
+                own_noise,
                 pattern,
                 (*scale, row_loss[row]),
                 levels,

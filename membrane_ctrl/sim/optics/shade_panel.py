@@ -13,18 +13,24 @@ from membrane_ctrl.sim.optics.node_interpolation import interpolate_cubic, inter
 from membrane_ctrl.sim.optics.pattern_levels import Light, screen_light
 from membrane_ctrl.sim.optics.pixel_noise import GOLDEN, LOW_16, MIX_1, random_64_bits
 
-# of the lens, at the panel: it does not resolve a checkerboard, and takes 0.4 % of a fringe of 100
-# px
+# Blur of the lens, in pixels of the panel: it does not resolve a checkerboard, and lowers the
+# contrast of a fringe of 100 px by 0.4 %.
 _BLUR_PX = 1.5
 
 
 @dataclass(frozen=True, slots=True)
 class PanelPicture:
-    """A picture on a panel as the camera sees it; its place on the screen is that of the pattern
-    region.
+    """A picture on a panel as the camera sees it, at the place of the pattern region.
+
+    Attributes
+    ----------
+    levels : (height, width) array
+        What the panel's pixels show.
+    raster : ScreenRaster
+        Place of the pixels on the screen.
     """
 
-    levels: Levels  # (height, width)
+    levels: Levels
     raster: ScreenRaster
 
     @property
@@ -35,31 +41,37 @@ class PanelPicture:
         return np.array([column_px - half_px, row_px + half_px, self.raster.pixel_mm])
 
     def light_of_pixels(self, light: Light) -> Singles:
-        """Share of a white screen's light, (height, width), not resolved further than the lens
-        does.
-        """
-        sharp = screen_light(np.arange(256) / 255.0, light).astype(np.float32)[self.levels]
-        return np.asarray(
-            cv2.GaussianBlur(sharp, (0, 0), _BLUR_PX, borderType=cv2.BORDER_REFLECT), np.float32
-        )
+        """Share of a white screen's light (height, width), blurred by the lens."""
+        light_of_levels = screen_light(np.arange(256) / 255.0, light).astype(np.float32)
+        sharp = light_of_levels[self.levels]
+        blurred = cv2.GaussianBlur(sharp, (0, 0), _BLUR_PX, borderType=cv2.BORDER_REFLECT)
+        return np.asarray(blurred, np.float32)
 
 
 @compile_loop(nogil=True)
 def shade_panel_rows(
-    nodes: FloatArray,  # as in `shade`
-    weights: FloatArray,  # (step, 4) of `cubic_weights`
-    radius_mm: float,  # of the film's rim
-    places: FloatArray,  # of a `PanelPicture`
-    picture: Singles,  # (rows, columns) its light
-    scale: FloatArray,  # (4,): as in `shade`
-    loss: tuple[FloatArray, FloatArray],  # as in `shade`
-    noise: tuple[Singles, float, int],  # as in `shade`
+    nodes: FloatArray,
+    weights: FloatArray,
+    radius_mm: float,
+    places: FloatArray,
+    picture: Singles,
+    scale: FloatArray,
+    loss: tuple[FloatArray, FloatArray],
+    noise: tuple[Singles, float, int],
     out: Pixels,
     start: int,
     stop: int,
 ) -> None:
-    """Fill rows start to stop of `out` (H, W) with what the camera sees of a panel in dark
-    surroundings.
+    """Fill rows of the picture of a panel in dark surroundings.
+
+    Parameters
+    ----------
+    places : (3,) array
+        `PanelPicture.places`.
+    picture : (rows, columns) array
+        `PanelPicture.light_of_pixels`.
+    nodes, weights, radius_mm, scale, loss, noise, out, start, stop
+        As in `shade.shade_rows`.
     """
     step = weights.shape[0]
     dark, white, leak, full = scale
@@ -91,19 +103,12 @@ def shade_panel_rows(
 @compile_loop()
 def _pixel_light(picture: Singles, column: float, row: float, outside: float) -> float:
     """Light at a place of a picture, between its pixels by bilinear interpolation."""
-    first_column, first_row = int(np.floor(column)), int(np.floor(row))
-    if (
-        first_column < 0
-        or first_row < 0
-        or first_column + 1 >= picture.shape[1]
-        or first_row + 1 >= picture.shape[0]
-    ):
+    left = int(np.floor(column))
+    top = int(np.floor(row))
+    if left < 0 or top < 0 or left + 1 >= picture.shape[1] or top + 1 >= picture.shape[0]:
         return outside
-    right, down = column - first_column, row - first_row
-    above = (1.0 - right) * picture[first_row, first_column] + right * picture[
-        first_row, first_column + 1
-    ]
-    below = (1.0 - right) * picture[first_row + 1, first_column] + right * picture[
-        first_row + 1, first_column + 1
-    ]
-    return float((1.0 - down) * above + down * below)
+    right_share = column - left
+    lower_share = row - top
+    upper = (1.0 - right_share) * picture[top, left] + right_share * picture[top, left + 1]
+    lower = (1.0 - right_share) * picture[top + 1, left] + right_share * picture[top + 1, left + 1]
+    return float((1.0 - lower_share) * upper + lower_share * lower)
