@@ -19,7 +19,7 @@ from membrane_ctrl.acquisition import (
 from membrane_ctrl.acquisition.remote import Remote
 from membrane_ctrl.acquisition.spec import AcquisitionSpec
 from membrane_ctrl.acquisition.twin_truth import TwinTruth
-from membrane_ctrl.acquisition.vibrations import vibration_listener
+from membrane_ctrl.acquisition.vibrations import make_vibration_handler
 from membrane_ctrl.acquisition.waiting_clock import WaitingClock
 from membrane_ctrl.acquisition.warm_up import TYPICAL_FILM, coarse_optics, warm_up
 from membrane_ctrl.config.schema import Config, OpticsConfig
@@ -62,7 +62,7 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
         reconstructor, plan, period_s = _make_reconstructor(spec, geometry.optics, plan)
         drift, hear = (
             geometry_watch.GeometryWatch(geometry, config.shape.bin_px),
-            vibration_listener(config, spec.clock, spec.run_dir),
+            make_vibration_handler(config, spec.clock, spec.run_dir),
         )
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.vibrations import vibration_listener
+from membrane_ctrl.acquisition.vibrations import make_vibration_handler
 from membrane_ctrl.alarms.book import AlarmMessage
 from membrane_ctrl.alarms.process import Outbox, Watcher
 from membrane_ctrl.cli import run as command_line
@@ -107,7 +107,7 @@ class Hold:
         return True
 
     def restart_acquisition(self) -> None:
-        self.hear = vibration_listener(self.config, self.clock, self.folder)
+        self.hear = make_vibration_handler(self.config, self.clock, self.folder)
 
     def ticks(self, at_s: float) -> None:
         """Six seconds of telemetry."""

@@ -24,7 +24,7 @@ _DAY_S = 86_400.0
 _PAST_EVERY_S, _WEEK_S = _DAY_S / 4, 8 * _DAY_S  # a shift that takes a whole week is within it
 
 
-class Stethoscope:
+class VibrationFollower:
     """The mirror's vibrations while it is held, searched in each minute of tracked figures.
 
     Eight modes are followed. One that moves by 1 % within a week tells of another tension; one
@@ -34,14 +34,14 @@ class Stethoscope:
     """
 
     def __init__(
-        self, stroke_hz: float = 0.0, begin_utc_s: float = 0.0, known: "Heard | None" = None
+        self, stroke_hz: float = 0.0, begin_utc_s: float = 0.0, known: "FollowedModes | None" = None
     ) -> None:
         self._time_s: list[float] = []
         self._terms_um: list[FloatArray] = []
         self._stroke_hz, self._begin_utc_s = stroke_hz, begin_utc_s
-        self.heard = known or Heard()
+        self.followed = known or FollowedModes()
 
-    def after(self, estimate: ShapeEstimate) -> list[events.Event]:
+    def add_estimate(self, estimate: ShapeEstimate) -> list[events.Event]:
         """Take a figure; once a minute, say what was heard, if ever there was something."""
         if estimate.kind != "track" or estimate.verdict == "rejected":
             return []
@@ -60,7 +60,7 @@ class Stethoscope:
         found = find_modes(time_s, terms_um)
         if found is None:
             return []
-        utc_s, modes = self._begin_utc_s + float(time_s[-1]), self.heard.modes
+        utc_s, modes = self._begin_utc_s + float(time_s[-1]), self.followed.modes
         for mode in modes:
             mode.begin_search(utc_s)
         for line in (line for line in found if not line.aliases_hz):
@@ -76,7 +76,7 @@ class Stethoscope:
             )
             free = next((k for k, mode in enumerate(modes) if mode.gone), len(modes))
             if known is None and free < MODES:
-                modes[free : free + 1] = [known := HeardMode(line)]
+                modes[free : free + 1] = [known := FollowedMode(line)]
             if known is not None:
                 known.add(line, utc_s)
         if not modes:
@@ -91,11 +91,11 @@ class Stethoscope:
             told or "none",
         )
         followed = [mode for mode in modes if mode.past and not mode.gone]
-        return [heard, *self._tension(followed, utc_s), *self._strokes(followed)]
+        return [heard, *self._judge_tension(followed, utc_s), *self._judge_strokes(followed)]
 
-    def _tension(self, modes: "Sequence[HeardMode]", utc_s: float) -> list[events.Event]:
+    def _judge_tension(self, modes: "Sequence[FollowedMode]", utc_s: float) -> list[events.Event]:
         """A notice when a mode has moved, and when none has within a week."""
-        limit = MOVED / 2 if "film_tension" in self.heard.said else MOVED
+        limit = MOVED / 2 if "film_tension" in self.followed.active_notices else MOVED
         moved = next((mode for mode in modes if abs(mode.moved[0]) > limit), None)
         says = ""
         if moved is not None:
@@ -110,7 +110,7 @@ class Stethoscope:
             "film_tension", says, "no vibration of the mirror has moved within a week"
         )
 
-    def _strokes(self, modes: "Sequence[HeardMode]") -> list[events.Event]:
+    def _judge_strokes(self, modes: "Sequence[FollowedMode]") -> list[events.Event]:
         """A notice when the pump's strokes meet a mode, and when none has been heard there for some
         searches.
         """
@@ -134,17 +134,17 @@ class Stethoscope:
 
     def _notice(self, name: str, says: str, over: str) -> list[events.Event]:
         """What is new of a matter: that it begins, or that it is over."""
-        if bool(says) == (name in self.heard.said):
+        if bool(says) == (name in self.followed.active_notices):
             return []
         if says:
-            self.heard.said.append(name)
+            self.followed.active_notices.append(name)
         else:
-            self.heard.said.remove(name)
+            self.followed.active_notices.remove(name)
         return [events.Maintenance(name, says) if says else events.MaintenanceOver(name, over)]
 
 
 @dataclass
-class HeardMode(StateNode):
+class FollowedMode(StateNode):
     """A mode over the searches; times are UTC in seconds.
 
     Attributes
@@ -195,16 +195,16 @@ class HeardMode(StateNode):
 
 
 @dataclass
-class Heard(StateNode):
+class FollowedModes(StateNode):
     """What one follower passes on to the next.
 
     Attributes
     ----------
-    modes : list[HeardMode]
+    modes : list[FollowedMode]
         Each keeps its place.
-    said : list[str]
+    active_notices : list[str]
         Codes of the notices that are active.
     """
 
-    modes: list[HeardMode] = field(default_factory=list)
-    said: list[str] = field(default_factory=list)
+    modes: list[FollowedMode] = field(default_factory=list)
+    active_notices: list[str] = field(default_factory=list)

@@ -24,7 +24,7 @@ from membrane_ctrl.metrology.tracking.live_tracker import (
     _make_estimate,
 )
 from membrane_ctrl.metrology.tracking.tracked_frame import rejected_frame
-from membrane_ctrl.metrology.vibrations.mode_follower import Stethoscope
+from membrane_ctrl.metrology.vibrations.mode_follower import VibrationFollower
 from membrane_ctrl.model.acquisition_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -241,7 +241,7 @@ def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
     tracker = LiveTracker(optics, LiveReconstructor(optics, 1), 32, step_s=10.0)
     modes = tuple(replace(mode, amplitude_nm=20.0) for mode in DRUM_MODES)
     renderer = OpticsRenderer(optics, FILM, seed=3, modes=modes)
-    film_um, listener, told = held_um(126.0), Stethoscope(), []
+    film_um, listener, told = held_um(126.0), VibrationFollower(), []
     still = [
         renderer.render_picture(p, float(film_um[0]))
         for p in pattern_sequence.full_sequence(optics.pattern)
@@ -252,7 +252,9 @@ def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
         picture = renderer.render_picture(
             tracker.pattern, float(film_um[round(50 * time_s)]), time_s=time_s
         )
-        told += listener.after(tracker.fringes([picture], np.array([time_s]), np.array([math.nan])))
+        told += listener.add_estimate(
+            tracker.fringes([picture], np.array([time_s]), np.array([math.nan]))
+        )
         time_s += tracker.slower / 20
     assert len(told) == 2
     for heard in told:

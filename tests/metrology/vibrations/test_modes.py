@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.metrology.vibrations import mode_follower
-from membrane_ctrl.metrology.vibrations.mode_follower import Heard, Stethoscope
+from membrane_ctrl.metrology.vibrations.mode_follower import FollowedModes, VibrationFollower
 from membrane_ctrl.metrology.vibrations.mode_search import VibrationMode, find_modes
 from membrane_ctrl.model.acquisition_events import Vibrations
 from membrane_ctrl.model.event_lines import from_dict
@@ -130,7 +130,7 @@ def test_a_line_that_one_rate_cannot_see_makes_no_other(seed: int) -> None:
 
 
 def test_a_hold_does_not_tell_of_a_line_that_may_be_another() -> None:
-    assert Stethoscope().search(*watched(4, lines_hz=(48.0,), rates_hz=(20.0,))[:2]) == []
+    assert VibrationFollower().search(*watched(4, lines_hz=(48.0,), rates_hz=(20.0,))[:2]) == []
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -169,7 +169,7 @@ def test_too_short(seconds: float) -> None:
 
 @pytest.mark.campaign
 def test_a_night_of_steps_and_outliers_tells_no_line() -> None:
-    listener = Stethoscope()
+    listener = VibrationFollower()
     for seed in range(1000, 1480):
         time_s, coeffs_um, _ = watched(seed, lines_hz=())
         rng = np.random.default_rng(seed)
@@ -220,7 +220,7 @@ Searches = list[dict[int, float]]
 
 
 def heard(
-    monkeypatch: pytest.MonkeyPatch, listener: Stethoscope, lines: Searches, day: float = 0.0
+    monkeypatch: pytest.MonkeyPatch, listener: VibrationFollower, lines: Searches, day: float = 0.0
 ) -> list[list[Event]]:
     """What a hold tells in minutes, from a day on, in which modes, by the number of their shape,
     have these lines.
@@ -255,7 +255,9 @@ def scaled(by: float) -> dict[int, float]:
 def test_a_mode_keeps_its_place_and_a_minute_without_it_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    told = heard(monkeypatch, Stethoscope(), [{}, {3: 48.0}, {}, {7: 27.0, 3: 48.1}, {3: 47.0}])
+    told = heard(
+        monkeypatch, VibrationFollower(), [{}, {3: 48.0}, {}, {7: 27.0, 3: 48.1}, {3: 47.0}]
+    )
     assert places(told) == [[48.0], [None], [48.1, 27.0], [47.0, None]]
     assert told[2][0].to_dict()["message"] == "none"
 
@@ -265,7 +267,7 @@ def test_a_line_that_passes_by_leaves_its_place_and_a_mode_does_not(
 ) -> None:
     """A hold of a week would be full of them."""
     passing: Searches = [{3: 48.0, k: 30.0 + 5 * k} for k in range(8, 20)]
-    told = heard(monkeypatch, Stethoscope(), [{3: 48.0}] * 5 + [{}] * 9 + passing)
+    told = heard(monkeypatch, VibrationFollower(), [{3: 48.0}] * 5 + [{}] * 9 + passing)
     lines = places(told)
     assert max(len(each) for each in lines) == 6
     assert all(each[0] == 48.0 for each in lines[-12:])
@@ -275,14 +277,14 @@ def test_a_line_that_passes_by_leaves_its_place_and_a_mode_does_not(
 def test_of_two_modes_of_nearly_one_frequency_each_keeps_its_place(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    told = heard(monkeypatch, Stethoscope(), [{3: 48.0, 4: 48.15}, {4: 48.15, 3: 48.0}])
+    told = heard(monkeypatch, VibrationFollower(), [{3: 48.0, 4: 48.15}, {4: 48.15, 3: 48.0}])
     assert places(told) == [[48.0, 48.15], [48.0, 48.15]]
 
 
 def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    listener, lower = Stethoscope(), {3: 47.3, 7: 61.0}
+    listener, lower = VibrationFollower(), {3: 47.3, 7: 61.0}
     assert notices(heard(monkeypatch, listener, 10 * [USUAL] + 10 * [{3: 48.2, 7: 61.0}])) == []
     moved, *again = notices(
         heard(
@@ -302,7 +304,7 @@ def test_a_slow_shift_within_a_week_is_told(
     monkeypatch: pytest.MonkeyPatch, change: float, told: int
 ) -> None:
     """Five minutes a day; the last on day 7."""
-    listener, said = Stethoscope(), []
+    listener, said = VibrationFollower(), []
     for day in range(8):
         said += notices(heard(monkeypatch, listener, 5 * [scaled(1 + change * day / 7)], day))
     assert [type(event) for event in said] == [Maintenance] * told
@@ -315,7 +317,7 @@ def test_a_slow_shift_within_a_week_is_told(
 def test_what_stays_where_it_moved_to_is_the_usual_after_a_week(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    listener = Stethoscope()
+    listener = VibrationFollower()
     said = [
         [
             event.kind
@@ -329,13 +331,13 @@ def test_what_stays_where_it_moved_to_is_the_usual_after_a_week(
 
 
 def test_a_shift_slower_than_that_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    listener = Stethoscope()
+    listener = VibrationFollower()
     for day in range(30):
         assert notices(heard(monkeypatch, listener, 5 * [scaled(1 + 0.007 * day / 7)], day)) == []
 
 
 def test_a_mode_that_was_away_for_a_week_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    listener = Stethoscope()
+    listener = VibrationFollower()
     heard(monkeypatch, listener, 6 * [USUAL])
     assert notices(heard(monkeypatch, listener, 12 * [scaled(1.015)], day=9)) == []
 
@@ -343,12 +345,14 @@ def test_a_mode_that_was_away_for_a_week_begins_anew(monkeypatch: pytest.MonkeyP
 def test_the_next_listener_goes_on_where_the_last_one_ended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    first = Stethoscope(61.0, begin_utc_s=0.0)
+    first = VibrationFollower(61.0, begin_utc_s=0.0)
     (driven,) = notices(heard(monkeypatch, first, 6 * [USUAL]))
-    same_run = Stethoscope(61.0, begin_utc_s=0.0, known=first.heard)
+    same_run = VibrationFollower(61.0, begin_utc_s=0.0, known=first.followed)
     assert driven.name == "pump_resonance"
     assert notices(heard(monkeypatch, same_run, [USUAL], 0.1)) == []
-    next_run = Stethoscope(0.0, begin_utc_s=2 * DAY_S, known=Heard(first.heard.modes))
+    next_run = VibrationFollower(
+        0.0, begin_utc_s=2 * DAY_S, known=FollowedModes(first.followed.modes)
+    )
     moved = notices(heard(monkeypatch, next_run, 5 * [scaled(0.99)]))
     assert [event.name for event in moved] == ["film_tension"]
     assert "48.00 Hz moved by -1.0% within 48 h" in moved[0].message
@@ -361,7 +365,7 @@ def test_strokes_of_the_pump_at_a_mode_are_told_once_and_their_end_too(
 
     def told(stroke_hz: float) -> list[Event]:
         minutes = [*5 * [USUAL], *4 * [away], USUAL, *6 * [away], *5 * [USUAL]]
-        return notices(heard(monkeypatch, Stethoscope(stroke_hz), minutes))
+        return notices(heard(monkeypatch, VibrationFollower(stroke_hz), minutes))
 
     assert told(0.0) == told(59.9) == told(52.0) == []
     driven, over, again = told(61.5)
@@ -374,14 +378,15 @@ def test_strokes_of_the_pump_at_a_mode_are_told_once_and_their_end_too(
 
 def test_a_line_heard_once_at_the_strokes_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (
-        notices(heard(monkeypatch, Stethoscope(61.5), [{3: 48.0}, USUAL, *8 * [{3: 48.0}]])) == []
+        notices(heard(monkeypatch, VibrationFollower(61.5), [{3: 48.0}, USUAL, *8 * [{3: 48.0}]]))
+        == []
     )
 
 
 @pytest.mark.campaign
 def test_a_listener_hears_what_is_planted() -> None:
     time_s, coeffs_um, planted = watched(1, lines_hz=(48.0,))
-    (told,) = Stethoscope().search(time_s, coeffs_um)
+    (told,) = VibrationFollower().search(time_s, coeffs_um)
     assert isinstance(told, Vibrations)
     assert told.frequency_hz == pytest.approx([planted[0].frequency_hz], abs=0.05)
 
