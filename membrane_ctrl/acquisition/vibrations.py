@@ -17,56 +17,63 @@ from membrane_ctrl.model.state_tree import decode_state, encode_state
 from membrane_ctrl.run_files import run_config
 
 _VIBRATIONS_FILE = "vibrations.json"  # in the run's folder
-_HEARD_SCHEMA = "membrane-vibrations/1"
+_SCHEMA = "membrane-vibrations/1"
+_MODES_KEY = "modes"  # of the modes in the file
 _FILE_BYTES_MAX = 1 << 20  # usually 10 kB
 
 
 def make_vibration_handler(
     config: Config, clock: RunClock, run_dir: Path | None
 ) -> Callable[[ShapeEstimate], list[Event]]:
-    """What takes the figures and tells the mirror's vibrations.
+    """Make the function that gets each figure and returns the events of the mirror's vibrations.
 
-    It goes on where the run's last acquisition ended, or that of the newest earlier run with the
-    same devices in the folder of runs: a film that moved meanwhile is told as well. What it has
-    heard is kept in the run's folder.
+    The modes continue from the run's last acquisition, or from the newest earlier run with the same
+    devices in the folder of runs: a film that moved in between is reported, too. They are stored in
+    the run's folder.
     """
     known = None if run_dir is None else _read_earlier(config, run_dir)
-    stethoscope = VibrationFollower(config.pump.stroke_hz, clock.origin_utc.timestamp(), known)
+    follower = VibrationFollower(config.pump.stroke_hz, clock.origin_utc.timestamp(), known)
 
-    def hear(estimate: ShapeEstimate) -> list[Event]:
-        told = stethoscope.add_estimate(estimate)
-        if told and run_dir is not None:
-            with suppress(OSError):  # a full disk: the recorder says so
-                heard = json.loads(encode_state(stethoscope.followed))
-                table = {**file_origin(_HEARD_SCHEMA), "heard": heard}
-                text = file_checksums.dumps_checked(table)
-                files.write_text_atomic(run_dir / _VIBRATIONS_FILE, text + "\n")
-        return told
+    def follow_vibrations(estimate: ShapeEstimate) -> list[Event]:
+        new_events = follower.add_estimate(estimate)
+        if new_events and run_dir is not None:
+            with suppress(OSError):  # a full disk: the recorder reports it
+                _write_followed(run_dir / _VIBRATIONS_FILE, follower.followed)
+        return new_events
 
-    return hear
+    return follow_vibrations
+
+
+def _write_followed(path: Path, followed: FollowedModes) -> None:
+    """Store the followed modes. Raises OSError."""
+    modes = json.loads(encode_state(followed))
+    text = file_checksums.dumps_checked({**file_origin(_SCHEMA), _MODES_KEY: modes})
+    files.write_text_atomic(path, text + "\n")
 
 
 def _read_earlier(config: Config, run_dir: Path) -> FollowedModes | None:
+    """The modes of this run, or of the newest earlier one with the same devices."""
     for path in sorted(run_dir.parent.glob(f"*/{_VIBRATIONS_FILE}"), reverse=True):
         run = path.parent
-        if run.name > run_dir.name or _bench_name(run_config.read_config(run, [])) != _bench_name(
-            config
-        ):
+        if run.name > run_dir.name:
             continue
-        with suppress(OSError, ValueError, RecursionError):  # damaged: take an older one
-            heard = _read_heard(path)
-            # what another run has reported, this one has not
-            return heard if run == run_dir else replace(heard, active_notices=[])
+        if _bench_name(run_config.read_config(run, [])) != _bench_name(config):
+            continue
+        with suppress(OSError, ValueError, RecursionError):  # damaged: read an older one
+            followed = _read_followed(path)
+            if run != run_dir:  # its notices are not those of this run
+                followed = replace(followed, active_notices=[])
+            return followed
     return None
 
 
-def _read_heard(path: Path) -> FollowedModes:
-    """Read what an acquisition has heard. Raises OSError; ValueError for a damaged file."""
+def _read_followed(path: Path) -> FollowedModes:
+    """Read the modes that an acquisition followed. Raises OSError; ValueError if damaged."""
     table = plain_json.loads(files.read_text(path, _FILE_BYTES_MAX))
     if not isinstance(table, dict) or not file_checksums.take_checksum(table):
         raise ValueError(f"{path}: damaged")
-    remove_origin(table, _HEARD_SCHEMA)
-    return decode_state(json.dumps(table.get("heard")).encode(), FollowedModes, _FILE_BYTES_MAX)
+    remove_origin(table, _SCHEMA)
+    return decode_state(json.dumps(table.get(_MODES_KEY)).encode(), FollowedModes, _FILE_BYTES_MAX)
 
 
 def _bench_name(config: Config) -> str:

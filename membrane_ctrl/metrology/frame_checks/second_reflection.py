@@ -328,7 +328,7 @@ def _coarse_places(centre_rad: float, every: int = 1) -> list[tuple[float, Float
 
 
 @dataclass(frozen=True)
-class _Scores:
+class _PlaceScores:
     """How well k places explain what the frames' own patterns leave: arrays (k,).
 
     Attributes
@@ -352,7 +352,7 @@ class _Scores:
 
 def _score_places(
     images: _Images, places: list[tuple[float, FloatArray]], frames: list[_GrayFrame]
-) -> _Scores:
+) -> _PlaceScores:
     """Score the places at which the frames determine a second image."""
     rows = [np.zeros((5, 0))]
     for scale, shifts_rad in places:
@@ -370,7 +370,7 @@ def _score_places(
         score = product * np.abs(product) / power
         scales = np.full(shifts_rad.size, scale)
         rows.append(np.stack([score, product / power, power, scales, shifts_rad]))
-    return _Scores(*np.concatenate(rows, axis=1))
+    return _PlaceScores(*np.concatenate(rows, axis=1))
 
 
 def _smooth_columns(scene: SampledBins) -> FloatArray:
