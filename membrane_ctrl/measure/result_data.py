@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from membrane_ctrl.measure.export_figure import ExportedMap, read_result
+from membrane_ctrl.measure.exported_map import ExportedMap, read_result
 from membrane_ctrl.measure.result_files import read_arrays
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.model import errors, files, plain_json

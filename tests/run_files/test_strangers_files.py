@@ -203,7 +203,7 @@ _OWN = {
     # into memory, and from there by `model.files`
     "measure/result_files.py",
     "measure/report_pdf.py",
-    "measure/export_figure.py",
+    "measure/export_formats.py",
     "review/report/figures.py",
 }
 _WRITES = re.compile(
