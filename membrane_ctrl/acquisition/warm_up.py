@@ -7,11 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.acquisition import (
-    cycle,
-    cycle_plan,
-    exposures,
-)
+from membrane_ctrl.acquisition import cycle, cycle_plan, exposures
 from membrane_ctrl.config.schema import OpticsConfig, TwinConfig
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 

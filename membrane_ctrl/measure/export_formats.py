@@ -5,8 +5,8 @@ High is towards +z.
 """
 
 import io
+import math
 import struct
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,28 +16,73 @@ from membrane_ctrl.measure.exported_map import ExportedMap
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.optional import import_optional
 
-_WAVELENGTH_M = float(
-    np.float32(632.8e-9)
-)  # a scale, which the formats require: no light was measured
+# Formats and the suffixes of their files.
+SUFFIXES = {
+    "zygo-dat": ".dat",
+    "zygo-xyz": ".xyz",
+    "codev-int": ".int",
+    "h5": ".h5",
+    "fits": ".fits",
+}
+# A scale that the formats require: no light was measured.
+_WAVELENGTH_M = float(np.float32(632.8e-9))
 _NO_DATA = 2147483640
 _RESOLUTIONS = {1: 32768, 0: 4096}  # code in the file, counts per wavelength
-_CODEV_MOST, _CODEV_MISSING = 32767, -32768
+_CODEV_MOST = 32767
+_CODEV_MISSING = -32768
 
 # A file's content, and the step of its heights in mm if they are whole numbers.
 Written = tuple[bytes, float | None]
 
 
-def _zygo_dat(seen: ExportedMap, _: object) -> Written:
+def write_map(form: str, seen: ExportedMap, zernike_table: dict[str, Any] | None) -> Written:
+    """Write a height map into the bytes of a file.
+
+    Parameters
+    ----------
+    form : str
+        One of `SUFFIXES`.
+    seen : ExportedMap
+        The map.
+    zernike_table : dict, optional
+        Its Zernike terms, which "h5" contains.
+
+    Returns
+    -------
+    bytes
+        The file's content.
+    float or None
+        Step of its heights in mm, if they are whole numbers.
+
+    Raises
+    ------
+    InputError
+        The format cannot hold the map, or a package is missing.
+    """
+    if form == "zygo-dat":
+        return _write_zygo_dat(seen)
+    if form == "zygo-xyz":
+        return _write_zygo_xyz(seen)
+    if form == "codev-int":
+        return _write_codev_int(seen)
+    if form == "h5":
+        return _write_hdf5(seen, zernike_table)
+    return fits_bytes(seen.x_mm, seen.y_mm, seen.height_mm, seen.removed), None
+
+
+def _write_zygo_dat(seen: ExportedMap) -> Written:
     """MetroPro's binary file, version 1: a header of 834 bytes and big-endian counts."""
+    # The finest resolution that holds the largest height; a wave of path is half a wave of height.
     largest_mm = float(np.nanmax(np.abs(seen.height_mm)))
-    counts = {
+    counts_per_mm = {
         code: per_wave / (_WAVELENGTH_M * 1e3 * 0.5) for code, per_wave in _RESOLUTIONS.items()
     }
-    code = next((code for code, per_mm in counts.items() if largest_mm * per_mm < _NO_DATA), None)
-    if code is None:
+    fitting = [code for code, per_mm in counts_per_mm.items() if largest_mm * per_mm < _NO_DATA]
+    if not fitting:
         raise errors.InputError(
             f"--format zygo-dat: holds heights up to 166 mm, not {largest_mm:.0f} mm"
         )
+    code = fitting[0]
     rows, columns = seen.height_mm.shape
     header = bytearray(834)
     fields: tuple[tuple[int, str, Any], ...] = (
@@ -60,11 +105,11 @@ def _zygo_dat(seen: ExportedMap, _: object) -> Written:
     )
     for place, kind, value in fields:
         struct.pack_into(kind, header, place, value)
-    heights = seen.top_down(counts[code], _NO_DATA).astype(">i4")
-    return bytes(header) + heights.tobytes(), 1 / counts[code]
+    heights = seen.top_down(counts_per_mm[code], _NO_DATA).astype(">i4")
+    return bytes(header) + heights.tobytes(), 1 / counts_per_mm[code]
 
 
-def _zygo_xyz(seen: ExportedMap, _: object) -> Written:
+def _write_zygo_xyz(seen: ExportedMap) -> Written:
     """MetroPro's text of points: column, row, height in µm."""
     rows, columns = seen.height_mm.shape
     head = (
@@ -83,16 +128,16 @@ def _zygo_xyz(seen: ExportedMap, _: object) -> Written:
         "1 0",
         "#",
     )
-    um = 1e3 * seen.height_mm[::-1]
-    points = (
-        f"{j} {i} {value:.6f}" if value == value else f"{j} {i} No Data"
-        for i, row in enumerate(um.tolist())
-        for j, value in enumerate(row)
-    )
+    height_um = 1e3 * seen.height_mm[::-1]
+    points = []
+    for row, values in enumerate(height_um.tolist()):
+        for column, value in enumerate(values):
+            text = "No Data" if math.isnan(value) else f"{value:.6f}"
+            points.append(f"{column} {row} {text}")
     return ("\n".join([*head, *points]) + "\n#\n").encode(), 1e-9
 
 
-def _codev_int(seen: ExportedMap, _: object) -> Written:
+def _write_codev_int(seen: ExportedMap) -> Written:
     """Code V's grid interferogram of a surface: whole numbers of 16 bits, SSZ of them a wavelength
     of 1 µm.
     """
@@ -125,17 +170,3 @@ def _write_hdf5(seen: ExportedMap, table: dict[str, Any] | None) -> Written:
         for name, value in (table or {}).items():
             file.require_group("zernike").attrs[name] = value
     return memory.getvalue(), None
-
-
-def _fits_file(seen: ExportedMap, _: object) -> Written:
-    """FITS: path difference, mask and height."""
-    return fits_bytes(seen.x_mm, seen.y_mm, seen.height_mm, seen.removed), None
-
-
-WRITERS: dict[str, tuple[str, Callable[[ExportedMap, dict[str, Any] | None], Written]]] = {
-    "zygo-dat": (".dat", _zygo_dat),
-    "zygo-xyz": (".xyz", _zygo_xyz),
-    "codev-int": (".int", _codev_int),
-    "h5": (".h5", _write_hdf5),
-    "fits": (".fits", _fits_file),
-}

@@ -16,6 +16,8 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 REMOVABLE = {"piston": (0,), "tilt": (1, 2), "power": (3,)}  # places in the Fringe set
 _CELLS_MAX = 4_000_000
 _HEIGHT_MAX_MM = 1e4
+_UNEVEN_STEP = 1e-6  # relative difference of steps that are called even
+_REMOVABLE_TERMS = 4
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,8 @@ class ExportedMap:
 
     def top_down(self, counts_per_mm: float, missing: int) -> IntArray:
         """Heights as whole numbers, first row at +y."""
-        whole = np.where(
-            self.is_measured, np.rint(np.nan_to_num(self.height_mm) * counts_per_mm), missing
-        )
+        counts = np.rint(np.nan_to_num(self.height_mm) * counts_per_mm)
+        whole = np.where(self.is_measured, counts, missing)
         return whole[::-1].astype(np.int64)
 
 
@@ -70,37 +71,37 @@ def read_result(folder: Path) -> tuple[ExportedMap, dict[str, Any]]:
         ) from None
     except ValueError as error:
         raise errors.InputError(f"{folder}: not a usable result: {error}") from None
-    where, (x, y, height) = folder / "height.npz", arrays
-    if (
-        height.ndim != 2
-        or height.shape != (y.size, x.size)
-        or x.ndim != 1
-        or y.ndim != 1
-        or min(height.shape) < 2
-    ):
+    x_mm, y_mm, height_mm = arrays
+    _check_map(folder / "height.npz", x_mm, y_mm, height_mm)
+    radius_mm = np.where(np.isfinite(height_mm), np.hypot(x_mm, y_mm[:, None]), 0)
+    seen = ExportedMap(x_mm, y_mm, height_mm, float(np.max(radius_mm)))
+    return seen, table if isinstance(table, dict) else {}
+
+
+def _check_map(where: Path, x_mm: FloatArray, y_mm: FloatArray, height_mm: FloatArray) -> None:
+    """Raise InputError for a map of another shape, uneven steps, few cells or large heights."""
+    is_grid = x_mm.ndim == 1 and y_mm.ndim == 1 and height_mm.shape == (y_mm.size, x_mm.size)
+    if not is_grid or min(height_mm.shape) < 2:
         raise errors.InputError(f"{where}: h_mm has not the shape of y_mm and x_mm, at least 2 x 2")
-    steps = np.concatenate([np.diff(x), np.diff(y)])
-    if not np.isfinite(steps).all() or steps.min() <= 0 or np.ptp(steps) > 1e-6 * steps.max():
+    steps = np.concatenate([np.diff(x_mm), np.diff(y_mm)])
+    is_rising = np.isfinite(steps).all() and steps.min() > 0
+    if not is_rising or np.ptp(steps) > _UNEVEN_STEP * steps.max():
         raise errors.InputError(f"{where}: x_mm and y_mm must rise in even steps of one size")
-    measured = np.isfinite(height)
-    if np.count_nonzero(measured) < LEAST_CELLS:
-        raise errors.InputError(
-            f"{where}: has {np.count_nonzero(measured)} measured cells, too few for a figure"
-        )
-    if (
-        not np.nanmax(np.abs(np.where(measured, height, 0))) <= _HEIGHT_MAX_MM
-        or np.isinf(height).any()
-    ):
+    measured = np.isfinite(height_mm)
+    cells = np.count_nonzero(measured)
+    if cells < LEAST_CELLS:
+        raise errors.InputError(f"{where}: has {cells} measured cells, too few for a figure")
+    largest_mm = np.max(np.abs(np.where(measured, height_mm, 0)))
+    if largest_mm > _HEIGHT_MAX_MM or np.isinf(height_mm).any():
         raise errors.InputError(f"{where}: h_mm has heights beyond {_HEIGHT_MAX_MM:g} mm")
-    radius = float(np.max(np.where(measured, np.hypot(x, y[:, None]), 0)))
-    return ExportedMap(x, y, height, radius), table if isinstance(table, dict) else {}
 
 
 def fit_fringe_terms(seen: ExportedMap, terms: int) -> grid_fit.GridFit:
-    axes = seen.x_mm / seen.radius_mm, seen.y_mm / seen.radius_mm
-    return grid_fit.GridFit(
-        axes[0], seen.is_measured, [zernike.fringe_set_orders(j + 1) for j in range(terms)], axes[1]
-    )
+    """Prepare the fit of the first `terms` Fringe terms to the measured cells."""
+    orders = [zernike.fringe_set_orders(j + 1) for j in range(terms)]
+    x = seen.x_mm / seen.radius_mm
+    y = seen.y_mm / seen.radius_mm
+    return grid_fit.GridFit(x, seen.is_measured, orders, y)
 
 
 def remove_parts(seen: ExportedMap, names: list[str]) -> ExportedMap:
@@ -109,7 +110,8 @@ def remove_parts(seen: ExportedMap, names: list[str]) -> ExportedMap:
     Piston, tilt and power are fitted together; what is not named stays. `sphere` leaves the
     deviation along the best sphere's normal, and then the other parts of that.
     """
-    height, measured = seen.height_mm, seen.is_measured
+    height = seen.height_mm
+    measured = seen.is_measured
     if "sphere" in names:
         rows, columns = np.nonzero(measured)
         points = np.stack([seen.x_mm[columns], seen.y_mm[rows], height[measured]])
@@ -117,8 +119,8 @@ def remove_parts(seen: ExportedMap, names: list[str]) -> ExportedMap:
         height[measured] = best_sphere.best_sphere(points).deviation(points)[0]
     places = [place for name in names for place in REMOVABLE.get(name, ())]
     if places:
-        fit = fit_fringe_terms(seen, 4)
-        coefficients = np.zeros(4)
+        fit = fit_fringe_terms(seen, _REMOVABLE_TERMS)
+        coefficients = np.zeros(_REMOVABLE_TERMS)
         coefficients[places] = fit.coefficients(height)[places]
         height = height - fit.values(coefficients)
     return ExportedMap(seen.x_mm, seen.y_mm, height, seen.radius_mm, ", ".join(names) or "nothing")

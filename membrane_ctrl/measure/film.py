@@ -18,11 +18,19 @@ from membrane_ctrl.metrology.uncertainty import linear_covariance
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
-# The paper's film, to which an unknown one is compared
-_STIFFNESS_N_PER_M, _POISSON, _PRESSURE_PA, _PAPER_EDGE_MM = 2.05e5, 0.3, 600.0, 3.0
-_TOGETHER = 0.98  # correlation of two numbers that the sets give only together
-_UNLIKE_LAW = 0.5  # of the departure from Hencky left unexplained: another law
-_SURELY_LEFT = 3.0  # sigmas
+# The paper's film, to which an unknown one is compared.
+_STIFFNESS_N_PER_M = 2.05e5
+_POISSON = 0.3
+_PRESSURE_PA = 600.0
+_PAPER_EDGE_MM = 3.0
+_TOGETHER = 0.98  # correlation of two numbers that the sets determine only together
+_UNLIKE_LAW = 0.5  # share of the departure from Hencky that the law leaves: another law
+_SURELY_LEFT = 3.0  # sigmas beyond which the law leaves something
+_PROFILE_POINTS = 96
+_PROFILE_ANGLES = 16
+# Unit and factor of the amounts of waves, where it is not mm.
+_WAVE_UNITS = {"prestrain": ("µm/m", 1e6), "modulus": ("%", 100.0), "shear": ("%", 100.0)}
+_OF_FILM = ("modulus", "shear")  # causes of the film; others are the ring's
 _CAUSES: dict[str, str] = {
     "prestrain": "pre-strain varies",
     "flat": "ring not flat",
@@ -46,28 +54,38 @@ class FilmOptions:
 
 @dataclass(frozen=True)
 class _Departure:
-    """Profiles (n, points) of the sets less those of the paper's film without pre-strain, mm;
-    `left` by the law.
+    """Departure of the sets' profiles from Hencky's law and from the fitted one.
+
+    Attributes
+    ----------
+    radius_mm : (points,) array
+        Where the profiles are known.
+    seen_mm : (n, points) array
+        Profiles less those of the paper's film without pre-strain.
+    left_mm : (n, points) array
+        What the fitted law leaves of the profiles.
+    sigma_mm : (n, points) array
+        Standard uncertainty of a profile from noise, geometry and the law's misfit.
     """
 
     radius_mm: FloatArray
     seen_mm: FloatArray
     left_mm: FloatArray
-    sigma_mm: FloatArray  # (n, points): of a profile, by noise, geometry and the law's misfit
+    sigma_mm: FloatArray
 
     @property
     def seen_um(self) -> float:
-        """RMS over the area."""
+        """RMS of `seen_mm` over the area."""
         return self._rms_um(self.seen_mm)
 
     @property
     def left_um(self) -> float:
-        """What the law leaves of it."""
+        """RMS of `left_mm` over the area."""
         return self._rms_um(self.left_mm)
 
     @property
     def sigma_um(self) -> float:
-        """1 sigma of `left_um`."""
+        """Standard uncertainty of `left_um`."""
         return self._rms_um(self.sigma_mm)
 
     @property
@@ -126,60 +144,62 @@ def _read_figures(
     spread, source = spread_file.geometry_spread(sets[0].head.optics, geometry)
     out = []
     for one in sets:
-        bench, surface = one.make_trial_bench(), one.figure.fit.surface
-        noise, geometric = (
-            linear_covariance.noise_covariance(bench),
-            linear_covariance.geometry_jacobian(bench, spread) @ spread.root(),
+        bench = one.make_trial_bench()
+        surface = one.figure.fit.surface
+        noise_mm2 = linear_covariance.noise_covariance(bench)
+        geometry_mm = linear_covariance.geometry_jacobian(bench, spread) @ spread.root()
+        figure = film_figure.FilmFigure(
+            one.head.folder.name,
+            surface.parameters,
+            noise_mm2,
+            geometry_mm,
+            one.head.pressure_pa,
+            surface.sag_mm,
         )
-        name, pressure = one.head.folder.name, one.head.pressure_pa
-        out.append(
-            film_figure.FilmFigure(
-                name, surface.parameters, noise, geometric, pressure, surface.sag_mm
-            )
-        )
+        out.append(figure)
     return out, source
 
 
 def _compute_departure(
     figures: list[film_figure.FilmFigure], fit: material_fit.FilmFit, reach_mm: float
 ) -> _Departure:
-    radius = np.linspace(0.0, reach_mm, 96)
-    seen, left = [], []
-    for k, figure in enumerate(figures):
-        law = FilmLaw(0.0, _POISSON, _STIFFNESS_N_PER_M, fit.law.radius_mm)
-        known = np.isfinite(figure.pressure_pa)
-        hencky = law.under(figure.pressure_pa) if known else law.with_sag(figure.sag_mm)
-        profiles = [
-            _profile_mm(parameters, fit.law.radius_mm, radius)
-            for parameters in (figure.parameters_mm, fit.left_mm[k])
-        ]
-        seen.append(profiles[0] - hencky.height_mm(radius / fit.law.radius_mm))
-        left.append(profiles[1])
-    sigma_mm = np.array(
-        [_profile_sigma_mm(one, fit, radius / fit.law.radius_mm) for one in figures]
-    )
-    return _Departure(radius, np.array(seen), np.array(left), sigma_mm)
+    """The departure of the figures up to a radius."""
+    disc_mm = fit.law.radius_mm
+    radius_mm = np.linspace(0.0, reach_mm, _PROFILE_POINTS)
+    rho = radius_mm / disc_mm
+    paper = FilmLaw(0.0, _POISSON, _STIFFNESS_N_PER_M, disc_mm)
+    seen_mm = []
+    left_mm = []
+    for figure, left in zip(figures, fit.left_mm, strict=True):
+        # Hencky's bowl of the same pressure, or of the same sag if no gauge was read.
+        if np.isfinite(figure.pressure_pa):
+            hencky = paper.under(figure.pressure_pa)
+        else:
+            hencky = paper.with_sag(figure.sag_mm)
+        measured_mm = _profile_mm(figure.parameters_mm, disc_mm, radius_mm)
+        seen_mm.append(measured_mm - hencky.height_mm(rho))
+        left_mm.append(_profile_mm(left, disc_mm, radius_mm))
+    sigma_mm = np.array([_profile_sigma_mm(figure, fit, rho) for figure in figures])
+    return _Departure(radius_mm, np.array(seen_mm), np.array(left_mm), sigma_mm)
 
 
 def _profile_sigma_mm(
     figure: film_figure.FilmFigure, fit: material_fit.FilmFit, rho: FloatArray
 ) -> FloatArray:
     """Sigma (points,) of a round profile: noise, geometry, and the law's misfit."""
-    profiles = np.stack(
-        [
-            _profile_mm(unit, fit.law.radius_mm, rho * fit.law.radius_mm)
-            for unit in np.eye(figure.parameters_mm.size)
-        ]
-    )
+    disc_mm = fit.law.radius_mm
+    # Profile of 1 mm of each parameter.
+    units = np.eye(figure.parameters_mm.size)
+    profiles = np.stack([_profile_mm(unit, disc_mm, rho * disc_mm) for unit in units])
     misfit_mm = 1e-3 * fit.misfit_um * np.sqrt(np.sum(profiles[material_fit.ROUND] ** 2, axis=0))
-    own = np.einsum("ip,ij,jp->p", profiles, figure.noise_mm2, profiles)
-    geometric = np.sum((profiles.T @ figure.geometry_mm) ** 2, axis=1)
-    return np.asarray(np.sqrt(own + geometric + misfit_mm**2))
+    noise_mm2 = np.einsum("ip,ij,jp->p", profiles, figure.noise_mm2, profiles)
+    geometry_mm2 = np.sum((profiles.T @ figure.geometry_mm) ** 2, axis=1)
+    return np.asarray(np.sqrt(noise_mm2 + geometry_mm2 + misfit_mm**2))
 
 
 def _profile_mm(parameters_mm: FloatArray, radius_mm: float, at_mm: FloatArray) -> FloatArray:
     """The rotationally symmetric part of a figure's height."""
-    angle = 2 * np.pi * np.arange(16)[:, None] / 16
+    angle = 2 * np.pi * np.arange(_PROFILE_ANGLES)[:, None] / _PROFILE_ANGLES
     surface = Surface.from_parameters(parameters_mm, radius_mm)
     return np.asarray(surface.height(at_mm * np.cos(angle), at_mm * np.sin(angle)).mean(axis=0))
 
@@ -187,7 +207,7 @@ def _profile_mm(parameters_mm: FloatArray, radius_mm: float, at_mm: FloatArray) 
 def _list_limits(
     figures: list[film_figure.FilmFigure], fit: material_fit.FilmFit, departure: _Departure
 ) -> list[str]:
-    """What these sets cannot tell, in words."""
+    """What these sets cannot determine, in words."""
     gauged = [figure.pressure_pa for figure in figures if np.isfinite(figure.pressure_pa)]
     notes = [
         f"{waves.order} waves of {waves.rms_um:.3g} µm RMS, cause unknown; it looks like "
@@ -228,9 +248,19 @@ def _make_fit_table(
     source: str,
     notes: list[str],
 ) -> dict[str, Any]:
-    law, (strain, poisson, relative) = fit.law, fit.sigmas
+    """The content of `film.json`."""
+    law = fit.law
+    strain, poisson, relative = fit.sigmas
     gauged = any(np.isfinite(figure.pressure_pa) for figure in figures)
     edge = [float(profile[-1]) for profile in departure.seen_mm]
+    stiffness = None
+    stiffness_n_per_m: FloatArray | float = _STIFFNESS_N_PER_M
+    if gauged:
+        stiffness_n_per_m = law.stiffness_n_per_m
+        stiffness = {
+            "value": law.stiffness_n_per_m,
+            "sigma": float(relative) * float(law.stiffness_n_per_m),
+        }
     return {
         **program.file_origin("membrane-film/1"),
         "sets": [
@@ -245,14 +275,7 @@ def _make_fit_table(
         ],
         "prestrain": {"value": law.prestrain, "sigma": float(strain)},
         "poisson": {"value": law.poisson, "sigma": float(poisson)},
-        "stiffness_n_per_m": (
-            {
-                "value": law.stiffness_n_per_m,
-                "sigma": float(relative) * float(law.stiffness_n_per_m),
-            }
-            if gauged
-            else None
-        ),
+        "stiffness_n_per_m": stiffness,
         "covariance": fit.covariance.tolist(),  # of pre-strain, nu, relative stiffness
         "ring": [
             {
@@ -270,9 +293,7 @@ def _make_fit_table(
             "left_um": departure.left_um,
             "left_sigma_um": departure.sigma_um,
         },
-        "paper_prestrain": _paper_prestrain(
-            float(law.poisson), law.stiffness_n_per_m if gauged else _STIFFNESS_N_PER_M
-        ),
+        "paper_prestrain": _paper_prestrain(float(law.poisson), stiffness_n_per_m),
         "geometry": source,
         "notes": notes,
     }
@@ -287,7 +308,10 @@ def _paper_prestrain(poisson: float, stiffness: FloatArray | float) -> float:
 
 
 def _format_fit(table: dict[str, Any], figures: list[film_figure.FilmFigure]) -> list[str]:
-    strain, poisson, stiffness = table["prestrain"], table["poisson"], table["stiffness_n_per_m"]
+    """The result as lines of text."""
+    strain = table["prestrain"]
+    poisson = table["poisson"]
+    stiffness = table["stiffness_n_per_m"]
     sags = [figure.sag_mm for figure in figures]
     lines = [
         f"sets       {len(figures)}, sag {min(sags):.2f} to {max(sags):.2f} mm; geometry: "
@@ -317,17 +341,17 @@ def _format_fit(table: dict[str, Any], figures: list[film_figure.FilmFigure]) ->
 
 def _wave_line(wave: dict[str, Any]) -> str:
     """Amount of one cause of waves, and its direction if it is the film's."""
-    unit, scale = {"prestrain": ("µm/m", 1e6), "modulus": ("%", 100.0), "shear": ("%", 100.0)}.get(
-        wave["cause"], ("mm", 1.0)
-    )
-    amount, sigma = scale * np.hypot(*wave["cos_sin"]), scale * max(wave["sigmas"])
-    head = "film" if wave["cause"] in ("modulus", "shear") else "ring"
+    cause = wave["cause"]
     cosine, sine = wave["cos_sin"]
+    unit, scale = _WAVE_UNITS.get(cause, ("mm", 1.0))
+    amount = scale * np.hypot(cosine, sine)
+    sigma = scale * max(wave["sigmas"])
+    origin = "film" if cause in _OF_FILM else "ring"
     along = ""
-    if wave["cause"] == "modulus":
+    if cause == "modulus":
         along = f", along {np.degrees(np.arctan2(sine, cosine)) / 2 % 180:.0f} degrees"
     return (
-        f"{head:<11}{_CAUSES[wave['cause']]}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} "
+        f"{origin:<11}{_CAUSES[cause]}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} "
         f"{unit}{along}"
     )
 
@@ -338,6 +362,7 @@ def _draw_fit(
     fit: material_fit.FilmFit,
     departure: _Departure,
 ) -> None:
+    """Draw the departures, and the error ellipse of pre-strain and Poisson ratio."""
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(13, 4.2), layout="constrained")

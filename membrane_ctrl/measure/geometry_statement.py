@@ -1,8 +1,8 @@
 """How well the geometry of a measured set is known: a statement beside the set's own verdict.
 
-The verdict says whether the frames gave a sound figure. The figure's absolute error is mostly the
-geometry's, which no frame shows, so it is stated apart: a sound set on a bench that was measured
-with a ruler is `ok` and `uncalibrated`.
+The verdict states whether the frames gave a sound figure. The figure's absolute error is mostly
+that of the geometry, which no frame shows, so it is stated separately: a sound set on a bench that
+was measured with a ruler is `ok` and `uncalibrated`.
 """
 
 from dataclasses import dataclass
@@ -19,16 +19,22 @@ class GeometryState(StrEnum):
 
     CALIBRATED = "calibrated"  # it has a covariance from a calibration, and the rim agrees
     UNCALIBRATED = "uncalibrated"  # rulers or data sheets; the rim agrees with their sigmas
-    CONTRADICTED = "contradicted"  # rim or slopes are what no stated uncertainty explains
+    CONTRADICTED = "contradicted"  # no stated uncertainty explains the rim or the slopes
 
-
-_NEXT_STEP = {
-    GeometryState.CALIBRATED: "",
-    GeometryState.UNCALIBRATED: "`membrane-ctrl calibrate` makes the error bar of the geometry "
-    "smaller; changes between sets of this bench do not need it",
-    GeometryState.CONTRADICTED: "check the camera's pose, the lens and mirror.radius_mm, then run "
-    "`membrane-ctrl calibrate`",
-}
+    @property
+    def next_step(self) -> str:
+        """What to do, in words; empty: nothing."""
+        if self is GeometryState.UNCALIBRATED:
+            return (
+                "`membrane-ctrl calibrate` makes the error bar of the geometry smaller; changes "
+                "between sets of this bench do not need it"
+            )
+        if self is GeometryState.CONTRADICTED:
+            return (
+                "check the camera's pose, the lens and mirror.radius_mm, then run `membrane-ctrl "
+                "calibrate`"
+            )
+        return ""
 
 
 @dataclass(frozen=True)
@@ -66,10 +72,10 @@ class GeometryStatement:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What it says against the figure; empty unless it is contradicted."""
+        """What contradicts the geometry; empty if nothing does."""
         found = []
         if self.rim is not None and self.rim.contradicts:
-            found.append(f"{self.rim.describe()}: {_NEXT_STEP[GeometryState.CONTRADICTED]}")
+            found.append(f"{self.rim.describe()}: {GeometryState.CONTRADICTED.next_step}")
         if self.slopes.contradicts:
             found.append(
                 f"{self.slopes.describe()}: cause unknown; it looks like a camera, screen or lens "
@@ -79,8 +85,10 @@ class GeometryStatement:
 
     def describe(self) -> str:
         """State, source and the next step in words."""
-        next_step = _NEXT_STEP[self.state]
-        return f"{self.state}: {self.source}" + (f"; {next_step}" if next_step else "")
+        finding = f"{self.state}: {self.source}"
+        if not self.state.next_step:
+            return finding
+        return f"{finding}; {self.state.next_step}"
 
     def table(self) -> dict[str, Any]:
         """The block `geometry_known` of `result.json`."""
@@ -88,7 +96,7 @@ class GeometryStatement:
         return {
             "state": self.state.value,
             "source": self.source,
-            "next_step": _NEXT_STEP[self.state],
+            "next_step": self.state.next_step,
             "rim_offset_mm": None if rim is None else rim.offset_mm,
             "rim_size_ratio": None if rim is None else rim.size_ratio,
             "rim_sigmas": None if rim is None else rim.sigmas,
