@@ -1,4 +1,7 @@
-"""Poses of the simulated camera and screen, and the rays through the camera's pixels."""
+"""Poses of the simulated camera and screen, and the rays through the camera's pixels.
+
+World: origin at the mirror's vertex, x horizontal, y up, z out of the reflective side; mm.
+"""
 
 from dataclasses import dataclass
 from math import cos, radians, sin
@@ -13,10 +16,6 @@ from membrane_ctrl.config.optics import (
 )
 from membrane_ctrl.model.arrays import FloatArray
 
-# Camera and screen of the twin as exact poses: rays from the pinhole, and the plane in which they
-# end.
-#
-# World: origin at the mirror's vertex, x horizontal, y up, z out of the reflective side; mm.
 _UNDISTORT_STEPS = 200  # each gains about a digit with a usual lens
 _UNDISTORT_TOLERANCE = 1e-14  # tangent of the ray's angle
 _BOW_RADIUS_MM = 200.0  # half side of the paper's pattern region, rounded
@@ -24,8 +23,14 @@ _BOW_RADIUS_MM = 200.0  # half side of the paper's pattern region, rounded
 
 @dataclass(frozen=True, slots=True)
 class CameraPose:
-    """Pinhole `position_mm` (3,); rows of `rotation` (3, 3): camera x (right), y (down), z
-    (forward) in world.
+    """Pose of the camera.
+
+    Attributes
+    ----------
+    position_mm : (3,) array
+        Pinhole in world.
+    rotation : (3, 3) array
+        Rows: camera x (right), y (down) and z (forward) in world.
     """
 
     position_mm: FloatArray
@@ -34,11 +39,21 @@ class CameraPose:
 
 @dataclass(frozen=True, slots=True)
 class ScreenPose:
-    """O' as `origin_mm` and the unit vectors of `s_x` and `s_y`, each (3,), in world; bow and
-    height map of the face.
+    """Pose and face of the screen.
 
-    The face departs from the plane by bow_per_mm (s_x^2 + s_y^2) and the map, towards s_x x s_y,
+    The face deviates from the plane by bow_per_mm (s_x^2 + s_y^2) and the map, towards s_x x s_y,
     which points at the mirror.
+
+    Attributes
+    ----------
+    origin_mm : (3,) array
+        O' in world.
+    s_x, s_y : (3,) arrays
+        Unit vectors in world.
+    bow_per_mm : float
+        Coefficient of the bow.
+    height_map : HeightMapConfig or None
+        A measured map.
     """
 
     origin_mm: FloatArray
@@ -52,9 +67,13 @@ class ScreenPose:
 class ScreenError:
     """Deviation of a screen from its nominal pose.
 
-    `tilt_about_x_deg` and `tilt_about_y_deg` turn it about its own s_x and s_y axes (right-handed);
-    `bow_mm` is how far the face stands towards the mirror 200 mm away from O' (paraboloid; s_x and
-    s_y count along the flat plane).
+    Attributes
+    ----------
+    tilt_about_x_deg, tilt_about_y_deg : float
+        Turns about its own s_x and s_y axes (right-handed).
+    bow_mm : float
+        Deviation of the face towards the mirror, 200 mm away from O' (paraboloid; s_x and s_y count
+        along the flat plane).
     """
 
     tilt_about_x_deg: float = 0.0
@@ -63,8 +82,8 @@ class ScreenError:
 
 
 def camera_pose(geometry: GeometryConfig) -> CameraPose:
-    """Pose of the camera: as given, or F = a (cos alpha, 0,
-    sin alpha) looking at O without roll.
+    """Pose of the camera: as given, or F = a (cos alpha, 0, sin alpha), looking at O without
+    roll.
     """
     if geometry.camera is not None:
         return CameraPose(np.array(geometry.camera.position_mm), np.array(geometry.camera.rotation))
@@ -81,28 +100,30 @@ def screen_pose(geometry: GeometryConfig, error: ScreenError | None = None) -> S
     face = geometry.screen or ScreenPoseConfig()
     given = face.pose
     if given is not None:
-        origin, s_x, s_y = (np.array(vector) for vector in given)
+        origin_mm, s_x, s_y = (np.array(vector) for vector in given)
     else:
         _, b_mm, alpha = _find_short_form(geometry)
-        origin = b_mm * np.array([-cos(alpha), 0.0, sin(alpha)])
-        s_x, s_y = np.array([-sin(alpha), 0.0, -cos(alpha)]), np.array([0.0, 1.0, 0.0])
+        origin_mm = b_mm * np.array([-cos(alpha), 0.0, sin(alpha)])
+        s_x = np.array([-sin(alpha), 0.0, -cos(alpha)])
+        s_y = np.array([0.0, 1.0, 0.0])
     error = error or ScreenError()
     s_y = _rotate_vector(s_y, s_x, radians(error.tilt_about_x_deg))
     s_x = _rotate_vector(s_x, s_y, radians(error.tilt_about_y_deg))
-    return ScreenPose(
-        origin, s_x, s_y, (face.bow_mm + error.bow_mm) / _BOW_RADIUS_MM**2, face.height_map
-    )
+    bow_per_mm = (face.bow_mm + error.bow_mm) / _BOW_RADIUS_MM**2
+    return ScreenPose(origin_mm, s_x, s_y, bow_per_mm, face.height_map)
 
 
 def pixel_directions(
     camera: CameraConfig, pose: CameraPose, columns: FloatArray, rows: FloatArray
 ) -> FloatArray:
-    """Unit vectors in world (N, 3) of the rays through the given pixel positions (N,), lens
-    distortion undone.
+    """Unit vectors in world (N, 3) of the rays through the given pixel positions (N,), without the
+    lens' distortion.
     """
     focal_px = camera.focal_mm * 1000.0 / camera.pixel_um
-    c0, r0 = camera.principal
-    x, y = _undistort_points((columns - c0) / focal_px, (rows - r0) / focal_px, camera.distortion)
+    column_px, row_px = camera.principal
+    pictured_x = (columns - column_px) / focal_px
+    pictured_y = (rows - row_px) / focal_px
+    x, y = _undistort_points(pictured_x, pictured_y, camera.distortion)
     in_world = np.stack([x, y, np.ones_like(x)], axis=1) @ pose.rotation
     return np.asarray(in_world / np.linalg.norm(in_world, axis=1, keepdims=True), dtype=np.float64)
 
@@ -118,6 +139,7 @@ def _undistort_points(
     k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *[0.0] * 8)[:8]
     x, y = x_d, y_d
     for _ in range(_UNDISTORT_STEPS):
+        # x <- (x_d - tangential(x, y)) / radial(r^2)
         r2 = x * x + y * y
         radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
         x_next = (x_d - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)) / radial
@@ -141,7 +163,7 @@ def _find_short_form(geometry: GeometryConfig) -> tuple[float, float, float]:
 
 
 def _rotate_vector(vector: FloatArray, axis: FloatArray, angle_rad: float) -> FloatArray:
-    """A vector across the unit `axis`, turned about it (Rodrigues,
-    whose third term vanishes here).
+    """A vector across the unit `axis`, turned about it (Rodrigues, whose third term vanishes
+    here).
     """
     return vector * cos(angle_rad) + np.cross(axis, vector) * sin(angle_rad)

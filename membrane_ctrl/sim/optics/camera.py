@@ -1,6 +1,4 @@
-"""Screen and camera of the twin: the screen, seen in the film as it
-is at the moment of exposure.
-"""
+"""Screen and camera of the twin: the screen as the camera sees it in the film, at any moment."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -33,11 +31,11 @@ from membrane_ctrl.sim.optics.shade_crossed import shade_crossed_rows
 from membrane_ctrl.sim.optics.shade_panel import PanelPicture, shade_panel_rows
 from membrane_ctrl.sim.optics.trace import Trace, trace_rays
 
-# Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace
-# (asserted in the tests)
+# Distance of the nodes on the mirror: a typical film's phase is then less than 1e-4 rad off the
+# exact trace (asserted in the tests).
 _NODE_MM = 4.6
-# Displacements traced; a parabola through three of them is exact to 1e-6 rad, a straight line only
-# to 2e-5 rad
+# Distance of the displacements that are traced: a parabola through three of them is exact to 1e-6
+# rad, a straight line only to 2e-5 rad.
 _CELL_UM = 100.0
 _KEPT_TRACES = 8
 _DARK = Pattern("black")
@@ -81,12 +79,9 @@ class OpticsRenderer:
         camera = self.optics.camera
         self._camera_pose = camera_pose(self.optics.geometry)
         self._screen_pose = screen_pose(self.optics.geometry, self.screen_error)
-        pixel_mm = (
-            camera.pixel_um
-            / 1000.0
-            / camera.focal_mm
-            * float(np.linalg.norm(self._camera_pose.position_mm))
-        )
+        # Size of a pixel on the mirror, and pixels between nodes.
+        distance_mm = float(np.linalg.norm(self._camera_pose.position_mm))
+        pixel_mm = camera.pixel_um / 1000.0 / camera.focal_mm * distance_mm
         self._step = 1 if self.exact else max(1, int(_NODE_MM / pixel_mm + 0.5))
         self._weights = cubic_weights(self._step)
         self._columns = node_positions(camera.width_px, self._step)
@@ -95,9 +90,8 @@ class OpticsRenderer:
         self._directions = pixel_directions(
             camera, self._camera_pose, columns.ravel(), rows.ravel()
         )
-        self._side_mm = (
-            self.optics.pattern.periods * self.optics.pattern.period_mm
-        )  # of the pattern's region
+        # Side of the pattern's region.
+        self._side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm
         self._loss = vignetting_loss(camera.width_px, camera.height_px, self.light.vignetting)
         if self.disturbances != DisturbancesConfig():
             self._disturber = self._disturb_nodes()
@@ -134,40 +128,42 @@ class OpticsRenderer:
             )
         self._pictures += 1
         paint = self._make_painter(shown, gain)
-        nodes, times_s = self._interpolate_nodes(displacement_um), np.array([[time_s]])
+        # Maps at the nodes, moved by the bench's disturbances and by vibrations.
+        nodes = self._interpolate_nodes(displacement_um)
+        times_s = np.array([[time_s]])
         if self._disturber is not None:
-            nodes, times_s = (
-                nodes + self._disturber.ray_disturbance(time_s),
-                self._disturber.row_times_s(time_s),
-            )
+            nodes = nodes + self._disturber.ray_disturbance(time_s)
+            times_s = self._disturber.row_times_s(time_s)
         for mode in self.modes:
             nodes = nodes + mode.swing_um(times_s) * self._swing_maps(mode)
         if self._disturber is not None:
             pattern = shown if isinstance(shown, Pattern) else _NO_PATTERN
             nodes = np.concatenate([nodes, self._disturber.light_disturbance(time_s, pattern)])
+
+        # Half of the rows on each of two threads.
         seed = (self.seed << 32) + self._pictures
         middle = camera.height_px // 2
-        other = _second_hand().submit(paint, nodes, seed, picture, middle, camera.height_px)
+        other = _second_thread().submit(paint, nodes, seed, picture, middle, camera.height_px)
         paint(nodes, seed, picture, 0, middle)
         other.result()
         return picture
 
     def _make_painter(self, shown: Pattern | PanelPicture, gain: float) -> Callable[..., None]:
-        """What shades rows of a picture of what is shown."""
+        """The function that shades rows of a picture of what is shown."""
         if isinstance(shown, PanelPicture):
             return self._make_panel_painter(shown, gain)
-        return (
-            self._make_crossed_painter(shown, gain)
-            if shown.role == "crossed"
-            else self._make_stripe_painter(shown, gain)
-        )
+        if shown.role == "crossed":
+            return self._make_crossed_painter(shown, gain)
+        return self._make_stripe_painter(shown, gain)
 
     def _make_panel_painter(self, panel: PanelPicture, gain: float) -> Callable[..., None]:
         """Shades rows of a picture of a panel's pixels."""
-        noise_adu, radius_mm = self.optics.camera.noise_adu, self.film.radius_mm
+        noise_adu = self.optics.camera.noise_adu
+        radius_mm = self.film.radius_mm
         dark, white, full = self._compute_levels(gain)
         scale = np.array([dark, white, self.light.leak, full])
-        light, places = panel.light_of_pixels(self.light), panel.places
+        light = panel.light_of_pixels(self.light)
+        places = panel.places
 
         def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
             noise = normal_quantiles(), noise_adu, seed
@@ -189,8 +185,8 @@ class OpticsRenderer:
 
     def _make_stripe_painter(self, pattern: Pattern, gain: float) -> Callable[..., None]:
         """Shades rows of a picture of a pattern along one axis."""
-        config, noise_adu = self.optics.pattern, self.optics.camera.noise_adu
-        table = level_table(pattern, config, self.light)
+        noise_adu = self.optics.camera.noise_adu
+        table = level_table(pattern, self.optics.pattern, self.light)
         dark, white, full = self._compute_levels(gain)
 
         def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
@@ -215,28 +211,22 @@ class OpticsRenderer:
         """Shades rows of a picture of crossed fringes."""
         if pattern.index < 1:
             raise ValueError(f"pattern {pattern.name!r}: crossed fringes need 1 or more periods")
-        first = (
-            shift_rad / (2 * np.pi) - 0.5 for shift_rad in (pattern.shift_rad, pattern.shift_y_rad)
-        )
-        shape: tuple[float, ...] = (
+        # All numbers in single precision, as `shade_crossed_rows` needs them.
+        shape = _to_singles(
             pattern.index / self._side_mm,
-            *first,
+            pattern.shift_rad / (2 * np.pi) - 0.5,
+            pattern.shift_y_rad / (2 * np.pi) - 0.5,
             self._side_mm / 2,
             self.film.radius_mm**2,
         )
         dark, white, full = self._compute_levels(gain)
-        scale: tuple[float, ...] = (
-            dark,
-            white,
-            self.light.leak,
-            self.light.gamma,
-            self.optics.camera.noise_adu,
-            full,
-        )
-        columns, rows = (loss.astype(np.float32) for loss in self._loss)
-        columns = np.pad(columns, (0, -columns.size % self._step)).reshape(-1, self._step).T
-        weights, loss = self._weights.T.astype(np.float32), (columns.copy(), rows)
-        shape, scale = (tuple(np.array(each, np.float32)) for each in (shape, scale))
+        noise_adu = self.optics.camera.noise_adu
+        scale = _to_singles(dark, white, self.light.leak, self.light.gamma, noise_adu, full)
+        weights = self._weights.T.astype(np.float32)
+        column_loss, row_loss = (loss.astype(np.float32) for loss in self._loss)
+        # Columns k + step * cell in row k.
+        padded = np.pad(column_loss, (0, -column_loss.size % self._step))
+        loss = (padded.reshape(-1, self._step).T.copy(), row_loss)
 
         def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
             shade_crossed_rows(
@@ -265,6 +255,7 @@ class OpticsRenderer:
     def _trace_film(
         self, directions: FloatArray, displacement_um: float, film: FilmTerms | None = None
     ) -> Trace:
+        """Follow rays (N, 3) to the film at a displacement, or to another one, and to the screen."""
         vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
         sag_mm = self.film.sag_at_mm(displacement_um)
         film = film or self.film.terms_at(displacement_um)
@@ -281,11 +272,13 @@ class OpticsRenderer:
         nearest = float(np.floor(displacement_um / _CELL_UM + 0.5))
         f = displacement_um / _CELL_UM - nearest
         below, here, above = (self._trace_nodes((nearest + k) * _CELL_UM) for k in (-1, 0, 1))
-        return (
-            0.5 * f * (f - 1.0) * below + (1.0 - f) * (1.0 + f) * here + 0.5 * f * (f + 1.0) * above
-        )
+        weight_below = 0.5 * f * (f - 1.0)
+        weight_here = (1.0 - f) * (1.0 + f)
+        weight_above = 0.5 * f * (f + 1.0)
+        return weight_below * below + weight_here * here + weight_above * above
 
     def _trace_nodes(self, displacement_um: float) -> FloatArray:
+        """Traced maps at the nodes; the last ones are kept."""
         if displacement_um in self._traces:
             self._traces.move_to_end(displacement_um)
             return self._traces[displacement_um]
@@ -300,28 +293,34 @@ class OpticsRenderer:
         displacement.
         """
         if mode not in self._swings:
-            still, moved = (
-                self._make_maps(self._trace_film(self._directions, 0.0, film))
-                for film in (self.film.terms_at(0.0), mode.displace_film(self.film))
-            )
-            self._swings[mode] = moved - still
+            still = self._trace_film(self._directions, 0.0)
+            moved = self._trace_film(self._directions, 0.0, mode.displace_film(self.film))
+            self._swings[mode] = self._make_maps(moved) - self._make_maps(still)
         return self._swings[mode]
 
     def _disturb_nodes(self) -> Disturber:
         """The disturbances, for the nodes of a film at displacement 0."""
-        pose, still = self._camera_pose, self._trace_film(self._directions, 0.0)
-        self._camera_pose = replace(
-            pose, position_mm=pose.position_mm * (1 + 1 / np.linalg.norm(pose.position_mm))
-        )
-        maps, grown = (
-            self._make_maps(found) for found in (still, self._trace_film(self._directions, 0.0))
-        )
+        still = self._trace_film(self._directions, 0.0)
+        maps = self._make_maps(still)
+
+        # The same with the camera 1 mm further away, as the growth of its mount moves it.
+        pose = self._camera_pose
+        further_mm = pose.position_mm * (1 + 1 / np.linalg.norm(pose.position_mm))
+        self._camera_pose = replace(pose, position_mm=further_mm)
+        grown = self._make_maps(self._trace_film(self._directions, 0.0))
         self._camera_pose = pose
-        x_mm, y_mm = (place.reshape(maps.shape[1:]) for place in (still.x_mm, still.y_mm))
-        row_share = (self._rows + 0.5) / self.optics.camera.height_px - 0.5
-        full = self._compute_levels(1.0)[2]
-        places = maps[0], maps[1], x_mm, y_mm, row_share
-        nodes = Nodes(*places, self._side_mm, self.film.radius_mm, full, grown - maps)
+
+        nodes = Nodes(
+            s_x_mm=maps[0],
+            s_y_mm=maps[1],
+            x_mm=still.x_mm.reshape(maps.shape[1:]),
+            y_mm=still.y_mm.reshape(maps.shape[1:]),
+            row_share=(self._rows + 0.5) / self.optics.camera.height_px - 0.5,
+            side_mm=self._side_mm,
+            radius_mm=self.film.radius_mm,
+            full_adu=self._compute_levels(1.0)[2],
+            grown=grown - maps,
+        )
         return Disturber(self.disturbances, nodes, self.seed)
 
     def _make_maps(self, found: Trace) -> FloatArray:
@@ -339,8 +338,13 @@ class OpticsRenderer:
         return maps.reshape(3, len(self._rows), len(self._columns))
 
 
+def _to_singles(*values: float) -> tuple[float, ...]:
+    """The numbers in single precision."""
+    return tuple(np.array(values, np.float32))
+
+
 @cache
-def _second_hand() -> ThreadPoolExecutor:
+def _second_thread() -> ThreadPoolExecutor:
     """A thread that shades half of each picture."""
     return ThreadPoolExecutor(1, "shade")
 
@@ -381,12 +385,10 @@ class TwinOptics:
         clock: Clock,
         film: FilmShape | None = None,
     ) -> None:
-        self._optics = (
-            optics
-            if twin.geometry is None
-            else optics.model_copy(update={"geometry": twin.geometry})
-        )
-        self._twin, self._seed = twin, twin.seed
+        if twin.geometry is not None:
+            optics = optics.model_copy(update={"geometry": twin.geometry})
+        self._optics = optics
+        self._twin = twin
         self._truth = truth
         self._clock = clock
         self._film = film
@@ -403,7 +405,7 @@ class TwinOptics:
     @property
     def film(self) -> FilmShape:
         """The film; its sag belongs to displacement 0."""
-        return self._render_view().film
+        return self._find_renderer().film
 
     def expose(self, out: Pixels | None) -> Frame:
         """Take one picture of the screen now."""
@@ -418,20 +420,24 @@ class TwinOptics:
         return self._expose(self.screen.shown or _DARK, None).pixels
 
     def _expose(self, shown: Pattern | PanelPicture, out: Pixels | None) -> Frame:
-        renderer = self._render_view()
+        """Take one picture of what is shown, at the film's true position."""
+        renderer = self._find_renderer()
         time_s = self._clock.now()
-        return Frame(
-            renderer.render_picture(shown, self._truth().displacement_um, out, time_s=time_s),
-            time_s,
-        )
+        displacement_um = self._truth().displacement_um
+        picture = renderer.render_picture(shown, displacement_um, out, time_s=time_s)
+        return Frame(picture, time_s)
 
-    def _render_view(self) -> OpticsRenderer:
+    def _find_renderer(self) -> OpticsRenderer:
+        """The renderer, made at the first call from the film's position then."""
         if self._renderer is None:
             position = self._truth()
             sag_mm = position.sag_mm - position.displacement_um / 1000.0
-            material = self._twin.film_prestrain, self._twin.film_poisson
             film = self._film or typical_film(
-                sag_mm, self._optics.mirror.radius_mm, self._seed, *material
+                sag_mm,
+                self._optics.mirror.radius_mm,
+                self._twin.seed,
+                self._twin.film_prestrain,
+                self._twin.film_poisson,
             )
             stated = self._optics.geometry.reference_displacement_um
             reference_um = position.displacement_um if stated is None else stated
@@ -439,7 +445,7 @@ class TwinOptics:
                 self._optics,
                 film,
                 reference_um=reference_um,
-                seed=self._seed,
+                seed=self._twin.seed,
                 modes=drum_modes(self._twin.drum_nm),
                 disturbances=self._twin.disturbances,
             )

@@ -1,9 +1,8 @@
-"""What disturbs the pictures of a real bench: light, room, dust, air, the camera's stand, and the
-film's vibrations.
+"""What disturbs the pictures of a real bench: light, room, dust, air and the camera's mount.
 
 Each effect is a map over the nodes of `shade`: two move the point of the screen that a ray meets,
 two change the counts. The amplitudes are settings (`[twin.disturbances]`); sizes of waves and
-spots, and times, are not.
+spots, and times, are constants.
 """
 
 import math
@@ -16,23 +15,25 @@ from membrane_ctrl.config.optics import DisturbancesConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.random_field import RandomField
 
-_BRIGHT_MM = 75.0  # lengths of the waves on the screen, and memory
+# Brightness of the screen: length of the waves on it, and their memory.
+_BRIGHT_MM = 75.0
 _BRIGHT_S = 60.0
-_AIR_MM = 400.0  # of cells of warm air over the mirror
+# Cells of warm air over the mirror, and their memory.
+_AIR_MM = 400.0
 _AIR_S = 0.5
-_DUST_S, _DUST_MM, _DUST_LOSS = (
-    25.0,
-    6.0,
-    0.6,
-)  # how long it lies; radius and loss of light of a spot
-_EXPOSURE_S = 0.02  # of a pulse of the backlight
+# Dust: how long it lies in one place, radius of a spot and its loss of light.
+_DUST_S = 25.0
+_DUST_MM = 6.0
+_DUST_LOSS = 0.6
+# Pulsed backlight: exposure of a picture, and share of the time in which it is lit.
+_EXPOSURE_S = 0.02
 _LIT_SHARE = 0.7
-_STICKING_S = 3600.0  # a panel's memory
-_GROWTH_MM_PER_K, _WARMS_S = (
-    0.060,
-    1200.0,
-)  # of an aluminium stand of 2.6 m; period of an air conditioner
-_SLOPE = 0.3  # of the room's light: across the mirror, and in time
+_RETENTION_S = 3600.0  # a panel's memory of the pictures that it has shown
+# Camera's mount: growth of 2.6 m of aluminium, and period of an air conditioner.
+_GROWTH_MM_PER_K = 0.060
+_WARMS_S = 1200.0
+# Room light: its slope across the mirror, its swing, and the period of that.
+_SLOPE = 0.3
 _SWING = 0.2
 _SWING_S = 120.0
 
@@ -54,7 +55,7 @@ class Nodes:
     radius_mm : float
     full_adu : float
     grown : (3, rows, columns) array
-        Change of the renderer's maps by 1 mm of the stand.
+        Change of the renderer's maps by 1 mm of growth of the camera's mount.
     """
 
     s_x_mm: FloatArray
@@ -74,92 +75,97 @@ class Disturber:
     """
 
     def __init__(self, wanted: DisturbancesConfig, nodes: Nodes, seed: int) -> None:
-        self._wanted, self._nodes, self._seed = wanted, nodes, seed
+        self._wanted = wanted
+        self._nodes = nodes
+        self._seed = seed
         rngs = [np.random.default_rng([seed, k]) for k in range(3)]
         self._bright = RandomField(_BRIGHT_MM, _BRIGHT_S, nodes.side_mm / 2, rngs[0])
         self._air = [RandomField(_AIR_MM, _AIR_S, nodes.radius_mm, rng) for rng in rngs[1:]]
-        self._dust = (-1, np.ones_like(nodes.x_mm))  # since which change, and what it lets through
-        self._burnt, self._shown_s = np.zeros(2, complex), 0.0
+        # Number of the last change of the dust, and the share of light that passes since then.
+        self._dust = (-1, np.ones_like(nodes.x_mm))
+        # What the panel retains: phasors of the x and the y fringes, and when that was computed.
+        self._retained = np.zeros(2, complex)
+        self._retained_s = 0.0
 
     def row_times_s(self, time_s: float) -> FloatArray:
         """Middle of the exposure of each row of nodes, (rows, 1)."""
         return time_s + self._wanted.rolling_s * self._nodes.row_share[:, None]
 
     def ray_disturbance(self, time_s: float) -> FloatArray:
-        """What to add to the renderer's maps, (3, rows, columns): the stand's growth, and air that
+        """What to add to the renderer's maps, (3, rows, columns): the mount's growth, and air that
         bends the rays.
         """
-        wanted, nodes = self._wanted, self._nodes
+        wanted = self._wanted
+        nodes = self._nodes
         warm_k = wanted.stand_k * math.sin(2 * math.pi * time_s / _WARMS_S)
         moved = _GROWTH_MM_PER_K * warm_k * nodes.grown
         if wanted.seeing_um:
             for k, air in enumerate(self._air):
-                moved[k] += (
-                    1e-3 * wanted.seeing_um * air.evaluate_at(time_s, nodes.x_mm, nodes.y_mm)
-                )
+                bent = air.evaluate_at(time_s, nodes.x_mm, nodes.y_mm)
+                moved[k] += 1e-3 * wanted.seeing_um * bent
         return moved
 
     def light_disturbance(self, time_s: float, pattern: Pattern) -> FloatArray:
         """Factor of the screen's light, and counts of the room's, (2, rows, columns)."""
-        wanted, nodes = self._wanted, self._nodes
+        wanted = self._wanted
+        nodes = self._nodes
         factor = self._dust_at(time_s) * self._backlight_factor(self.row_times_s(time_s))
         factor = factor * math.exp(-wanted.dimming_fraction_per_h * time_s / 3600.0)
         if wanted.brightness_fraction:
             half_mm = nodes.side_mm / 2
-            factor *= 1.0 + wanted.brightness_fraction * self._bright.evaluate_at(
+            brighter = self._bright.evaluate_at(
                 time_s, nodes.s_x_mm - half_mm, nodes.s_y_mm - half_mm
             )
+            factor *= 1.0 + wanted.brightness_fraction * brighter
         if wanted.sticking_fraction and pattern.role == "crossed":
             factor *= 1.0 - wanted.sticking_fraction * self._retained_level(time_s, pattern)
         swing = _SWING * math.sin(2 * math.pi * time_s / _SWING_S)
-        room_adu = (
-            wanted.ambient_fraction
-            * nodes.full_adu
-            * (1.0 + _SLOPE * nodes.x_mm / nodes.radius_mm + swing)
-        )
+        room_factor = 1.0 + _SLOPE * nodes.x_mm / nodes.radius_mm + swing
+        room_adu = wanted.ambient_fraction * nodes.full_adu * room_factor
         return np.stack([factor, room_adu])
 
     def _dust_at(self, time_s: float) -> FloatArray:
-        """Share of light that passes; the spots lie elsewhere every now and then."""
-        nodes, change = self._nodes, math.floor(time_s / _DUST_S)
+        """Share of light that passes; the spots change their places every 25 s."""
+        nodes = self._nodes
+        change = math.floor(time_s / _DUST_S)
         if self._wanted.dust and self._dust[0] != change:
             places_mm = np.random.default_rng([self._seed, 3, change % 2**32]).uniform(
                 -nodes.radius_mm, nodes.radius_mm, (self._wanted.dust, 2)
             )
             passes = np.ones_like(nodes.x_mm)
             for x_mm, y_mm in places_mm:
-                away2_mm2 = (nodes.x_mm - x_mm) ** 2 + (nodes.y_mm - y_mm) ** 2
-                passes *= 1.0 - _DUST_LOSS * np.exp(-away2_mm2 / (2 * _DUST_MM**2))
+                distance_mm2 = (nodes.x_mm - x_mm) ** 2 + (nodes.y_mm - y_mm) ** 2
+                passes *= 1.0 - _DUST_LOSS * np.exp(-distance_mm2 / (2 * _DUST_MM**2))
             self._dust = change, passes
         return self._dust[1].copy()
 
     def _backlight_factor(self, middle_s: FloatArray) -> FloatArray:
-        """Light of an exposure over the mean: how much of it falls into the pulses of the
-        backlight.
-        """
+        """Light of an exposure over the mean, from the pulses of the backlight that it contains."""
         hz = self._wanted.backlight_hz
         if not hz:
             return np.ones_like(middle_s)
 
-        def pulses(turns: FloatArray) -> FloatArray:
+        def lit_turns(turns: FloatArray) -> FloatArray:
+            """Lit part of so many periods from the start of a pulse."""
             whole = np.floor(turns)
             return np.asarray(whole * _LIT_SHARE + np.minimum(turns - whole, _LIT_SHARE))
 
         half_s = _EXPOSURE_S / 2
-        lit = pulses(hz * (middle_s + half_s)) - pulses(hz * (middle_s - half_s))
+        lit = lit_turns(hz * (middle_s + half_s)) - lit_turns(hz * (middle_s - half_s))
         return np.asarray(lit / (_LIT_SHARE * hz * _EXPOSURE_S))
 
     def _retained_level(self, time_s: float, pattern: Pattern) -> FloatArray:
-        """Level, 0 to 1, of the picture that the panel remembers: the mean of the patterns shown so
-        far.
+        """Level, 0 to 1, of the picture that the panel retains: the mean of the patterns shown so
+        far, with an exponential memory.
         """
         nodes = self._nodes
-        now = np.exp(1j * np.array([pattern.shift_rad, pattern.shift_y_rad]))
-        keep = math.exp(min(0.0, self._shown_s - time_s) / _STICKING_S)
-        self._burnt, self._shown_s = keep * self._burnt + (1.0 - keep) * now, time_s
-        rate = 2 * math.pi * pattern.index / nodes.side_mm
-        waves = [
-            np.real(burnt * np.exp(1j * (rate * s_mm - math.pi)))
-            for burnt, s_mm in zip(self._burnt, (nodes.s_x_mm, nodes.s_y_mm), strict=True)
-        ]
-        return np.asarray(0.5 + 0.25 * (waves[0] + waves[1]))
+        shown = np.exp(1j * np.array([pattern.shift_rad, pattern.shift_y_rad]))
+        keep = math.exp(min(0.0, self._retained_s - time_s) / _RETENTION_S)
+        self._retained = keep * self._retained + (1.0 - keep) * shown
+        self._retained_s = time_s
+        rad_per_mm = 2 * math.pi * pattern.index / nodes.side_mm
+        wave_x, wave_y = (
+            np.real(phasor * np.exp(1j * (rad_per_mm * s_mm - math.pi)))
+            for phasor, s_mm in zip(self._retained, (nodes.s_x_mm, nodes.s_y_mm), strict=True)
+        )
+        return np.asarray(0.5 + 0.25 * (wave_x + wave_y))

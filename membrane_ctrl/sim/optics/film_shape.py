@@ -178,10 +178,13 @@ class FilmShape:
 
 def _film_terms(film: FilmShape) -> FilmTerms:
     """The film as numbers for the kernel, its offset chosen so that h(0, 0) = 0."""
-    waves = [(r, 2.0 * pi / r.wavelength_mm, radians(r.direction_deg)) for r in film.ripples]
-    ripples = [
-        (r.amplitude_um / 1000.0, k * cos(turn), k * sin(turn), r.phase_rad) for r, k, turn in waves
-    ]
+    ripples = []
+    for ripple in film.ripples:
+        rad_per_mm = 2.0 * pi / ripple.wavelength_mm
+        direction = radians(ripple.direction_deg)
+        k_x = rad_per_mm * cos(direction)
+        k_y = rad_per_mm * sin(direction)
+        ripples.append((ripple.amplitude_um / 1000.0, k_x, k_y, ripple.phase_rad))
     wrinkles = [(w.amplitude_um / 1000.0, float(w.lobes), w.phase_rad) for w in film.wrinkles]
     bumps = [(b.amplitude_um / 1000.0, b.x_mm, b.y_mm, b.sigma_mm) for b in film.bumps]
     raised = FilmTerms(
@@ -213,10 +216,8 @@ def typical_film(
     coeffs_um = np.zeros(_TYPICAL_TERMS)
     for amplitude_um, sine, cosine in ((300.0, 5, 6), (100.0, 7, 8), (50.0, 9, 10)):
         angle = rng.uniform(0.0, 2.0 * pi)
-        coeffs_um[sine - 1], coeffs_um[cosine - 1] = (
-            amplitude_um * sin(angle),
-            amplitude_um * cos(angle),
-        )
+        coeffs_um[sine - 1] = amplitude_um * sin(angle)
+        coeffs_um[cosine - 1] = amplitude_um * cos(angle)
     higher = rng.normal(size=_TYPICAL_TERMS - 10)
     coeffs_um[10:] = 10.0 * higher / sqrt(float(np.dot(higher, higher)))
     figure = tuple(float(c) for c in coeffs_um)

@@ -7,32 +7,48 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import FloatArray
 
-_WAVES = 40  # a smooth field needs no more
-_NODES_A_WAVE = 16
+_WAVES = 40  # plane waves of a field; a smooth one needs no more
+_NODES_A_WAVE = 16  # of the grid on which it is computed
+_LENGTH_SCATTER = 0.3  # of the logarithm of the waves' lengths
 
 
 class RandomField:
-    """A random field of unit RMS on a square: plane waves about `length_mm` long, each with a
-    memory.
+    """A random field of unit RMS on a square.
+
+    It is a sum of plane waves in all directions, whose amplitudes are Ornstein-Uhlenbeck processes.
+
+    Parameters
+    ----------
+    length_mm : float
+        Typical length of the waves.
+    memory_s : float
+        Time after which an amplitude has lost all but 1 / e of its value.
+    half_side_mm : float
+        Half a side of the square.
+    rng : Generator
+        Source of the random numbers.
     """
 
     def __init__(
         self, length_mm: float, memory_s: float, half_side_mm: float, rng: np.random.Generator
     ) -> None:
-        self._rng, self._memory_s = rng, memory_s
+        self._rng = rng
+        self._memory_s = memory_s
+        # A square grid of nodes.
         count = max(8, math.ceil(2 * half_side_mm / length_mm * _NODES_A_WAVE))
-        self._half_side_mm, self._per_mm = half_side_mm, (count - 1) / (2 * half_side_mm)
-        along = np.linspace(-half_side_mm, half_side_mm, count)
-        across, down = np.meshgrid(along, along)
-        lengths_mm, turns = (
-            length_mm * rng.lognormal(0.0, 0.3, _WAVES),
-            rng.uniform(0.0, 2 * math.pi, _WAVES),
-        )
-        ways = [
-            np.multiply.outer(2 * math.pi / lengths_mm * part, place)
-            for part, place in ((np.cos(turns), across), (np.sin(turns), down))
-        ]
-        self._basis = np.concatenate([np.cos(sum(ways)), np.sin(sum(ways))]) / math.sqrt(_WAVES)
+        self._half_side_mm = half_side_mm
+        self._nodes_per_mm = (count - 1) / (2 * half_side_mm)
+        axis_mm = np.linspace(-half_side_mm, half_side_mm, count)
+        x_mm, y_mm = np.meshgrid(axis_mm, axis_mm)
+        # Cosine and sine of each wave there.
+        lengths_mm = length_mm * rng.lognormal(0.0, _LENGTH_SCATTER, _WAVES)
+        directions_rad = rng.uniform(0.0, 2 * math.pi, _WAVES)
+        rad_per_mm = 2 * math.pi / lengths_mm
+        along_x_rad = np.multiply.outer(rad_per_mm * np.cos(directions_rad), x_mm)
+        along_y_rad = np.multiply.outer(rad_per_mm * np.sin(directions_rad), y_mm)
+        phase_rad = along_x_rad + along_y_rad
+        waves = np.concatenate([np.cos(phase_rad), np.sin(phase_rad)])
+        self._basis = waves / math.sqrt(_WAVES)
         self._amplitudes = rng.standard_normal(2 * _WAVES)
         self._time_s = -math.inf
 
@@ -44,8 +60,7 @@ class RandomField:
             self._amplitudes = keep * self._amplitudes + math.sqrt(1.0 - keep * keep) * fresh
             self._time_s = time_s
         field = np.tensordot(self._amplitudes, self._basis, 1).astype(np.float32)
-        column, row = (
-            ((p + self._half_side_mm) * self._per_mm).astype(np.float32) for p in (x_mm, y_mm)
-        )
-        moved = cv2.remap(field, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(moved, dtype=float)
+        column = ((x_mm + self._half_side_mm) * self._nodes_per_mm).astype(np.float32)
+        row = ((y_mm + self._half_side_mm) * self._nodes_per_mm).astype(np.float32)
+        values = cv2.remap(field, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(values, dtype=float)

@@ -1,5 +1,5 @@
-"""Exact trace of camera rays to the film and, reflected, to the screen:
-Newton on the true surface.
+"""Exact trace of camera rays to the film and, reflected, to the screen, by Newton's method on the
+true surface.
 """
 
 from dataclasses import dataclass
@@ -18,11 +18,15 @@ _MAX_STEPS = 20  # Newton needs 4 on any bowl; a grazing ray may never converge
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Where rays met film and screen, each (N,), in mm.
+    """Where rays met film and screen.
 
-    `x_mm`, `y_mm`: on the film, or on the plane of its rim for rays far outside it, which are not
-    traced; NaN for rays that never come down on that plane. `s_x_mm`, `s_y_mm`: on the screen; 0
-    for rays that are not traced, NaN for those that never reach the screen.
+    Attributes
+    ----------
+    x_mm, y_mm : (N,) arrays
+        On the film, or on the plane of its rim for rays far outside it, which are not traced; NaN
+        for rays that never come down on that plane.
+    s_x_mm, s_y_mm : (N,) arrays
+        On the screen; 0 for rays that are not traced, NaN for those that never reach the screen.
     """
 
     x_mm: FloatArray
@@ -43,9 +47,26 @@ def trace_rays(
     vertex_z_mm: float,
     screen: ScreenPose,
 ) -> Trace:
-    """Follow rays, unit vectors (N, 3) in world, from the pinhole over the film to the screen.
+    """Follow rays from the pinhole over the film to the screen.
 
-    The film is the surface z = vertex_z_mm + h(x, y), its bowl `sag_mm` deep.
+    Parameters
+    ----------
+    camera : CameraPose
+        The pinhole.
+    directions : (N, 3) array
+        Unit vectors in world.
+    film : FilmTerms
+        The surface z = vertex_z_mm + h(x, y).
+    sag_mm : float
+        Depth of its bowl.
+    vertex_z_mm : float
+        Height of its vertex.
+    screen : ScreenPose
+        The screen.
+
+    Returns
+    -------
+    Trace
     """
     hits = _trace_kernel(
         camera.position_mm,
@@ -75,11 +96,11 @@ def _film_distance(
     """
     t = guess_mm
     for _ in range(_MAX_STEPS):
-        h, hx, hy = height_and_slopes(
-            film, sag_mm, start[0] + t * direction[0], start[1] + t * direction[1]
-        )
-        miss = start[2] + t * direction[2] - vertex_z_mm - h
-        step = miss / (direction[2] - hx * direction[0] - hy * direction[1])
+        x = start[0] + t * direction[0]
+        y = start[1] + t * direction[1]
+        h, hx, hy = height_and_slopes(film, sag_mm, x, y)
+        above = start[2] + t * direction[2] - vertex_z_mm - h
+        step = above / (direction[2] - hx * direction[0] - hy * direction[1])
         t -= step
         if abs(step) < TOLERANCE_MM:
             return float(t)
@@ -95,7 +116,8 @@ def _plane_point(
 
     In the screen's axes the ray is q + t r.
     """
-    q, r = axes @ (p - origin), axes @ direction
+    q = axes @ (p - origin)
+    r = axes @ direction
     if q[2] * r[2] >= 0.0:
         return np.nan, np.nan, np.nan, np.nan
     t = -q[2] / r[2]
@@ -116,26 +138,36 @@ def _trace_kernel(
     hits = np.zeros((6, directions.shape[0]))
     rim_z_mm = vertex_z_mm + sag_mm
     beyond = (_BEYOND * film.radius_mm) ** 2
-    normal, p = np.empty(3), np.empty(3)
+    normal = np.empty(3)
+    p = np.empty(3)
     for n in range(directions.shape[0]):
         d = directions[n]
         if d[2] >= 0.0 or start[2] <= rim_z_mm:  # never comes down on the film
             hits[:, n] = np.nan
             continue
+
+        # Where it crosses the rim's plane; far outside the rim it is not followed.
         to_rim_mm = (rim_z_mm - start[2]) / d[2]
-        hits[0, n], hits[1, n] = start[0] + to_rim_mm * d[0], start[1] + to_rim_mm * d[1]
+        hits[0, n] = start[0] + to_rim_mm * d[0]
+        hits[1, n] = start[1] + to_rim_mm * d[1]
         if hits[0, n] ** 2 + hits[1, n] ** 2 > beyond:
             continue
+
+        # Where it meets the film.
         t = _film_distance(start, d, film, sag_mm, vertex_z_mm, to_rim_mm)
         if np.isnan(t):
             hits[2:, n] = np.nan
             continue
         for axis in range(3):
             p[axis] = start[axis] + t * d[axis]
+        hits[0, n] = p[0]
+        hits[1, n] = p[1]
+
+        # Law of reflection: r = d - 2 (d n) n / (n n).
         _, hx, hy = height_and_slopes(film, sag_mm, p[0], p[1])
-        normal[0], normal[1], normal[2] = -hx, -hy, 1.0
-        # law of reflection: r = d - 2 (d n) n / (n n)
+        normal[0] = -hx
+        normal[1] = -hy
+        normal[2] = 1.0
         reflected = d - (2.0 * np.dot(d, normal) / np.dot(normal, normal)) * normal
-        hits[0, n], hits[1, n] = p[0], p[1]
         hits[2, n], hits[3, n], hits[4, n], hits[5, n] = _plane_point(p, reflected, origin, axes)
     return hits
