@@ -40,24 +40,31 @@ from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
-SLACKEST = 21.0  # the series' last term is then below 1e-12; a slacker film wrinkles at its ring
-_USUAL = 3.0  # slackness of a film that is stretched by half a per cent under 600 Pa
+# Largest slackness: the series' last term is then below 1e-12; a slacker film wrinkles at its ring.
+SLACKEST = 21.0
+_USUAL = 3.0  # slackness of a film that is stretched by 0.5 % under 600 Pa
+_TAUTEST = 1e-15  # slackness at which the search begins for a tauter film
 _SERIES_TERMS = 80
-_WAVE_TERMS = 14  # of a disturbance: it converges tenfold a term
-_NODES = 48
+_NEWTON_STEPS = 80
+_WAVE_TERMS = 14  # of a disturbance: its error falls tenfold a term
+_NODES = 48  # of the quadrature of the energy
 COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 HarmonicCause = Literal["prestrain", "flat", "round", "modulus", "shear"]
 
 
 @cache
 def _universal_series() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """F, F' and G = integral of dx / F from 0, as power series in x."""
-    force, square = (
-        np.zeros(_SERIES_TERMS),
-        np.zeros(_SERIES_TERMS),
-    )  # F and F^-2, by the recurrence for powers
-    inverse = np.zeros(_SERIES_TERMS)
-    force[0] = square[0] = inverse[0] = 1.0
+    """F, F' and G = integral of dx / F from 0, as power series in x.
+
+    The equation of the film gives F_(k+1) from F^-2; the recurrences for powers of a series give
+    F^-2 and 1 / F from F.
+    """
+    force = np.zeros(_SERIES_TERMS)  # F
+    square = np.zeros(_SERIES_TERMS)  # F^-2
+    inverse = np.zeros(_SERIES_TERMS)  # 1 / F
+    force[0] = 1.0
+    square[0] = 1.0
+    inverse[0] = 1.0
     for k in range(_SERIES_TERMS - 1):
         force[k + 1] = -square[k] / (32 * (k + 1) * (k + 2))
         m = np.arange(1, k + 2)
@@ -67,13 +74,11 @@ def _universal_series() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _ring_strain(slackness: AnyArray, poisson: FloatArray | float) -> AnyArray:
-    """Strain e / q^(2/3) of the hoop at the ring; falls, ever more slowly, as the film gets
-    slacker.
-    """
+    """Strain e / q^(2/3) of the hoop at the ring; a convex function that falls with slackness."""
     force, slope, _ = _universal_series()
-    at_ring = (1 - poisson) * series.polyval(slackness, force) + 2 * slackness * series.polyval(
-        slackness, slope
-    )
+    force_at_ring = series.polyval(slackness, force)
+    slope_at_ring = series.polyval(slackness, slope)
+    at_ring = (1 - poisson) * force_at_ring + 2 * slackness * slope_at_ring
     return np.asarray(slackness ** (-1 / 3) * at_ring)
 
 
@@ -83,14 +88,16 @@ def _normalised_sag(slackness: AnyArray) -> AnyArray:
 
 
 def _invert_for_slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatArray) -> FloatArray:
-    """Where a convex falling function has the wanted values: Newton from the left, which never
-    overshoots.
+    """Slackness at which a convex falling function has the wanted values.
 
+    Newton's method from the left, which never overshoots; the derivative is that of a complex step.
     Raises ValueError if a film would be slack at its ring.
     """
-    usual = np.all(falls(np.asarray(_USUAL)) > wanted)
-    s = np.full(np.shape(wanted), _USUAL if usual else 1e-15)
-    for _ in range(80):
+    start = _TAUTEST
+    if np.all(falls(np.asarray(_USUAL)) > wanted):
+        start = _USUAL
+    s = np.full(np.shape(wanted), start)
+    for _ in range(_NEWTON_STEPS):
         value = falls(s + 1j * COMPLEX_STEP)
         step = (wanted - value.real) / (value.imag / COMPLEX_STEP)
         s = np.minimum(s + step, SLACKEST)
@@ -105,14 +112,26 @@ def _invert_for_slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatAr
 
 @dataclass(frozen=True)
 class FilmLaw:
-    """A film in its ring; any number may be an array. Raises
-    ValueError for one that no film has.
+    """A film in its ring; any number may be an array.
+
+    Raises ValueError for a number that no film has.
+
+    Attributes
+    ----------
+    prestrain : float or array
+        Strain of the flat film, equal in all directions; below 0: slack.
+    poisson : float or array
+        Poisson ratio, 0 to 0.5.
+    stiffness_n_per_m : float or array
+        E t.
+    radius_mm : float
+        Radius of the ring.
     """
 
-    prestrain: FloatArray | float  # of the flat film, equal in all directions; below 0: slack
+    prestrain: FloatArray | float
     poisson: FloatArray | float
-    stiffness_n_per_m: FloatArray | float  # E t
-    radius_mm: float  # of the ring
+    stiffness_n_per_m: FloatArray | float
+    radius_mm: float
 
     def __post_init__(self) -> None:
         if not np.all((np.asarray(self.poisson) >= 0) & (np.asarray(self.poisson) <= 0.5)):
@@ -124,28 +143,27 @@ class FilmLaw:
         """The film under a gauge pressure above 0. Raises ValueError if it would be slack at its
         ring.
         """
-        return self.loaded(np.asarray(pressure_pa) * self.radius_mm * 1e-3 / self.stiffness_n_per_m)
+        load = np.asarray(pressure_pa) * self.radius_mm * 1e-3 / self.stiffness_n_per_m
+        return self.loaded(load)
 
     def loaded(self, load: FloatArray) -> "Bowl":
-        """The film under a load q. Raises ValueError as `under`."""
+        """The film under a load q = p a / (E t). Raises ValueError as `under`."""
         wanted = np.asarray(self.prestrain / load ** (2 / 3))
-        return Bowl(
-            _invert_for_slackness(lambda s: _ring_strain(s, self.poisson), wanted),
-            load,
-            self.poisson,
-            self.radius_mm,
-        )
+        slackness = _invert_for_slackness(lambda s: _ring_strain(s, self.poisson), wanted)
+        return Bowl(slackness, load, self.poisson, self.radius_mm)
 
     def with_sag(self, sag_mm: FloatArray | float) -> "Bowl":
         """The film at a sag above 0; no stiffness is needed. Raises ValueError if it would be slack
         at its ring.
         """
+        # With depth = sag / a, the load q^(1/3) = depth / (normalised sag) is eliminated.
         depth = np.asarray(sag_mm) / self.radius_mm
-        s = _invert_for_slackness(
+        slackness = _invert_for_slackness(
             lambda s: _ring_strain(s, self.poisson) / _normalised_sag(s) ** 2,
             self.prestrain / depth**2,
         )
-        return Bowl(s, (depth / _normalised_sag(s)) ** 3, self.poisson, self.radius_mm)
+        load = (depth / _normalised_sag(slackness)) ** 3
+        return Bowl(slackness, load, self.poisson, self.radius_mm)
 
     def pressure_pa(self, bowl: "Bowl") -> FloatArray:
         """The pressure under a bowl of this film."""
@@ -154,10 +172,22 @@ class FilmLaw:
 
 @dataclass(frozen=True)
 class Bowl:
-    """A film under its load, or several: arrays (n, 1) give results (n, points)."""
+    """A film under its load, or several: arrays (n, 1) give results (n, points).
+
+    Attributes
+    ----------
+    slackness : () or (n, 1) array
+        s.
+    load : () or (n, 1) array
+        q.
+    poisson : float or array
+        Poisson ratio.
+    radius_mm : float
+        Radius of the ring.
+    """
 
     slackness: FloatArray
-    load: FloatArray  # q
+    load: FloatArray
     poisson: FloatArray | float
     radius_mm: float
 
@@ -168,24 +198,26 @@ class Bowl:
 
     def height_mm(self, rho: FloatArray) -> FloatArray:
         """Height above the vertex at rho = r / a."""
-        return np.asarray(
-            self._scale_mm * series.polyval(self.slackness * rho**2, _universal_series()[2])
-        )
+        _, _, integral = _universal_series()
+        return np.asarray(self._scale_mm * series.polyval(self.slackness * rho**2, integral))
 
     def rise_mm(self, rho: FloatArray) -> FloatArray:
         """dh / drho."""
-        force = series.polyval(self.slackness * rho**2, _universal_series()[0])
-        return np.asarray(2 * rho * self.slackness * self._scale_mm / force)
+        force, _, _ = _universal_series()
+        force_there = series.polyval(self.slackness * rho**2, force)
+        return np.asarray(2 * rho * self.slackness * self._scale_mm / force_there)
 
     def stresses(self, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Radial and hoop force per length, in E t."""
         force, slope, _ = _universal_series()
-        x, scale = self.slackness * rho**2, self.load ** (2 / 3) * np.cbrt(1 / self.slackness)
+        x = self.slackness * rho**2
+        scale = self.load ** (2 / 3) * np.cbrt(1 / self.slackness)
         radial = scale * series.polyval(x, force)
         return radial, radial + 2 * scale * x * series.polyval(x, slope)
 
     @property
     def _scale_mm(self) -> FloatArray:
+        """Factor of G in the height."""
         return np.asarray(self.radius_mm * np.cbrt(self.load) * self.slackness ** (-2 / 3) / 4)
 
     def harmonic(self, order: int, cause: HarmonicCause) -> Legendre:
@@ -206,72 +238,115 @@ class Bowl:
         Legendre
             f(v) on [0, 1] with h = (r / a)^m f(v), in mm.
         """
-        one, a = np.ones(()), self.radius_mm
-        rise = float(self.rise_mm(one)) / a
-        radial, hoop = (float(force) for force in self.stresses(one))
+        a = self.radius_mm
+        rim = np.ones(())
+        rise = float(self.rise_mm(rim)) / a
+        radial, hoop = (float(force) for force in self.stresses(rim))
         nu = float(self.poisson)
-        stretch = hoop - nu * radial - (radial - nu * hoop - rise**2 / 2)  # u / a - du/dr
-        ring = {"prestrain": (1.0, 0.0), "flat": (0.0, 1 / a), "round": (stretch / a, -rise / a)}
-        outward, upward = ring.get(cause, (0.0, 0.0))
-        of_film = {
-            "modulus": (0.5 / (1 - nu**2), 0.0),
-            "shear": (0.0, -0.25 / (1 + nu)),
-        }
-        return Legendre(
-            a * self._ritz(order, outward, upward, *of_film.get(cause, (0.0, 0.0))), domain=[0, 1]
-        )
 
-    def _ritz(
+        # Displacements / a of the film at the ring, outward and upward, by one unit of the cause.
+        outward, upward = 0.0, 0.0
+        if cause == "prestrain":
+            outward = 1.0
+        elif cause == "flat":
+            upward = 1 / a
+        elif cause == "round":
+            # A wider ring takes the film's edge along: u / a - du/dr outward, -dh/dr upward.
+            stretch = hoop - nu * radial - (radial - nu * hoop - rise**2 / 2)
+            outward = stretch / a
+            upward = -rise / a
+
+        # The film's stiffnesses U2 and U3 / (E t) by one unit of the cause.
+        two_waves, four_waves = 0.0, 0.0
+        if cause == "modulus":
+            two_waves = 0.5 / (1 - nu**2)
+        elif cause == "shear":
+            four_waves = -0.25 / (1 + nu)
+        height = self._minimise_energy(order, outward, upward, two_waves, four_waves)
+        return Legendre(a * height, domain=[0, 1])
+
+    def _minimise_energy(
         self, order: int, outward: float, upward: float, two_waves: float, four_waves: float
     ) -> FloatArray:
-        """Coefficients (_WAVE_TERMS,) of the height / a with the least energy, given the ring's
-        displacements / a and the film's stiffnesses U2 and U3 / (E t).
+        """Coefficients (_WAVE_TERMS,) of the height / a with the least energy (Ritz).
+
+        Unknowns are the coefficients of the displacements / a: w upward, and two functions for u
+        outward and v around. The constraints are those of the ring.
+
+        Parameters
+        ----------
+        order : int
+            m.
+        outward, upward : float
+            The ring's displacements / a.
+        two_waves, four_waves : float
+            The film's stiffnesses U2 and U3 / (E t).
         """
         nodes, weights = legendre.leggauss(_NODES)
         rho = (nodes + 1) / 2
-        rise, stresses = self.rise_mm(rho) / self.radius_mm, self.stresses(rho)
-        height, climb = _radial_powers(rho, order)
+        area = weights * rho
+        rise = self.rise_mm(rho) / self.radius_mm
+        radial_stress, hoop_stress = self.stresses(rho)
+        nu = float(self.poisson)
+
+        # Displacements and their derivatives along the radius, (3 _WAVE_TERMS, nodes): upward, and
+        # in the plane (u, v) = rho^(m-1) P (1, -1) and rho^(m+1) P (1, 1), which are smooth at the
+        # vertex.
+        height, height_r = _radial_powers(rho, order)
+        lower, lower_r = _radial_powers(rho, order - 1)
+        higher, higher_r = _radial_powers(rho, order + 1)
         zero = np.zeros_like(height)
-        # in the plane, (u, v) = rho^(m-1) P (1, -1) and rho^(m+1) P (1, 1) are smooth at the vertex
-        (less, less_r), (more, more_r) = (
-            _radial_powers(rho, order - 1),
-            _radial_powers(rho, order + 1),
-        )
-        u, u_r = np.vstack([zero, less, more]), np.vstack([zero, less_r, more_r])
-        v, v_r = np.vstack([zero, -less, more]), np.vstack([zero, -less_r, more_r])
-        w, w_r = np.vstack([height, zero, zero]), np.vstack([climb, zero, zero])
+        u = np.vstack([zero, lower, higher])
+        u_r = np.vstack([zero, lower_r, higher_r])
+        v = np.vstack([zero, -lower, higher])
+        v_r = np.vstack([zero, -lower_r, higher_r])
+        w = np.vstack([height, zero, zero])
+        w_r = np.vstack([height_r, zero, zero])
+
+        # Their strains.
         radial = u_r + rise * w_r
         hoop = (u + order * v) / rho
         shear = v_r - (order * u + v) / rho - order * rise * w / rho
-        nu, area = float(self.poisson), weights * rho
-        energy = (
-            (radial * area) @ (radial + nu * hoop).T + (hoop * area) @ (hoop + nu * radial).T
-        ) / (1 - nu**2)
+
+        # Energy of stretching, of shear, and of the present forces on the slopes.
+        stretching = (radial * area) @ (radial + nu * hoop).T
+        stretching += (hoop * area) @ (hoop + nu * radial).T
+        energy = stretching / (1 - nu**2)
         energy += (shear * area) @ shear.T / (2 * (1 + nu))
-        energy += (w_r * area * stresses[0]) @ w_r.T + order**2 * (
-            w * area * stresses[1] / rho**2
-        ) @ w.T
-        ones, none = np.ones(_WAVE_TERMS), np.zeros(_WAVE_TERMS)
+        along_radius = (w_r * area * radial_stress) @ w_r.T
+        around = order**2 * (w * area * hoop_stress / rho**2) @ w.T
+        energy += along_radius + around
+
+        # Displacements at the ring, where all P_k are 1: u, v and w.
+        ones = np.ones(_WAVE_TERMS)
+        none = np.zeros(_WAVE_TERMS)
         ring = np.stack(
             [
                 np.concatenate([none, ones, ones]),
                 np.concatenate([none, -ones, ones]),
-                np.append(ones, [none, none]),
+                np.concatenate([ones, none, none]),
             ]
         )
+
+        # Forces of the uneven stiffness on the strains of the even film.
+        radial_strain = radial_stress - nu * hoop_stress
+        hoop_strain = hoop_stress - nu * radial_stress
+        pull = radial @ (two_waves * radial_strain * area)
+        pull -= hoop @ (two_waves * hoop_strain * area)
+        pull -= shear @ (two_waves * (radial_strain + hoop_strain) / 2 * area)
+        pull += (radial - hoop - shear) @ (four_waves * (radial_strain - hoop_strain) * area)
+
+        # Least energy with Lagrange multipliers for the ring.
         system = np.block([[energy, ring.T], [ring, np.zeros((3, 3))]])
-        # the forces of the uneven stiffness on the strains of the even film
-        along = stresses[0] - nu * stresses[1]
-        around = stresses[1] - nu * stresses[0]
-        pull = radial @ (two_waves * along * area) - hoop @ (two_waves * around * area)
-        pull -= shear @ (two_waves * (along + around) / 2 * area)
-        pull += (radial - hoop - shear) @ (four_waves * (along - around) * area)
         right = np.append(-pull, [outward, 0.0, upward])
         return np.asarray(np.linalg.solve(system, right)[:_WAVE_TERMS])
 
 
 def _radial_powers(rho: FloatArray, power: int) -> tuple[FloatArray, FloatArray]:
     """rho^power P_k(2 rho^2 - 1) and its derivative, (_WAVE_TERMS, n)."""
-    x, table = 2 * rho**2 - 1, np.eye(_WAVE_TERMS)
-    value, slope = legendre.legval(x, table), legendre.legval(x, legendre.legder(table))
-    return value * rho**power, power * rho ** (power - 1) * value + 4 * rho ** (power + 1) * slope
+    x = 2 * rho**2 - 1
+    table = np.eye(_WAVE_TERMS)
+    value = legendre.legval(x, table)
+    slope = legendre.legval(x, legendre.legder(table))
+    derivative = power * rho ** (power - 1) * value + 4 * rho ** (power + 1) * slope
+    return value * rho**power, derivative

@@ -14,75 +14,123 @@ from numpy.polynomial import chebyshev
 from membrane_ctrl.metrology.film.film_law import COMPLEX_STEP, FilmLaw
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
-_FINITE_TERMS = 14  # of U: 1e-12 of the slopes
+_FINITE_TERMS = 14  # of U, which give the slopes to 1e-12
+_NEWTON_STEPS = 20
+_FORCE_STEPS = 40  # of Newton's method for the radial force
+_PLACE_STEPS = 8  # from the deformed film back to the flat one
 
 
 def finite_rise_mm(law: FilmLaw, load: float, rho: FloatArray) -> FloatArray:
-    """dh / drho (n,) at radii rho of the deformed film, of one film under one load. Raises
-    ValueError as `under`.
+    """dh / drho at radii of the deformed film, of one film under one load.
+
+    Parameters
+    ----------
+    law : FilmLaw
+        The film.
+    load : float
+        q = p a / (E t).
+    rho : (n,) array
+        Radii over that of the ring.
+
+    Returns
+    -------
+    (n,) array
+        In mm.
+
+    Raises
+    ------
+    ValueError
+        The film would be slack at its ring.
     """
-    v, outward, grows, slope = _finite_tables()
-    bowl, poisson = law.loaded(np.asarray(load)), float(law.poisson)
-    film = float(law.prestrain), poisson, load
+    v, outward, outward_v, slope = _finite_tables()
+    bowl = law.loaded(np.asarray(load))
+    prestrain = float(law.prestrain)
+    poisson = float(law.poisson)
+    film = prestrain, poisson, load
+
+    # Start: U from the hoop's strain of the film with small slopes.
     radial, hoop = bowl.stresses(np.sqrt(v))
-    unknowns = np.linalg.lstsq(outward, hoop - poisson * radial - film[0], rcond=None)[0]
-    steps = COMPLEX_STEP * 1j * np.eye(unknowns.size + 1)[:, 1:].T  # the first column stays
-    for _ in range(20):
-        near = unknowns[:, None] + steps
-        force, around, along, wide = _finite_forces(film, v, outward @ near, grows @ near, radial)
-        pull = force * along
-        left = (
-            pull
-            + 2 * v[:, None] * (slope @ pull)
-            - around * wide
-            + load**2 * v[:, None] * wide**3 / (2 * force)
+    unknowns = np.linalg.lstsq(outward, hoop - poisson * radial - prestrain, rcond=None)[0]
+
+    # Newton's method on the balance of forces outward. Derivatives are those of complex steps, one
+    # in each column but the first.
+    steps = COMPLEX_STEP * 1j * np.eye(unknowns.size + 1)[:, 1:].T
+    for _ in range(_NEWTON_STEPS):
+        tried = unknowns[:, None] + steps
+        force, around, along, wide = _finite_forces(
+            film, v, outward @ tried, outward_v @ tried, radial
         )
-        step = np.linalg.solve(left[:, 1:].imag / COMPLEX_STEP, -left[:, 0].real)
+        pull = force * along
+        change_of_pull = pull + 2 * v[:, None] * (slope @ pull)
+        pressure = load**2 * v[:, None] * wide**3 / (2 * force)
+        imbalance = change_of_pull - around * wide + pressure
+        jacobian = imbalance[:, 1:].imag / COMPLEX_STEP
+        step = np.linalg.solve(jacobian, -imbalance[:, 0].real)
         unknowns = unknowns + step
         if np.max(np.abs(step)) < 1e-14:
             break
-    at = rho**2
-    for _ in range(8):  # from where the film is to where it was: it moved by some 1e-3
-        at = rho**2 / (1 + _finite_basis(at)[0] @ unknowns) ** 2
-    there, climbs = (table @ unknowns[:, None] for table in _finite_basis(at))
-    force, _, along, wide = _finite_forces(film, at, there, climbs, bowl.stresses(rho)[0])
-    return np.asarray(law.radius_mm * load * np.sqrt(at) * (wide**2 / (2 * force * along))[:, 0])
+
+    # From places of the deformed film to those of the flat one, which moved by some 1e-3.
+    flat_v = rho**2
+    for _ in range(_PLACE_STEPS):
+        flat_v = rho**2 / (1 + _finite_basis(flat_v)[0] @ unknowns) ** 2
+    there, change = (table @ unknowns[:, None] for table in _finite_basis(flat_v))
+
+    # dh/dr of the flat film over 1 + u', the stretch of the radius.
+    force, _, along, wide = _finite_forces(film, flat_v, there, change, bowl.stresses(rho)[0])
+    rise = load * np.sqrt(flat_v) * (wide**2 / (2 * force * along))[:, 0]
+    return np.asarray(law.radius_mm * rise)
 
 
 def _finite_forces(
     film: tuple[float, float, float],
     v: FloatArray,
     outward: AnyArray,
-    grows: AnyArray,
-    near: FloatArray,
+    outward_v: AnyArray,
+    start: FloatArray,
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    """S, H, 1 + u' and 1 + U, (n, m), from U and dU/dv; S is the positive root of a cubic, by
-    Newton from `near`.
+    """S, H, 1 + u' and 1 + U, each (n, m).
+
+    With the slope by the balance along z, Hooke's law is a cubic equation for S; its positive root
+    is found by Newton's method.
+
+    Parameters
+    ----------
+    film : three floats
+        Pre-strain, Poisson ratio and load.
+    v : (n,) array
+        Places.
+    outward, outward_v : (n, m) arrays
+        U and dU/dv.
+    start : (n,) array
+        Where Newton's method begins.
     """
     prestrain, poisson, load = film
-    u_r, hoop = outward + 2 * v[:, None] * grows, prestrain + outward + outward**2 / 2
-    flat = prestrain + u_r + u_r**2 / 2 + poisson * hoop
+    u_r = outward + 2 * v[:, None] * outward_v
+    hoop_strain = prestrain + outward + outward**2 / 2
+    flat_strain = prestrain + u_r + u_r**2 / 2 + poisson * hoop_strain
     climb = load**2 * v[:, None] * (1 + outward) ** 4 / 8
-    force = near[:, None] + 0 * outward
-    for _ in range(40):
-        miss = (1 - poisson**2) * force - flat - climb / force**2
-        force = force - miss / (1 - poisson**2 + 2 * climb / force**3)
-    return force, hoop + poisson * force, 1 + u_r, 1 + outward
+    force = start[:, None] + 0 * outward
+    for _ in range(_FORCE_STEPS):
+        excess = (1 - poisson**2) * force - flat_strain - climb / force**2
+        force = force - excess / (1 - poisson**2 + 2 * climb / force**3)
+    return force, hoop_strain + poisson * force, 1 + u_r, 1 + outward
 
 
 def _finite_basis(v: FloatArray) -> tuple[FloatArray, FloatArray]:
     """U and dU/dv (n, terms) of U = (1 - v) T_k(2 v - 1): the ring holds the film."""
-    eye = np.eye(_FINITE_TERMS)
-    value, slope = (
-        chebyshev.chebval(2 * v - 1, eye).T,
-        2 * chebyshev.chebval(2 * v - 1, chebyshev.chebder(eye)).T,
-    )
+    units = np.eye(_FINITE_TERMS)
+    value = chebyshev.chebval(2 * v - 1, units).T
+    slope = 2 * chebyshev.chebval(2 * v - 1, chebyshev.chebder(units)).T
     return (1 - v)[:, None] * value, (1 - v)[:, None] * slope - value
 
 
 @cache
 def _finite_tables() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Places v (n,), U and dU/dv there, and the derivatives (n, n) from values there."""
-    v, eye = (chebyshev.chebpts1(_FINITE_TERMS) + 1) / 2, np.eye(_FINITE_TERMS)
-    slope = 2 * chebyshev.chebval(2 * v - 1, chebyshev.chebder(eye)).T
-    return v, *_finite_basis(v), slope @ np.linalg.inv(chebyshev.chebval(2 * v - 1, eye).T)
+    v = (chebyshev.chebpts1(_FINITE_TERMS) + 1) / 2
+    units = np.eye(_FINITE_TERMS)
+    value = chebyshev.chebval(2 * v - 1, units).T
+    slope = 2 * chebyshev.chebval(2 * v - 1, chebyshev.chebder(units)).T
+    outward, outward_v = _finite_basis(v)
+    return v, outward, outward_v, slope @ np.linalg.inv(value)

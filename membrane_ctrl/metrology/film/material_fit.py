@@ -3,7 +3,7 @@ the ring's form.
 
 Each figure gives its rotationally symmetric numbers: with 36 terms Noll 4, 11, 22 and the excess.
 The law (`film_law`) predicts them from the pre-strain, the Poisson ratio and the set's own load q;
-the gauge says q = p a / (E t). Terms with azimuthal order 1 to 5 belong to the ring and to an
+the gauge measures q = p a / (E t). Terms with azimuthal order 1 to 5 belong to the ring and to an
 orthotropic film (`ring_waves`).
 
 No film obeys a law exactly. Its misfit is a random figure of unknown size that stays, or grows

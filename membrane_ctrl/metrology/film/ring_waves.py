@@ -22,8 +22,8 @@ from membrane_ctrl.metrology.film.radial_quadrature import slope_radii
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
 
-# What may cause waves of each azimuthal order; a tilted ring (flat, 1) is not separable from a
-# tilted bench
+# What may cause waves of each azimuthal order. A tilted ring (flat, 1) cannot be separated from a
+# tilted bench.
 CAUSES: dict[int, tuple[HarmonicCause, ...]] = {
     1: ("prestrain", "round"),
     2: ("prestrain", "flat", "round", "modulus"),
@@ -31,7 +31,7 @@ CAUSES: dict[int, tuple[HarmonicCause, ...]] = {
     4: ("flat", "shear"),
     5: ("flat",),
 }
-# 1 sigma known before: a strain, mm, or a share of the modulus
+# Standard uncertainty of each cause before any measurement: a strain, mm, or a share of a modulus.
 _CAUSE_SIGMAS: dict[HarmonicCause, float] = {
     "prestrain": 1e-3,
     "flat": 1.0,
@@ -40,22 +40,36 @@ _CAUSE_SIGMAS: dict[HarmonicCause, float] = {
     "shear": 0.3,
 }
 _OF_FILM = ("modulus", "shear")
-_SURE = 4.0  # sigmas
-_FOEPPL = 0.03  # of an orthotropic film's wave: what finite slopes change of it
-_SECOND_ORDER = 2.0  # of the modulus' square: what it adds to four waves, as a share of the shear
-_UNEXPLAINED = 0.1  # of the waves of an order: more left over is another cause
-_LEAST_SEEN_MM = 2e-3  # RMS of an order's terms that is worth a statement
+_SURE = 4.0  # sigmas beyond which a cause is stated
+_FOEPPL = 0.03  # relative change of an orthotropic film's wave by finite slopes
+# Share of the shear modulus that the square of the moduli's difference adds to four waves.
+_SECOND_ORDER = 2.0
+_UNEXPLAINED = 0.1  # share of an order's waves: if more is left, there is another cause
+_LEAST_SEEN_MM = 2e-3  # least RMS of an order's terms that is stated
+_FIRST_FREE_ORDER = 4  # orders from here on show how large terms without a cause are
 
 
 @dataclass(frozen=True)
 class RingWave:
-    """One cause of waves: amounts of cos(m theta) and sin(m theta), a strain, mm or a share."""
+    """One cause of waves.
+
+    Attributes
+    ----------
+    cause : HarmonicCause
+        The cause.
+    order : int
+        m.
+    amounts, sigmas : (2,) arrays
+        Amounts of cos(m theta) and sin(m theta), a strain, mm or a share; their uncertainties.
+    explained : bool
+        Whether all causes together explain the waves of this order.
+    """
 
     cause: HarmonicCause
     order: int
-    amounts: FloatArray  # (2,)
-    sigmas: FloatArray  # (2,)
-    explained: bool  # whether all causes together explain the waves of this order
+    amounts: FloatArray
+    sigmas: FloatArray
+    explained: bool
 
     @property
     def seen(self) -> bool:
@@ -65,21 +79,43 @@ class RingWave:
 
 @dataclass(frozen=True)
 class UnexplainedWaves:
-    """Waves of an azimuthal order that no cause of the law has."""
+    """Waves of an azimuthal order that no cause of the law explains.
+
+    Attributes
+    ----------
+    order : int
+        m.
+    rms_um : float
+        RMS of the waves over the disc.
+    left_um : float
+        RMS of what the causes leave.
+    likely : tuple of HarmonicCause
+        The causes, by what each leaves alone; the best first.
+    """
 
     order: int
-    rms_um: float  # over the disc
+    rms_um: float
     left_um: float
-    likely: tuple[HarmonicCause, ...]  # the causes that alone leave least, the best first
+    likely: tuple[HarmonicCause, ...]
 
 
 @dataclass(frozen=True)
 class WaveFit:
-    """All causes, the orders without one, and what the causes add to the parameters."""
+    """All causes, the orders without one, and what the causes add to the figures.
+
+    Attributes
+    ----------
+    waves : tuple of RingWave
+        All causes.
+    unexplained : tuple of UnexplainedWaves
+        Orders without a cause.
+    added_mm : (n, parameters) array
+        What the causes add to the parameters of each figure.
+    """
 
     waves: tuple[RingWave, ...]
     unexplained: tuple[UnexplainedWaves, ...]
-    added_mm: FloatArray  # (n, parameters)
+    added_mm: FloatArray
 
 
 def azimuthal_terms(order: int) -> IntArray:
@@ -109,12 +145,17 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
     reach : float
         Radius of the analysed disc in radii of the ring.
     seen_mm : float
-        Size of a term that no law has.
+        Size of a term that no law explains.
+
+    Returns
+    -------
+    WaveFit
     """
     added = np.zeros((len(figures), ZERNIKE_TERMS))
     waves: list[RingWave] = []
     unexplained: list[UnexplainedWaves] = []
     for order, causes in CAUSES.items():
+        # Cosine and sine terms of the order, (2, n, 3), and their fit by its causes.
         terms = azimuthal_terms(order)
         response = wave_responses_mm(bowls, order, reach)
         data = np.stack([[one.parameters_mm[part] for one in figures] for part in terms])
@@ -124,8 +165,11 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
         ]
         for parity, (amounts, _) in enumerate(fits):
             added[:, terms[parity]] = response @ amounts
+
+        # Do the causes explain the waves?
         left = data - np.stack([response @ amounts for amounts, _ in fits])
-        rms_mm, left_mm = (float(np.sqrt(np.sum(part**2) / len(figures))) for part in (data, left))
+        rms_mm = float(np.sqrt(np.sum(data**2) / len(figures)))
+        left_mm = float(np.sqrt(np.sum(left**2) / len(figures)))
         explained = left_mm < max(_UNEXPLAINED * rms_mm, 2 * seen_mm)
         if not explained and rms_mm > _LEAST_SEEN_MM:
             likely = _rank_causes(causes, response, data)
@@ -156,15 +200,17 @@ def _fit_parity(
     seen_mm: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Amounts of the causes and their sigmas, from the cosine or the sine terms of an order."""
-    known = np.array([_CAUSE_SIGMAS[cause] for cause in causes])
+    prior_sigmas = np.array([_CAUSE_SIGMAS[cause] for cause in causes])
     noise = shared_covariance(figures, terms) + 1e-14 * np.eye(data.size)
     spread = np.stack([np.kron(part, np.eye(terms.size)) for part in misfit_covariances(figures)])
     of_film = [k for k, cause in enumerate(causes) if cause in _OF_FILM]
-    design, size_mm = response.reshape(-1, len(causes)), seen_mm
-    # twice: what finite slopes change of an orthotropic film's waves follows from their size
+    design = response.reshape(-1, len(causes))
+    prior_mean = np.zeros(len(causes))
+    size_mm = seen_mm
+    # Twice: what finite slopes change of an orthotropic film's waves follows from their size.
     for _ in range(2):
         found = average_over_misfits(
-            design, data.ravel(), noise, spread, np.zeros(len(causes)), known**-2, size_mm
+            design, data.ravel(), noise, spread, prior_mean, prior_sigmas**-2, size_mm
         )
         waves_mm = response[..., of_film] @ found.mean[of_film]
         size_mm = float(np.hypot(seen_mm, _FOEPPL * np.sqrt(np.mean(waves_mm**2))))
@@ -175,40 +221,43 @@ def _rank_causes(
     causes: Sequence[HarmonicCause], response: FloatArray, data: FloatArray
 ) -> tuple[HarmonicCause, ...]:
     """The causes by what each leaves alone, the best first."""
+    both = data.reshape(2, -1)
     left = []
     for k in range(len(causes)):
         column = response[..., k].ravel()
-        amounts = data.reshape(2, -1) @ column / (column @ column)
-        left.append(float(np.sum((data.reshape(2, -1) - np.outer(amounts, column)) ** 2)))
+        amounts = both @ column / (column @ column)
+        left.append(float(np.sum((both - np.outer(amounts, column)) ** 2)))
     return tuple(causes[k] for k in np.argsort(left))
 
 
 def unexplained_term_mm(figures: Sequence[FilmFigure], bowls: Bowl, reach: float) -> float:
-    """RMS of a term that no cause explains, from the azimuthal orders of 4 and more; noise
-    subtracted.
+    """RMS of a term that no cause explains, from the azimuthal orders of 4 and more, without noise.
+
+    Arguments as in `fit_waves`.
     """
-    squares, freedom = 0.0, 0
-    for order in range(4, ZERNIKE_DEGREE + 1):
+    squares = 0.0
+    freedom = 0
+    for order in range(_FIRST_FREE_ORDER, ZERNIKE_DEGREE + 1):
         for terms in azimuthal_terms(order):
             data = np.array([one.parameters_mm[terms] for one in figures])
             noise = sum(float(np.sum(np.diag(one.noise_mm2)[terms])) for one in figures)
-            # of a figure that stays, a ring that is not flat takes one number
-            taken = 1 if "flat" in CAUSES.get(order, ()) else 0
-            if taken:
+            # A ring that is not flat adds one number, the same to all figures; it is fitted first.
+            fitted = 0
+            if "flat" in CAUSES.get(order, ()):
+                fitted = 1
                 columns = wave_responses_mm(bowls, order, reach)
                 columns = columns.reshape(-1, columns.shape[-1])
                 amounts = np.linalg.lstsq(columns, data.ravel(), rcond=None)[0]
                 data = data - (columns @ amounts).reshape(data.shape)
             squares += (float(np.sum(data**2)) - noise) / len(figures)
-            freedom += terms.size - taken
+            freedom += terms.size - fitted
     return float(np.sqrt(max(squares / freedom, 0.0)))
 
 
 def wave_responses_mm(bowls: Bowl, order: int, reach: float) -> FloatArray:
     """Zernike terms (n, k, causes) of one unit of each cause of an order."""
-    return np.stack(
-        [_wave_terms_mm(bowls, order, cause, reach) for cause in CAUSES[order]], axis=-1
-    )
+    columns = [_wave_terms_mm(bowls, order, cause, reach) for cause in CAUSES[order]]
+    return np.stack(columns, axis=-1)
 
 
 def _wave_terms_mm(bowls: Bowl, order: int, cause: HarmonicCause, reach: float) -> FloatArray:
@@ -219,20 +268,29 @@ def _wave_terms_mm(bowls: Bowl, order: int, cause: HarmonicCause, reach: float) 
 
     rho, weight = slope_radii(reach)
 
-    def slopes(part: legendre.Legendre) -> FloatArray:
-        value, climbs = part(rho**2), part.deriv()(rho**2)
-        along = order * rho ** (order - 1) * value + 2 * rho ** (order + 1) * climbs
-        return np.concatenate([along * weight, order * rho ** (order - 1) * value * weight])
+    def compute_slopes(part: legendre.Legendre) -> FloatArray:
+        """Weighted slopes along the radius and around, of rho^m part(rho^2)."""
+        value = part(rho**2)
+        derivative = part.deriv()(rho**2)
+        around = order * rho ** (order - 1) * value
+        along = around + 2 * rho ** (order + 1) * derivative
+        return np.concatenate([along * weight, around * weight])
 
+    # Slopes of the order's Zernike terms. R_n^m / rho^m is the Jacobi polynomial P_k^(0, m)(2 v -
+    # 1), here by Legendre's least squares (exact).
     terms = []
     for n in range(order, ZERNIKE_DEGREE + 1, 2):
-        # R_n^m / rho^m is the Jacobi polynomial P_k^(0, m)(2 v - 1), here by Legendre's least
-        # squares (exact)
         jacobi = eval_jacobi((n - order) // 2, 0, order, 2 * rho**2 - 1)
         radial = legendre.Legendre.fit(rho**2, jacobi, ZERNIKE_DEGREE // 2, domain=[0, 1])
-        terms.append(np.sqrt(2 * (n + 1)) * slopes(radial))
-    onto = np.linalg.pinv(np.stack(terms).T)
-    loads = zip(bowls.slackness.ravel(), bowls.load.ravel(), strict=True)
-    each = (Bowl(np.asarray(s), np.asarray(q), bowls.poisson, bowls.radius_mm) for s, q in loads)
-    found = np.array([onto @ slopes(bowl.harmonic(order, cause)) for bowl in each])
-    return found[:, 1:] if order == 1 else found  # without tilt
+        terms.append(np.sqrt(2 * (n + 1)) * compute_slopes(radial))
+    onto_terms = np.linalg.pinv(np.stack(terms).T)
+
+    # Least squares of the wave's slopes onto them, in each bowl.
+    found = []
+    for slackness, load in zip(bowls.slackness.ravel(), bowls.load.ravel(), strict=True):
+        bowl = Bowl(np.asarray(slackness), np.asarray(load), bowls.poisson, bowls.radius_mm)
+        found.append(onto_terms @ compute_slopes(bowl.harmonic(order, cause)))
+    terms_mm = np.array(found)
+    if order == 1:
+        return terms_mm[:, 1:]  # without tilt
+    return terms_mm

@@ -255,7 +255,7 @@ class OpticsRenderer:
     def _trace_film(
         self, directions: FloatArray, displacement_um: float, film: FilmTerms | None = None
     ) -> Trace:
-        """Follow rays (N, 3) to the film at a displacement, or to another one, and to the screen."""
+        """Follow rays (N, 3) to the film at a displacement, or to another, and to the screen."""
         vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
         sag_mm = self.film.sag_at_mm(displacement_um)
         film = film or self.film.terms_at(displacement_um)
