@@ -341,17 +341,17 @@ def _format_fit(table: dict[str, Any], figures: list[film_figure.FilmFigure]) ->
 
 def _wave_line(wave: dict[str, Any]) -> str:
     """Amount of one cause of waves, and its direction if it is the film's."""
-    cause = wave["cause"]
+    kind = wave["cause"]
     cosine, sine = wave["cos_sin"]
-    unit, scale = _WAVE_UNITS.get(cause, ("mm", 1.0))
+    unit, scale = _WAVE_UNITS.get(kind, ("mm", 1.0))
     amount = scale * np.hypot(cosine, sine)
     sigma = scale * max(wave["sigmas"])
-    origin = "film" if cause in _OF_FILM else "ring"
+    origin = "film" if kind in _OF_FILM else "ring"
     along = ""
-    if cause == "modulus":
+    if kind == "modulus":
         along = f", along {np.degrees(np.arctan2(sine, cosine)) / 2 % 180:.0f} degrees"
     return (
-        f"{origin:<11}{_CAUSES[cause]}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} "
+        f"{origin:<11}{_CAUSES[kind]}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} "
         f"{unit}{along}"
     )
 
