@@ -146,7 +146,7 @@ class _Steps:
         """What the model of level and phasor leaves of the fringes' harmonics (h, N, n)."""
         swing = np.hypot(*self._parts[1:])
         psi_rad = np.arctan2(self._parts[2], self._parts[1]) + self._shifts_rad[:, None]
-        return off @ np.stack([swing * np.cos(n * psi_rad) for n in _HARMONICS])
+        return np.asarray(off @ np.stack([swing * np.cos(n * psi_rad) for n in _HARMONICS]))
 
     def _solve_unknowns(
         self, off: FloatArray, waves: FloatArray, harmonics: FloatArray

@@ -27,10 +27,10 @@ def _cosine_of_turns(turns: float) -> float:
 
 
 @compile_loop(fastmath=True)
-def _interpolate(line, c, weights):  # type: ignore[no-untyped-def]
-    """The cubic through four neighbouring nodes of a row, from node c on."""
+def _interpolate(lines, k, c, weights):  # type: ignore[no-untyped-def]
+    """The cubic of quantity k through four neighbouring nodes of a row, from node c on."""
     w0, w1, w2, w3 = weights
-    return w0 * line[c] + w1 * line[c + 1] + w2 * line[c + 2] + w3 * line[c + 3]
+    return w0 * lines[k, c] + w1 * lines[k, c + 1] + w2 * lines[k, c + 2] + w3 * lines[k, c + 3]
 
 
 @compile_loop(fastmath=True)
@@ -48,9 +48,9 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
 
     # The screen's level where the ray meets it, 0 beside the pattern; white on the film, else 0.
     for c in range(counts.size):
-        x = _interpolate(lines[0], c, weights)
-        y = _interpolate(lines[1], c, weights)
-        r2 = _interpolate(lines[2], c, weights)
+        x = _interpolate(lines, 0, c, weights)
+        y = _interpolate(lines, 1, c, weights)
+        r2 = _interpolate(lines, 2, c, weights)
         fringes = _cosine_of_turns(x * rate + first_x) + _cosine_of_turns(y * rate + first_y)
         level = _FLOAT(0.5) + _FLOAT(0.25) * fringes
         inside = (abs(x - half_mm) < half_mm) & (abs(y - half_mm) < half_mm)
@@ -60,8 +60,8 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
     # A disturbed bench: factor of the screen's light, and the room's light on the film.
     if lines.shape[0] > 3:
         for c in range(counts.size):
-            factor = _interpolate(lines[3], c, weights)
-            room = _interpolate(lines[4], c, weights)
+            factor = _interpolate(lines, 3, c, weights)
+            room = _interpolate(lines, 4, c, weights)
             rooms[c] = room if counts[c] > none else none
             counts[c] *= factor
 
