@@ -39,7 +39,7 @@ def solution() -> Solution:
     return solve_calibration(truth.problem(FREE))
 
 
-def test_the_file_says_the_calibrated_bench(solution: Solution) -> None:
+def test_the_file_contains_the_calibrated_bench(solution: Solution) -> None:
     tables = tomllib.loads(tomli_w.dumps(tables_of(solution, OPTICS, ORIGIN)))
     geometry = GeometryConfig.model_validate(tables["geometry"])
     assert geometry.reference_displacement_um == 0.0
@@ -132,7 +132,7 @@ def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(after.T @ before).as_rotvec()
 
 
-def test_the_hash_stands_for_the_numbers_alone(solution: Solution) -> None:
+def test_the_hash_depends_on_the_numbers_alone(solution: Solution) -> None:
     tables = tables_of(solution, OPTICS, ORIGIN)
     there_and_back = tomllib.loads(tomli_w.dumps(tables))
     assert content_hash(there_and_back) == tables["calibration"]["hash"]

@@ -78,7 +78,7 @@ def test_from_photographs_to_a_prior(
         prior.apply_to_optics(OpticsConfig())
 
 
-def test_what_was_gained_is_said(
+def test_the_gain_in_accuracy_is_printed(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(words(bench, tmp_path / "camera.toml")) == 0
@@ -88,7 +88,7 @@ def test_what_was_gained_is_said(
     assert f"calibrate --prior {tmp_path / 'camera.toml'}" in said
 
 
-def test_mirrored_photographs_are_named(
+def test_mirrored_photographs_are_reported(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "mirrored"
@@ -154,7 +154,7 @@ def test_bad_input_is_one_line(
     assert not out.exists()
 
 
-def test_priors_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_invalid_prior_files_are_refused(tmp_path: Path) -> None:
     for text, says in (
         ('schema = "membrane-geometry/1"', "pass a geometry with --geometry"),
         ('schema = "membrane-prior/1"\n[sigmas]\nb_m = 1.0', "sigmas.b_m: not a parameter"),
@@ -174,7 +174,7 @@ def test_priors_that_are_none_are_refused(tmp_path: Path) -> None:
         ("charuco:10x7", "charuco:7x10", "--board charuco:10x7"),
     ],
 )
-def test_a_board_of_another_size_is_named(
+def test_a_board_of_another_size_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], shown: str, stated: str, named: str
 ) -> None:
     (tmp_path / "lab.toml").write_text(CONFIG)

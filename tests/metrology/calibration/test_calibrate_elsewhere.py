@@ -184,7 +184,7 @@ def test_a_moved_screen_and_the_screen_itself_sharpen_the_sag_and_tell_the_truth
 @pytest.mark.parametrize(
     "seed", [3, *(pytest.param(k, marks=pytest.mark.campaign) for k in range(4, 9))]
 )
-def test_a_screen_seen_through_its_cover_glass_is_no_other_screen(seed: int) -> None:
+def test_the_cover_glass_is_not_taken_for_another_screen(seed: int) -> None:
     """A millimetre of glass was taken for another lens, or another screen."""
     values, truth, problem = bench_of(seed)
     glass_mm = float(np.random.default_rng(seed).uniform(0.5, 2.0))
@@ -218,7 +218,7 @@ def test_advised_screens_keep_their_promise(seed: int) -> None:
     assert screen_advice(both, 3) == ()
 
 
-def test_a_screen_that_stood_elsewhere_than_stated_is_named() -> None:
+def test_a_screen_at_another_place_than_stated_is_reported() -> None:
     values, truth, problem = bench_of(4)
     first, second = problem.sets
     moved = with_moved_screen(values, truth, second, 4, off_mm=3.0)
@@ -230,7 +230,7 @@ def test_a_screen_that_stood_elsewhere_than_stated_is_named() -> None:
 
 
 @pytest.mark.campaign
-def test_a_screen_seen_through_another_lens_is_named() -> None:
+def test_a_screen_seen_through_another_lens_is_reported() -> None:
     values, _, problem = bench_of(5)
     other = values.copy()
     other[NAMES.index("focal_relative")] += 0.01
@@ -249,7 +249,7 @@ def test_a_screen_seen_through_another_lens_is_named() -> None:
     ]
 
 
-def test_what_is_no_plane_with_fringes_is_refused() -> None:
+def test_a_picture_without_a_plane_of_fringes_is_refused() -> None:
     rng = np.random.default_rng(1)
     column, row = rng.uniform(0, 2447, 300), rng.uniform(0, 2047, 300)
     with pytest.raises(ValueError, match="not a plane with fringes"):
@@ -299,7 +299,7 @@ def test_derivatives_of_moved_and_seen_screens_are_those_of_the_rays() -> None:
             )
 
 
-def test_means_of_many_points_keep_the_places_of_the_screen_apart() -> None:
+def test_means_of_many_points_do_not_mix_the_places_of_the_screen() -> None:
     values, truth, problem = bench_of(6)
     moved = with_moved_screen(values, truth, problem.sets[1], 6)
     solution = solve_calibration(replace(problem, sets=(problem.sets[0], moved)))

@@ -121,7 +121,7 @@ def test_the_waves_are_those_of_the_film() -> None:
     assert left_um[1] < 2e-3
 
 
-def test_a_mount_that_creeps_is_named() -> None:
+def test_a_mount_that_creeps_is_reported() -> None:
     moved = {k: VALUES + 0.1 * k * (np.array(NAMES) == "screen_x_mm") for k in range(len(SAGS_MM))}
     truth = make(VALUES, 5, points=600, bumped=moved)
     (finding,) = solve_any_film(truth.problem(SIGMAS))[1]  # waves do not explain it better
@@ -129,7 +129,7 @@ def test_a_mount_that_creeps_is_named() -> None:
     assert finding.says.startswith("camera or screen crept from set0 to set4")
 
 
-def test_the_rim_knows_the_size_and_better_measurements_are_advised() -> None:
+def test_the_rim_determines_the_size_and_better_measurements_are_advised() -> None:
     truth = make(VALUES, 6, points=600)
     theta = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     x, y = 500.0 * np.cos(theta), 500.0 * np.sin(theta)
@@ -148,7 +148,7 @@ def test_the_rim_knows_the_size_and_better_measurements_are_advised() -> None:
     assert propagate_to_figure(obeyed, 2, 475.0).sag_um == pytest.approx(best.sag_um, rel=0.05)
 
 
-def test_residuals_that_neighbours_share_lower_the_trust_and_noise_does_not() -> None:
+def test_residuals_common_to_neighbours_lower_the_weights_and_noise_does_not() -> None:
     rng = np.random.default_rng(1)
     column, row = rng.uniform(0, 1000, (2, 3000))
     phases = SetPhases("a", column, row, np.zeros((2, 3000)), np.ones(3000), 0.0)

@@ -21,7 +21,7 @@ def test_it_is_what_sets_of_a_mounted_film_claim(
     assert claim.figure_rms_um == pytest.approx(figure_um, rel=0.15)
 
 
-def test_a_bench_that_sees_no_fringes_is_named() -> None:
+def test_a_bench_that_shows_no_fringes_is_reported() -> None:
     optics = OpticsConfig(
         camera=CameraConfig(principal_px=(-9000.0, 1023.5))
     )  # looks past the mirror

@@ -41,7 +41,7 @@ def test_the_lens_is_found_within_its_sigmas(views: list[BoardView]) -> None:
     assert lens.sigmas["focal_relative"] < 2e-3
 
 
-def test_a_plain_chessboard_says_the_same() -> None:
+def test_a_plain_chessboard_gives_the_same_lens() -> None:
     board = Board.parse("chessboard:11x9")
     lens = calibrate_lens(
         views_of(board, photographs(TRUE, board.draw(SQUARE_PX), SQUARE_PX, 5, 2)), STATED
@@ -49,7 +49,7 @@ def test_a_plain_chessboard_says_the_same() -> None:
     assert lens.focal_px == pytest.approx(TRUE.focal_px, rel=3e-3)
 
 
-def test_a_view_that_does_not_fit_is_left_out_and_named(views: list[BoardView]) -> None:
+def test_a_view_that_does_not_fit_is_left_out_and_reported(views: list[BoardView]) -> None:
     rng = np.random.default_rng(0)
     bad = replace(
         views[3],
@@ -105,7 +105,7 @@ def test_a_board_that_is_not_flat_is_in_the_sigmas() -> None:
     assert 0.5 * lens.sigmas["focal_relative"] < off < 1.5 * lens.sigmas["focal_relative"]
 
 
-def test_photographs_of_two_cameras_are_named() -> None:
+def test_photographs_of_two_cameras_are_reported() -> None:
     both = [*corner_views(5, 1), *corner_views(5, 2, focal_px=2450.0)]
     with pytest.raises(ValueError, match="of two cameras, or the focus was changed") as refused:
         calibrate_lens(both, WIDE)
@@ -146,6 +146,6 @@ def test_the_picture_is_exact_to_the_pixel() -> None:
         ("charuco:11x9", 80, "880 x 720 pixels, the screen 640 x 480"),
     ],
 )
-def test_boards_that_cannot_be_are_said(text: str, square_px: int, says: str) -> None:
+def test_impossible_boards_are_refused(text: str, square_px: int, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         on_screen(Board.parse(text), square_px, 640, 480)

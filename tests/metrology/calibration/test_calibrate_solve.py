@@ -183,7 +183,7 @@ def test_outliers_do_not_move_the_solution() -> None:
     assert moved.max() < 1.0
 
 
-def test_what_is_not_determined_is_named() -> None:
+def test_undetermined_parameters_are_reported() -> None:
     assert condition_number(solved(0)[1]) > 1e6
     near = make(drawn(0), 0, points=600, sags_mm=(36.5, 37.0, 37.5))
     weak = weak_combinations(solve_calibration(near.problem(SIGMAS)), 1, 475.0)
@@ -205,7 +205,7 @@ def test_one_step_settles_from_the_solution() -> None:
     )
 
 
-def test_progress_is_told() -> None:
+def test_progress_is_reported() -> None:
     truth, _ = solved(3)
     told: list[tuple[int, float]] = []
     solution = solve_calibration(

@@ -201,7 +201,7 @@ def test_terms_of_a_leaning_sphere() -> None:
     assert np.sqrt(spread[10, 10]) == pytest.approx(1e-5, rel=0.01)
 
 
-def test_a_sphere_with_the_form_error_that_is_stated_is_believed() -> None:
+def test_a_sphere_with_its_stated_form_error_is_accepted() -> None:
     """Its terms are drawn from the sigma; the twin traces the rays."""
     values, rng = drawn(7), np.random.default_rng(7)
     truth, problem = bench_of(values, 7)

@@ -86,7 +86,7 @@ def test_good_sets_have_nothing_against_them() -> None:
         (reading(lambda d: d + 50), (1,), "set1 disagrees with all the others: its laser reads +"),
     ],
 )
-def test_laser_faults_are_named(edit: Edit, which: tuple[int, ...], says: str) -> None:
+def test_laser_faults_are_reported(edit: Edit, which: tuple[int, ...], says: str) -> None:
     (finding,) = judged(good(), edited(edit, *which))
     assert finding.fatal
     assert finding.says.startswith(says)
@@ -103,7 +103,7 @@ def test_laser_faults_are_named(edit: Edit, which: tuple[int, ...], says: str) -
         (reading(lambda d: 1.02 * d), ALL_SETS, "the laser's scale is wrong: the optics see 0.98"),
     ],
 )
-def test_a_film_that_moved_is_named_alone_unless_the_still_sets_have_a_cause(
+def test_only_a_moved_film_is_reported_unless_the_sets_at_rest_show_a_cause(
     edit: Edit, which: tuple[int, ...], says: str
 ) -> None:
     sets = list(edited(edit, *which))
@@ -132,21 +132,21 @@ def test_without_a_laser_fringes_and_ring_say_it() -> None:
     assert np.sqrt(np.mean(error**2)) < 2
 
 
-def test_a_bumped_camera_is_named_with_its_turn() -> None:
+def test_a_bumped_camera_is_reported_with_its_turn() -> None:
     (finding,) = judged(yawed(0.02, 3, 4))
     assert finding.fatal
     assert finding.sets == (3, 4)
     assert finding.says.startswith("the camera had moved from set3 on: yaw +0.0")
 
 
-def test_a_camera_bumped_and_put_back_is_named() -> None:
+def test_a_camera_bumped_and_put_back_is_reported() -> None:
     (finding,) = judged(yawed(0.02, 2))
     assert finding.fatal
     assert finding.says.startswith("the camera had moved in set2")
 
 
 @pytest.mark.campaign
-def test_a_camera_that_was_moved_far_is_told_by_the_halves() -> None:
+def test_a_camera_that_moved_far_is_found_by_comparing_the_halves() -> None:
     (finding,) = judged(yawed(1.0, 3, 4))
     assert finding.fatal
     assert "between set2 and set3" in finding.says
@@ -165,7 +165,7 @@ def test_bins_are_not_averaged_about_a_bench_that_was_not_found() -> None:
     assert np.isin(kept, mixed.sets[2].screen_mm).all()
 
 
-def test_one_set_of_another_rig_is_named() -> None:
+def test_one_set_of_another_bench_is_reported() -> None:
     other = VALUES + SIGMAS * np.random.default_rng(9).normal(size=len(NAMES))
     (finding,) = judged(make(VALUES, 3, points=600, bumped={1: other}))
     assert finding.fatal
@@ -180,7 +180,7 @@ def test_sets_of_many_rigs_are_refused() -> None:
     assert "bench" in finding.says or "one bench" in finding.says
 
 
-def test_a_bow_is_told_by_its_pattern() -> None:
+def test_a_bow_is_found_by_its_pattern() -> None:
     bent = make(VALUES, 3, points=600, bow_mm=1.0)
     (finding,) = judged(bent)
     assert finding.fatal
@@ -192,7 +192,7 @@ def test_a_bow_is_told_by_its_pattern() -> None:
     assert judged(make(VALUES, 3, points=600, bow_mm=0.001)) == ()
 
 
-def test_a_set_with_bad_fringes_hardly_counts_and_is_named() -> None:
+def test_a_set_with_bad_fringes_has_little_weight_and_is_reported() -> None:
     rng = np.random.default_rng(1)
     noisy = edited(
         lambda p: replace(p, screen_mm=p.screen_mm + rng.normal(size=p.screen_mm.shape) * 0.2), 3

@@ -121,7 +121,7 @@ def test_fringe_orders_are_carried_on_from_cycle_to_cycle() -> None:
 
 
 @pytest.mark.parametrize("jump_um", [1100.0, -1500.0, 3000.0])
-def test_jump_beyond_half_a_fringe_asks_for_a_full_cycle(jump_um: float) -> None:
+def test_a_jump_beyond_half_a_fringe_requires_a_full_cycle(jump_um: float) -> None:
     live = _live()
     lost = live.fringes(*_render("fringes", jump_um))
     assert lost.verdict == "rejected"
@@ -184,7 +184,7 @@ def test_failed_full_cycle_leaves_nothing_to_follow() -> None:
     assert live.fringes(*_render("fringes")).tracking_lost
 
 
-def test_overexposed_pixels_are_left_out_and_told() -> None:
+def test_overexposed_pixels_are_left_out_and_reported() -> None:
     live = _live()
     frames, times, where = _render("fringes")
     frames = [frame.copy() for frame in frames]
@@ -243,7 +243,7 @@ def _moving(amplitude_um: float) -> np.ndarray:
     return amplitude_um * np.sin(2 * np.pi * 0.3 * 0.1 * np.arange(8) + 0.4)
 
 
-def test_motion_during_the_frames_is_taken_out() -> None:
+def test_motion_during_the_frames_is_corrected() -> None:
     """The film swings by 5 µm at 0.3 Hz; the figure is that of the mean position."""
     live = _live()
     where = _moving(5.0)
@@ -402,7 +402,7 @@ def test_the_geometrys_covariance_is_what_wrong_geometries_do() -> None:
     assert estimate.sag_sigma_um < 1  # what this cycle does not share
 
 
-def test_without_a_spread_nothing_is_said_of_the_geometry() -> None:
+def test_without_a_spread_the_geometry_has_no_error_bar() -> None:
     live = LiveReconstructor(OPTICS, 2)
     assert np.isnan(live.full(*_render("full")).geometry_sag_sigma_um)
     assert np.isnan(live.common_covariance_um2).all()
@@ -416,7 +416,7 @@ def _flickering(kind: str, seed: int, share: float) -> Frames:
     ]
 
 
-def test_light_that_flickers_is_taken_out_and_the_rest_is_in_the_bar() -> None:
+def test_flicker_is_corrected_and_the_rest_is_in_the_error_bar() -> None:
     live = _live(bin_px=2)
     still = live.fringes(*_render("fringes"))
     found = [
@@ -434,7 +434,7 @@ def test_light_that_flickers_is_taken_out_and_the_rest_is_in_the_bar() -> None:
 
 
 @pytest.mark.parametrize(("share", "most_um"), [(0.02, 0.05), (0.12, 0.3)])
-def test_bands_of_a_pulsed_backlight_are_taken_out_of_full_and_fringes_cycles(
+def test_bands_of_a_pulsed_backlight_are_removed_from_full_and_fringes_cycles(
     share: float, most_um: float
 ) -> None:
     """They moved the figure by 0.3 and 1.6 µm in cycles called ok; large ones are told."""
@@ -506,7 +506,7 @@ def test_the_harmonics_of_the_display_move_with_the_film() -> None:
     assert moved.sag_sigma_um < 1.5 * pure.fringes(*_render("fringes", where)).sag_sigma_um
 
 
-def test_what_a_wrong_geometry_makes_of_a_told_motion_is_in_the_bar() -> None:
+def test_the_effect_of_a_wrong_geometry_on_a_measured_motion_is_in_the_error_bar() -> None:
     """A film that is deeper in all x frames than in all y frames, as the laser says; benches that
     are a sigma off.
     """

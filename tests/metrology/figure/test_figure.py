@@ -131,7 +131,7 @@ def test_fringe_terms_are_refitted_over_a_map_with_a_hole() -> None:
     np.testing.assert_allclose(of(seen(height, hole=True)).fringe_um, wanted, atol=1e-5)
 
 
-def test_the_invariant_part_is_told_from_the_rest() -> None:
+def test_the_rotationally_invariant_part_is_separated_from_the_rest() -> None:
     rho = R / APERTURE
     round_um = 3 * (6 * rho**4 - 6 * rho**2 + 1) + 0.4 * np.cos(2 * np.pi * R / 60)
     rest_um = 5 * rho**2 * np.cos(2 * THETA) + 2 * np.sin(X / 9)
@@ -177,7 +177,7 @@ def test_the_spot_agrees_with_a_ray_trace_by_householder() -> None:
     assert found.numbers.spot_rms_mm == pytest.approx(np.sqrt(np.mean(radii**2)), rel=0.01)
 
 
-def test_the_spectrum_is_prysms_and_sees_a_ripple() -> None:
+def test_the_spectrum_equals_that_of_prysm_and_shows_a_ripple() -> None:
     axis = np.linspace(
         -APERTURE, APERTURE, 160
     )  # an even number: prysm centres odd ones half a cell off

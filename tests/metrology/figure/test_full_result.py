@@ -119,7 +119,7 @@ def test_noise_repeats_to_ten_nanometres() -> None:
     assert 1e6 * float(np.std(maps[0] - maps[1])) / math.sqrt(2) <= 40.0
 
 
-def test_motion_is_taken_out_of_the_phase() -> None:
+def test_motion_is_removed_from_the_phase() -> None:
     """From frame to frame of an axis by the fringes, from x to y by the laser, whose noise is a
     micrometre.
     """
@@ -215,7 +215,7 @@ def test_the_frames_say_what_light_they_had_and_where_the_film_was(
 
 
 @pytest.mark.parametrize(("flicker", "drift"), [(0.02, 0.0), (0.0, 0.05)], ids=["lamp", "ambient"])
-def test_light_that_differs_between_the_frames_is_taken_out(flicker: float, drift: float) -> None:
+def test_light_that_differs_between_the_frames_is_corrected(flicker: float, drift: float) -> None:
     """Two hundredths of flicker bend the figure by 0.3 µm, an ambient light that grows by a
     twentieth by 0.14.
     """

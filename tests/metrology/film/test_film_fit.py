@@ -129,7 +129,7 @@ def test_what_no_law_explains_widens_the_bars() -> None:
         assert np.abs(_z(fit, world)).max() < 3.5
 
 
-def test_a_ring_that_is_not_flat_is_told_from_an_uneven_strain() -> None:
+def test_a_ring_that_is_not_flat_is_distinguished_from_an_uneven_strain() -> None:
     """Waves of the film's law, seen through Zernike terms of another library."""
     world = World()
     law = FilmLaw(world.prestrain, world.poisson, STIFFNESS, RADIUS_MM)
@@ -237,7 +237,7 @@ def test_an_orthotropic_film_is_named_with_its_direction_beside_an_uneven_ring()
     assert fit.unexplained == ()
 
 
-def test_waves_that_no_cause_has_are_named_as_unknown() -> None:
+def test_waves_without_a_known_cause_are_reported_as_unknown() -> None:
     """Two waves whose profile and growth belong to no cause."""
     figures = []
     for figure in World().figures(6):

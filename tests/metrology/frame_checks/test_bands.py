@@ -99,7 +99,9 @@ def slow_error_rad(stack: FrameStack, gain: Array | None, turned: bool = False) 
         ({"bend": 0.05, "motion_rad": 0.003}, False, 0.3),
     ],
 )
-def test_bands_leave_the_phases(change: dict[str, float], turned: bool, share: float) -> None:
+def test_bands_are_removed_from_the_phases(
+    change: dict[str, float], turned: bool, share: float
+) -> None:
     stack = stack_of(turned=turned, **change)  # type: ignore[arg-type]
     found, binned, _ = remove_bands(stack, bin_frames(stack, 4095))
     assert found.gain is not None
@@ -123,7 +125,7 @@ def test_bands_leave_the_phases(change: dict[str, float], turned: bool, share: f
         {"steps": 3},
     ],
 )
-def test_what_looks_like_bands_changes_nothing(change: dict[str, float]) -> None:
+def test_effects_that_look_like_bands_change_nothing(change: dict[str, float]) -> None:
     """Fringes of a bent panel and of a film that moved, noise, a lamp that flickers; three steps
     cannot tell.
     """
@@ -162,7 +164,7 @@ def test_bands_are_those_of_the_pixels_rows() -> None:
     np.testing.assert_allclose(found.gain[:, 8:-8], expected[:, 8:-8], atol=1e-3)
 
 
-def test_a_frame_without_a_picture_has_no_part_in_the_bands() -> None:
+def test_a_frame_without_a_picture_does_not_change_the_bands() -> None:
     stack = stack_of(steps=5)
     stack.frames[1] = 0
     stack = replace(stack, unusable={1: "unreadable"})
@@ -213,7 +215,7 @@ def test_wrong_pictures_are_no_bands(fault: str, turned: bool) -> None:
     assert remove_bands(stack, bin_frames(stack, 4095))[0].gain is None
 
 
-def test_the_gain_goes_with_the_picture() -> None:
+def test_the_gain_belongs_to_the_picture_that_it_was_found_in() -> None:
     stack = stack_of()
     found, *_ = remove_bands(stack, bin_frames(stack, 4095))
     order = [1, 0, *range(2, 8)]

@@ -89,7 +89,7 @@ def test_clipping_that_is_not_found_does_no_harm() -> None:
 
 
 @pytest.mark.parametrize("level", [0.08, 0.15])
-def test_clipping_at_black_is_named(level: float) -> None:
+def test_clipping_at_black_is_reported(level: float) -> None:
     """Also in the video range, where black is 16."""
     verdict, reason, share = measured(render_set(quarter_bench(), LightEffects(clip_low=level)))
     assert verdict == "rejected"

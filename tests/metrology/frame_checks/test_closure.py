@@ -38,7 +38,7 @@ def checks(frames, shifts, phase, mean, amplitude):
 
 
 @pytest.mark.parametrize("steps", [4, 5, 8])
-def test_good_frames_leave_the_noise_and_no_frame_stands_out(steps):
+def test_good_frames_leave_noise_and_no_frame_is_suspect(steps):
     for result in checks(*scene(steps)):
         assert result.rms_adu == pytest.approx(NOISE_ADU, rel=0.03)
         np.testing.assert_allclose(result.without_rms_adu, NOISE_ADU, rtol=0.05)
@@ -47,7 +47,7 @@ def test_good_frames_leave_the_noise_and_no_frame_stands_out(steps):
 
 @pytest.mark.parametrize("steps", [4, 5, 8])
 @pytest.mark.parametrize("bad", [0, 2, 3])
-def test_a_stale_frame_is_named(steps, bad):
+def test_a_stale_frame_is_the_suspect(steps, bad):
     frames, *truth = scene(steps)
     frames[bad] = frames[bad - 1]
     for result in checks(frames, *truth):
@@ -57,7 +57,7 @@ def test_a_stale_frame_is_named(steps, bad):
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1])
-def test_a_partly_stale_frame_is_named(share):
+def test_a_partly_stale_frame_is_the_suspect(share):
     frames, *truth = scene(4)
     frames[2] += share * (frames[1] - frames[2])
     for result in checks(frames, *truth):
@@ -65,7 +65,7 @@ def test_a_partly_stale_frame_is_named(share):
         assert result.gain > 1.2
 
 
-def test_four_steps_alone_see_the_fault_but_blame_all_alike():
+def test_four_steps_alone_show_the_fault_but_no_suspect():
     frames, shifts, *_ = scene(4)
     frames[1] += 30
     result = compute_closure(frames, shifts)

@@ -51,7 +51,7 @@ def named(
 
 @pytest.mark.parametrize("frame", EVERY[1:])
 @pytest.mark.parametrize("kind", ["repeated", "stale"])
-def test_a_stale_frame_is_named_and_done_without(kind: str, frame: str) -> None:
+def test_a_stale_frame_is_reported_and_left_out(kind: str, frame: str) -> None:
     flagged, reasons, wrong = named(kind, frame)
     assert flagged == {frame}
     assert "stale" in reasons[0]
@@ -74,7 +74,7 @@ def test_a_twentieth_of_the_frame_before_is_seen(frame: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "word"), [("dark", "dark"), ("flicker", "flicker"), ("saturated", "")]
 )
-def test_a_wrong_exposure_is_named(kind: str, word: str, frame: str) -> None:
+def test_a_wrong_exposure_is_reported(kind: str, word: str, frame: str) -> None:
     flagged, reasons, wrong = named(kind, frame)
     assert flagged == {frame}
     assert word in reasons[0]
@@ -83,7 +83,7 @@ def test_a_wrong_exposure_is_named(kind: str, word: str, frame: str) -> None:
 
 
 @pytest.mark.parametrize("frame", EVERY[:-1])
-def test_swapped_frames_are_both_named_and_put_back(frame: str) -> None:
+def test_swapped_frames_are_both_reported_and_put_back(frame: str) -> None:
     flagged, _, wrong = named("swapped", frame)
     assert flagged == {frame, NAMES[NAMES.index(frame) + 1]}
     assert wrong is not None
@@ -93,7 +93,7 @@ def test_swapped_frames_are_both_named_and_put_back(frame: str) -> None:
 @pytest.mark.parametrize(
     "frame", [p for p, name in zip(EVERY, NAMES, strict=True) if name in SINUSOIDS]
 )
-def test_a_film_that_moved_behind_the_lasers_back_is_named(frame: str) -> None:
+def test_a_film_that_moved_unnoticed_by_the_laser_is_reported(frame: str) -> None:
     flagged, reasons, wrong = named("moved", frame)
     assert flagged == {frame}
     assert reasons[0].startswith("moved")
@@ -140,7 +140,9 @@ def test_two_of_three_steps_that_were_swapped_are_put_back(frame: str) -> None:
     ("steps", "gamma"),
     [(4, 2.2), *(pytest.param(*more, marks=pytest.mark.campaign) for more in ((5, 2.2), (8, 1.8)))],
 )
-def test_faults_are_seen_through_the_displays_gamma(kind: str, steps: int, gamma: float) -> None:
+def test_faults_are_found_in_spite_of_the_displays_gamma(
+    kind: str, steps: int, gamma: float
+) -> None:
     flagged, _, wrong = named(kind, "x_sin_1", steps, gamma)
     assert flagged == ({"x_sin_1", "x_sin_2"} if kind == "swapped" else {"x_sin_1"})
     assert wrong is not None
@@ -157,7 +159,7 @@ def test_no_alarm_for_a_gray_frame_without_an_edge(periods: int) -> None:
     assert check_set(good_set(_coarse(periods)), _coarse(periods)).flags == ()
 
 
-def test_a_wrong_picture_instead_of_a_gray_frame_without_an_edge_is_named() -> None:
+def test_a_wrong_picture_in_place_of_a_gray_frame_without_an_edge_is_reported() -> None:
     stack = good_set(_coarse(4))
     frame = NAMES.index("x_gray_1")
     stack.frames[frame] = stack.frames[frame - 1] + np.uint8(1)  # the same to the eye alone
@@ -253,7 +255,7 @@ def test_identical_frames_are_found_whichever_they_are() -> None:
     assert find_identical_frames(stack) == {9: 2}
 
 
-def test_geometry_that_sees_no_mirror_is_rejected() -> None:
+def test_a_geometry_without_the_mirror_in_view_is_rejected() -> None:
     optics = bench()
     blind = type(optics)(
         geometry=optics.geometry.model_copy(update={"alpha_deg": 20.0}),
@@ -266,7 +268,7 @@ def test_geometry_that_sees_no_mirror_is_rejected() -> None:
         check_set(stack, blind)
 
 
-def test_a_picture_that_is_mirrored_is_named() -> None:
+def test_a_mirrored_picture_is_reported() -> None:
     stack = good_set(bench())
     stack.frames[:] = stack.frames[:, ::-1].copy()
     with pytest.raises(RejectedSetError, match="mirrored top to bottom"):

@@ -90,7 +90,7 @@ def test_periods_of_any_ratio_give_the_figure(case: Case) -> None:
         pytest.param(Case(steps=5), "y_sin_0_of_61.7mm", marks=pytest.mark.campaign),
     ],
 )
-def test_a_first_frame_that_is_too_dark_is_named(case: Case, name: str) -> None:
+def test_a_first_frame_that_is_too_dark_is_reported(case: Case, name: str) -> None:
     """A display that is still warming up: a tenth of the light is missing."""
     stack = case.stack({name: 0.9})
     checked = check_frequencies(stack, case.optics())
@@ -98,7 +98,7 @@ def test_a_first_frame_that_is_too_dark_is_named(case: Case, name: str) -> None:
     assert error_um(checked, case) < 0.1
 
 
-def test_both_first_frames_of_an_axis_are_named() -> None:
+def test_both_first_frames_of_an_axis_are_reported() -> None:
     case, names = Case(steps=5), ["x_sin_0", "x_sin_0_of_55.3mm"]
     stack = case.stack(dict.fromkeys(names, 0.9))
     assert blamed(check_frequencies(stack, case.optics()), stack) == names

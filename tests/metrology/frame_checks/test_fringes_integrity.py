@@ -37,7 +37,7 @@ def error_um(surface: Surface) -> float:
 
 @pytest.mark.parametrize("frame", ["x_sin_1", "y_sin_2"])
 @pytest.mark.parametrize("kind", ["stale", "swapped", "flicker", "dark", "moved", "saturated"])
-def test_a_bad_frame_of_fringes_is_named(anchor: Anchor, kind: str, frame: str) -> None:
+def test_a_bad_frame_of_a_fringes_set_is_reported(anchor: Anchor, kind: str, frame: str) -> None:
     stack = fringes_of(faulty_set(kind, frame))
     checked = check_set(stack, bench(), anchor)
     other = {"x_sin_1": "x_sin_2", "y_sin_2": "y_sin_3"}[frame]
@@ -46,7 +46,7 @@ def test_a_bad_frame_of_fringes_is_named(anchor: Anchor, kind: str, frame: str) 
     assert error_um(checked.state.surface) < 0.05
 
 
-def test_a_film_that_moved_too_far_asks_for_a_full_set(anchor: Anchor) -> None:
+def test_a_film_that_moved_too_far_requires_a_full_set(anchor: Anchor) -> None:
     moved = fringes_of(good_set(bench(), motion_um=lambda _t: 2500.0))
     with pytest.raises(RejectedSetError, match="half a period from the reference"):
         check_set(moved, bench(), anchor)

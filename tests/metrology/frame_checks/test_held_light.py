@@ -59,7 +59,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_held_light_is_found_and_taken_out(name: str) -> None:
+def test_held_light_is_found_and_removed(name: str) -> None:
     """The figure would be off by 3.6 µm at 1 %; no frame is flagged, and the rest is in the bar."""
     effects, allowed_um = CASES[name]
     checked, found_um = coefficients_um(render_set(OPTICS, effects, seed=3))

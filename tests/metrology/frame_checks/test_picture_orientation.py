@@ -70,7 +70,7 @@ def with_axes_exchanged(stack: FrameStack) -> FrameStack:
 
 @pytest.mark.parametrize("what", TURNED)
 @pytest.mark.parametrize("steps", [3, 4])
-def test_turned_pictures_are_named_and_rejected(what: str, steps: int) -> None:
+def test_turned_pictures_are_reported_and_rejected(what: str, steps: int) -> None:
     stack = turned(good_set(bench(steps)), TURNED[what])
     with pytest.raises(RejectedSetError) as rejected:
         check_set(stack, bench(steps))
@@ -78,7 +78,7 @@ def test_turned_pictures_are_named_and_rejected(what: str, steps: int) -> None:
     assert not rejected.value.flags  # no single frame is blamed
 
 
-def test_a_screen_with_exchanged_axes_is_named() -> None:
+def test_a_screen_with_exchanged_axes_is_reported() -> None:
     with pytest.raises(RejectedSetError, match="pattern on the screen is shown with x and y"):
         check_set(with_axes_exchanged(good_set(bench())), bench())
 

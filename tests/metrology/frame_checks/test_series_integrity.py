@@ -62,7 +62,7 @@ def test_good_frames_pass_whatever_the_display_does(second: float) -> None:
 
 @pytest.mark.parametrize("index", [0, 1, 2])
 @pytest.mark.parametrize("step", [0, 1, 3])
-def test_a_stale_frame_is_named_and_done_without(index: int, step: int) -> None:
+def test_a_stale_frame_is_reported_and_left_out(index: int, step: int) -> None:
     y, x = scene()
     before = (
         y.frames[-1, -1]
@@ -78,7 +78,7 @@ def test_a_stale_frame_is_named_and_done_without(index: int, step: int) -> None:
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (1, 2), (0, 2), (1, 3)])
-def test_exchanged_steps_are_named_and_put_back(pair: tuple[int, int]) -> None:
+def test_exchanged_steps_are_reported_and_put_back(pair: tuple[int, int]) -> None:
     y, x = scene()
     frames = x.frames.copy()
     frames[1, list(pair)] = frames[1, list(pair[::-1])]
@@ -87,7 +87,7 @@ def test_exchanged_steps_are_named_and_put_back(pair: tuple[int, int]) -> None:
     assert np.array_equal(found.axes[1].frames, x.frames)
 
 
-def test_a_flickering_frame_is_named() -> None:
+def test_a_flickering_frame_is_reported() -> None:
     _, x = scene()
     found = checked(spoiled(2, 1, 0.7 * x.frames[2, 1]))
     assert named(found) == {("x", 2, 1)}

@@ -45,7 +45,7 @@ def test_a_missing_frame_is_counted(tmp_path):
         sofast_file.read_sofast_file(measurement(tmp_path / "m.h5", frames=31))
 
 
-def test_a_missing_item_a_missing_file_and_a_wrong_file_are_named(tmp_path):
+def test_a_missing_item_a_missing_file_and_a_wrong_file_are_reported(tmp_path):
     with pytest.raises(ValueError, match=r"e\.h5: Camera/intrinsic_mat is missing"):
         sofast_facet.read_camera(write(tmp_path / "e.h5", other=1))
     with pytest.raises(FileNotFoundError, match="no such file"):
@@ -92,13 +92,13 @@ def test_oblong_pixels_become_square_ones_of_the_same_rays(tmp_path):
     )
 
 
-def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
+def test_without_h5py_the_missing_extra_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ImportError, match=r"membrane-ctrl\[sofast\]"):
         sofast_facet.read_camera(tmp_path / "c.h5")
 
 
-def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
+def test_links_out_of_the_file_and_too_large_data_are_refused(tmp_path):
     other = write(tmp_path / "other.h5", Camera__intrinsic_mat=np.eye(3))
     path = tmp_path / "e.h5"
     with h5py.File(path, "w") as file:

@@ -49,13 +49,13 @@ def test_islands_vote_for_themselves_and_specks_are_dropped() -> None:
     assert found.phase_rad[known] == pytest.approx(PHASE[known])
 
 
-def test_a_torn_phase_is_left_to_the_code() -> None:
+def test_a_torn_phase_gets_the_orders_of_the_code() -> None:
     torn = np.where(np.sin(PHASE) > 0, 0.01, math.pi - 0.01) + 0.3 * np.sin(7 * ROWS)
     wrapped = np.angle(np.exp(1j * torn))
     assert resolve_orders(wrapped, true_bits(), EVERYWHERE).torn
 
 
-def test_continuity_goes_around_holes() -> None:
+def test_continuity_leads_around_holes() -> None:
     mask = EVERYWHERE.copy()
     mask[5:55, 20:70] = False
     smooth, region = unwrap_regions(WRAPPED, mask)

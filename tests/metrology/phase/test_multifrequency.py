@@ -68,7 +68,7 @@ def test_prediction_does_not_look_at_the_frequency_it_predicts(index):
     np.testing.assert_allclose(predicted, 2 * np.pi * PERIODS[index] * position, atol=1e-9)
 
 
-def test_prediction_of_the_coarsest_takes_it_for_the_order_only():
+def test_the_prediction_of_the_coarsest_uses_it_for_the_order_alone():
     position = np.linspace(0.1, 0.9, 50)
     phases = wrapped(position)
     phases[0] += 0.1

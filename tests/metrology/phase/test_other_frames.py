@@ -62,7 +62,7 @@ def test_places_that_two_orders_explain_are_not_given() -> None:
     assert given.mean() < 0.01  # 26 mm beyond one end looks like the other end, 420 mm away
 
 
-def test_places_refuse_what_they_cannot_use() -> None:
+def test_places_refuse_invalid_phases_and_periods() -> None:
     for periods, span in (
         ([10.0], (0, 1)),
         ([10.0, 20.0, 30.0], (0, 1)),
@@ -82,7 +82,7 @@ def test_a_gray_code_of_any_length(bits: int) -> None:
     np.testing.assert_array_equal(k2, (half + 1) // 2)
 
 
-def test_crossed_fringes_are_told_apart() -> None:
+def test_crossed_fringes_of_x_and_y_are_separated() -> None:
     random = np.random.default_rng(2)
     phi_x, phi_y = random.uniform(-np.pi, np.pi, (2, 500))
     steps = 2 * np.pi * np.arange(5) / 5

@@ -42,7 +42,7 @@ def test_only_watched_frames_count_as_saturated() -> None:
     assert not binner.saturated.any()
 
 
-def test_views_and_read_only_frames_are_taken() -> None:
+def test_views_and_read_only_frames_are_accepted() -> None:
     frames = RNG.integers(0, 255, (8, 24)).astype(np.uint8)
     binner = Binner(8, 8, 4, 255, 1)
     view = frames[:, ::3]
@@ -110,7 +110,7 @@ def test_phase_is_followed_across_its_jumps(steps: int) -> None:
     assert size == pytest.approx(80e3, rel=1e-4)
 
 
-def test_known_motion_is_taken_out_of_the_steps() -> None:
+def test_known_motion_is_removed_from_the_steps() -> None:
     """20 µm, 3 mrad of phase a micrometre: the error left is of third order."""
     phase = RNG.uniform(-3, 3, 500)
     q = RNG.uniform(-3e-3, 3e-3, 500)
@@ -137,5 +137,7 @@ def test_a_constant_displacement_is_a_plain_shift() -> None:
         ([0.0, 9.0, math.nan, 9.0], False),
     ],
 )
-def test_motion_within_the_lasers_noise_is_left_alone(readings: list[float], worth: bool) -> None:
+def test_motion_within_the_lasers_noise_is_not_corrected(
+    readings: list[float], worth: bool
+) -> None:
     assert worth_correcting(np.array(readings), 1.0) is worth

@@ -97,5 +97,5 @@ def test_profile_of_a_hencky_bowl() -> None:
     assert profile.high_mm[-1] - profile.low_mm[-1] == pytest.approx(0.2, abs=0.03)
 
 
-def test_pressure_goes_with_the_cube_of_the_sag() -> None:
+def test_pressure_is_proportional_to_the_cube_of_the_sag() -> None:
     assert pressure_pa(2 * 37.1, 500.0) == pytest.approx(8 * pressure_pa(37.1, 500.0))

@@ -58,7 +58,7 @@ def _error_um(surface: Surface) -> float:
     return float(1e3 * np.std((surface.height(x, y) - FILM.height_mm(x, y))[inside]))
 
 
-def test_the_map_goes_through_its_nodes_and_a_cubic_is_exact() -> None:
+def test_the_map_passes_through_its_nodes_and_a_cubic_is_exact() -> None:
     x, y = np.meshgrid(NODES_X, NODES_Y)
     face = Face.of(ScreenPoseConfig(height_map=MAP))
     assert face.heights(np.stack([x, y]))[0] == pytest.approx(np.array(MAP.heights_mm), abs=1e-12)
@@ -87,7 +87,7 @@ def test_few_nodes_make_a_bow_or_a_plane() -> None:
     assert tilted.heights(points)[0] == pytest.approx(0.01 * points[0], abs=1e-12)
 
 
-def test_beyond_the_map_its_edge_goes_on() -> None:
+def test_beyond_the_map_the_height_of_its_edge_continues() -> None:
     face = Face.of(ScreenPoseConfig(height_map=MAP))
     edge, beyond = face.heights(np.array([[250.0, 400.0], [30.0, 30.0]])).T
     assert beyond[0] == pytest.approx(edge[0])
@@ -95,7 +95,7 @@ def test_beyond_the_map_its_edge_goes_on() -> None:
     assert beyond[2] == pytest.approx(edge[2])
 
 
-def test_rays_meet_the_face_where_the_twin_says() -> None:
+def test_rays_meet_the_face_where_the_twin_has_them() -> None:
     optics = _optics(CROOKED)
     geometry = Geometry.from_config(optics)
     rays = geometry.rays(*pixel_grid(SMALL, stride=3))

@@ -43,7 +43,7 @@ def test_a_film_that_moved_without_a_laser_is_in_the_bar_of_its_sag(moved_um: in
         ("blur of 8 px", "focus the camera"),
     ],
 )
-def test_what_a_set_says_of_itself_is_in_its_verdict(name: str, doubt: str) -> None:
+def test_failed_consistency_checks_of_a_set_are_in_its_verdict(name: str, doubt: str) -> None:
     assert_held(BY_NAME[name], doubt)
 
 

@@ -72,7 +72,7 @@ def golden_focal_mm(result):
     ]  # h = x^2 / (4 f), coefficients in 1/m
 
 
-def test_every_pixel_unwraps_alike(golden, measurement, response):
+def test_every_pixel_unwraps_to_the_same_place(golden, measurement, response):
     decoded = decode(measurement, golden[1].mask, response)
     assert decoded.consistent.all()
     assert max(np.abs(axis.step_periods).max() for axis in (decoded.x, decoded.y)) < 0.09
@@ -92,7 +92,7 @@ def test_rays_and_screen_points_are_the_golden_ones(golden, seen, camera):
     )
 
 
-def test_the_pose_taken_over_stands_at_the_measured_distance(golden, measurement, camera):
+def test_the_adopted_pose_has_the_measured_distance(golden, measurement, camera):
     origin_mm = golden[1].geometry(camera).screen_origin_mm
     assert np.linalg.norm(origin_mm) == pytest.approx(measurement.distance_mm, abs=1e-6)
 
@@ -192,7 +192,7 @@ def test_no_frame_of_this_set_is_stale(measurement, mask, axis):
 @pytest.mark.parametrize("axis", ["x", "y"])
 @pytest.mark.parametrize("index", [0, 1, 2, 3])
 @pytest.mark.parametrize("step", [1, 2, 3])
-def test_a_stale_frame_put_into_it_is_named(measurement, mask, axis, index, step):
+def test_a_planted_stale_frame_is_reported(measurement, mask, axis, index, step):
     frames, periods = frame_series(measurement, mask, axis)
     frames[index, step] = frames[index, step - 1]
     assert compute_closure(frames[index], SHIFTS_RAD).rms_adu > 20
@@ -230,7 +230,7 @@ def test_the_untouched_frames_raise_no_alarm(measurement, mask):
     assert lit_pixels(measurement)[mask].all()  # all that the tool used, found without it
 
 
-def test_every_stale_frame_is_named_by_the_check(measurement):
+def test_the_check_reports_every_stale_frame(measurement):
     noise = np.random.default_rng(2).normal(0, 1.0, int(lit_pixels(measurement).sum()))
     for axis, index, step in product(range(2), range(4), range(1, 4)):
 
@@ -246,7 +246,7 @@ def test_every_stale_frame_is_named_by_the_check(measurement):
         assert found.flags[0].reason.startswith("stale")
 
 
-def test_exchanged_frames_are_named_by_the_check(measurement):
+def test_the_check_reports_exchanged_frames(measurement):
     seen = 0
     for axis, index, (a, b) in product(range(2), (1, 3), ((0, 1), (0, 2), (1, 3))):
 
@@ -258,7 +258,7 @@ def test_exchanged_frames_are_named_by_the_check(measurement):
     assert seen == 12
 
 
-def test_a_stale_frame_of_the_finest_fringe_costs_nothing_once_it_is_known(measurement):
+def test_a_known_stale_frame_of_the_finest_fringe_does_not_change_the_result(measurement):
     good = series(measurement).axes[1]
 
     def stale(axes):

@@ -83,7 +83,7 @@ def measured(effects: Effects, folder: Path) -> MeasuredErrors:
 
 
 @pytest.mark.parametrize("name", CAUSES)
-def test_the_cause_is_named_and_no_other(name: str, tmp_path: Path) -> None:
+def test_the_cause_of_wrong_light_is_reported_and_no_other(name: str, tmp_path: Path) -> None:
     cause = CAUSES[name]
     found = measured(cause.effects, tmp_path / "set")
     printed = {word for word, text in WORDS.items() if text in found.reason}

@@ -64,7 +64,7 @@ def test_a_statement_blames_its_cause(statement: str, cause: str) -> None:
     assert not is_true(causes, ["gamma above 1"])
 
 
-def test_a_cause_that_only_may_be_is_not_a_named_one() -> None:
+def test_a_possible_cause_is_not_reported_as_certain() -> None:
     name, causes = blamed("cause unknown; it looks like light from a second reflection")
     assert (name, causes) == ("", ())
 

@@ -81,7 +81,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> SetFigure:
     ("periods", "why"),
     [(12, "only 8 fringes across the mirror"), (120, r"only \d\.\d pixels a fringe")],
 )
-def test_fringes_that_tell_nothing_are_refused(
+def test_fringes_that_determine_nothing_are_refused(
     reference: SetFigure, periods: int, why: str
 ) -> None:
     with pytest.raises(ValueError, match=why):
@@ -205,7 +205,7 @@ def test_a_hand_makes_the_error_bars_larger_while_it_is_there(bench: Bench) -> N
     assert back == pytest.approx(1.0, abs=0.1)
 
 
-def test_jumps_at_steps_of_the_pattern_are_told_from_noise_and_motion() -> None:
+def test_jumps_at_steps_of_the_pattern_are_distinguished_from_noise_and_motion() -> None:
     """The first parameter moves, the second jumps at steps, the others are noise."""
     random, jumps, expected = np.random.default_rng(1), Jumps(), []
     for k in range(60):
@@ -249,7 +249,9 @@ def hand(frame: NDArray[np.uint8], columns: int, light_adu: float = 9) -> NDArra
     return out
 
 
-def test_a_hand_in_one_of_the_first_five_steps_takes_no_light_from_the_others(bench: Bench) -> None:
+def test_a_hand_in_one_of_the_first_five_steps_does_not_change_the_light_of_the_others(
+    bench: Bench,
+) -> None:
     """Its bins had no weight from then on: figures called ok were 13 sigma off."""
     tracker = bench.tracker()
     pictures = [bench.frame(shifts=(float(x), float(y))) for x, y in STEPS]
@@ -269,7 +271,7 @@ def dusty(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.where(spots, 0.8 * frame, frame).astype(np.uint8)
 
 
-def test_a_fit_that_stays_lost_knows_no_forgotten_bands(
+def test_a_fit_that_stays_lost_has_no_removed_bands(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A brighter frame may be lost and yet be accepted: bands that were forgotten then ended the
@@ -340,7 +342,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         ("stripes", "rejected", "no fringes"),
     ],
 )
-def test_a_faulty_frame_is_named_and_spoils_no_other(
+def test_a_faulty_frame_is_reported_and_does_not_change_others(
     bench: Bench, name: str, verdict: str, reason: str
 ) -> None:
     faulty, after = judged(bench, name)

@@ -192,7 +192,7 @@ def test_steps_take_out_what_no_smooth_map_can(bench: Bench) -> None:
     assert off_um(bench.frames(20)) < 0.5 * before
 
 
-def test_a_lost_order_is_said_and_found_again_by_a_full_cycle(bench: Bench) -> None:
+def test_a_lost_order_is_reported_and_a_full_cycle_finds_it_again(bench: Bench) -> None:
     bench.frames(6)
     lost = bench.frames(round(LOST_S * RATE_HZ) + 1, 900.0)
     assert {e.verdict for e in lost} == {"rejected"}
@@ -213,7 +213,7 @@ def test_after_a_short_jump_the_frames_are_followed_again(bench: Bench) -> None:
     assert {(e.verdict, e.tracking_lost) for e in found} == {("ok", False)}
 
 
-def test_the_dark_asks_for_a_full_cycle_only_after_a_while(bench: Bench) -> None:
+def test_dark_frames_require_a_full_cycle_only_after_a_while(bench: Bench) -> None:
     assert {e.verdict for e in bench.frames(6)} == {"ok"}
     dark = bench.frames(round(REJECTED_S * RATE_HZ) + 1, gain=0.05)
     assert {e.reason.split(":")[0] for e in dark} == {"dark"}
@@ -231,7 +231,7 @@ def held_um(seconds: float) -> NDArray[np.float64]:
 
 
 @pytest.mark.campaign
-def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
+def test_a_hold_finds_the_films_vibrations_and_no_others() -> None:
     """Two minutes of the twin's film, as a hold moves it, vibrating by 20 nm at each of a drum's
     frequencies.
     """
@@ -268,7 +268,7 @@ def test_without_an_anchor_a_frame_is_rejected() -> None:
     assert (found.kind, found.verdict, found.tracking_lost) == ("track", "rejected", True)
 
 
-def test_a_pattern_too_fine_for_the_camera_is_named() -> None:
+def test_a_pattern_too_fine_for_the_camera_is_reported() -> None:
     bench = Bench()
     bench.tracker = LiveTracker(OPTICS, LiveReconstructor(OPTICS, 1), 200, STEP_S)
     found = bench.full()

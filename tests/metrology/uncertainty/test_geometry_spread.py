@@ -80,7 +80,7 @@ def test_general_form_is_shifted_and_turned_about_its_own_origin() -> None:
     )
 
 
-def test_nothing_named_changes_nothing() -> None:
+def test_a_change_of_no_parameter_leaves_the_geometry_unchanged() -> None:
     assert change_geometry(_general(), (), []) == _general()
 
 

@@ -40,7 +40,7 @@ def test_tally() -> None:
     assert (tally.count, tally.mean, tally.low, tally.high) == (3, 2.0, -1.0, 4.0)
 
 
-def test_default_points_are_inside_and_apart() -> None:
+def test_default_points_are_inside_the_mirror_and_different() -> None:
     points = default_points_mm(475.0)
     assert list(points) == ["A", "B", "C"]
     radii = [math.hypot(*place) for place in points.values()]

@@ -20,7 +20,7 @@ from tests.worlds.vibrating_mirror import watched
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_lines_beyond_half_the_frame_rate_are_named(seed: int) -> None:
+def test_lines_beyond_half_the_frame_rate_are_found(seed: int) -> None:
     time_s, coeffs_um, planted = watched(seed)
     found = find_modes(time_s, coeffs_um)
     assert len(found) == len(planted)
@@ -33,7 +33,7 @@ def test_lines_beyond_half_the_frame_rate_are_named(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_frames_of_a_busy_machine_name_the_lines_as_well(seed: int) -> None:
+def test_lines_are_found_with_the_jitter_of_a_busy_machine(seed: int) -> None:
     """Intervals that scatter by some per cent were no steady rate: nothing was searched."""
     time_s, coeffs_um, planted = watched(seed, jitter_s=2e-3)
     found = find_modes(time_s, coeffs_um)
@@ -42,7 +42,7 @@ def test_frames_of_a_busy_machine_name_the_lines_as_well(seed: int) -> None:
     assert all(mode.seen_by(found) for mode in planted)
 
 
-def test_lines_with_one_alias_at_one_rate_make_no_others() -> None:
+def test_lines_with_one_alias_at_one_rate_give_no_false_lines() -> None:
     """A drum's, which move the vertex: at 17.1 frames a second,
     27 and 61 Hz are at 7.2 and 7.4 Hz.
     """
@@ -59,7 +59,7 @@ def test_lines_with_one_alias_at_one_rate_make_no_others() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_terms_of_less_noise_than_a_nanometre_make_no_others(seed: int) -> None:
+def test_terms_with_less_noise_than_a_nanometre_give_no_false_lines(seed: int) -> None:
     """A hold gives whole nanometres: a term that hardly leaves one
     has next to no noise of its own.
     """
@@ -78,7 +78,7 @@ def test_terms_of_less_noise_than_a_nanometre_make_no_others(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 5])
-def test_the_slow_motion_of_a_held_film_makes_no_lines(seed: int) -> None:
+def test_the_slow_motion_of_a_held_film_gives_no_false_lines(seed: int) -> None:
     """It is nearly all in one term, 28 nm/rtHz at 1 Hz, and at one of the rates among a mode's
     aliases.
     """
@@ -151,7 +151,7 @@ def test_steps_outliers_and_rejected_frames_are_no_line_and_hide_none() -> None:
     assert planted[0].seen_by(found)
 
 
-def test_one_frame_rate_leaves_the_aliases_and_says_so() -> None:
+def test_one_frame_rate_leaves_aliases_which_are_reported() -> None:
     time_s, coeffs_um, planted = watched(4, lines_hz=(48.0,), rates_hz=(20.0,))
     (seen,) = find_modes(time_s, coeffs_um)
     possible = [seen.frequency_hz, *seen.aliases_hz]
@@ -252,7 +252,7 @@ def scaled(by: float) -> dict[int, float]:
     return {k: by * hz for k, hz in USUAL.items()}
 
 
-def test_a_mode_keeps_its_place_and_a_minute_without_it_says_so(
+def test_a_mode_keeps_its_place_and_a_minute_without_it_has_none_there(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     told = heard(
@@ -281,7 +281,7 @@ def test_of_two_modes_of_nearly_one_frequency_each_keeps_its_place(
     assert places(told) == [[48.0, 48.15], [48.0, 48.15]]
 
 
-def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(
+def test_a_mode_that_moves_by_a_per_cent_gives_one_notice_and_its_return_ends_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     listener, lower = VibrationFollower(), {3: 47.3, 7: 61.0}
@@ -300,7 +300,7 @@ def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(
 @pytest.mark.parametrize(
     ("change", "told"), [(0.01, 1), (-0.01, 1), (0.003, 0), (-0.003, 0), (0.0, 0)]
 )
-def test_a_slow_shift_within_a_week_is_told(
+def test_a_slow_shift_within_a_week_gives_a_notice(
     monkeypatch: pytest.MonkeyPatch, change: float, told: int
 ) -> None:
     """Five minutes a day; the last on day 7."""
@@ -330,19 +330,21 @@ def test_what_stays_where_it_moved_to_is_the_usual_after_a_week(
     assert said == [[], [], ["maintenance"], *[[]] * 7, ["maintenance_over"], []]
 
 
-def test_a_shift_slower_than_that_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shift_slower_than_that_gives_no_notice(monkeypatch: pytest.MonkeyPatch) -> None:
     listener = VibrationFollower()
     for day in range(30):
         assert notices(heard(monkeypatch, listener, 5 * [scaled(1 + 0.007 * day / 7)], day)) == []
 
 
-def test_a_mode_that_was_away_for_a_week_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mode_that_was_absent_for_a_week_has_no_earlier_frequencies(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     listener = VibrationFollower()
     heard(monkeypatch, listener, 6 * [USUAL])
     assert notices(heard(monkeypatch, listener, 12 * [scaled(1.015)], day=9)) == []
 
 
-def test_the_next_listener_goes_on_where_the_last_one_ended(
+def test_the_next_follower_continues_with_the_modes_of_the_last_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     first = VibrationFollower(61.0, begin_utc_s=0.0)
@@ -358,7 +360,7 @@ def test_the_next_listener_goes_on_where_the_last_one_ended(
     assert "48.00 Hz moved by -1.0% within 48 h" in moved[0].message
 
 
-def test_strokes_of_the_pump_at_a_mode_are_told_once_and_their_end_too(
+def test_pump_strokes_at_a_mode_give_one_notice_which_ends_with_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     away = {3: 48.0}
@@ -376,7 +378,7 @@ def test_strokes_of_the_pump_at_a_mode_are_told_once_and_their_end_too(
     assert again == driven
 
 
-def test_a_line_heard_once_at_the_strokes_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_found_once_at_the_strokes_gives_no_notice(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (
         notices(heard(monkeypatch, VibrationFollower(61.5), [{3: 48.0}, USUAL, *8 * [{3: 48.0}]]))
         == []
@@ -384,14 +386,14 @@ def test_a_line_heard_once_at_the_strokes_is_not_told(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.campaign
-def test_a_listener_hears_what_is_planted() -> None:
+def test_a_follower_finds_planted_vibrations() -> None:
     time_s, coeffs_um, planted = watched(1, lines_hz=(48.0,))
     (told,) = VibrationFollower().search(time_s, coeffs_um)
     assert isinstance(told, Vibrations)
     assert told.frequency_hz == pytest.approx([planted[0].frequency_hz], abs=0.05)
 
 
-def test_what_was_heard_survives_the_line_to_the_hold_and_has_a_sentence() -> None:
+def test_the_vibrations_event_survives_encoding_and_has_a_sentence() -> None:
     event = Vibrations([48.0, None], [5.0, None], "48.00 Hz 5.0 nm")
     assert from_dict(event.to_dict()) == event
     assert event.sentence == "Vibrations of the mirror: 48.00 Hz 5.0 nm"
