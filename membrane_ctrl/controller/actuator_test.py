@@ -1,27 +1,57 @@
-"""The actuator test before a hold: the vent must sink the mirror, the pump must lift it. Pure."""
+"""The actuator test before a hold: the vent must sink the mirror, the pump must lift it. Pure.
 
+Three parts follow each other, each with one command: everything off (the film's own speed), vent a
+little open, pump at most of its flow. A response is awaited: a part ends as soon as the film's
+speed has changed clearly, and the test fails if it has not after the part's longest time. A slow
+pump or a weak vent takes longer, and a dead or reversed one is found.
+"""
+
+import math
 from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control import pump_curve
-from membrane_ctrl.control.line_slope import Slope
-from membrane_ctrl.model.state_tree import StateNode
+from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
 _RATE_HZ = 50.0  # tick rate of the parts' times
-# At 50 Hz and with 1 µm of noise the vent's speed has a standard deviation of 1.4 µm/s, the pump's
-# 0.6 µm/s, and the means of two 1.0 and 0.4 µm/s. Three of them are clear; two and a half decide in
-# the end.
-_VENT_CLEAR_UM_PER_S = 4.5
-_VENT_LEAST_UM_PER_S = 2.5
+# A change of speed is clear beyond so many standard deviations: judged in some ten independent
+# windows, noise alone then passes two dead actuators in a thousand.
+_CLEAR_SIGMAS = 3.5
+# Slower than this no vent lowers the mirror in time, and gusts change the speed by as much.
+_VENT_LEAST_UM_PER_S = 1.0
 _PUMP_CLEAR_SHARE = 0.5
+# At the end of the longest time: a pump that is still accelerating, or weaker than its curve.
 _PUMP_LEAST_SHARE = 0.3
 _PUMP_MOST_SHARE = 3.0
+# A straight line that leaves more than this was disturbed: by something in the beam, or a door.
+_UNSTEADY_NOISES = 2.0
+_UNSTEADY_LEAST_UM = 2.0
+_NOISE_LEAST_UM = 0.3  # gusts and the laser's resolution
+_OFF_REPEATS = 2
+# All changes of speed are measured from that with everything off. With 1 µm of noise it has
+# 0.4 µm/s after the part's measuring time; a noisier laser takes longer.
+_OFF_SIGMA_MOST_UM_PER_S = 0.6
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A part of the actuator test: commands, response time (lag 0.15 s, transport 0.1 s), measuring
-    time.
+    """A part of the actuator test.
+
+    Attributes
+    ----------
+    name : str
+    pump_fraction, vent_fraction : float
+        Commands.
+    wait_s : float
+        What a quick actuator needs to respond: lag 0.15 s, transport 0.1 s.
+    measure_s : float
+        Time over which a speed is measured.
+    longest_s : float
+        After which the test fails without a response.
     """
 
     name: str
@@ -29,38 +59,89 @@ class Part:
     vent_fraction: float
     wait_s: float
     measure_s: float
+    longest_s: float
 
 
 # The vent costs 7 µm of height, which the pump must restore. The pump comes last, at 0.8: its gas
-# is needed on the way to the setpoint anyway.
+# is needed on the way to the setpoint anyway. Five seconds are enough for a delay of 2 s with a lag
+# of 1.5 s, and together with the other parts they are what a test took that ran twice.
 PARTS = (
-    Part("off", 0.0, 0.0, 0.0, 1.2),
-    Part("vent", 0.0, 0.08, 0.35, 0.5),
-    Part("pump", 0.8, 0.0, 0.5, 1.0),
+    Part("off", 0.0, 0.0, 0.0, 1.2, 3.0),
+    Part("vent", 0.0, 0.08, 0.35, 0.5, 3.0),
+    Part("pump", 0.8, 0.0, 0.5, 1.0, 5.0),
 )
+# A speed is measured over all readings after a part's waiting time, but at most over so many
+# seconds: noise averages out, and the beginning of a slow response is left behind.
+_VENT_WINDOW_MOST_S = 2.0
+_PUMP_WINDOW_MOST_S = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """A measured speed of the film.
+
+    Attributes
+    ----------
+    um_per_s, sigma_um_per_s : float
+        The slope of a straight line through readings, and its standard deviation.
+    residual_um : float
+        Root mean square of the readings' distance from that line.
+    """
+
+    um_per_s: float
+    sigma_um_per_s: float
+    residual_um: float
 
 
 @dataclass(slots=True)
 class ActuatorTestState(StateNode):
-    """What a test was begun with, and its slopes so far."""
+    """A test in progress.
+
+    Attributes
+    ----------
+    pump : PumpConfig
+        With which it was begun.
+    test_vent : bool
+        Whether it has the part `vent`.
+    part : int
+        Number of the running part.
+    part_s : float
+        How long it has run.
+    readings : (n, 2) array
+        Its readings: time in the part in s, displacement in µm.
+    noise_um : float
+        Noise of a reading, found while everything was off.
+    off_um_per_s, off_sigma_um_per_s : float
+        Speed while everything was off.
+    off_repeats : int
+        How often that part was repeated.
+    reversed_s : float
+        How long the pump has lowered the mirror clearly.
+    failure : str
+        What does not respond; empty if nothing has failed.
+    """
 
     pump: PumpConfig
     test_vent: bool
-    speeds: dict[str, Slope]  # by part
-    before: dict[str, float] = field(default_factory=dict)  # of the first run, µm/s
-    elapsed_s: float = 0.0
+    part: Count = 0
+    part_s: float = 0.0
+    readings: Annotated[FloatArray, ArrayShape((-1, 2))] = field(
+        default_factory=lambda: np.empty((0, 2))
+    )
+    noise_um: float = math.nan
+    off_um_per_s: float = math.nan
+    off_sigma_um_per_s: float = math.nan
+    off_repeats: Count = 0
+    reversed_s: float = 0.0
+    failure: str = ""
 
 
 class ActuatorTest:
     """Does the film respond to vent and pump? Each tick executes the commands of `part` and gives
     `step` its reading.
 
-    The speed of the centre in each part is the slope of the laser readings. The test checks sign
-    and size within a
-    factor: it finds a disconnected hose, a stuck valve or a laser on the wrong spot, not a pump 30
-    % too weak. After an unclear response it runs again; then a clear response suffices, otherwise
-    the mean of both decides. With 1 µm of noise a good bench needs the second run in one start of a
-    hundred.
+    The test checks sign and size within a factor: it finds a disconnected hose, a stuck valve or a
+    laser on the wrong spot, not a pump 30 % too weak.
 
     Parameters
     ----------
@@ -68,7 +149,7 @@ class ActuatorTest:
     test_vent : bool
         Whether the bench has a vent and the mirror pressure to release.
     rate_hz : float
-        Tick rate; fewer readings per second take longer to show a slope.
+        Tick rate; fewer readings per second take longer to show a speed.
     memory : ActuatorTestState, optional
         Of a test in progress, with this pump and vent.
     """
@@ -80,81 +161,179 @@ class ActuatorTest:
         rate_hz: float,
         memory: ActuatorTestState | None = None,
     ) -> None:
-        # the slope's standard deviation goes with rate^(-1/2) T^(-3/2): this T keeps it
+        # A speed's standard deviation goes with rate^(-1/2) T^(-3/2): this T keeps it.
         longer = (_RATE_HZ / min(rate_hz, _RATE_HZ)) ** (1 / 3)
         self._parts = [
-            replace(part, measure_s=part.measure_s * longer)
-            for part in PARTS
-            if test_vent or part.name != "vent"
+            _lengthen(part, longer) for part in PARTS if test_vent or part.name != "vent"
         ]
-        self.memory = memory or ActuatorTestState(pump, test_vent, self._fresh_slopes())
-
-    def _fresh_slopes(self) -> dict[str, Slope]:
-        return {part.name: Slope() for part in self._parts}
-
-    def again(self) -> None:
-        """Start the second run; the mean of both decides if it is unclear too."""
-        memory = self.memory
-        memory.before = {name: slope.per_s for name, slope in memory.speeds.items()}
-        memory.speeds = self._fresh_slopes()
-        memory.elapsed_s = 0.0
-
-    @property
-    def is_second(self) -> bool:
-        """Whether the test runs for the second and last time."""
-        return bool(self.memory.before)
-
-    @property
-    def duration_s(self) -> float:
-        """Total duration of all parts."""
-        return sum(part.wait_s + part.measure_s for part in self._parts)
+        self.memory = memory or ActuatorTestState(pump, test_vent)
 
     @property
     def part(self) -> Part | None:
-        """The running part; None when all are done."""
-        left_s = self.memory.elapsed_s
-        for part in self._parts:
-            if left_s < part.wait_s + part.measure_s - 1e-9:
-                return part
-            left_s -= part.wait_s + part.measure_s
-        return None
+        """The running part; None when the test is over."""
+        number = self.memory.part
+        return self._parts[number] if number < len(self._parts) else None
+
+    @property
+    def longest_s(self) -> float:
+        """The longest time of all parts, without repeats."""
+        return sum(part.longest_s for part in self._parts)
+
+    @property
+    def failure(self) -> str:
+        """What does not respond; empty if nothing has failed."""
+        return self.memory.failure
+
+    @property
+    def _expected_um_per_s(self) -> float:
+        """How fast the pump should lift the mirror, by its curve."""
+        return pump_curve.PumpCurve(self.memory.pump).flow(PARTS[-1].pump_fraction)
+
+    @property
+    def leak_um_per_s(self) -> float:
+        """How fast the mirror sank with the pump off and the vent closed."""
+        return max(0.0, -self.memory.off_um_per_s)
 
     def step(self, displacement_um: float, dt_s: float) -> None:
         """Take one reading (NaN: none) and advance the time."""
         part = self.part
         if part is None:
             return
-        before = sum(p.wait_s + p.measure_s for p in self._parts[: self._parts.index(part)])
-        if self.memory.elapsed_s - before >= part.wait_s:
-            self.memory.speeds[part.name].add(self.memory.elapsed_s, displacement_um)
-        self.memory.elapsed_s += dt_s
+        memory = self.memory
+        if math.isfinite(displacement_um):
+            reading = [[memory.part_s, displacement_um]]
+            memory.readings = np.concatenate((memory.readings, reading))
+        memory.part_s += dt_s
+        if memory.part_s < part.wait_s + part.measure_s - 1e-9:
+            return
+        match part.name:
+            case "off":
+                self._judge_off(part)
+            case "vent":
+                self._judge_vent(part)
+            case "pump":
+                self._judge_pump(part, dt_s)
 
-    @property
-    def leak_um_per_s(self) -> float:
-        """How fast the mirror sank with the pump off and the vent closed."""
-        return max(0.0, -self.memory.speeds["off"].per_s)
+    def _judge_off(self, part: Part) -> None:
+        """Measure the film's own speed, and the noise of a reading."""
+        memory = self.memory
+        values_um = memory.readings[:, 1]
+        steps_um = np.diff(values_um)
+        noise_um = float(np.sqrt(np.mean(steps_um**2) / 2)) if steps_um.size else math.inf
+        memory.noise_um = max(noise_um, _NOISE_LEAST_UM)
+        speed = self._measure(0.0)
+        most_um = max(_UNSTEADY_NOISES * memory.noise_um, _UNSTEADY_LEAST_UM)
+        if speed is None or speed.residual_um > most_um:
+            if memory.off_repeats >= _OFF_REPEATS:
+                self._fail("its readings jump by micrometres with pump and vent off")
+                return
+            memory.off_repeats += 1
+            self._begin_part(memory.part)
+            return
+        is_last = memory.part_s >= part.longest_s - 1e-9
+        if speed.sigma_um_per_s > _OFF_SIGMA_MOST_UM_PER_S and not is_last:
+            return
+        memory.off_um_per_s = speed.um_per_s
+        memory.off_sigma_um_per_s = speed.sigma_um_per_s
+        self._begin_part(memory.part + 1)
 
-    def failure(self) -> str:
-        """What failed to respond, or in the first run to respond clearly; empty if nothing."""
-        speeds = {name: slope.per_s for name, slope in self.memory.speeds.items()}
-        unclear = self._judged(speeds, _VENT_CLEAR_UM_PER_S, _PUMP_CLEAR_SHARE)
-        if not (unclear and self.memory.before):
-            return unclear  # something may have been in the beam during the first run
-        means = {name: (speed + self.memory.before[name]) / 2 for name, speed in speeds.items()}
-        return self._judged(means, _VENT_LEAST_UM_PER_S, _PUMP_LEAST_SHARE)
+    def _judge_vent(self, part: Part) -> None:
+        memory = self.memory
+        from_s = max(part.wait_s, memory.part_s - _VENT_WINDOW_MOST_S)
+        speed = self._measure(from_s)
+        if speed is None:
+            self._fail_late(part, "no reading while the vent is open")
+            return
+        sinks_um_per_s = memory.off_um_per_s - speed.um_per_s
+        sigma_um_per_s = self._sigma_of_change(speed)
+        least_um_per_s = max(_VENT_LEAST_UM_PER_S, _CLEAR_SIGMAS * sigma_um_per_s)
+        if sinks_um_per_s >= least_um_per_s and self._is_straight(speed):
+            self._begin_part(memory.part + 1)
+            return
+        self._fail_late(
+            part,
+            f"the vent, {part.vent_fraction:.0%} open for {memory.part_s:.1f} s, lets the mirror "
+            f"down by only {sinks_um_per_s:.1f} ± {sigma_um_per_s:.1f} µm/s",
+        )
 
-    def _judged(
-        self, speeds: dict[str, float], vent_least_um_per_s: float, pump_least_share: float
-    ) -> str:
-        if "vent" in speeds:
-            vent_um_per_s = speeds["off"] - speeds["vent"]
-            if vent_um_per_s < vent_least_um_per_s:
-                return f"the vent lets the mirror down by only {vent_um_per_s:.1f} µm/s"
-        expected_um_per_s = pump_curve.PumpCurve(self.memory.pump).flow(PARTS[-1].pump_fraction)
-        rise_um_per_s = speeds["pump"] - speeds["off"]
-        if not pump_least_share <= rise_um_per_s / expected_um_per_s <= _PUMP_MOST_SHARE:
-            return (
-                f"the pump lifts the mirror by {rise_um_per_s:.1f} µm/s, not by about "
-                f"{expected_um_per_s:.1f} µm/s"
-            )
-        return ""
+    def _judge_pump(self, part: Part, dt_s: float) -> None:
+        memory = self.memory
+        is_last = memory.part_s >= part.longest_s - 1e-9
+        from_s = max(part.wait_s, memory.part_s - _PUMP_WINDOW_MOST_S)
+        speed = self._measure(from_s)
+        if speed is None:
+            self._fail_late(part, "no reading while the pump runs")
+            return
+        rises_um_per_s = speed.um_per_s - memory.off_um_per_s
+        sigma_um_per_s = self._sigma_of_change(speed)
+        expected_um_per_s = self._expected_um_per_s
+        share = rises_um_per_s / expected_um_per_s
+        least_share = _PUMP_LEAST_SHARE if is_last else _PUMP_CLEAR_SHARE
+        is_large = abs(rises_um_per_s) >= _CLEAR_SIGMAS * sigma_um_per_s
+        is_clear = is_large and self._is_straight(speed)
+        found = (
+            f"the pump, at {part.pump_fraction:.0%} for {memory.part_s:.1f} s, lifts the mirror by "
+            f"{rises_um_per_s:.1f} ± {sigma_um_per_s:.1f} µm/s, not by about "
+            f"{expected_um_per_s:.1f} µm/s"
+        )
+        if is_clear:
+            if share > _PUMP_MOST_SHARE:
+                self._fail(found)
+                return
+            if share >= least_share:
+                self._begin_part(memory.part + 1)
+                return
+        memory.reversed_s = memory.reversed_s + dt_s if is_clear and share < 0.0 else 0.0
+        # Noise may look like a reversed pump for a moment.
+        if memory.reversed_s > 1.2 * part.measure_s:
+            self._fail(found)
+            return
+        self._fail_late(part, found)
+
+    def _measure(self, from_s: float) -> Speed | None:
+        """Speed by the readings of the running part from a time on; None without three readings."""
+        memory = self.memory
+        chosen = memory.readings[memory.readings[:, 0] >= from_s - 1e-9]
+        if len(chosen) < 3:
+            return None
+        time_s = chosen[:, 0] - chosen[:, 0].mean()
+        height_um = chosen[:, 1] - chosen[:, 1].mean()
+        spread_s2 = float(time_s @ time_s)
+        slope_um_per_s = float(time_s @ height_um) / spread_s2
+        residual_um = height_um - slope_um_per_s * time_s
+        return Speed(
+            slope_um_per_s,
+            memory.noise_um / math.sqrt(spread_s2),
+            float(np.sqrt(np.mean(residual_um**2))),
+        )
+
+    def _sigma_of_change(self, speed: Speed) -> float:
+        """Standard deviation of a speed's difference from that with everything off."""
+        return math.hypot(speed.sigma_um_per_s, self.memory.off_sigma_um_per_s)
+
+    def _is_straight(self, speed: Speed) -> bool:
+        """Whether readings follow a line, but for noise and the onset of a flow."""
+        most_um = max(_UNSTEADY_NOISES * self.memory.noise_um, _UNSTEADY_LEAST_UM)
+        return speed.residual_um <= most_um
+
+    def _begin_part(self, number: int) -> None:
+        memory = self.memory
+        memory.part, memory.part_s = number, 0.0
+        memory.readings = np.empty((0, 2))
+
+    def _fail_late(self, part: Part, found: str) -> None:
+        """End the test if the part has lasted for its longest time."""
+        if self.memory.part_s >= part.longest_s - 1e-9:
+            self._fail(found)
+
+    def _fail(self, found: str) -> None:
+        self.memory.failure = found
+        self._begin_part(len(self._parts))
+
+
+def _lengthen(part: Part, factor: float) -> Part:
+    """A part for a slower tick rate."""
+    measure_s = part.measure_s * factor
+    # Two windows after each other must fit.
+    longest_s = max(part.longest_s, part.wait_s + 2.2 * measure_s)
+    return replace(part, measure_s=measure_s, longest_s=longest_s)

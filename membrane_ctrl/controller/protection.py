@@ -46,7 +46,7 @@ class Activity(Enum):
     """What a hold does while gas can move; the value is its name for people.
 
     Gains and a pump curve on trial change the numbers of the loop, not its activity. In `check` the
-    actuator test runs the pump for less than two seconds, and only while all sensors are good. In
+    actuator test runs the pump for at most five seconds, and only while all sensors are good. In
     `lower` and `fault` the pump is off or ramps down; `pump_runs_on` and `gas_comes_in` watch it
     there.
     """

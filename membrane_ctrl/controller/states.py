@@ -382,13 +382,11 @@ def _test_actuators(context: TickContext) -> State:
         return State.CHECK
     if _list_missing_checks(context) != NO_REASON:
         return State.CHECK  # the loop starts from a reading
-    failure = test.failure()
-    if failure:
-        if test.is_second:
-            context.unfit = failure
-        responds = f"the film does not respond{'' if context.unfit else ' clearly'}: {failure}"
-        context.explain(WhyCode.FILM_NOT_RESPONDING, responds, test.is_second)
-        test.again()
+    if test.failure:
+        context.unfit = test.failure
+        context.test_memory = None
+        responds = f"the film does not respond: {test.failure}"
+        context.explain(WhyCode.FILM_NOT_RESPONDING, responds)
         return State.CHECK
     return _begin_loop(context, test.leak_um_per_s)
 

@@ -88,7 +88,7 @@ FIELDS: list[tuple[str, Any, Any]] = [
     ("states.hold_flow_max_s", 600.0, 60.0),
     ("states.ramp_down_s", 600.0, 60.0),
     ("states.pause_max_s", 1e5, 3600.0),
-    ("states.check_timeout_s", 3.0, 5.0),
+    ("states.check_timeout_s", 11.0, 11.1),
     ("states.settle_timeout_s", 1.5, 2.0),
     ("states.lower_timeout_s", 0.5, 0.6),
     ("states.inflate_stall_s", 1.0, 1.3),

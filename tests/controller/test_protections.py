@@ -320,7 +320,7 @@ def test_gas_consumption_is_judged_while_only_the_optics_show_the_film_at_rest()
         wrong.no_light = True
         wrong.vent_stuck_fraction = 0.02  # the film takes 2 µm/s more
 
-    held = settled(config_of("estimate", limits=limits), settle_s=130.0).fail(150.0, fail)
+    held = settled(config_of("estimate", limits=limits), settle_s=130.0).fail(180.0, fail)
     assert held.faults == ["gas_excess"]
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from firmware_iface.emulators.pump_board import BoardSample
-from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, StatesConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 STEP_S = 0.01
@@ -248,12 +248,9 @@ def foreign_bench(plant: ForeignPlant) -> VirtualBench:
 
 
 def foreign_config(**loop: float) -> Config:
-    """What somebody knows who knows nothing: the defaults, without the test that presumes a quick
-    pump.
-    """
+    """What somebody knows who knows nothing: the defaults."""
     return Config(
         loop=LoopConfig.model_validate({"flow_max_um_per_s": 5.3, **loop}),
         pump=PumpConfig(),
-        states=StatesConfig(actuator_test=False),
         shape=ShapeConfig(enabled=False),
     )

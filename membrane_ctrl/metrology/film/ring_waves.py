@@ -233,7 +233,8 @@ def _rank_causes(
 def unexplained_term_mm(figures: Sequence[FilmFigure], bowls: Bowl, reach: float) -> float:
     """RMS of a term that no cause explains, from the azimuthal orders of 4 and more, without noise.
 
-    Arguments as in `fit_waves`.
+    Arguments as in `fit_waves`. 0 if these orders have no term beyond the causes, as with 21
+    Zernike terms.
     """
     squares = 0.0
     freedom = 0
@@ -251,7 +252,7 @@ def unexplained_term_mm(figures: Sequence[FilmFigure], bowls: Bowl, reach: float
                 data = data - (columns @ amounts).reshape(data.shape)
             squares += (float(np.sum(data**2)) - noise) / len(figures)
             freedom += terms.size - fitted
-    return float(np.sqrt(max(squares / freedom, 0.0)))
+    return float(np.sqrt(max(squares / freedom, 0.0))) if freedom else 0.0
 
 
 def wave_responses_mm(bowls: Bowl, order: int, reach: float) -> FloatArray:

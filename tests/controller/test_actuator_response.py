@@ -1,0 +1,246 @@
+"""The actuator test waits for a response: slow and weak actuators pass, dead and reversed ones do
+not, and the failure states what was seen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.controller.actuator_test import ActuatorTest, ActuatorTestState
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.hold.virtual_run import VirtualRun
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
+from membrane_ctrl.model.state_tree import decode_state, encode_state
+from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual_bench import VirtualBench
+from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
+from tests.worlds.virtual_record import run_virtual
+
+# What a test took that ran twice on a dead actuator, at 50 Hz.
+PRESENT_TIME_S = 7.2
+_SUBSTEPS = 10
+Error = Callable[[float], float]
+
+
+def no_error(_: float) -> float:
+    return 0.0
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A film that moves at the speed of its gas, and its actuators: dead time, then a lag."""
+
+    rate_hz: float = 50.0
+    pump_share: float = 1.0  # of the flow that the curve promises
+    pump_delay_s: float = 0.1
+    pump_lag_s: float = 0.15
+    vent_um_per_s: float = 100.0  # fully open
+    vent_delay_s: float = 0.1
+    vent_lag_s: float = 0.15
+    noise_um: float = 1.0
+    error_um: Error = no_error  # of the laser, by the time of the test
+
+    def run(self, seed: int) -> tuple[str, float]:
+        """The test's failure, and how long it took."""
+        rng = np.random.default_rng(seed)
+        pump = PumpConfig()
+        test = ActuatorTest(pump, True, self.rate_hz)
+        dt_s = 1.0 / self.rate_hz / _SUBSTEPS
+        pumped, vented = (
+            deque([0.0] * max(1, round(delay_s / dt_s)))
+            for delay_s in (self.pump_delay_s, self.vent_delay_s)
+        )
+        inflow = outflow = height_um = time_s = 0.0
+        while (part := test.part) is not None:
+            drive = max(0.0, part.pump_fraction - pump.dead_fraction) / (1 - pump.dead_fraction)
+            for _ in range(_SUBSTEPS):
+                pumped.append(self.pump_share * pump.flow_full_um_per_s * drive)
+                vented.append(self.vent_um_per_s * part.vent_fraction)
+                inflow -= (pumped.popleft() - inflow) * math.expm1(-dt_s / self.pump_lag_s)
+                outflow -= (vented.popleft() - outflow) * math.expm1(-dt_s / self.vent_lag_s)
+                height_um += dt_s * (inflow - outflow - 1.2)
+            seen_um = height_um + self.error_um(time_s) + self.noise_um * rng.standard_normal()
+            test.step(seen_um, 1.0 / self.rate_hz)
+            time_s += 1.0 / self.rate_hz
+        return test.failure, time_s
+
+    def failures(self, count: int) -> list[str]:
+        """Failures of tests with different noise; those that pass are left out."""
+        found = (self.run(seed)[0] for seed in range(count))
+        return [failure for failure in found if failure]
+
+    def durations_s(self, count: int) -> list[float]:
+        return [self.run(seed)[1] for seed in range(count)]
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 50.0])
+def test_a_quick_bench_passes_whatever_the_noise(rate_hz: float) -> None:
+    bench = Bench(rate_hz)
+    assert bench.failures(100) == []
+    if rate_hz == 50.0:
+        assert np.median(bench.durations_s(20)) == pytest.approx(3.56, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "lag_s"), [(0.3, 0.5), (0.4, 0.8), (1.0, 1.0), (2.0, 1.5), (0.0, 2.0)]
+)
+@pytest.mark.parametrize("rate_hz", [10.0, 50.0])
+def test_a_slow_pump_is_awaited(rate_hz: float, delay_s: float, lag_s: float) -> None:
+    assert Bench(rate_hz, pump_delay_s=delay_s, pump_lag_s=lag_s).failures(40) == []
+
+
+def test_a_weak_and_slow_vent_is_awaited() -> None:
+    assert len(Bench(vent_um_per_s=30.0).failures(100)) <= 1
+    assert len(Bench(vent_um_per_s=40.0, vent_delay_s=0.4, vent_lag_s=0.5).failures(100)) <= 1
+
+
+def test_a_noisy_laser_takes_longer_and_is_no_failure() -> None:
+    bench = Bench(noise_um=3.0)
+    assert bench.failures(60) == []
+    assert np.median(bench.durations_s(20)) > np.median(Bench().durations_s(20))
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 50.0])
+@pytest.mark.parametrize(
+    ("dead", "words"),
+    [
+        ({"pump_share": 0.0}, "the pump, at 80% for 5."),
+        ({"vent_um_per_s": 0.0}, "the vent, 8% open for 3."),
+    ],
+    ids=["pump", "vent"],
+)
+def test_noise_rarely_hides_a_dead_actuator(
+    rate_hz: float, dead: dict[str, float], words: str
+) -> None:
+    found = replace(Bench(rate_hz), **dead).failures(300)
+    assert len(found) >= 295  # a pass in a hundred at most
+    assert all(words in failure for failure in found)
+    assert all(" ± " in failure for failure in found)
+
+
+def test_a_dead_actuator_is_found_within_the_time_of_two_quick_tests() -> None:
+    assert max(Bench(pump_share=0.0).durations_s(20)) <= PRESENT_TIME_S
+    assert max(Bench(vent_um_per_s=0.0).durations_s(20)) <= PRESENT_TIME_S
+
+
+def test_a_reversed_pump_is_found_earlier_than_a_dead_one() -> None:
+    bench = Bench(pump_share=-1.0)
+    assert all("lifts the mirror by -" in failure for failure in bench.failures(20))
+    assert len(bench.failures(20)) == 20
+    assert np.median(bench.durations_s(20)) < 5.0
+
+
+@pytest.mark.parametrize("share", [0.1, 4.0])
+def test_a_pump_of_another_size_than_its_curve_fails(share: float) -> None:
+    failures = Bench(pump_share=share).failures(40)
+    assert len(failures) >= 39
+    assert all("not by about 4.1 µm/s" in failure for failure in failures)
+
+
+@pytest.mark.parametrize(
+    "error_um",
+    [
+        lambda time_s: -20.0 * (0.5 < time_s < 0.9),  # everything off
+        lambda time_s: -20.0 * (1.4 < time_s < 1.7),  # the vent is open
+        lambda time_s: -20.0 * (time_s > 3.3),  # the pump runs: looks like a reversed one
+    ],
+    ids=["off", "vent", "pump"],
+)
+def test_something_in_the_beam_is_no_failure(error_um: Error) -> None:
+    assert Bench(error_um=error_um).failures(40) == []
+
+
+@pytest.mark.parametrize("ends_s", [3.4, math.inf])
+def test_something_in_the_beam_is_no_response(ends_s: float) -> None:
+    bench = Bench(pump_share=0.0, error_um=lambda time_s: 20.0 * (2.9 < time_s < ends_s))
+    assert len(bench.failures(60)) >= 58
+
+
+def test_a_film_that_jumps_with_everything_off_is_named() -> None:
+    bench = Bench(error_um=lambda time_s: 20.0 * (math.fmod(time_s, 0.6) < 0.3))
+    assert bench.failures(5) == ["its readings jump by micrometres with pump and vent off"] * 5
+
+
+def test_a_test_goes_on_from_its_memory() -> None:
+    """As after each tick, and from a snapshot."""
+    pump = PumpConfig()
+    rng = np.random.default_rng(2)
+    whole, memory = ActuatorTest(pump, True, 50.0), ActuatorTestState(pump, True)
+    for number in range(250):
+        reading_um = 0.01 * number + float(rng.standard_normal())
+        whole.step(reading_um, 0.02)
+        memory = decode_state(encode_state(memory), ActuatorTestState, 1_000_000)
+        part = ActuatorTest(memory.pump, memory.test_vent, 50.0, memory)
+        part.step(reading_um, 0.02)
+        assert (part.part, part.failure) == (whole.part, whole.failure)
+    assert whole.failure
+
+
+SLOW_PUMPS = {
+    "0.3 + 0.5 s": ForeignPump(delay_s=0.3, lag_s=0.5),
+    "0.4 + 0.8 s": ForeignPump(delay_s=0.4, lag_s=0.8),
+    "s-shaped, 0.5 + 1 s": ForeignPump("s-shaped", delay_s=0.5, lag_s=1.0),
+}
+
+
+@pytest.mark.parametrize("name", SLOW_PUMPS)
+def test_a_hold_starts_with_a_slow_pump_of_another_world(name: str) -> None:
+    for seed in range(4):
+        config = foreign_config()
+        assert config.states.actuator_test
+        bench = foreign_bench(ForeignPlant(replace(SLOW_PUMPS[name], _tube=deque()), seed))
+        run = VirtualRun(config, bench, zernike_projection())
+        ticks = [run.run_tick((Command("hold", "test"),))]
+        while run.now_s < 20.0 and run.finished is None:
+            ticks.append(run.run_tick())
+        states = [tick.row.state for tick in ticks if tick is not None]
+        assert State.INFLATE in states, seed
+        assert State.FAULT not in states, seed
+
+
+@pytest.mark.parametrize(
+    "rate_hz", [5.0, 10.0, 20.0, pytest.param(50.0, marks=pytest.mark.campaign)]
+)
+def test_the_film_of_the_twin_passes_at_any_rate(rate_hz: float) -> None:
+    for seed in range(12):
+        config = Config(
+            loop=LoopConfig(rate_hz=rate_hz),
+            twin=TwinConfig(seed=seed),
+            shape=ShapeConfig(enabled=False),
+        )
+        rows = [
+            t.row
+            for t in run_virtual(
+                config, Plant(config.twin, config.pump), 14.0, zernike_projection()
+            )
+        ]
+        assert any(row.state == State.INFLATE for row in rows), seed
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 25.0, pytest.param(100.0, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    "wrong", [{"pump_share": 0.0}, {"vent_stuck_fraction": 0.0}], ids=["pump", "vent"]
+)
+def test_the_twin_is_not_inflated_with_a_dead_actuator_at_any_rate(
+    rate_hz: float, wrong: dict[str, float]
+) -> None:
+    config = Config(loop=LoopConfig(rate_hz=rate_hz), shape=ShapeConfig(enabled=False))
+    for seed in range(6):
+        twin = config.twin.model_copy(update={"seed": seed})
+        bench = VirtualBench(Plant(twin, config.pump))
+        for name, value in wrong.items():
+            setattr(bench.wrong, name, value)
+        run = VirtualRun(config, bench, zernike_projection())
+        ticks = [run.run_tick((Command("hold", "test"),))]
+        while run.now_s < 25.0 and run.finished is None:
+            ticks.append(run.run_tick())
+        states = {tick.row.state for tick in ticks if tick is not None}
+        assert State.INFLATE not in states, seed
