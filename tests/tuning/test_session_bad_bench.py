@@ -184,8 +184,8 @@ def test_an_interrupted_outer_restores_setpoint_shape_loop_and_time_constant(
     while hold.rows[-1].mono_s < until_s:
         hold._advance(5)
     assert hold.rows[-1].setpoint_um == pytest.approx(
-        setpoint_um, abs=0.2
-    )  # the shape loop trims it
+        setpoint_um, abs=0.4
+    )  # of a step of 5; the shape loop trims it
     assert time_constant_s(hold) == hold.config.shape.time_constant_s
     assert hold.rows[-1].shape_state in (ShapeState.WAITING, ShapeState.TRACKING)
 
