@@ -98,7 +98,8 @@ def test_a_run_that_ends_in_a_fault_states_the_fault_first(
     first = "\n".join(lines[:count])
     assert all(part in first for part in says)
     assert (count > 0) == bool(says)
-    assert lines[count].startswith("missed ticks:")
+    assert lines[count].startswith("held:")
+    assert lines[count + 1].startswith("missed ticks:")
 
 
 def test_the_fault_is_printed_without_a_disk_and_with_json(

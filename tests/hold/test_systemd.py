@@ -21,7 +21,8 @@ from membrane_ctrl.model.telemetry import FIELDS, State, TelemetryRow
 from tests.support.machine_needs import needs
 
 ROW = TelemetryRow(**dict.fromkeys(FIELDS, 0.0))
-UNIT = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "membrane-ctrl.service"
+EXAMPLES = Path(__file__).parents[2] / "membrane_ctrl" / "examples"
+HOLD_UNIT, SERVICE_UNIT = EXAMPLES / "membrane-hold@.service", EXAMPLES / "membrane-service.service"
 
 
 def outputs(
@@ -112,7 +113,7 @@ def test_a_full_socket_is_not_waited_for(systemd: socket.socket) -> None:
 def test_the_unit_stops_what_it_must_and_never_restarts_into_a_fault() -> None:
     unit = configparser.ConfigParser(strict=False, interpolation=None, delimiters=("=",))
     unit.optionxform = str  # type: ignore[assignment,method-assign]
-    unit.read(UNIT)
+    unit.read(HOLD_UNIT)
     service = unit["Service"]
     assert service["Type"] == "notify"
     # the children ignore what a terminal sends, and so outlive the control process to close the run
@@ -128,9 +129,9 @@ def test_the_unit_stops_what_it_must_and_never_restarts_into_a_fault() -> None:
 
 
 @needs("systemd-analyze")
-def test_the_unit_file_is_one_that_systemd_takes_and_calls_protected(tmp_path: Path) -> None:
-    example = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "membrane-ctrl.service"
-    unit = tmp_path / example.name
+@pytest.mark.parametrize("example", [HOLD_UNIT, SERVICE_UNIT], ids=["hold", "service"])
+def test_systemd_accepts_a_unit_file_and_calls_it_protected(example: Path, tmp_path: Path) -> None:
+    unit = tmp_path / example.name.replace("@", "@lab")
     unit.write_text(
         example.read_text().replace("/opt/membrane-ctrl/.venv/bin/membrane-ctrl", sys.executable)
     )
