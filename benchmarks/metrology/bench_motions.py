@@ -54,8 +54,8 @@ def row(part: str, found: TrackedErrors) -> str:
     reason = found.reasons[last + 1].split(";")[0] if refused.size else ""
     given = np.flatnonzero(found.given)
     usable = ok[given]
-    figures = np.abs(found.terms[usable, 2:]).max()
-    sags = np.abs(found.sag[usable]).max()
+    figures = np.abs(found.moved_terms[usable, 2:]).max()
+    sags = np.abs(found.moved_sag[usable]).max()
     place = int(np.flatnonzero(given == last)[0])
     figure_nm = 1e3 * np.abs(found.terms_um[place, 2:]).max()
     bar_nm = 1e3 * found.terms_sigma_um[place, 2:].max()

@@ -83,7 +83,7 @@ def _judged(name: str, found: TrackedErrors) -> list[Figure]:
             "um",
             0.05,
             "1 sigma",
-            rms(found.sag_sigma_um),
+            rms(found.steady_sag_sigma_um),
         ),
         within,
         at_most(f"{name}: error / sigma of the sag", rms(found.sag), ""),
@@ -101,4 +101,4 @@ def _figure_um(found: TrackedErrors) -> float:
 
 
 def _stated_um(found: TrackedErrors) -> float:
-    return float(np.sqrt(np.mean(np.sum(found.terms_sigma_um**2, axis=1))))
+    return float(np.sqrt(np.mean(np.sum(found.steady_terms_sigma_um**2, axis=1))))

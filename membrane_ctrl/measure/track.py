@@ -92,7 +92,16 @@ class Track:
 
     def make_columns(self) -> dict[str, Any]:
         """The arrays of `track.npz`."""
-        numbers = ("time_s", "coeffs_um", "sigma_um", "hencky_um", "sag_um", "sag_sigma_um")
+        numbers = (
+            "time_s",
+            "coeffs_um",
+            "sigma_um",
+            "steady_sigma_um",
+            "hencky_um",
+            "sag_um",
+            "sag_sigma_um",
+            "steady_sag_sigma_um",
+        )
         words = ("verdict", "reason")
         return {
             name: np.array([getattr(frame, name) for frame in self.frames])
@@ -256,8 +265,9 @@ def _read_pictures(
 def _make_track_table(track: Track) -> dict[str, Any]:
     """The result in numbers."""
     used = [frame for frame in track.frames if frame.verdict != "rejected"]
-    sag, sigma = (
-        np.array([getattr(frame, name) for frame in used]) for name in ("sag_um", "sag_sigma_um")
+    sag, sigma, steady = (
+        np.array([getattr(frame, name) for frame in used])
+        for name in ("sag_um", "sag_sigma_um", "steady_sag_sigma_um")
     )
     reasons = Counter(f"{frame.verdict}: {frame.reason}" for frame in track.frames if frame.reason)
     counts = Counter(frame.verdict for frame in track.frames)
@@ -271,6 +281,7 @@ def _make_track_table(track: Track) -> dict[str, Any]:
         "sag_mean_um": float(sag.mean()) if used else None,
         "sag_sd_um": float(sag.std()) if used else None,
         "sag_sigma_um": float(np.median(sigma)) if used else None,
+        "steady_sag_sigma_um": float(np.median(steady)) if used else None,
         "rest_share": float(np.median([frame.rest_share for frame in used])) if used else None,
         "reasons": dict(reasons.most_common()),
     }
@@ -291,7 +302,11 @@ def _format_track(table: dict[str, Any]) -> list[str]:
         lines.append(
             f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation "
             f"{table['sag_sd_um']:.3f} µm, "
-            f"1 sigma of a frame {table['sag_sigma_um']:.3f} µm"
+            f"1 sigma of a frame {table['steady_sag_sigma_um']:.3f} µm"
+        )
+        lines.append(
+            f"          1 sigma {table['sag_sigma_um']:.2g} µm, if the bench has moved since the "
+            "reference in ways that frames do not show"
         )
         lines.append(f"fit       leaves {table['rest_share']:.2%} of the fringes' swing")
     return lines
@@ -304,7 +319,8 @@ def _write_pictures(out: Path, track: Track, lines: Sequence[str]) -> None:
     from membrane_ctrl.measure.rerun_recording import log_pictures, open_recording
 
     columns = track.make_columns()
-    time_s, sag_um, sigma_um = columns["time_s"], columns["sag_um"], columns["sag_sigma_um"]
+    time_s, sag_um = columns["time_s"], columns["sag_um"]
+    sigma_um = columns["steady_sag_sigma_um"]
     change_um = (
         columns["coeffs_um"] - np.nanmean(columns["coeffs_um"], axis=0)
         if np.isfinite(sag_um).any()
@@ -340,7 +356,7 @@ def _draw_track(
     figure, (terms, sag, left) = new_sheet(9, 13, 3, 1)
     every = max(1, len(columns["time_s"]) // _SHOWN_FRAMES)
     time_s, sag_um, sigma_um = (
-        columns[name][::every] for name in ("time_s", "sag_um", "sag_sigma_um")
+        columns[name][::every] for name in ("time_s", "sag_um", "steady_sag_sigma_um")
     )
     if change_um is not None:
         shown = change_um[::every, FIRST_FIGURE_INDEX - 1 :].T

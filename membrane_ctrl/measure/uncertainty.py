@@ -27,6 +27,7 @@ from membrane_ctrl.metrology.uncertainty import (
     monte_carlo,
     trial_bench,
 )
+from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.processes.worker_pool import run_jobs
@@ -105,6 +106,7 @@ class Spread:
     linear: FloatArray
     noise: FloatArray
     budget: FloatArray
+    motion: MotionFinding | None  # of the bench between two sets
 
 
 def uncertainty_command(options: UncertaintyOptions) -> int:
@@ -133,7 +135,7 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
     )
     seconds = time.perf_counter() - begin
     result = _compute_spread(
-        benches, spread, parameters, _compute_budget(folders, given, options.geometry)
+        benches, spread, parameters, *_compute_budget(folders, given, options.geometry)
     )
     mirror = sets[0].head.optics.mirror
     grid = height_map.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
@@ -151,9 +153,9 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
 
 def _compute_budget(
     folders: Sequence[Path], given: file.GeometryFile | None, geometry: Path | None
-) -> FloatArray:
+) -> tuple[FloatArray, MotionFinding | None]:
     """Covariance (parameters, parameters), mm^2, of the only set by its budget, or of its change
-    since the second.
+    since the second, and what it contains of motions of the bench.
     """
     budgets = []
     for folder in folders:
@@ -163,11 +165,9 @@ def _compute_budget(
             raise errors.RejectedError(f"{folder}: rejected: {measured.reason}")
         budgets.append(bars.budget)
     own, *earlier = budgets
-    return (
-        own.change_covariance(earlier[0])
-        if earlier
-        else own.covariance(True) + own.covariance(False)
-    )
+    if not earlier:
+        return own.covariance(True) + own.covariance(False), None
+    return own.change_covariance(earlier[0]), own.find_motion(earlier[0])
 
 
 def _compute_spread(
@@ -175,6 +175,7 @@ def _compute_spread(
     spread: geometry_spread.GeometrySpread,
     parameters: FloatArray,
     budget: FloatArray,
+    motion: MotionFinding | None,
 ) -> Spread:
     """Spread of the only set, or of the first minus the second, trial by trial."""
     own = parameters[:, 0] if len(benches) == 1 else parameters[:, 0] - parameters[:, 1]
@@ -184,6 +185,7 @@ def _compute_spread(
         linear_covariance.linear_covariance(benches, spread),
         noise,
         budget,
+        motion,
     )
 
 
@@ -198,6 +200,11 @@ def _make_comparison_table(
     spreads = result.covariance, result.linear, result.noise, result.budget
     rmse, linear, noise, budget = (1e3 * grid.sigma(c) for c in spreads)
     coeffs = np.sqrt(np.diag(parameter_to_coeffs() @ result.covariance @ parameter_to_coeffs().T))
+    motion_um, moved = None, ""
+    if result.motion is not None:
+        sigma_um = 1e3 * grid.sigma(result.motion.covariance_mm2)
+        motion_um = {"mean": float(sigma_um.mean()), "max": float(sigma_um.max())}
+        moved = result.motion.describe() if result.motion.is_sure else ""
     sag = sag_gradient()
     return {
         **program.file_origin("membrane-uncertainty/1"),
@@ -215,6 +222,8 @@ def _make_comparison_table(
         "linear_um": {"mean": float(linear.mean()), "max": float(linear.max())},
         "noise_um": {"mean": float(noise.mean()), "max": float(noise.max())},
         "budget_um": {"mean": float(budget.mean()), "max": float(budget.max())},
+        "motion_um": motion_um,
+        "moved": moved,
         "sag_sigma_um": 1e3 * float(np.sqrt(sag @ result.covariance @ sag)),
         "coeffs_sigma_um": (1e3 * coeffs).tolist(),
     }
@@ -245,6 +254,14 @@ def _write_comparison(
 
 def _format_comparison(table: dict[str, Any]) -> list[str]:
     what = "height" if table["against"] is None else "change of height"
+    motion = []
+    if table["motion_um"] is not None:
+        motion.append(
+            f"            of it motions of the bench between the sets: mean "
+            f"{table['motion_um']['mean']:.4g} µm, largest {table['motion_um']['max']:.4g} µm"
+        )
+    if table["moved"]:
+        motion.append(f"moved       {table['moved']}")
     return [
         f"{what}: mean RMSE {table['rmse_um']['mean']:.4g} µm, largest "
         f"{table['rmse_um']['max']:.4g} µm "
@@ -257,4 +274,5 @@ def _format_comparison(table: dict[str, Any]) -> list[str]:
         f"budget      mean {table['budget_um']['mean']:.4g} µm, largest "
         f"{table['budget_um']['max']:.4g} µm: "
         "also film, light, blur and slopes left of each set",
+        *motion,
     ]

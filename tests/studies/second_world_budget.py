@@ -224,7 +224,6 @@ PLANTS = (
         effects=lambda _: replace(STILL, panel=Panel(previous_share=0.05)),
     ),
     Plant(
-        OWN_ROWS,
         ("second_image",),
         "second reflection of 1 %, 12 and 5 mm beside the first",
         effects=lambda _: replace(STILL, panel=Panel(ghost=Ghost(0.01))),

@@ -35,13 +35,17 @@ SIZE = {"width": 245, "height": 205, "pixel_um": 34.5}
 class TrackedErrors:
     """Errors of the m frames that have a figure, and their error bars;
     a verdict for every frame.
+
+    The steady bars are those of a bench that does not move.
     """
 
     time_s: Array  # (m,)
     sag_um: Array  # (m,)
     sag_sigma_um: Array
+    steady_sag_sigma_um: Array
     terms_um: Array  # (m, terms - 1): all terms but piston
     terms_sigma_um: Array
+    steady_terms_sigma_um: Array
     verdicts: tuple[str, ...]
     reasons: tuple[str, ...]
     given: NDArray[np.bool_]  # (frames,): which have a figure
@@ -53,12 +57,22 @@ class TrackedErrors:
 
     @property
     def sag(self) -> Array:
-        """Errors of the sag in their own sigmas."""
-        return np.asarray(self.sag_um / self.sag_sigma_um)
+        """Errors of the sag in their own steady sigmas."""
+        return np.asarray(self.sag_um / self.steady_sag_sigma_um)
 
     @property
     def terms(self) -> Array:
-        """Errors of the terms in their own sigmas."""
+        """Errors of the terms in their own steady sigmas."""
+        return np.asarray(self.terms_um / self.steady_terms_sigma_um)
+
+    @property
+    def moved_sag(self) -> Array:
+        """Errors of the sag in their own sigmas, on a bench that may have moved."""
+        return np.asarray(self.sag_um / self.sag_sigma_um)
+
+    @property
+    def moved_terms(self) -> Array:
+        """Errors of the terms in their own sigmas, on a bench that may have moved."""
         return np.asarray(self.terms_um / self.terms_sigma_um)
 
 
@@ -99,8 +113,10 @@ def compared(world: CrossedWorld, folder: Path) -> TrackedErrors:
         found["time_s"][given],
         (found["sag_um"] - 1e3 * details["sag_mm"] - rim_um.mean(axis=1))[given],
         found["sag_sigma_um"][given],
+        found["steady_sag_sigma_um"][given],
         error_um[given, 1:],
         found["sigma_um"][given, 1:],
+        found["steady_sigma_um"][given, 1:],
         tuple(found["verdict"].tolist()),
         tuple(found["reason"].tolist()),
         given,

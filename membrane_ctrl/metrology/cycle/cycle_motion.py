@@ -17,6 +17,7 @@ from membrane_ctrl.metrology.uncertainty.motion_evidence import (
     MotionEffects,
     MotionFinding,
     MotionTest,
+    SlopeEvidence,
     ring_tilt,
 )
 from membrane_ctrl.model.arrays import FloatArray, IntArray
@@ -114,11 +115,11 @@ class CycleMotion:
         test = MotionTest(
             self.effects,
             ring @ (covariance_mm2 + self.covariance_mm2) @ ring.T,
-            squares @ squares.T,
-            flat @ flat.T,
+            SlopeEvidence(squares @ squares.T, flat @ flat.T),
+            None,
         )
         moved_mm = surface.parameters - self.surface.parameters
-        return test.find(ring @ moved_mm, parts.sum(axis=1))
+        return test.find(ring @ moved_mm, np.zeros(2), parts.sum(axis=1))
 
     def tilt_urad(self, surface: Surface) -> float:
         """Tilt of the ring since the reference."""

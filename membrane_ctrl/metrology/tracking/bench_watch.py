@@ -2,9 +2,10 @@
 
 A frame is fitted with the reference's geometry. A camera that turns by 5 µrad looks like a film
 with other coma. Each frame is therefore compared with the signatures of all small motions
-(`motion_evidence`): the ring's tilt since the reference, and the light that the fit leaves along
-slopes that no surface has. Five steps of the pattern make new phases for the bins; what they take
-for the bins' own is added to the evidence, so that a motion is not lost in a new anchor.
+(`motion_evidence`): the ring's tilt since the reference, its saddle since the first frames, and the
+light that the fit leaves along slopes that no surface has. Five steps of the pattern make new
+phases for the bins; what they take for the bins' own is added to the evidence, so that a motion is
+not lost in a new anchor.
 """
 
 import math
@@ -17,15 +18,20 @@ from membrane_ctrl.metrology.rays import bench_motions, ray_tracing
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter, Shifts
+from membrane_ctrl.metrology.tracking.step_solution import ENOUGH_STEPS
 from membrane_ctrl.metrology.uncertainty.motion_evidence import (
     MotionEffects,
     MotionFinding,
     MotionTest,
+    SlopeEvidence,
+    ring_saddle,
     ring_tilt,
 )
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 _RENEWED_EVERY_S = 0.4
+# variance of a frame's saddle since the first frames, over that of a frame: their mean has errors
+_SADDLE_VARIANCE = 1.5
 _BLOCKS = 14  # squares along the diameter whose errors count as independent, as in `FrameFitter`
 
 
@@ -36,6 +42,31 @@ class _Scores:
     left: FloatArray  # q (components,)
     covariance: FloatArray  # (components, components): from the scatter of squares of the mirror
     gram: FloatArray  # G (components, components)
+
+
+@dataclass
+class _FirstSaddle:
+    """Saddle of the ring in the first frames.
+
+    An error of the reference is a saddle of all frames: they are compared with the first ones.
+    """
+
+    mean_mm: FloatArray = field(default_factory=lambda: np.zeros(2))  # since the reference
+    count: int = 0  # frames in it
+    is_settled: bool = False  # the first five steps have given the bins their phases
+
+    def compare(self, saddle_mm: FloatArray) -> FloatArray:
+        """Change (2,) since the first frames of a saddle since the reference (2,)."""
+        if not self.is_settled and self.count < ENOUGH_STEPS:
+            self.count += 1
+            self.mean_mm = self.mean_mm + (saddle_mm - self.mean_mm) / self.count
+        return saddle_mm - self.mean_mm
+
+    def settle(self, moved_mm: FloatArray) -> None:
+        """Take no more frames; the first five steps have moved their figures."""
+        if not self.is_settled:
+            self.mean_mm = self.mean_mm + moved_mm
+            self.is_settled = True
 
 
 @dataclass
@@ -75,6 +106,7 @@ class BenchWatch:
         place = (scene.position_mm / scene.surface.radius_mm + 1) / 2 * _BLOCKS
         column, row = np.floor(cells.planes(place)[:, 0]).astype(int)
         self._square = (row + 1) * (_BLOCKS + 2) + column + 1
+        self._saddle = _FirstSaddle()
         self._test: MotionTest | None = None
         self._tested_s = math.nan
         self._before = none = np.zeros(bench_motions.COMPONENTS)
@@ -86,8 +118,12 @@ class BenchWatch:
         """Weights (2, n) of the phases of x and y: mean squares of the light's derivatives."""
         return np.asarray(scene.light_adu[1:] ** 2 * scene.edge / 2)
 
-    def take_scene(self, scene: CrossedScene) -> None:
-        """Keep what the bins' own phases of a new scene have taken since the reference."""
+    def take_scene(self, scene: CrossedScene, moved_mm: FloatArray) -> None:
+        """Keep what the bins' own phases of a new scene have taken since the reference.
+
+        `moved_mm` (parameters,) is by how much the figures of its steps move with it.
+        """
+        self._saddle.settle(ring_saddle() @ moved_mm)
         weights = self._bin_weights(scene)
         moved_rad = (scene.beyond_mm - self._reference.beyond_mm) * scene.rad_per_mm
         self._anchor = self._scores(weights * moved_rad, weights)
@@ -125,19 +161,20 @@ class BenchWatch:
         signatures = self._effects.left.reshape(len(self._before), -1)
         left = signatures @ sums.ravel() + self._before
         moved_mm = fit.surface.parameters - self._reference.surface.parameters
-        return self._test.find(ring_tilt() @ moved_mm, left)
+        saddle_mm = self._saddle.compare(ring_saddle() @ moved_mm)
+        return self._test.find(ring_tilt() @ moved_mm, saddle_mm, left)
 
     def _renew_test(self, now: _Scores, covariance_mm2: FloatArray) -> None:
         """Take from a frame how well ring and slopes are known."""
-        before, ring = self._anchor, ring_tilt()
+        before, ring, saddle = self._anchor, ring_tilt(), ring_saddle()
         # A frame shows less than five steps where a hand covers it: both in the frame's weights.
         share = float(np.trace(now.gram) / np.trace(before.gram))
         self._before = share * before.left
         self._test = MotionTest(
             self._effects,
             ring @ covariance_mm2 @ ring.T,
-            now.covariance + share**2 * before.covariance,
-            now.gram,
+            SlopeEvidence(now.covariance + share**2 * before.covariance, now.gram),
+            _SADDLE_VARIANCE * (saddle @ covariance_mm2 @ saddle.T),
         )
 
     def tilt_urad(self, shape: Surface) -> float:

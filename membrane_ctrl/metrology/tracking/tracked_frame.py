@@ -1,7 +1,7 @@
 """The figure of one tracked frame."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,9 +31,10 @@ class TrackedFrame:
     saturated_share: float = 0.0  # of the bins
     # the mirror may not be where the last good frame left it: a new reference is needed
     lost: bool = False
-    # standard deviation of the sag without motions of the bench that are too small to be found,
-    # which all frames share
+    # standard deviations of sag and terms without motions of the bench that frames do not show:
+    # those of changes from frame to frame
     steady_sag_sigma_um: float = math.nan
+    steady_sigma_um: FloatArray = field(default_factory=_NONE.copy)
 
     @property
     def sigma_um(self) -> FloatArray:

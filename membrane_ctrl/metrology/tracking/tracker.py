@@ -176,7 +176,7 @@ class Tracker:
         places = [surface.Surface.from_parameters(place, radius_mm) for place in seen_at]
         fits = [replace(fit, surface=place) for fit, place in zip(fits, places, strict=True)]
         scene, moved, moved_mm2 = solve_steps(self._fitter, fits, seen_adu, np.array(shifts_rad))
-        self._watch.take_scene(scene)
+        self._watch.take_scene(scene, moved)
         self._mean_place = float(np.mean(time_s)), seen_at.mean(axis=0) + moved
         self._places_mm2 = dict(zip(shifts_rad, place_mm2 + moved_mm2, strict=True))
         self._anchor_light /= float(
@@ -311,12 +311,14 @@ class Tracker:
         if worst.verdict == "ok":
             self._remember(shifts_rad, self._clear, fit, time_s)
         steady_mm2 = covariance_mm2 + motion.found_mm2
-        gradient = surface.sag_gradient()
+        gradient, to_coeffs = surface.sag_gradient(), surface.parameter_to_coeffs()
         found = self._result(fit, steady_mm2 + motion.allowed_mm2, time_s, worst, rest)
-        found = replace(
-            found, steady_sag_sigma_um=1e3 * math.sqrt(gradient @ steady_mm2 @ gradient)
+        return replace(
+            found,
+            steady_sag_sigma_um=1e3 * math.sqrt(gradient @ steady_mm2 @ gradient),
+            steady_sigma_um=1e3 * np.sqrt(np.diag(to_coeffs @ steady_mm2 @ to_coeffs.T)),
+            saturated_share=float(np.mean(saturated)),
         )
-        return replace(found, saturated_share=float(np.mean(saturated)))
 
     def mean_residual_adu(self) -> FloatArray:
         """Light (rows, columns) that the fits left on average, over the bins; NaN outside the

@@ -19,6 +19,8 @@ from membrane_ctrl.metrology.rays.surface import (
     parameter_to_coeffs,
     sag_gradient,
 )
+from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding
+from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
 from membrane_ctrl.model.arrays import FloatArray
 
 
@@ -68,6 +70,8 @@ class Budget:
 
     sources: tuple[Source, ...]
     disc: float  # analysis radius over the radius of the terms
+    # what motions of the bench after this set would do to the next figure; None: not known
+    motion: PairMotion | None = None
 
     def covariance(self, common: bool) -> FloatArray:
         """(parameters, parameters) in mm^2 of the parameters, from what all sets of the bench share
@@ -77,7 +81,21 @@ class Budget:
 
     def change_covariance(self, earlier: "Budget") -> FloatArray:
         """(parameters, parameters) in mm^2 of the parameters' change since another set of the same
-        bench.
+        bench, which may have moved in between.
+        """
+        steady = self.steady_change_covariance(earlier)
+        found = self.find_motion(earlier)
+        return steady if found is None else steady + found.covariance_mm2
+
+    def find_motion(self, earlier: "Budget") -> MotionFinding | None:
+        """Motions of the bench since another set; None if a budget does not know their effects."""
+        if self.motion is None or earlier.motion is None:
+            return None
+        return self.motion.find(earlier.motion, self.steady_change_covariance(earlier))
+
+    def steady_change_covariance(self, earlier: "Budget") -> FloatArray:
+        """(parameters, parameters) in mm^2 of the parameters' change since another set of the same
+        bench, at rest.
 
         What both share cancels but for the difference of its effects on the two.
         """

@@ -2,10 +2,11 @@
 
 A motion of camera, screen, lens or mirror changes the screen points by E per µm or µrad. The fit
 of the surface takes S = (J^T W J)^-1 J^T W E of it for a change of the film; R = E - J S remains as
-slopes that no surface has. Two observations contradict the film:
+slopes that no surface has. Observations that contradict the film:
 
-- the *ring*: the film is clamped in a ring, which does not tilt with it. The first harmonic of the
-  rim's height, c = H p, stays while only the film moves; a motion changes it by H S a;
+- the *ring*: the film is clamped in a ring, which neither tilts nor bends with it. The first
+  harmonic of the rim's height (the tilt), c = H p, stays while only the film moves, and so does the
+  second one (the saddle); a motion changes them by H S a;
 - the *slopes that no surface has*: their products with R, q = R^T W r, are G a for a motion a, with
   G = R^T W R.
 
@@ -17,19 +18,26 @@ with the covariances C_c and C_q of both observations. K is the size of a knock 
 some motions leave so little that their estimate is noise alone. The gain b^T a is the decrease of
 chi-square.
 
+A hidden motion, such as a shift along an axis, tilts the ring by 0.2 to 0.5 nm per µm and looks
+like a change of the bowl otherwise. A mirror that settles tilts the ring by more. Hidden motions
+are therefore estimated from saddle and slopes alone. An error of the reference may be a saddle,
+too (film that moved between its x and y frames): only frames that share the reference's error are
+compared in their saddle.
+
 Motions that are too small to be found are an error of the figure, too: each group adds
 S (A + 1 / tau^2)^-1 S^T to the covariance, where tau, its allowance, is how far a body may move
-without any sign.
+without any sign. Where the saddle is compared, a hidden motion may be as large as the saddle
+admits.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
 from membrane_ctrl.metrology.rays import rim_harmonics
-from membrane_ctrl.metrology.rays.bench_motions import AXIAL_UM, GROUPS, group_columns
+from membrane_ctrl.metrology.rays.bench_motions import GROUPS, group_columns
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_DEGREE
 
@@ -46,9 +54,18 @@ _FIGURE = slice(FIRST_FIGURE_INDEX - 2, None)  # of the parameters: without tilt
 
 
 @cache
+def _ring_harmonic(order: int) -> FloatArray:
+    return rim_harmonics.rim_harmonics()[[order, order + ZERNIKE_DEGREE]]
+
+
 def ring_tilt() -> FloatArray:
     """Matrix (2, parameters): cosine and sine of the rim's height around the azimuth, in mm."""
-    return rim_harmonics.rim_harmonics()[[1, 1 + ZERNIKE_DEGREE]]
+    return _ring_harmonic(1)
+
+
+def ring_saddle() -> FloatArray:
+    """Matrix (2, parameters): cosine and sine of the rim's height around twice the azimuth."""
+    return _ring_harmonic(2)
 
 
 @dataclass(frozen=True)
@@ -94,12 +111,15 @@ class GroupFit:
 class MotionFinding:
     """The motions that explain an observation."""
 
-    fits: tuple[GroupFit, ...]  # most likely first
+    tilted: tuple[GroupFit, ...]  # what is not hidden, by the ring's tilt; most likely first
+    bent: tuple[GroupFit, ...]  # all but the mirror's tilt, by the ring's saddle; empty without it
     # (parameters, parameters): what motions beyond chance may have done to the figure, and what
-    # motions may have done that are too small to be found; the latter is common to all frames
+    # motions may have done that are hidden or too small to be found; the latter is common to all
+    # frames
     found_mm2: FloatArray
     allowed_mm2: FloatArray
-    figure_um: float  # RMS of the worst plausible effect, without tilt
+    figure_um: float  # RMS of the worst plausible effect, without tilt, of motions that tilt
+    hidden_um: float  # the same, of hidden motions
 
     @property
     def covariance_mm2(self) -> FloatArray:
@@ -107,19 +127,29 @@ class MotionFinding:
         return self.found_mm2 + self.allowed_mm2
 
     @property
-    def excess_gain(self) -> float:
-        """By how much the best motion explains more than the film or a mirror that tilts."""
-        mirror = max(fit.gain for fit in self.fits if GROUPS[fit.group].is_of_mirror)
-        return self.fits[0].gain - mirror
+    def is_tilt_sure(self) -> bool:
+        """Whether something else than film and mirror has moved, by the ring's tilt."""
+        mirror = max(fit.gain for fit in self.tilted if GROUPS[fit.group].is_of_mirror)
+        return self.tilted[0].gain - mirror > _SURE_GAIN
+
+    @property
+    def is_hidden_sure(self) -> bool:
+        """Whether the ring has bent, most likely by a hidden motion."""
+        if not self.bent:
+            return False
+        best = self.bent[0]
+        return GROUPS[best.group].is_hidden and best.gain > _SURE_GAIN
 
     @property
     def is_sure(self) -> bool:
-        """Whether something else than film and mirror has moved."""
-        return self.excess_gain > _SURE_GAIN
+        """Whether a motion of the bench is proven that bends the figure."""
+        return (self.is_tilt_sure and self.figure_um > _PROVEN_UM) or (
+            self.is_hidden_sure and self.hidden_um > _PROVEN_UM
+        )
 
     def describe(self) -> str:
         """The most likely motion, with the runner-up unless it is excluded."""
-        best, second = self.fits[:2]
+        best, second = (self.tilted if self.is_tilt_sure or not self.bent else self.bent)[:2]
         if best.gain - second.gain > _PLAUSIBLE_GAIN:
             return best.describe()
         return f"it looks like {best.describe()}, or {second.describe()}"
@@ -136,7 +166,7 @@ def find_motion_doubt(motion: MotionFinding, own_mm2: FloatArray, tilt_urad: flo
     tilt_urad : float
         Of the ring since the reference.
     """
-    if motion.is_sure and motion.figure_um > _PROVEN_UM:
+    if motion.is_sure:
         return f"knocked: {motion.describe()}; check camera and screen"
     own_um = 1e3 * math.sqrt(float(np.trace(own_mm2[_FIGURE, _FIGURE])))
     if motion.figure_um > max(own_um, _POSSIBLE_UM):
@@ -167,78 +197,144 @@ def _spread(information: FloatArray, size: float) -> FloatArray:
     return np.asarray(np.linalg.inv(information + np.eye(len(information)) / size**2))
 
 
+@dataclass(frozen=True)
+class SlopeEvidence:
+    """How well the slopes that no surface has are known.
+
+    Attributes
+    ----------
+    covariance, gram : (components, components) arrays
+        C_q and G.
+    """
+
+    covariance: FloatArray
+    gram: FloatArray
+
+
 class MotionTest:
     """Estimates motions from observations of the same covariance.
 
     Parameters
     ----------
     effects : MotionEffects
-    ring_mm2 : (2, 2) array
+    tilt_mm2 : (2, 2) array
         Covariance C_c of the ring's tilt.
-    left_covariance, gram : (components, components) arrays
-        C_q and G of the slopes that no surface has.
+    slopes : SlopeEvidence or None
+        None: slopes are not compared.
+    saddle_mm2 : (2, 2) array or None
+        Covariance of the ring's saddle. None: saddles are not compared, and hidden motions are
+        assumed to be within their allowance.
     """
 
     def __init__(
         self,
         effects: MotionEffects,
-        ring_mm2: FloatArray,
-        left_covariance: FloatArray,
-        gram: FloatArray,
+        tilt_mm2: FloatArray,
+        slopes: SlopeEvidence | None,
+        saddle_mm2: FloatArray | None,
     ) -> None:
         self._effects = effects
-        self._tests: list[_GroupTest] = []
+        self._slopes = slopes
+        self._by_tilt = self._tests(ring_tilt(), tilt_mm2)
+        self._by_saddle: dict[int, _GroupTest] = {}
+        if saddle_mm2 is not None:
+            self._by_saddle = self._tests(ring_saddle(), saddle_mm2)
         self._undetected_mm2 = np.zeros((len(effects.figure_mm),) * 2)
+        for number, group in enumerate(GROUPS):
+            if group.allowance == 0:
+                continue
+            test = self._by_tilt[number]
+            effect = effects.figure_mm[:, test.columns]
+            if group.is_hidden:
+                allowed = group.allowance**2 * np.eye(group.components)
+                if self._by_saddle:
+                    allowed = allowed + self._by_saddle[number].spread
+            else:
+                allowed = _spread(test.information, group.allowance)
+            self._undetected_mm2 += effect @ allowed @ effect.T
+
+    def _tests(self, harmonic: FloatArray, ring_mm2: FloatArray) -> dict[int, _GroupTest]:
+        """Of each group, by a harmonic of the ring and by the slopes."""
+        tests = {}
         ring_weight = np.linalg.inv(ring_mm2)
-        for group, columns in zip(GROUPS, group_columns(), strict=True):
-            tilt = ring_tilt() @ effects.figure_mm[:, columns]
-            by_ring = tilt.T @ ring_weight
-            own = gram[columns, columns]
-            scatter = left_covariance[columns, columns]
-            by_left = own @ np.linalg.pinv(scatter, rcond=1e-9, hermitian=True)
-            information = by_ring @ tilt + by_left @ own
+        for number, (group, columns) in enumerate(zip(GROUPS, group_columns(), strict=True)):
+            change = harmonic @ self._effects.figure_mm[:, columns]
+            by_ring = change.T @ ring_weight
+            information = by_ring @ change
+            by_left = np.zeros((group.components,) * 2)
+            if self._slopes is not None:
+                own = self._slopes.gram[columns, columns]
+                scatter = self._slopes.covariance[columns, columns]
+                by_left = own @ np.linalg.pinv(scatter, rcond=1e-9, hermitian=True)
+                information = information + by_left @ own
             spread = _spread(information, group.knock)
-            self._tests.append(_GroupTest(columns, by_ring, by_left, information, spread))
-            if group.allowance > 0:
-                effect = effects.figure_mm[:, columns]
-                allowed = _spread(information, group.allowance)
-                self._undetected_mm2 += effect @ allowed @ effect.T
+            tests[number] = _GroupTest(columns, by_ring, by_left, information, spread)
+        return tests
 
-    def find(self, ring_mm: FloatArray, left: FloatArray) -> MotionFinding:
-        """Estimate every group from the ring's tilt c (2,) and the products q (components,)."""
-        weighed = [test.weigh(ring_mm, left) for test in self._tests]
+    def find(self, tilt_mm: FloatArray, saddle_mm: FloatArray, left: FloatArray) -> MotionFinding:
+        """Estimate every group.
+
+        From the ring's tilt and saddle c (2,) each, and the products q (components,). What is not
+        compared counts for nothing.
+        """
+        tilted = [fit for fit in self._fit_tilt(tilt_mm, left) if not GROUPS[fit.group].is_hidden]
+        bent = self._fit(self._by_saddle, saddle_mm, left)
+        bent = [fit for fit in bent if not GROUPS[fit.group].is_of_mirror]
+        seen_mm, seen_um = _worst_effect(self._effects, tilted, is_hidden=False)
+        hidden_mm, hidden_um = _worst_effect(self._effects, bent, is_hidden=True)
+        return MotionFinding(
+            tuple(tilted),
+            tuple(bent),
+            np.outer(seen_mm, seen_mm),
+            self._undetected_mm2 + np.outer(hidden_mm, hidden_mm),
+            seen_um,
+            hidden_um,
+        )
+
+    def _fit_tilt(self, tilt_mm: FloatArray, left: FloatArray) -> list[GroupFit]:
+        """By the ring's tilt: knocks are at least some times what the mirror would have tilted."""
         mirror = next(number for number, group in enumerate(GROUPS) if group.is_of_mirror)
-        tilt = np.linalg.solve(self._tests[mirror].information, weighed[mirror])
+        test = self._by_tilt[mirror]
+        tilt = np.linalg.solve(test.information, test.weigh(tilt_mm, left))
         tilt_knock = _KNOCK_PER_TILT * float(np.linalg.norm(tilt))
-        fits: list[GroupFit] = []
-        for number, (test, right) in enumerate(zip(self._tests, weighed, strict=True)):
-            spread = test.spread
-            if tilt_knock > GROUPS[number].knock:
-                spread = _spread(test.information, tilt_knock)
-            amount = spread @ right
+        tests = {
+            number: replace(test, spread=_spread(test.information, tilt_knock))
+            if tilt_knock > GROUPS[number].knock
+            else test
+            for number, test in self._by_tilt.items()
+        }
+        return self._fit(tests, tilt_mm, left)
+
+    @staticmethod
+    def _fit(tests: dict[int, _GroupTest], ring_mm: FloatArray, left: FloatArray) -> list[GroupFit]:
+        """The groups, the most likely first."""
+        fits = []
+        for number, test in tests.items():
+            right = test.weigh(ring_mm, left)
+            amount = test.spread @ right
             fits.append(GroupFit(number, amount, float(right @ amount)))
-        fits.sort(key=lambda fit: -fit.gain)
-        worst, figure_um = _worst_effect(self._effects, fits)
-        return MotionFinding(tuple(fits), np.outer(worst, worst), self._undetected_mm2, figure_um)
+        return sorted(fits, key=lambda fit: -fit.gain)
 
 
-def _worst_effect(effects: MotionEffects, fits: list[GroupFit]) -> tuple[FloatArray, float]:
+def _worst_effect(
+    effects: MotionEffects, fits: list[GroupFit], is_hidden: bool
+) -> tuple[FloatArray, float]:
     """Change (parameters,) of the figure by the worst plausible motion, and its RMS without tilt.
 
-    Amounts count as far as they are beyond chance.
+    Of the hidden motions or of the others. Amounts count as far as they are beyond chance.
     """
-    worst, figure_um = np.zeros(len(effects.figure_mm)), -math.inf
+    worst, figure_um = np.zeros(len(effects.figure_mm)), 0.0
     for fit in fits:
         group = GROUPS[fit.group]
-        if group.is_of_mirror or group.knock <= AXIAL_UM:  # no error; within the allowance
+        if group.is_of_mirror or group.is_hidden != is_hidden:
             continue
         if fit.gain < fits[0].gain - _PLAUSIBLE_GAIN:
             continue
         columns = group_columns()[fit.group]
-        chance = _CHANCE_GAIN * GROUPS[fit.group].components
+        chance = _CHANCE_GAIN * group.components
         share = math.sqrt(max(0.0, 1 - chance / max(fit.gain, 1e-12)))
         effect = share * (effects.figure_mm[:, columns] @ fit.amount)
         size_um = 1e3 * float(np.linalg.norm(effect[_FIGURE]))
         if size_um > figure_um:
             worst, figure_um = effect, size_um
-    return worst, max(figure_um, 0.0)
+    return worst, figure_um

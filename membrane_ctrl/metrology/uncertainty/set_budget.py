@@ -27,12 +27,16 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.held_light_error import held_light_source
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
+from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
 from membrane_ctrl.metrology.uncertainty.second_reflection_error import second_reflection_source
 from membrane_ctrl.metrology.uncertainty.set_moment import moment_source
 from membrane_ctrl.metrology.uncertainty.slope_misfit import SlopeMisfit, measure_slope_misfit
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
-from membrane_ctrl.metrology.uncertainty.unseen_motion import estimate_unseen_motion
+from membrane_ctrl.metrology.uncertainty.unseen_motion import (
+    UnseenMotion,
+    estimate_unseen_motion,
+)
 
 _BLUR_UM = 0.5  # RMS of the height: a picture is out of focus, not only seen through a lens
 # the fringes' error in the film's place at a frame, the share of a motion within an axis that its
@@ -86,7 +90,10 @@ def assemble_budget(
     )
     sigmas = optics.geometry.sigmas or SigmasConfig()
     moved = FilmMotion.of(checked)
-    film, doubts = _film_source(bench, spread, moved)
+    unseen = None
+    if not math.isfinite(moved.x_to_y_sigma_um):
+        unseen = estimate_unseen_motion(bench, spread)
+    film, doubts = _film_source(bench, moved, unseen)
     blur = image_blur.blur_source(bench, _blur_px(optics, checked))
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
     if budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM:
@@ -98,7 +105,7 @@ def assemble_budget(
         *bench_sources.geometry_sources(bench, spread, 1.0 if rim is None else rim.widening),
         *bench_sources.bench_sources(bench, sigmas),
         *film,
-        *filter(None, [moment_source(checked, moved, optics.mirror.radius_mm)]),
+        *filter(None, [moment_source(checked, moved, unseen, optics.mirror.radius_mm)]),
         _vertex_source(bench, sigmas, checked, film[0].sigma),
         film_shape_source(full, slope_variance),
         blur,
@@ -113,7 +120,8 @@ def assemble_budget(
         held_light_source(bench, checked.stack, checked.view.used, checked.held),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
-    return SetBudget(budget.Budget(tuple(sources), disc), tuple(doubts), rim, slopes)
+    whole = budget.Budget(tuple(sources), disc, PairMotion.of(bench))
+    return SetBudget(whole, tuple(doubts), rim, slopes)
 
 
 def _blur_px(optics: OpticsConfig, checked: Checked) -> float:
@@ -150,17 +158,16 @@ def _film_um(film: FilmMotion) -> float:
 
 
 def _film_source(
-    bench: TrialBench, spread: GeometrySpread, film: FilmMotion
+    bench: TrialBench, film: FilmMotion, moved: UnseenMotion | None
 ) -> tuple[list[budget.Source], list[str]]:
     """The film's motion from x to y: by the laser, else by the fringes."""
-    if math.isfinite(film.x_to_y_sigma_um):
+    if moved is None:
         left = _TOLD_SHARE if film.worth_correcting else 1.0
         sigma_um = math.hypot(
             film.x_to_y_sigma_um, left * float(film.told_um[0].mean() - film.told_um[1].mean())
         )
         says = "motion of the film from x to y, by the laser"
         return [bench_sources.film_source(bench, (sigma_um,), says, paired=False)], []
-    moved = estimate_unseen_motion(bench, spread)
     says = "motion of the film from x to y, without a laser"
     source = bench_sources.film_source(bench, (moved.moved_um, moved.shared_um), says, paired=True)
     says = "noise of the fringes that show the film's motion from x to y"

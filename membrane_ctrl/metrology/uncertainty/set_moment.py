@@ -3,8 +3,10 @@
 The figure is that of the mean of the sinusoids. A film that drifts is elsewhere on average over the
 whole set, or at its middle. The fringes of each axis show how the film moves from one frame to the
 next: a drift that both axes have is continued over the set, and of what is left, half is assumed to
-differ between the sinusoids and the other frames. A step between the axes leaves no trace here; by
-the sinusoids' mean the sag is right then, too.
+differ between the sinusoids and the other frames. A step between the axes leaves no trace in either
+of them, but the slopes in x of one bowl and in y of another do not belong together
+(`unseen_motion`): what they show beyond the drift and beyond their own sigma may have happened at
+any time between the two.
 
 With a laser the figure holds for the mean of all its readings. Where a frame is left out, only the
 readings show how far the film was from there in the other frames, and their noise remains.
@@ -18,6 +20,7 @@ from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM, FilmMotion
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty.budget import Source
+from membrane_ctrl.metrology.uncertainty.unseen_motion import UnseenMotion
 from membrane_ctrl.model.arrays import FloatArray
 
 _UNEVEN_SHARE = 0.5  # of an uneven motion within the axes: 0.15 to 0.4 of it for steps and swings
@@ -39,21 +42,54 @@ def moment_sigma_um(
     count_frames : int
         Of the set.
     """
-    rates_um, rate_sigma_um = [], 0.0
-    centred = []
+    rate_um, rate_sigma_um = drift_um(frames, film_um), 0.0
+    left = []
     for numbers, places_um in zip(frames, np.split(film_um, [len(frames[0])]), strict=True):
         from_middle = numbers - numbers.mean()
         square = float(from_middle @ from_middle)
-        rates_um.append(float(from_middle @ places_um) / square)
         rate_sigma_um = max(rate_sigma_um, noise_um / math.sqrt(square))
-        centred.append((from_middle, places_um - places_um.mean()))
-    # A drift is the same in both axes. A step within one of them is none.
-    agree = rates_um[0] * rates_um[1] > 0
-    drift_um = min(rates_um, key=abs) if agree else 0.0
-    left_um = np.concatenate([places - drift_um * numbers for numbers, places in centred])
-    uneven_um = math.sqrt(max(float(np.mean(left_um**2)) - noise_um**2, 0.0))
+        left.append(places_um - places_um.mean() - rate_um * from_middle)
+    uneven_um = math.sqrt(max(float(np.mean(np.concatenate(left) ** 2)) - noise_um**2, 0.0))
     later = (count_frames - 1) / 2 - float(np.concatenate(frames).mean())
-    return math.hypot(later * drift_um, later * rate_sigma_um, _UNEVEN_SHARE * uneven_um)
+    return math.hypot(later * rate_um, later * rate_sigma_um, _UNEVEN_SHARE * uneven_um)
+
+
+def drift_um(frames: tuple[FloatArray, FloatArray], film_um: FloatArray) -> float:
+    """Drift of the film from one frame to the next, as the fringes show it.
+
+    A drift is the same in both axes. A step within one of them is none.
+    """
+    rates_um = []
+    for numbers, places_um in zip(frames, np.split(film_um, [len(frames[0])]), strict=True):
+        from_middle = numbers - numbers.mean()
+        rates_um.append(float(from_middle @ places_um) / float(from_middle @ from_middle))
+    agree = rates_um[0] * rates_um[1] > 0
+    return min(rates_um, key=abs) if agree else 0.0
+
+
+def step_sigma_um(
+    frames: tuple[FloatArray, FloatArray], step_um: float, sigma_um: float, count_frames: int
+) -> float:
+    """1 sigma of the film's mean place over a set, about that over the sinusoids, after a step.
+
+    Parameters
+    ----------
+    frames : two arrays
+        Numbers of the used sinusoids of x and of y in the set.
+    step_um, sigma_um : float
+        Motion from x to y beyond a drift, as the fringes show it, with its sigma.
+    count_frames : int
+        Of the set.
+    """
+    sure_um = math.sqrt(max(step_um**2 - sigma_um**2, 0.0))
+    before, after = sorted(frames, key=lambda numbers: float(numbers.mean()))
+    # share of the frames after the step, if it was directly before or after those in between
+    shares = 1 - np.array([before.max() + 1, after.min()]) / count_frames
+    sinusoids = after.size / (before.size + after.size)
+    away = shares - sinusoids
+    # mean square over all times in between
+    mean_square = float(np.mean(away)) ** 2 + float(np.ptp(away)) ** 2 / 12
+    return sure_um * math.sqrt(mean_square)
 
 
 def left_out_sigma_um(used: int, shown: int, laser_noise_um: float) -> float:
@@ -61,8 +97,13 @@ def left_out_sigma_um(used: int, shown: int, laser_noise_um: float) -> float:
     return laser_noise_um * math.sqrt(1 / used - 1 / shown)
 
 
-def moment_source(checked: Checked, film: FilmMotion, radius_mm: float) -> Source | None:
-    """The row of the budget; None with a laser, unless the film moved and a frame is left out."""
+def moment_source(
+    checked: Checked, film: FilmMotion, seen: UnseenMotion | None, radius_mm: float
+) -> Source | None:
+    """The row of the budget; None with a laser, unless the film moved and a frame is left out.
+
+    `seen` is the motion from x to y as the fringes show it, without a laser.
+    """
     used = [np.array(frames, float) for frames in checked.view.used]
     stack = checked.stack
     if math.isfinite(film.x_to_y_sigma_um):
@@ -75,6 +116,11 @@ def moment_source(checked: Checked, film: FilmMotion, radius_mm: float) -> Sourc
         frames = used[0], used[1]
         count_frames = len(stack.patterns)
         sigma_um = moment_sigma_um(frames, checked.film_um, checked.film_noise_um, count_frames)
+        if seen is not None:
+            apart = float(frames[1].mean() - frames[0].mean())
+            step_um = seen.moved_um - apart * drift_um(frames, checked.film_um)
+            stepped_um = step_sigma_um(frames, step_um, seen.sigma_um, count_frames)
+            sigma_um = math.hypot(sigma_um, stepped_um)
         says = "motion of the film during the set, without a laser"
     deeper_mm = Surface.hencky_bowl(1e-3 * sigma_um, radius_mm).parameters
     return Source("moment_um", says, sigma_um, deeper_mm[:, None], common=False, paired=False)

@@ -65,7 +65,14 @@ def worst_sigmas(first: ShapeEstimate, later: ShapeEstimate, true_um: Array) -> 
 
 @pytest.mark.parametrize(
     ("part", "amount"),
-    [("camera_ry", 5.0), ("camera_rx", 20.0), ("camera_rz", 50.0), ("screen_x", 10.0)],
+    [
+        ("camera_ry", 5.0),
+        ("camera_rx", 20.0),
+        ("camera_rz", 50.0),
+        ("screen_x", 10.0),
+        ("camera_z", 50.0),
+        ("screen_z", 50.0),
+    ],
 )
 def test_a_small_motion_is_within_the_error_bars(
     optics: OpticsConfig, part: str, amount: float

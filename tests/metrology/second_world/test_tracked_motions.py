@@ -12,6 +12,7 @@ from membrane_ctrl.measure.track import Track, track_set
 from tests.worlds.second_optics import (
     FRAME_S,
     ROLL,
+    SHIFT_3,
     YAW,
     Bench,
     Effects,
@@ -64,6 +65,21 @@ def test_a_camera_that_turns_by_5_urad_is_within_the_bars(reference: Path) -> No
     track, true_um = tracked(
         reference, "yaw5", Effects(laser=False, camera_motion=step_motion(YAW, 5e-6, MOVES_S))
     )
+    assert worst_of_ok(track, true_um) < 4.0
+
+
+@pytest.mark.parametrize(
+    ("name", "effects"),
+    [
+        ("camera", Effects(laser=False, camera_motion=step_motion(SHIFT_3, 0.15, MOVES_S))),
+        ("screen", Effects(laser=False, screen_motion=step_motion(SHIFT_3, 1.0, MOVES_S))),
+    ],
+)
+def test_a_motion_along_an_axis_is_within_the_bars(
+    reference: Path, name: str, effects: Effects
+) -> None:
+    """The bars contained 10 µm: Z4 was 10 and 50 sigma off in `ok` frames."""
+    track, true_um = tracked(reference, f"axis-{name}", effects)
     assert worst_of_ok(track, true_um) < 4.0
 
 

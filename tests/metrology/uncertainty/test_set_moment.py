@@ -9,7 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.uncertainty.set_moment import left_out_sigma_um, moment_sigma_um
+from membrane_ctrl.metrology.uncertainty.set_moment import (
+    left_out_sigma_um,
+    moment_sigma_um,
+    step_sigma_um,
+)
 from tests.studies.second_world_errors import drawn_points_mm, measured_errors
 from tests.worlds.second_optics import FRAME_S, Bench, Effects, Mirror, World
 
@@ -21,6 +25,13 @@ COURSES: dict[str, Course] = {
     "linear": lambda time_s: MOVED_UM * time_s / ((FRAMES - 1) * FRAME_S),
     "step": lambda time_s: MOVED_UM * (time_s > 1.5 * FRAME_S),
     "oscillating": lambda time_s: MOVED_UM / 2 * math.sin(2 * math.pi * time_s / 0.64),
+}
+# at any time between the last sinusoid of x and the first of y: the sinusoids show no motion
+BETWEEN: dict[str, Course] = {
+    f"between the axes, before frame {frame}": lambda time_s, frame=frame: (  # type: ignore[misc]
+        MOVED_UM * (time_s > (frame - 0.5) * FRAME_S)
+    )
+    for frame in (4, 8)
 }
 
 
@@ -58,7 +69,7 @@ def test_a_film_at_rest_has_the_sigma_of_the_fringes_noise() -> None:
     assert 0.1 < np.mean(found) < 0.25
 
 
-@pytest.mark.parametrize("name", COURSES)
+@pytest.mark.parametrize("name", COURSES | BETWEEN)
 def test_a_change_of_the_sag_is_within_its_bar_whatever_moment_is_meant(
     name: str, tmp_path: Path
 ) -> None:
@@ -67,7 +78,8 @@ def test_a_change_of_the_sag_is_within_its_bar_whatever_moment_is_meant(
     """
     points = drawn_points_mm(np.random.default_rng(1), 20)
     found = []
-    for seed, course in enumerate((None, COURSES[name])):
+    moving_film = (COURSES | BETWEEN)[name]
+    for seed, course in enumerate((None, moving_film)):
         effects = Effects(laser=False, film_motion_um=course)
         world = World(Mirror(), Bench.paper(0.125), effects, seed=1 + seed)
         folder = tmp_path / f"set{seed}"
@@ -79,8 +91,20 @@ def test_a_change_of_the_sag_is_within_its_bar_whatever_moment_is_meant(
     error_um = moving.error_um - before.error_um
     ratio = error_um / moving.change_sigma_um(before)
     assert np.abs(ratio).max() < 2.0
-    of_mean_um = error_um[0] - moment_um(COURSES[name])
+    of_mean_um = error_um[0] - moment_um(moving_film)
     assert abs(of_mean_um) < 1.1 * moving.change_sigma_um(before)[0]
+
+
+def test_a_step_between_the_axes_may_have_been_at_any_time_between_them() -> None:
+    """Mean over the times at which the film may have stepped, of what the sinusoids do not show."""
+    away_um = []
+    for frame in range(4, 9):
+        place_um = MOVED_UM * (np.arange(FRAMES) >= frame)
+        used = np.concatenate(SINUSOIDS).astype(int)
+        away_um.append(place_um.mean() - place_um[used].mean())
+    sigma_um = step_sigma_um(SINUSOIDS, MOVED_UM, 0.0, FRAMES)
+    assert sigma_um == pytest.approx(float(np.sqrt(np.mean(np.square(away_um)))), rel=0.1)
+    assert step_sigma_um(SINUSOIDS, 2.0, 2.5, FRAMES) == 0.0  # no more than chance
 
 
 def test_a_left_out_frame_leaves_the_laser_s_noise() -> None:

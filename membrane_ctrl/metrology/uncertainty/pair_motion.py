@@ -1,0 +1,64 @@
+"""Motions of the bench between two sets, which a change of the figure contains.
+
+A set is measured with the geometry of its bench. If camera, screen or lens move before the next
+set, the change of the figure contains what the motion does to it. The ring's tilt shows such
+motions (`motion_evidence`); slopes that no surface has are not compared. Hidden motions are assumed
+to be within their allowances.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.metrology.rays import bench_motions
+from membrane_ctrl.metrology.uncertainty.motion_evidence import (
+    MotionEffects,
+    MotionFinding,
+    MotionTest,
+    ring_tilt,
+)
+from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, traced_points
+from membrane_ctrl.model.arrays import FloatArray
+
+# A motion of 100 µm or 100 µrad: the fit is linear there
+_AMOUNT = 100.0
+
+
+@dataclass(frozen=True)
+class PairMotion:
+    """What motions after a set would do to the next figure.
+
+    Attributes
+    ----------
+    effects : MotionEffects
+    parameters_mm : (parameters,) array
+        Of the set's surface.
+    """
+
+    effects: MotionEffects
+    parameters_mm: FloatArray
+
+    @classmethod
+    def of(cls, bench: TrialBench) -> "PairMotion":
+        """Of a set. Raises ArithmeticError if a fit does not converge."""
+        nominal = bench.geometry()
+        tracer, points = traced_points(bench, nominal.geometry)
+        tracer.intersect(points, bench.surface, newton=3)
+        changes = bench_motions.screen_changes(
+            nominal.geometry, points.rays, points.t_mm, bench.surface, bench.vertex_z_mm
+        )
+        found = [bench.solve(nominal, _AMOUNT * change, linear=True) for change in changes]
+        figure_mm = (np.stack(found, axis=1) - bench.surface.parameters[:, None]) / _AMOUNT
+        none = np.zeros((bench_motions.COMPONENTS, 2, 0))
+        return cls(MotionEffects(figure_mm, none), bench.surface.parameters)
+
+    def find(self, earlier: "PairMotion", covariance_mm2: FloatArray) -> MotionFinding:
+        """The motions since an earlier set.
+
+        `covariance_mm2` (parameters, parameters) is that of the change on a bench at rest.
+        """
+        ring = ring_tilt()
+        test = MotionTest(self.effects, ring @ covariance_mm2 @ ring.T, None, None)
+        moved_mm = self.parameters_mm - earlier.parameters_mm
+        none = np.zeros(bench_motions.COMPONENTS)
+        return test.find(ring @ moved_mm, np.zeros(2), none)
