@@ -117,11 +117,11 @@ def _evaluate(measurement: Measurement, options: MeasureOptions) -> _Outcome:
     try:
         bars = results.error_bars(measurement, options.geometry, outline)
     except errors.InputError as error:
-        reason = _name_lens_fold(measurement, str(error), explains=True)
+        reason = name_lens_fold(measurement, str(error), explains=True)
         raise errors.InputError(reason) from None
     measurement = results.degrade_doubtful(measurement, bars)
     contradicted = bars is not None and bool(bars.statement.doubts)
-    reason = _name_lens_fold(measurement, measurement.reason, explains=contradicted)
+    reason = name_lens_fold(measurement, measurement.reason, explains=contradicted)
     measurement = replace(measurement, reason=reason)
     figure = figure_results.measured_figure(measurement, bars, options.nominal_radius_mm)
     return _Outcome(measurement, bars, light, outline, profile, figure)
@@ -172,7 +172,7 @@ def _write_files(
         log_measurement(target / "measurement.rrd", measurement, drawn)
 
 
-def _name_lens_fold(measurement: Measurement, reason: str, explains: bool) -> str:
+def name_lens_fold(measurement: Measurement, reason: str, explains: bool) -> str:
     """The reason of a verdict, with a lens model that folds within the picture.
 
     If the frames contradict the geometry, such a model explains it (`explains`); otherwise it is

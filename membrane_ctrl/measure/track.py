@@ -96,17 +96,18 @@ class Track:
             "time_s",
             "coeffs_um",
             "sigma_um",
-            "steady_sigma_um",
             "hencky_um",
             "sag_um",
             "sag_sigma_um",
             "steady_sag_sigma_um",
         )
         words = ("verdict", "reason")
-        return {
+        columns: dict[str, Any] = {
             name: np.array([getattr(frame, name) for frame in self.frames])
             for name in (*numbers, *words)
         }
+        columns["steady_sigma_um"] = np.array([frame.steady_sigma_um for frame in self.frames])
+        return columns
 
 
 def track_command(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.measure import results
-from membrane_ctrl.measure.measure import light_and_rim
+from membrane_ctrl.measure.measure import light_and_rim, name_lens_fold
 from membrane_ctrl.measure.measurement import measure_set
 from membrane_ctrl.metrology.rays.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty.budget import Budget
@@ -122,9 +122,11 @@ def measured_errors(
     _, outline = light_and_rim(measurement)
     bars = results.error_bars(measurement, None, outline)
     measurement = results.degrade_doubtful(measurement, bars)
+    contradicted = bars is not None and bool(bars.statement.doubts)
+    reason = name_lens_fold(measurement, measurement.reason, contradicted)
     flagged = tuple(f"{item['file']}: {item['reason']}" for item in measurement.flagged_files())
     rows = quantity_rows(points_mm)
-    verdict, reason, full = measurement.verdict, measurement.reason, measurement.full
+    verdict, full = measurement.verdict, measurement.full
     if full is None or bars is None:
         return MeasuredErrors(verdict, reason, flagged, None, None, None, rows, None)
     values_um = 1e3 * rows @ full.surface.parameters

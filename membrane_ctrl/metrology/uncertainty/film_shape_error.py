@@ -1,4 +1,8 @@
-"""Error of the parameters for a film whose bowl is not Hencky's, as its residual slopes show it."""
+"""Error of the parameters for a film that is not Hencky's, as its residual slopes show it.
+
+Its bowl may have another round profile, and waves around the azimuth if its moduli differ with
+direction or its ring is not flat.
+"""
 
 import math
 from functools import cache
@@ -6,26 +10,29 @@ from functools import cache
 import numpy as np
 
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
+from membrane_ctrl.metrology.film import terms_beyond_fit
 from membrane_ctrl.metrology.rays import surface_basis
 from membrane_ctrl.metrology.rays.surface import sag_gradient
 from membrane_ctrl.metrology.uncertainty import budget, residual_patches
 from membrane_ctrl.model.arrays import FloatArray
 
 _HEAVY = 1e3  # weight of the sag beside the heights
+_ROUND_MM = 0.01  # of a round term: ten times that of a Hencky bowl
 
 
 @cache
 def _most_similar_surfaces() -> FloatArray:
-    """(parameters, k) parameters of the surfaces most like the round terms beyond the fit's, with
-    their sag.
+    """(parameters, k) parameters of the surfaces most like the terms beyond the fit's, with their
+    sag.
     """
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-1, 1, 41)] * 2))
     inside = np.hypot(x, y) <= 1
     rows, (heights, _, _) = (
         surface_basis.evaluate_basis(x[inside], y[inside])[0].T,
-        surface_basis.evaluate_round_basis(x[inside], y[inside]),
+        surface_basis.evaluate_beyond_basis(x[inside], y[inside]),
     )
-    rim = surface_basis.evaluate_round_basis(np.ones(1), np.zeros(1))[0]
+    rim = surface_basis.evaluate_beyond_basis(np.ones(1), np.zeros(1))[0]
+    rim[terms_beyond_fit.WAVE] = 0.0  # their mean over the rim
     table = np.vstack([rows, _HEAVY * sag_gradient()])
     return np.asarray(np.linalg.lstsq(table, np.vstack([heights.T, _HEAVY * rim.T]), rcond=None)[0])
 
@@ -36,18 +43,19 @@ def law_effect(
     inverse: FloatArray,
     slope_variance: float = 0.0,
 ) -> tuple[FloatArray, float]:
-    """(parameters,) error of the parameters, in mm, for a film whose bowl is not Hencky's, as its
+    """(parameters,) error of the parameters, in mm, for a film that is not Hencky's, as its
     residual slopes show it.
 
     The second answer is what noise of the points' slopes adds to its square.
 
     Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the terms and
-    the excess. Least squares take some of that for other terms, and the rest is missing from the
-    sag.
+    the excess; an orthotropic film or a ring that is not flat adds waves. Least squares take some
+    of that for other terms, and the rest is missing from the sag. Amplitudes are estimated from
+    the residual with the sigmas of films that nobody has measured.
     """
     x, y = patches.places_mm / radius_mm
     _, *of = surface_basis.evaluate_basis(x, y)
-    _, *beyond = surface_basis.evaluate_round_basis(x, y)
+    _, *beyond = surface_basis.evaluate_beyond_basis(x, y)
     absorbed = (
         inverse
         @ sum((a * patches.count) @ b.T for a, b in zip(of, beyond, strict=True))
@@ -55,10 +63,19 @@ def law_effect(
     )
     left = np.hstack([b - absorbed.T @ a for a, b in zip(of, beyond, strict=True)]).T
     weights = np.sqrt(np.tile(patches.count, 2))
-    answer = (
-        (absorbed - _most_similar_surfaces()) @ np.linalg.pinv(left * weights[:, None]) * radius_mm
-    )
-    return answer @ (patches.slopes.ravel() * weights), slope_variance * float(np.sum(answer**2))
+    seen = patches.slopes.ravel() * weights
+    left = left * weights[:, None] / radius_mm
+    scatter = max(float(np.mean(seen**2)), slope_variance)
+    known = scatter * np.diag(1 / _beyond_sigmas_mm() ** 2)
+    answer = (absorbed - _most_similar_surfaces()) @ np.linalg.solve(left.T @ left + known, left.T)
+    return answer @ seen, slope_variance * float(np.sum(answer**2))
+
+
+@cache
+def _beyond_sigmas_mm() -> FloatArray:
+    """(k,) sizes of the terms beyond the fit's in a film that nobody has measured."""
+    round_mm = np.full(len(terms_beyond_fit.ROUND_DEGREES), _ROUND_MM)
+    return np.append(round_mm, [wave.sigma_mm for wave in terms_beyond_fit.WAVES])
 
 
 def film_shape_source(full: FullResult, slope_variance: FloatArray) -> budget.Source:
@@ -67,5 +84,5 @@ def film_shape_source(full: FullResult, slope_variance: FloatArray) -> budget.So
         float(slope_variance.mean()),
     )
     effect, noise = law_effect(patches, full.surface.radius_mm, full.fit.normal.inverse, variance)
-    says = "film that is not Hencky's: round slopes that no term explains"
+    says = "film that is not Hencky's: round slopes and waves that no term explains"
     return budget.Source("film_law", says, math.nan, effect[:, None], common=False, noise_mm2=noise)

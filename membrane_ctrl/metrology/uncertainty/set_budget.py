@@ -96,10 +96,13 @@ def assemble_budget(
     film, doubts = _film_source(bench, moved, unseen)
     blur = image_blur.blur_source(bench, _blur_px(optics, checked))
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
-    if budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM:
-        doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
     rim = None if outline is None else measure_rim_misfit(bench, spread, outline)
     slopes = measure_slope_misfit(bench, spread, full.grid, full.residual_mm)
+    # Contrast is compared with the slopes of the fitted surface: where these are not those of a
+    # surface, it shows no blur.
+    is_blurred = budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM
+    if is_blurred and not slopes.contradicts:
+        doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
     slope_variance = full.slope_variance(optics, shifts, noise_adu)
     sources = [
         *bench_sources.geometry_sources(bench, spread, 1.0 if rim is None else rim.widening),
