@@ -45,6 +45,7 @@ ROWS_OF_PIXELS = {"principal_x_mm": "principal_x_px", "principal_y_mm": "princip
 # rows that no stated sigma of the bench gives: the set measures them itself
 OWN_ROWS = (
     "film_law",
+    "film_waves",
     "film_x_to_y_um",
     "film_seen_um",
     "vertex_um",
@@ -245,22 +246,22 @@ PLANTS = (
     ),
     Plant(("slope_urad",), "20 spots of dust", effects=lambda _: replace(STILL, dust=20), trials=3),
     Plant(
-        ("film_law", "slope_urad"),
+        ("film_law", "film_waves", "slope_urad"),
         "Poisson ratio 0.42",
         film=Mirror(material=Material(poisson=0.42)),
     ),
     Plant(
-        ("film_law", "slope_urad"),
+        ("film_law", "film_waves", "slope_urad"),
         "pre-strain 5e-4",
         film=Mirror(material=Material(prestrain=(5e-4, 5e-4, 0.0))),
     ),
     Plant(
-        ("film_law", "slope_urad"),
+        ("film_law", "film_waves", "slope_urad"),
         "orthotropic film, E2/E1 0.9",
         film=Mirror(material=Material(ratio=0.9, direction_rad=0.5)),
     ),
     Plant(
-        ("film_law", "slope_urad"),
+        ("film_law", "film_waves", "slope_urad"),
         "wrinkles of 5 µm at the rim",
         film=Mirror(wrinkles=Wrinkles(5.0)),
     ),

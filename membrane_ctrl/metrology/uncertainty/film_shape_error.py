@@ -17,7 +17,6 @@ from membrane_ctrl.metrology.uncertainty import budget, residual_patches
 from membrane_ctrl.model.arrays import FloatArray
 
 _HEAVY = 1e3  # weight of the sag beside the heights
-_ROUND_MM = 0.01  # of a round term: ten times that of a Hencky bowl
 
 
 @cache
@@ -42,16 +41,15 @@ def law_effect(
     radius_mm: float,
     inverse: FloatArray,
     slope_variance: float = 0.0,
-) -> tuple[FloatArray, float]:
-    """(parameters,) error of the parameters, in mm, for a film that is not Hencky's, as its
-    residual slopes show it.
+) -> tuple[FloatArray, FloatArray]:
+    """(parameters, 2) errors of the parameters, in mm, for a film that is not Hencky's, as its
+    residual slopes show it: by its round profile, and by waves.
 
-    The second answer is what noise of the points' slopes adds to its square.
+    The second answer (2,) is what noise of the points' slopes adds to their squares.
 
     Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the terms and
     the excess; an orthotropic film or a ring that is not flat adds waves. Least squares take some
-    of that for other terms, and the rest is missing from the sag. Amplitudes are estimated from
-    the residual with the sigmas of films that nobody has measured.
+    of that for other terms, and the rest is missing from the sag.
     """
     x, y = patches.places_mm / radius_mm
     _, *of = surface_basis.evaluate_basis(x, y)
@@ -61,28 +59,39 @@ def law_effect(
         @ sum((a * patches.count) @ b.T for a, b in zip(of, beyond, strict=True))
         / radius_mm**2
     )
+    error = absorbed - _most_similar_surfaces()
     left = np.hstack([b - absorbed.T @ a for a, b in zip(of, beyond, strict=True)]).T
     weights = np.sqrt(np.tile(patches.count, 2))
-    seen = patches.slopes.ravel() * weights
     left = left * weights[:, None] / radius_mm
+    seen = patches.slopes.ravel() * weights
+    # Any round profile; waves are as large as in films that nobody has measured.
+    round_left, wave_left = left[:, terms_beyond_fit.ROUND], left[:, terms_beyond_fit.WAVE]
     scatter = max(float(np.mean(seen**2)), slope_variance)
-    known = scatter * np.diag(1 / _beyond_sigmas_mm() ** 2)
-    answer = (absorbed - _most_similar_surfaces()) @ np.linalg.solve(left.T @ left + known, left.T)
-    return answer @ seen, slope_variance * float(np.sum(answer**2))
+    sigmas_mm = np.array([wave.sigma_mm for wave in terms_beyond_fit.WAVES])
+    waves = wave_left.T @ wave_left + scatter * np.diag(1 / sigmas_mm**2)
+    answers = (
+        error[:, terms_beyond_fit.ROUND] @ np.linalg.pinv(round_left),
+        error[:, terms_beyond_fit.WAVE] @ np.linalg.solve(waves, wave_left.T),
+    )
+    effects = np.stack([answer @ seen for answer in answers], axis=1)
+    noise = np.array([float(np.sum(answer**2)) for answer in answers])
+    return effects, slope_variance * noise
 
 
-@cache
-def _beyond_sigmas_mm() -> FloatArray:
-    """(k,) sizes of the terms beyond the fit's in a film that nobody has measured."""
-    round_mm = np.full(len(terms_beyond_fit.ROUND_DEGREES), _ROUND_MM)
-    return np.append(round_mm, [wave.sigma_mm for wave in terms_beyond_fit.WAVES])
-
-
-def film_shape_source(full: FullResult, slope_variance: FloatArray) -> budget.Source:
+def film_shape_sources(full: FullResult, slope_variance: FloatArray) -> tuple[budget.Source, ...]:
+    """The rows of the film's round profile and of its waves."""
     patches, variance = (
         residual_patches.Patches.of_grid(full.fit_grid),
         float(slope_variance.mean()),
     )
-    effect, noise = law_effect(patches, full.surface.radius_mm, full.fit.normal.inverse, variance)
-    says = "film that is not Hencky's: round slopes and waves that no term explains"
-    return budget.Source("film_law", says, math.nan, effect[:, None], common=False, noise_mm2=noise)
+    effects, noise = law_effect(patches, full.surface.radius_mm, full.fit.normal.inverse, variance)
+    rows = (
+        ("film_law", "film that is not Hencky's: round slopes that no term explains"),
+        ("film_waves", "film or ring that is not even: waves that no term explains"),
+    )
+    return tuple(
+        budget.Source(
+            name, says, math.nan, effects[:, [k]], common=False, noise_mm2=float(noise[k])
+        )
+        for k, (name, says) in enumerate(rows)
+    )

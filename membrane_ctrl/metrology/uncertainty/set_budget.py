@@ -22,7 +22,7 @@ from membrane_ctrl.metrology.uncertainty import (
     residual_patches,
     trial_bench,
 )
-from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_source
+from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_sources
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.held_light_error import held_light_source
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
@@ -110,7 +110,7 @@ def assemble_budget(
         *film,
         *filter(None, [moment_source(checked, moved, unseen, optics.mirror.radius_mm)]),
         _vertex_source(bench, sigmas, checked, film[0].sigma),
-        film_shape_source(full, slope_variance),
+        *film_shape_sources(full, slope_variance),
         blur,
         *frame_effects.frame_sources(
             bench,
