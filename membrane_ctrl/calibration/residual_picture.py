@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from membrane_ctrl.measure.result_files import write_picture
 from membrane_ctrl.metrology.calibration import solver
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.colours import DIVERGING_MAP
 from membrane_ctrl.model.files import resolve_user_path
 
 _INCHES = 2.6  # a panel
@@ -28,7 +29,7 @@ def draw_residuals(path: Path, solution: solver.Solution) -> None:
     reach = (
         float(np.nanpercentile(np.abs(maps), 98)) or 1.0
     )  # single cells at the edge must not set the scale
-    colours = ScalarMappable(Normalize(-reach, reach), "RdBu_r")
+    colours = ScalarMappable(Normalize(-reach, reach), DIVERGING_MAP)
     figure = Figure(figsize=(_INCHES * count, 2 * _INCHES), layout="constrained")
     panels = figure.subplots(2, count, squeeze=False, sharex=True, sharey=True)
     for axis, name in enumerate(("s_x", "s_y")):

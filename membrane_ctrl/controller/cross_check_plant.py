@@ -11,6 +11,7 @@ from firmware_iface.settings import ModbusMapConfig, Optoncdt1420Config
 from membrane_ctrl.config import sight
 from membrane_ctrl.config.schema import Config, LoopConfig, OpticsConfig
 from membrane_ctrl.control import film_monitor, leak_growth, loop_margins, pump_curve
+from membrane_ctrl.control.filling_time import find_fall_s, find_leak_speed
 from membrane_ctrl.controller import actuator_test, safety
 
 Severity = Literal["error", "warning"]
@@ -142,10 +143,6 @@ def judge_vent(config: Config, say: ConfigFindings) -> None:
 def _leak_estimate(config: Config) -> str:
     """How long the leak takes to lower the mirror, and on what basis; empty for a film that is
     slack already.
-
-    The outflow is proportional to the pressure p, and the volume to its cube root (a Hencky bowl).
-    So dp/dt = -(p / T) (p / p0)^(2/3), with the time constant T at p0, and p reaches p1 after
-    1.5 T ((p0 / p1)^(2/3) - 1).
     """
     mirror, end_pa, time_constant_s = (
         config.optics.mirror,
@@ -154,8 +151,8 @@ def _leak_estimate(config: Config) -> str:
     )
     if not mirror.pressure_pa > end_pa > 0.0:
         return ""
-    takes_s = 1.5 * time_constant_s * ((mirror.pressure_pa / end_pa) ** (2 / 3) - 1.0)
-    speed_um_per_s = 1e3 * mirror.sag_mm / (3.0 * time_constant_s)
+    speed_um_per_s = find_leak_speed(mirror.sag_mm, time_constant_s)
+    takes_s = find_fall_s(mirror.sag_mm, mirror.pressure_pa, end_pa, speed_um_per_s)
     return (
         f", from {mirror.pressure_pa:g} to {end_pa:g} Pa in about {takes_s / 3600.0:.2g} h "
         "(estimated with "

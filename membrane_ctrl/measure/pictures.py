@@ -18,6 +18,7 @@ from membrane_ctrl.metrology.figure.pixel_figure import FullResult
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.rays import rim_outline
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.colours import DIVERGING_MAP, SEQUENTIAL_MAP
 from membrane_ctrl.model.terminal import escape_controls
 
 if TYPE_CHECKING:  # half a second to load, and most measurements make no recording
@@ -50,10 +51,10 @@ def draw_measurement(
     axis, height = full.grid.axis_mm, full.height_mm()
     residual_um = 1e3 * full.residual_mm
     files += [
-        write_picture(out / "sag.png", _map_axes("height (mm)", axis, height, "viridis")),
+        write_picture(out / "sag.png", _map_axes("height (mm)", axis, height, SEQUENTIAL_MAP)),
         write_picture(
             out / "residual.png",
-            _map_axes("height over the fit (µm)", axis, residual_um, "RdBu_r", even=True),
+            _map_axes("height over the fit (µm)", axis, residual_um, DIVERGING_MAP, even=True),
         ),
         write_picture(
             out / "slopes.png", _draw_slopes(full, full.map() if figure is None else figure.seen)
@@ -97,7 +98,7 @@ def _draw_figure(found: MeasuredFigure) -> Figure:
         f"less the best sphere, R = {radius_mm:.1f} mm (µm)",
         axis,
         deviation_um,
-        "RdBu_r",
+        DIVERGING_MAP,
         even=True,
     )
     asymmetry_um = deviation_um - found.figure.rotational_um
@@ -106,7 +107,7 @@ def _draw_figure(found: MeasuredFigure) -> Figure:
         "and less its rotationally invariant part (µm)",
         axis,
         asymmetry_um,
-        "RdBu_r",
+        DIVERGING_MAP,
         even=True,
     )
     psd = found.spectrum
@@ -219,13 +220,13 @@ def _draw_slopes(full: FullResult, seen: SurfaceMap) -> Figure:
         (axes[0, 1], seen.slope_y, "dh/dy"),
     ):
         milli = np.where(grid.count > 0, 1e3 * slope, np.nan)
-        show_map(place, f"{name} measured (mrad)", grid.axis_mm, milli, "RdBu_r", even=True)
+        show_map(place, f"{name} measured (mrad)", grid.axis_mm, milli, DIVERGING_MAP, even=True)
     for place, slope, name in (
         (axes[1, 0], grid.slope_x, "dh/dx"),
         (axes[1, 1], grid.slope_y, "dh/dy"),
     ):
         left = np.where(grid.count > 0, 1e6 * slope, np.nan)
-        show_map(place, f"{name} less the fit (µrad)", grid.axis_mm, left, "RdBu_r", even=True)
+        show_map(place, f"{name} less the fit (µrad)", grid.axis_mm, left, DIVERGING_MAP, even=True)
     return figure
 
 

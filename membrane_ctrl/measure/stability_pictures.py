@@ -12,6 +12,7 @@ from membrane_ctrl.measure.pictures import show_map
 from membrane_ctrl.measure.rerun_recording import log_pictures, open_recording
 from membrane_ctrl.measure.result_files import write_picture
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.colours import DIVERGING_MAP, SEQUENTIAL_MAP
 from membrane_ctrl.model.zernike_terms import zernike_labels
 
 
@@ -22,9 +23,9 @@ def draw_uncertainty(
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     if pair:
-        show_map(left, "change of height (µm)", axis_mm, height_um, "RdBu_r", even=True)
+        show_map(left, "change of height (µm)", axis_mm, height_um, DIVERGING_MAP, even=True)
     else:
-        show_map(left, "height (mm)", axis_mm, height_um / 1e3, "viridis")
+        show_map(left, "height (mm)", axis_mm, height_um / 1e3, SEQUENTIAL_MAP)
     show_map(right, f"RMSE (µm), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
     write_picture(path, figure)
 
@@ -84,7 +85,12 @@ def draw_pairs(
     axes = figure.subplots(len(maps), 2, squeeze=False)
     for row, (lag_s, (change_um, rmse_um)) in zip(axes, maps.items(), strict=True):
         show_map(
-            row[0], f"change over {lag_s / 60:g} min (µm)", axis_mm, change_um, "RdBu_r", even=True
+            row[0],
+            f"change over {lag_s / 60:g} min (µm)",
+            axis_mm,
+            change_um,
+            DIVERGING_MAP,
+            even=True,
         )
         show_map(row[1], f"RMSE (µm), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
     write_picture(path, figure)

@@ -31,6 +31,7 @@ from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame, rejecte
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray, Image
+from membrane_ctrl.model.colours import DIVERGING_MAP
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS, zernike_labels
 
 _SAME_REGION = 1e-4  # of its side: rounding of written decimals
@@ -364,7 +365,7 @@ def _draw_track(
         most = float(np.nanquantile(np.abs(shown), 0.995)) or 1.0
         extent = (time_s[0], time_s[-1] + 1e-9, ZERNIKE_TERMS + 0.5, FIRST_FIGURE_INDEX - 0.5)
         style: dict[str, Any] = {
-            "cmap": "RdBu_r",
+            "cmap": DIVERGING_MAP,
             "vmin": -most,
             "vmax": most,
             "interpolation": "nearest",
@@ -378,7 +379,7 @@ def _draw_track(
     terms.set(title="terms less their means (µm RMS)", xlabel="time (s)", ylabel="Noll index")
     sag.set(xlabel="time (s)", ylabel="µm")
     most = float(np.nanquantile(np.abs(residual_adu), 0.995)) or 1.0
-    figure.colorbar(left.imshow(residual_adu, cmap="RdBu_r", vmin=-most, vmax=most), ax=left)
+    figure.colorbar(left.imshow(residual_adu, cmap=DIVERGING_MAP, vmin=-most, vmax=most), ax=left)
     left.set(
         title="mean light that the fits leave (ADU)", xlabel="column of bins", ylabel="row of bins"
     )

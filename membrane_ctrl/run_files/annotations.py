@@ -10,7 +10,9 @@ from membrane_ctrl.model.account import account_name
 ANNOTATIONS_FILE = "annotations.jsonl"
 
 
-def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> events.EventLine:
+def add_mark(
+    folder: Path, origin_utc: datetime, mono_s: float, text: str, author: str = ""
+) -> events.EventLine:
     """Append a mark at a time of the run; it then counts among the run's events.
 
     Parameters
@@ -23,12 +25,14 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> ev
         Time of the mark.
     text : str
         Text of the mark.
+    author : str
+        Who makes it; by default, the account of this program.
 
     Raises DeviceError if the folder cannot be written.
     """
     moment = datetime.fromtimestamp(origin_utc.timestamp() + mono_s, UTC)
     mark = run_events.Mark(
-        text, account_name(), made_utc=datetime.now(UTC).isoformat(timespec="seconds")
+        text, author or account_name(), made_utc=datetime.now(UTC).isoformat(timespec="seconds")
     )
     line = {"time_utc": moment.isoformat(), "mono_s": mono_s} | mark.to_dict()
     line["program"] = program.program_identity()

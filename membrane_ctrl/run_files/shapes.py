@@ -5,7 +5,7 @@ heights anywhere on the mirror.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -248,6 +248,19 @@ def without_terms(height: AnyArray, terms: int) -> AnyArray:
     # spans the same as the Zernike terms, which take 70 ms
     basis, left = np.stack((np.ones_like(x), x, y, x**2 + y**2))[:terms], height.copy()
     left[there] -= np.linalg.lstsq(basis.T, height[there].astype(np.float64), rcond=None)[0] @ basis
+    return left
+
+
+def without_noll_terms(height: AnyArray, indices: Sequence[int]) -> AnyArray:
+    """A map of the unit disc less the best fit of some Zernike terms, given by their Noll indices,
+    to its finite pixels.
+    """
+    there = np.isfinite(height)
+    inside = _inside_disc()
+    basis = _term_values()[[index - 1 for index in indices]][:, there[inside]]
+    left = height.copy()
+    coefficients = np.linalg.lstsq(basis.T, height[there].astype(np.float64), rcond=None)[0]
+    left[there] -= coefficients @ basis
     return left
 
 

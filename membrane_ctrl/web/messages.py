@@ -4,10 +4,14 @@ from typing import Literal
 
 from nicegui import ui
 
+# above the stop button, and far from the state at the top
+MESSAGE_CSS = ".membrane-message { margin-bottom: 4.5rem }"
+
 
 def show_message(text: str, good: bool | None = None) -> None:
-    """Show the viewer a message for some seconds, away from the stop button."""
+    """Show the viewer a message for some seconds, away from the state and the stop button."""
     kind: Literal["positive", "negative"] | None = (
         None if good is None else "positive" if good else "negative"
     )
-    ui.notify(text, type=kind, position="top", timeout=5000 if good is None else 8000)
+    timeout_ms = 5000 if good is None else 8000
+    ui.notify(text, type=kind, position="bottom", timeout=timeout_ms, classes="membrane-message")

@@ -1,20 +1,19 @@
-"""The page of one viewer: the hold now, its history, its figure, what it may be told, and the runs
-before it.
+"""The page of one viewer: the hold now, its history, its figure, its commands, and the runs before
+it.
 """
 
 import contextlib
-import gzip
-import json
 import time
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import urlencode
 
 from nicegui import ui
 
 from membrane_ctrl.control_port.outcome import Outcome
-from membrane_ctrl.control_port.status import alarm_lines, lock_lines
-from membrane_ctrl.model.columns import MISSING, PUBLISHED
+from membrane_ctrl.control_port.status import alarm_lines
+from membrane_ctrl.model.columns import MISSING, PUBLISHED, TelemetryColumn
 from membrane_ctrl.service.access import (
     ACTIONS,
     STOP,
@@ -26,32 +25,32 @@ from membrane_ctrl.service.access import (
     outranks,
     request,
 )
-from membrane_ctrl.service.feed import SPANS_S, HoldFeed, history, marks
+from membrane_ctrl.service.feed import SPANS_S, HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
-from membrane_ctrl.service.work_pools import (
-    FIGURES,
-    LIVE_CHARTS,
-    LONG_CHARTS,
-    SESSIONS,
-    PoolFullError,
-    pool_of_command,
-)
-from membrane_ctrl.web import figures
+from membrane_ctrl.service.work_pools import COMMANDS, PoolFullError, pool_of_command
+from membrane_ctrl.web import figure_map, history_chart
+from membrane_ctrl.web.action_dialog import ask_for_confirmation
+from membrane_ctrl.web.alarms_panel import alarms_panel
+from membrane_ctrl.web.chart_marks import is_now, mark_past
+from membrane_ctrl.web.consequences import Consequence, find_consequence
 from membrane_ctrl.web.fleet_panel import fleet_panel
+from membrane_ctrl.web.held_by import describe_holder
 from membrane_ctrl.web.log_lines import find_new_lines
-from membrane_ctrl.web.messages import show_message
+from membrane_ctrl.web.messages import MESSAGE_CSS, show_message
 from membrane_ctrl.web.no_hold import NoHoldPanel
 from membrane_ctrl.web.runs_panel import runs_panel
-from membrane_ctrl.web.tuning_panel import CHOOSES, SessionWatch, TuningPanel
+from membrane_ctrl.web.shared_views import CHART_EVERY_S, FIRST_FIGURE, LOOK_S, SharedViews
+from membrane_ctrl.web.tuning_panel import CHOOSES, TuningPanel
 
-_LOOK_S = 1.0
 _SESSION_DIGITS = 8
 _FETCH_S = 30.0  # for a browser to fetch a chart
-_CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
-_LONG_CHART_LIFE_S = 30.0
-_FIRST_SIGNAL = "error_um"  # of the chart
+_FIRST_SIGNALS = ["error_um"]  # of the chart
+_PANEL_REM = {1: 22, 2: 30, 3: 38, 4: 46}  # height of the chart by its panels
 # a phone is narrow
-_CSS = ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"
+_CSS = (
+    ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"
+    ".membrane-map canvas { touch-action: pan-y; display: block }" + MESSAGE_CSS
+)
 _PRIMARY = "#3276bb"  # white on it is legible (4.7 : 1); on NiceGUI's own blue it is not
 _COLOURS = {
     "hold": "positive",
@@ -60,42 +59,21 @@ _COLOURS = {
     "inflate": "info",
     "tune": "warning",
 }
-
-
-class SharedViews:
-    """What all viewers of a hold see alike, made once: charts, maps, the tuning session.
-
-    Browsers fetch charts and maps when they are ready, so that none pile up for a slow one.
-    """
-
-    def __init__(self, feeds: Mapping[str, HoldFeed]) -> None:
-        self._feeds = feeds
-        self._live_charts = figures.Shared(self._chart, LIVE_CHARTS, life_s=_LOOK_S)
-        self._long_charts = figures.Shared(self._chart, LONG_CHARTS, life_s=_LONG_CHART_LIFE_S)
-        self.maps = figures.Shared(self._map, FIGURES, life_s=60.0)
-        watches = {
-            name: SessionWatch(feed.logs) for name, feed in feeds.items() if feed.logs is not None
-        }
-        self.sessions = figures.Shared(lambda hold: watches[hold].look(), SESSIONS, life_s=_LOOK_S)
-
-    async def chart(self, hold: str, signal: str, span: str, utc: bool) -> bytes:
-        """Options of the history chart, as JSON in gzip. Raises PoolFullError if too many are asked
-        for.
-        """
-        charts = self._live_charts if SPANS_S[span] in _CHART_EVERY_S else self._long_charts
-        return await charts.get(hold, signal, span, utc)
-
-    def _chart(self, hold: str, signal: str, span: str, utc: bool) -> bytes:
-        feed, span_s = self._feeds[hold], SPANS_S[span]
-        made = marks(feed, feed.logs, span_s)
-        options = figures.chart(signal, history(feed, feed.logs, signal, span_s), utc, made)
-        return gzip.compress(json.dumps(options).encode(), 1)
-
-    def _map(self, hold: str, removed: str, _time_s: float) -> figures.MapPicture:
-        """The newest figure less some terms; a figure of another time is another map."""
-        seen = self._feeds[hold].seen
-        assert seen.figure is not None
-        return figures.map_picture(seen.figure, seen.reference, figures.REMOVED[removed])
+_BUTTON_COLOURS = {
+    Consequence.NOTHING: "primary",
+    Consequence.MOVES_GAS: "amber-5 text-color=black",
+    Consequence.COSTS_HOURS: "deep-orange-9",
+}
+_KEYS = {"h": "hold", "p": "pause", "m": "mark", "s": "stop"}
+_KEYS_HELP = (
+    ("h", "hold"),
+    ("p", "pause, or resume"),
+    ("m", "mark"),
+    ("s", "stop"),
+    ("?", "these keys"),
+    ("Enter", "confirms what leaves the mirror as it is, and STOP"),
+    ("Escape", "cancels"),
+)
 
 
 class WebPage:
@@ -114,13 +92,16 @@ class WebPage:
         self._feed = feeds[hold]
         self._logs = self._feed.logs
         self._utc = True
-        self._span, self._signal = "10 min", _FIRST_SIGNAL
-        self._removed = "nothing"
+        self._span = "10 min"
+        self._signals = list(_FIRST_SIGNALS)
+        self._removed: tuple[str, ...] = ()
+        self._reference = FIRST_FIGURE
         self._charted_s = -1e9
-        self._drawn: tuple[float, str] = (0.0, "")
+        self._drawn: tuple[object, ...] = ()
         self._coloured = ""
         self._buttons: list[tuple[ui.button, Action]] = []
         self._asking = False
+        self._clicked_s: float | None = None  # UTC of the last click on the chart
         # of this viewer, in records
         self._session = f"page {ui.context.client.id[:_SESSION_DIGITS]}"
 
@@ -128,37 +109,12 @@ class WebPage:
         """Put the page together."""
         self._dark = ui.dark_mode(None)
         ui.add_css(_CSS)
+        ui.add_head_html(f"<script>{history_chart.SCRIPT}\n{figure_map.SCRIPT}</script>")
         ui.colors(primary=_PRIMARY)
-        with ui.header().classes("items-center justify-between q-py-xs"):
-            self._name = ui.label().classes("text-h6")
-            self._state = ui.badge().classes("text-body1 q-pa-sm").props('aria-label="state"')
-            with ui.row().classes("items-center"):
-                ui.switch("UTC", value=True, on_change=lambda e: self._set("_utc", e.value)).props(
-                    "color=dark keep-color"
-                )
-                ui.button(icon="dark_mode", on_click=self._toggle_dark).props(
-                    'flat round color=white aria-label="dark"'
-                )
-                ui.label(f"{self._user.name} ({self._user.role})").classes("text-caption")
+        self._build_header()
         if len(self._feeds) > 1:
             fleet_panel(self._feeds)
-        with ui.tabs().classes("w-full") as tabs:
-            now, look_back, tune = ui.tab("Now"), ui.tab("Look back"), ui.tab("Tune")
-            for tab in (look_back, tune):
-                tab.set_visibility(self._logs is not None)  # the runs of a hold elsewhere are there
-        with ui.tab_panels(tabs, value=now).classes("w-full"):
-            with ui.tab_panel(now):
-                self._build_now()
-            if self._logs is not None:
-                with ui.tab_panel(look_back):
-                    load = runs_panel(self._logs, self._hold, self._user, lambda: self._utc)
-                    tabs.on_value_change(
-                        lambda event: load() if event.value == look_back.props["name"] else None
-                    )
-                with ui.tab_panel(tune):
-                    TuningPanel(
-                        lambda: self._views.sessions.get(self._hold), self._user, self._may_choose
-                    )
+        self._build_tabs()
         with ui.footer().classes(
             "justify-center q-pa-xs !bg-white dark:!bg-[#121212]"
         ):  # always on the screen
@@ -169,80 +125,159 @@ class WebPage:
             self._buttons.append((stop, STOP))
         # a button that was clicked keeps the focus: the keys work there, too
         ui.keyboard(on_key=self._key, repeating=False, ignore=["input", "select", "textarea"])
+        ui.on("membrane_chart_clicked", self._choose_moment)
         self._look()
-        ui.timer(_LOOK_S, self._look)
-        ui.timer(_LOOK_S, self._draw)
+        ui.timer(LOOK_S, self._look)
+        ui.timer(LOOK_S, self._draw)
+
+    def _build_header(self) -> None:
+        with ui.header().classes("items-center justify-between q-py-xs"):
+            self._name = ui.label().classes("text-h6")
+            self._state = ui.badge().classes("text-body1 q-pa-sm").props('aria-label="state"')
+            with ui.row().classes("items-center"):
+                ui.switch("UTC", value=True, on_change=lambda e: self._set("_utc", e.value)).props(
+                    "color=dark keep-color"
+                )
+                ui.button(icon="dark_mode", on_click=self._toggle_dark).props(
+                    'flat round color=white aria-label="dark or light"'
+                )
+                ui.button(icon="help_outline", on_click=self._show_keys).props(
+                    'flat round color=white aria-label="keys"'
+                )
+                ui.label(f"{self._user.name} ({self._user.role})").classes("text-caption")
+
+    def _build_tabs(self) -> None:
+        with ui.tabs().classes("w-full") as tabs:
+            now, look_back = ui.tab("Now"), ui.tab("Look back")
+            alarms, tune = ui.tab("Alarms"), ui.tab("Tune")
+            for tab in (look_back, alarms, tune):
+                tab.set_visibility(self._logs is not None)  # the runs of a hold elsewhere are there
+        with ui.tab_panels(tabs, value=now).classes("w-full"):
+            with ui.tab_panel(now):
+                self._build_now()
+            if self._logs is None:
+                return
+            with ui.tab_panel(look_back):
+                load_runs = runs_panel(self._logs, self._hold, self._user, lambda: self._utc)
+            with ui.tab_panel(alarms):
+                load_alarms = alarms_panel(
+                    lambda: self._views.alarms(self._hold), lambda: self._utc
+                )
+            with ui.tab_panel(tune):
+                TuningPanel(
+                    lambda: self._views.sessions.get(self._hold), self._user, self._may_choose
+                )
+        loads = {look_back.props["name"]: load_runs, alarms.props["name"]: load_alarms}
+
+        async def load(event: Any) -> None:
+            if event.value in loads:
+                await loads[event.value]()
+
+        tabs.on_value_change(load)
 
     def _may_choose(self) -> bool:
         return outranks(self._user.role, CHOOSES) and outranks(self._feed.seen.role, CHOOSES)
 
     def _build_now(self) -> None:
         self._why = ui.label().classes("text-subtitle1").props('role="status"')
+        self._holder = ui.label().props('aria-label="what holds the mirror"')
         self._alarm = ui.label().classes("text-negative text-bold").props('role="alert"')
         if self._logs is not None:
             NoHoldPanel(self._feed, self._hold, self._user, self._starter)
         with ui.row().classes("w-full items-stretch no-wrap max-lg:flex-wrap"):
-            with ui.column().classes("col-grow"):
+            with ui.column().classes("col-grow min-w-0"):
                 self._numbers = self._build_numbers()
                 self._build_chart()
-            with ui.column().style("width: 24rem; max-width: 100%"):
+            with ui.column().style("width: 26rem; max-width: 100%"):
                 self._build_actions()
                 self._build_figure()
         self._events = ui.log(max_lines=200).classes("w-full h-48").props('aria-label="events"')
         self._shown_events: tuple[str, ...] = ()
 
-    def _build_numbers(self) -> dict[str, ui.label]:
+    def _build_numbers(self) -> dict[str, tuple[ui.card, ui.label]]:
+        """A card of each published column; those without a value are hidden."""
         found = {}
         with (
             ui.grid()
             .classes("w-full gap-2")
-            .style("grid-template-columns: repeat(auto-fill, minmax(8.5rem, 1fr))")
+            .style("grid-template-columns: repeat(auto-fill, minmax(min(8.5rem, 28vw), 1fr))")
         ):
             for column in PUBLISHED:
-                with ui.card().classes("q-pa-sm gap-0"):
-                    ui.label(column.title).classes("text-caption")
-                    found[column.name] = (
-                        ui.label(MISSING).classes("text-h6").props(f'data-field="{column.name}"')
-                    )
+                with ui.card().classes("q-pa-sm gap-0") as card:
+                    ui.label(column.title).classes("text-caption leading-tight")
+                    label = ui.label(MISSING).classes("text-h6 leading-tight")
+                    label.props(f'data-field="{column.name}"')
+                card.tooltip(column.description)
+                found[column.name] = (card, label)
         return found
 
     def _build_chart(self) -> None:
-        with ui.row().classes("items-center"):
+        with ui.row().classes("items-center w-full"):
             ui.toggle(
                 list(SPANS_S), value=self._span, on_change=lambda e: self._set("_span", e.value)
-            ).props("dense")
-            ui.select(
+            ).props('dense no-caps aria-label="time span"')
+            self._select = ui.select(
                 {column.name: column.title for column in PUBLISHED},
-                value=self._signal,
-                on_change=lambda e: self._set("_signal", e.value),
-            ).props('dense aria-label="signal"')
-        self._chart = ui.echart({"series": []}).classes("w-full").style("height: 22rem")
+                value=self._signals,
+                multiple=True,
+                on_change=lambda e: self._choose_signals(e.value),
+            ).props(f'dense use-chips max-values={history_chart.SIGNALS_MOST} aria-label="signals"')
+            self._mark_here = ui.button(
+                "Mark", icon="bookmark", on_click=self._mark_moment, color=None
+            ).props("dense outline no-caps")
+            self._mark_here.set_visibility(False)
+        # the chart itself takes no attributes
+        with ui.element("div").classes("w-full").props('role="img" aria-label="history"'):
+            self._chart = ui.echart({"series": []}).classes("w-full")
+            self._chart.style(f"height: {_PANEL_REM[1]}rem")
 
     def _build_actions(self) -> None:
-        with ui.grid(columns=3).classes("w-full gap-1"):
-            for action in (*ACTIONS, UNLOCK):
-                button = ui.button(
-                    action.label, icon=action.icon, on_click=lambda _, a=action: self._confirm(a)
-                )
-                button.props("dense no-caps stack").tooltip(action.does)
-                self._buttons.append((button, action))
+        """The commands by what they do to the mirror."""
+        for consequence in Consequence:
+            ui.label(consequence.value).classes("text-caption")
+            with ui.grid(columns=4).classes("w-full gap-1").props('role="group"'):
+                for action in (*ACTIONS, UNLOCK):
+                    if find_consequence(action) is not consequence:
+                        continue
+                    button = ui.button(
+                        action.label,
+                        icon=action.icon,
+                        on_click=lambda _, chosen=action: self._confirm(chosen),
+                        color=None,
+                    )
+                    button.props(f"dense no-caps stack color={_BUTTON_COLOURS[consequence]}")
+                    button.tooltip(action.does)
+                    self._buttons.append((button, action))
 
     def _build_figure(self) -> None:
-        with ui.row().classes("items-center"):
-            ui.label("figure without")
-            ui.select(
-                list(figures.REMOVED),
-                value=self._removed,
-                on_change=lambda e: self._set("_removed", e.value),
-            ).props('dense aria-label="terms to remove"')
-        self._map = (
-            ui.image()
-            .classes("w-full")
-            .style("max-width: 24rem; aspect-ratio: 1")
-            .props('alt="figure"')
-        )
+        with ui.row().classes("items-center w-full"):
+            self._against = ui.select(
+                self._views.list_references(self._hold),
+                value=self._reference,
+                label="change since",
+                on_change=lambda e: self._set("_reference", e.value),
+            ).props('dense aria-label="change since"')
+            ui.button(
+                "Use this figure", icon="push_pin", on_click=self._keep_reference, color=None
+            ).props("dense outline no-caps").tooltip("Keep the newest figure as a reference")
+        ui.label("without").classes("text-caption")
+        with ui.row().classes("items-center gap-x-2 gap-y-0"):
+            boxes = {
+                name: ui.checkbox(name).props("dense size=sm") for name in figure_map.REMOVABLE
+            }
+        for box in boxes.values():
+            box.on_value_change(
+                lambda: self._set(
+                    "_removed", tuple(sorted(name for name, box in boxes.items() if box.value))
+                )
+            )
+        with ui.element("div").classes("membrane-map w-full"):
+            self._map = ui.element("canvas").props('role="img" aria-label="no figure yet"')
         self._map_words = ui.label("no figure yet").classes("text-caption")
-        self._terms = ui.echart({"series": []}).classes("w-full").style("height: 12rem")
+        with ui.element("div").classes("w-full").props('role="img" aria-label="terms"') as terms:
+            self._terms = ui.echart({"series": []}).classes("w-full").style("height: 13rem")
+        self._terms_place = terms
+        self._terms_place.set_visibility(False)
 
     def _toggle_dark(self) -> None:
         """From the system's choice to dark, then to light and back."""
@@ -250,7 +285,53 @@ class WebPage:
 
     def _set(self, name: str, value: object) -> None:
         setattr(self, name, value)
-        self._charted_s, self._drawn = -1e9, (0.0, "")
+        self._charted_s, self._drawn = -1e9, ()
+
+    def _choose_signals(self, signals: list[str]) -> None:
+        self._set("_signals", list(signals) or list(_FIRST_SIGNALS))
+        self._chart.style(f"height: {_PANEL_REM[len(self._signals)]}rem")
+
+    def _keep_reference(self) -> None:
+        name = self._views.add_reference(self._hold)
+        if not name:
+            show_message("There is no usable figure yet.", good=False)
+            return
+        self._against.set_options(self._views.list_references(self._hold), value=name)
+
+    def _choose_moment(self, event: Any) -> None:
+        """Offer to mark the moment at which the viewer has clicked into the chart."""
+        try:
+            shown_s = float(event.args) / 1e3
+            moment = datetime.fromtimestamp(shown_s, UTC)
+        except (TypeError, ValueError, OverflowError, OSError):  # a browser may send anything
+            return
+        offset = None if self._utc else moment.astimezone().utcoffset()
+        self._clicked_s = shown_s - (offset.total_seconds() if offset else 0.0)
+        mark = next(action for action in ACTIONS if action.do == "mark")
+        self._mark_here.set_text(f"Mark {moment:%H:%M:%S}")
+        self._mark_here.set_visibility(may(self._user, self._user.role, mark))
+
+    async def _mark_moment(self) -> None:
+        """Mark the chosen moment: a present one by the hold, a past one beside its recording."""
+        mark = next(action for action in ACTIONS if action.do == "mark")
+        if self._clicked_s is None or self._asking:
+            return
+        if is_now(self._clicked_s) or self._logs is None:
+            await self._confirm(mark)
+            return
+        given = await self._ask(mark)
+        if given is None or not outranks(self._user.role, mark.role):
+            return
+        who = f"web: {self._user.name}"
+        try:
+            outcome = await COMMANDS.run(mark_past, self._logs, self._clicked_s, given.text, who)
+        except PoolFullError as error:
+            outcome = Outcome.failed(mark.label, str(error))
+        if outcome.done:
+            self._feed.marks.append((self._clicked_s, given.text.strip()))
+            self._mark_here.set_visibility(False)
+            self._charted_s = -1e9
+        show_message(outcome.text, outcome.done)
 
     def _look(self) -> None:
         """Show the state and the events."""
@@ -264,34 +345,46 @@ class WebPage:
     async def _draw(self) -> None:
         """Show the figure and the history, if they are new; the next look waits for the browser."""
         seen = self._feed.seen
-        if seen.figure is not None and self._drawn != (seen.figure.time_s, self._removed):
-            self._drawn = (seen.figure.time_s, self._removed)
-            picture = await self._views.maps.get(self._hold, self._removed, seen.figure.time_s)
-            query = {"hold": self._hold, "removed": self._removed, "time_s": seen.figure.time_s}
-            self._map.set_source(f"/map?{urlencode(query)}")
-            self._map_words.set_text(picture.words)
-            self._terms.options.clear()
-            self._terms.options.update(picture.terms)
+        wanted = (seen.figure and seen.figure.time_s, self._removed, self._reference)
+        if seen.figure is not None and self._drawn != wanted:
+            self._drawn = wanted
+            await self._draw_figure(seen.figure.time_s)
         span_s = SPANS_S[self._span]
-        if time.monotonic() - self._charted_s > _CHART_EVERY_S.get(span_s, 60.0):
+        if time.monotonic() - self._charted_s > CHART_EVERY_S.get(span_s, 60.0):
             self._charted_s = time.monotonic()
             query = {
                 "hold": self._hold,
-                "signal": self._signal,
+                "signals": ",".join(self._signals),
                 "span": self._span,
                 "utc": self._utc,
             }
-            # the prefix of the public address, which NiceGUI puts into the page
-            fetched = (
-                f"const answer = await fetch(window.path_prefix + '/chart?{urlencode(query)}'); "
-                "if (answer.ok)"
-            )
-            drawn = (
-                f"runMethod({self._chart.id}, 'run_chart_method', ['setOption', await "
-                "answer.json()])"
-            )
-            with contextlib.suppress(TimeoutError):
-                await ui.run_javascript(f"{fetched} {drawn}", timeout=_FETCH_S)
+            drawn = f"await membraneDrawHistory({self._chart.id}, '/chart?{urlencode(query)}')"
+            await self._run_script(drawn)
+
+    async def _draw_figure(self, time_s: float) -> None:
+        try:
+            found = await self._views.map(self._hold, self._removed, self._reference, time_s)
+        except PoolFullError:
+            return
+        query = {
+            "hold": self._hold,
+            "removed": ",".join(self._removed),
+            "reference": self._reference,
+            "time_s": time_s,
+        }
+        self._map.props(f'aria-label="{found.words}"')
+        self._map_words.set_text(found.words)
+        self._terms_place.set_visibility(True)
+        self._terms.options.clear()
+        self._terms.options.update(found.terms)
+        await self._run_script(
+            f"await membraneDrawMap('c{self._map.id}', '/map?{urlencode(query)}')"
+        )
+
+    async def _run_script(self, script: str) -> None:
+        """Run a script of the page that fetches something."""
+        with contextlib.suppress(TimeoutError):
+            await ui.run_javascript(script, timeout=_FETCH_S)
 
     def _show_status(self) -> None:
         seen = self._feed.seen
@@ -308,17 +401,21 @@ class WebPage:
                 f"color={colour} text-color={'white' if colour == 'negative' else 'black'}"
             )
         self._why.set_text(silent or str(status.get("why") or "as it should be"))
+        self._holder.set_text("" if silent else describe_holder(status))
         self._alarm.set_text("; ".join(alarm_lines(status)))
         for column in PUBLISHED:
-            value = None if silent else row.get(column.name)
-            self._numbers[column.name].set_text(column.format_value(value))
+            card, label = self._numbers[column.name]
+            value = row.get(column.name)
+            label.set_text(format_number(column, None if silent else value))
+            card.set_visibility(value is not None)
         for button, action in self._buttons:
             allowed = not silent and may(self._user, seen.role, action) and state in action.states
+            allowed = allowed and changes_something(action, status)
             if button.enabled != allowed:
                 button.set_enabled(allowed)
 
     async def _key(self, event: Any) -> None:
-        """The console's keys: h, p, m, s."""
+        """The console's keys: h, p, m, s; ? shows them."""
         if (
             not event.action.keydown
             or event.modifiers.ctrl
@@ -326,45 +423,52 @@ class WebPage:
             or event.modifiers.meta
         ):
             return
-        paused = bool(self._feed.seen.status.get("paused"))
-        wanted = {"h": "hold", "p": "resume" if paused else "pause", "m": "mark", "s": "stop"}
-        action = next((a for a in (*ACTIONS, STOP) if a.do == wanted.get(str(event.key))), None)
+        if str(event.key) == "?":
+            await self._show_keys()
+            return
+        wanted = _KEYS.get(str(event.key))
+        if wanted == "pause" and self._feed.seen.status.get("paused"):
+            wanted = "resume"
+        action = next((each for each in (*ACTIONS, STOP) if each.do == wanted), None)
         if action is not None and may(self._user, self._feed.seen.role, action):
             await self._confirm(action)
 
-    async def _confirm(self, action: Action) -> None:
-        """Ask for the input and for a confirmation, send, and say what became of it."""
-        if self._asking:  # a key beside the open dialog
+    async def _show_keys(self) -> None:
+        if self._asking:
             return
-        with ui.dialog() as dialog, ui.card():
-            ui.label(action.label).classes("text-h6")
-            ui.label(action.does)
-            if action is UNLOCK:
-                ui.label("Type the word of the lock, or nothing for your own lock:")
-                for line in lock_lines(self._feed.seen.status):
-                    ui.label(line).classes("text-negative text-bold")
-            given = None
-            if action.asks:  # a hidden one would take the focus, and Enter with it
-                given = ui.input(
-                    f"{action.asks}{f', {action.unit}' if action.unit else ''}"
-                ).classes("w-full")
-                given.props(
-                    'autofocus inputmode="text"'
-                )  # a phone's decimal keys may lack the minus or the point
-                given.on("keydown.enter", lambda: dialog.submit("yes"))
-            take_over = ui.checkbox("take command from whoever has it")
-            with ui.row():
-                sure = ui.button("Do it", on_click=lambda: dialog.submit("yes"))
-                sure.props("color=primary" if action.asks else "color=primary autofocus")
-                ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None).props("flat")
         self._asking = True
+        with ui.dialog() as dialog, ui.card():
+            ui.label("Keys").classes("text-h6")
+            with ui.grid(columns="auto 1fr"):
+                for key, does in _KEYS_HELP:
+                    ui.label(key).classes("text-bold")
+                    ui.label(does)
+            ui.button("Close", on_click=lambda: dialog.submit(""), color=None).props(
+                "flat autofocus"
+            )
         try:
-            answer = await dialog
+            await dialog
         finally:
             self._asking = False
-        if not dialog.is_deleted:  # with the viewer
+        if not dialog.is_deleted:
             dialog.delete()
-        if not answer:
+
+    async def _ask(self, action: Action) -> Any:
+        """Show the dialog of a command, one at a time: a key may be pressed beside it."""
+        self._asking = True
+        try:
+            return await ask_for_confirmation(
+                action, self._feed.seen.status, self._views.config(self._hold)
+            )
+        finally:
+            self._asking = False
+
+    async def _confirm(self, action: Action) -> None:
+        """Ask for the input and for a confirmation, send, and show what became of it."""
+        if self._asking:
+            return
+        given = await self._ask(action)
+        if given is None:
             return
         if not may(
             self._user, self._feed.seen.role, action
@@ -372,12 +476,7 @@ class WebPage:
             show_message(f"{action.label}: needs the role {action.role}", good=False)
             return
         try:
-            asked = request(
-                action,
-                f"web: {self._user.name}",
-                str(given.value or "") if given else "",
-                bool(take_over.value),
-            )
+            asked = request(action, f"web: {self._user.name}", given.text, given.take_over)
         except ValueError as error:
             show_message(str(error), good=False)
             return
@@ -387,3 +486,26 @@ class WebPage:
         except PoolFullError as error:
             outcome = Outcome.failed(action.label, f"not sent: {error}")
         show_message(outcome.text, outcome.done)
+
+
+def format_number(column: TelemetryColumn, value: float | None) -> str:
+    """A value for its card; a fraction in per cent."""
+    if value is not None and column.name.endswith("_fraction"):
+        return f"{100.0 * value:.0f} %"
+    return column.format_value(value)
+
+
+def changes_something(action: Action, status: Mapping[str, Any]) -> bool:
+    """Whether a command would change anything, as far as the status shows."""
+    match action.do:
+        case "shape_on":
+            return status.get("shape") in (None, "off")
+        case "shape_off":
+            return status.get("shape") != "off"
+        case "pause":
+            return not status.get("paused")
+        case "resume":
+            return status.get("paused") is not False
+        case "unlock":
+            return bool(status.get("locks"))
+    return True

@@ -27,7 +27,7 @@ from membrane_ctrl.service.accounts import Accounts, known_users
 from membrane_ctrl.service.api import make_api
 from membrane_ctrl.service.connections import ConnectionGuard, GuardedHttp, raise_file_limit
 from membrane_ctrl.service.ended_run import REPORT_NAME
-from membrane_ctrl.service.feed import SIGNALS, SPANS_S, HoldFeed
+from membrane_ctrl.service.feed import SPANS_S, HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.idle_end import IdleEnd
 from membrane_ctrl.service.login import with_login
@@ -35,9 +35,9 @@ from membrane_ctrl.service.path_dispatch import PathDispatch
 from membrane_ctrl.service.public_address import public_address
 from membrane_ctrl.service.tokens import TokenBook, tokens_file
 from membrane_ctrl.service.work_pools import REPORT_FILES, PoolFullError
-from membrane_ctrl.web.figures import REMOVED
-from membrane_ctrl.web.page import SharedViews, WebPage
+from membrane_ctrl.web.page import WebPage
 from membrane_ctrl.web.runs_panel import run_folder
+from membrane_ctrl.web.shared_views import SharedViews, parse_removed, parse_signals
 
 _NICE = 5  # the hold comes first, also when the page was not started by one
 # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages
@@ -157,11 +157,15 @@ def _run_server(
         WebPage(feeds, shown, user, views, starter if is_ours else None).build()
 
     @app.get("/chart")
-    async def chart(hold: str, signal: str, span: str, utc: bool) -> Response:
-        if hold not in feeds or signal not in SIGNALS or span not in SPANS_S:
+    async def chart(hold: str, signals: str, span: str, utc: bool) -> Response:
+        try:
+            names = parse_signals(signals)
+        except ValueError:
+            return Response(status_code=404)
+        if hold not in feeds or span not in SPANS_S:
             return Response(status_code=404)
         try:
-            packed = await views.chart(hold, signal, span, utc)
+            packed = await views.chart(hold, names, span, utc)
         except PoolFullError as error:
             return PlainTextResponse(str(error), 503)
         return Response(
@@ -169,12 +173,23 @@ def _run_server(
         )
 
     @app.get("/map")
-    async def picture(hold: str, removed: str) -> Response:
+    async def picture(hold: str, removed: str, reference: str) -> Response:
         figure = feeds[hold].seen.figure if hold in feeds else None
-        if figure is None or removed not in REMOVED:
+        try:
+            terms = parse_removed(removed)
+        except ValueError:
             return Response(status_code=404)
-        drawn = await views.maps.get(hold, removed, figure.time_s)
-        return Response(drawn.png, media_type="image/png", headers=_FRESH)
+        if figure is None or reference not in views.list_references(hold):
+            return Response(status_code=404)
+        try:
+            drawn = await views.map(hold, terms, reference, figure.time_s)
+        except PoolFullError as error:
+            return PlainTextResponse(str(error), 503)
+        return Response(
+            drawn.data,
+            media_type="application/json",
+            headers={**_FRESH, "content-encoding": "gzip"},
+        )
 
     @app.get("/report/{name}")
     async def report(name: str, hold: str = "") -> Response:

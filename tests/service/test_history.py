@@ -15,7 +15,7 @@ import pytest
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.service.feed import HoldFeed, Seconds, Series, history, marks, thinned
-from membrane_ctrl.web import figures
+from membrane_ctrl.web.history_chart import Moment, make_history_chart
 
 NOW_S = 1_800_000_000.0
 
@@ -132,11 +132,12 @@ def test_sparklines_and_charts_are_drawn_of_anything() -> None:
         np.array([1.0, math.nan]),
         np.array([2.0, 1.0]),
     )
-    options = figures.chart("error_um", series, True)
+    options = make_history_chart([("error_um", series)], True)
     assert options["series"][2]["markLine"]["data"] == [], "earlier marks do not stay"
-    many = [(float(number), "x" * 30) for number in range(30)]
-    lines = figures.chart("error_um", series, True, many)["series"][2]["markLine"]["data"]
+    many = [Moment(float(number), "x" * 30) for number in range(30)]
+    marked = make_history_chart([("error_um", series)], True, many)
+    lines = marked["series"][2]["markLine"]["data"]
     assert [line["xAxis"] for line in lines] == [1e3 * number for number in range(10, 30)]
     assert {line["name"] for line in lines} == {"x" * 24}
-    assert options["series"][2]["data"] == [[1000.0, 1.0], [2000.0, None]]
+    assert options["series"][2]["data"] == [[1000.0, 1.0, 0.0, 2.0], [2000.0, None, None, 1.0]]
     assert options["series"][1]["data"][0] == [1000.0, 2.0], "the band's width above its lower edge"

@@ -32,8 +32,8 @@ class Routes:
 
     login: str = "login"
     # what a viewer fetches every second
-    live: str = "chart?hold=&signal=error_um&span=1+min&utc=true"
-    history: str = "chart?hold=&signal={signal}&span={span}&utc={utc}"
+    live: str = "chart?hold=&signals=error_um&span=1+min&utc=true"
+    history: str = "chart?hold=&signals={signal}&span={span}&utc={utc}"
     stop: str = "api/safety/stop?hold="
     socket: str = "_nicegui_ws/socket.io/?EIO=4&transport=websocket"
 

@@ -173,6 +173,7 @@ async def test_a_phone_and_the_keyboard_alone(tmp_path: Path) -> None:
             for name, has in (
                 ("LOOK BACK", "REFRESH"),
                 ("TUNE", "No tuning session"),
+                ("ALARMS", "no fault or notice"),
                 ("NOW", "0.25"),
             ):
                 await tab.value(PRESS.format(name))
@@ -222,7 +223,7 @@ async def test_a_phone_and_the_keyboard_alone(tmp_path: Path) -> None:
             if "Pause" in await tab.value(focus):
                 break
         await tab.press("Enter")
-        await tab.until(f"{focus}.trim() === 'DO IT'")
+        await tab.until(f"{focus}.trim() === 'CANCEL'")  # Enter confirms nothing that moves gas
         await tab.press("Escape")
         await tab.until("!document.querySelector('.q-dialog__inner')")
         await tab.until(f"{focus}.includes('Pause')")

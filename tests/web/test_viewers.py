@@ -15,7 +15,7 @@ from membrane_ctrl.service.work_pools import WorkPool
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_log import ANSWER, LiveLog, PageAnswer
 from membrane_ctrl.web import log_lines, server, tuning_panel
-from membrane_ctrl.web.figures import Shared
+from membrane_ctrl.web.made_once import MadeOnce
 
 
 async def test_what_all_see_is_made_once_and_again_when_it_is_old(
@@ -29,7 +29,7 @@ async def test_what_all_see_is_made_once_and_again_when_it_is_old(
         made.append((name, number))
         return f"{name}{number}"
 
-    shared = Shared(make, WorkPool("test", workers=4, waiting_max=100), life_s=1.0)
+    shared = MadeOnce(make, WorkPool("test", workers=4, waiting_max=100), life_s=1.0)
     asked = [asyncio.create_task(shared.get("a", 1)) for _ in range(50)]
     leaving = asyncio.create_task(shared.get("a", 1))
     other = asyncio.create_task(shared.get("b", 2))
@@ -59,7 +59,7 @@ async def test_what_cannot_be_made_is_tried_again() -> None:
             raise answer
         return answer
 
-    shared = Shared(make, WorkPool("test", workers=4, waiting_max=100), life_s=0.0)
+    shared = MadeOnce(make, WorkPool("test", workers=4, waiting_max=100), life_s=0.0)
     with pytest.raises(OSError, match="gone"):
         await shared.get()
     assert await shared.get() == "found"

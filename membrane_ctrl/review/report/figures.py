@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.model import colours, events, run_events, zernike_terms
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.model.colours import Colour
+from membrane_ctrl.model.colours import DIVERGING_MAP, SEQUENTIAL_MAP, Colour
 from membrane_ctrl.model.columns import (
     DRAWN,
     ERROR,
@@ -365,7 +365,12 @@ def draw_stability(shape: shape_review.ShapeReview) -> Markup:
         )
         points.legend(loc="upper right", ncols=3)
         _draw_map(
-            figure, sd, shape.sd_um, "Standard deviation of the height, µm", "viridis", (0, None)
+            figure,
+            sd,
+            shape.sd_um,
+            "Standard deviation of the height, µm",
+            SEQUENTIAL_MAP,
+            (0, None),
         )
         for name, (x, y) in shape_review.POINTS.items():
             sd.plot(x, y, "o", ms=4, mfc="none", mec="white")
@@ -409,7 +414,7 @@ def draw_pairs(shape: shape_review.ShapeReview) -> Markup:
                 most = (
                     float(np.nanquantile(np.abs(values), 0.99)) or 1e-3
                 )  # a few pixels must not hide the rest
-                _draw_map(figure, plot, values, said, "RdBu_r", (-most, most))
+                _draw_map(figure, plot, values, said, DIVERGING_MAP, (-most, most))
             if pair.sigma_um is None:
                 sigma.text(
                     0.5, 0.5, "no covariance was recorded", ha="center", transform=sigma.transAxes
@@ -417,7 +422,7 @@ def draw_pairs(shape: shape_review.ShapeReview) -> Markup:
                 sigma.set_axis_off()
             else:
                 title = f"Its uncertainty, 1 σ, µm (mean {pair.mean_sigma_um:.4f})"
-                _draw_map(figure, sigma, pair.sigma_um, title, "viridis", (0, None))
+                _draw_map(figure, sigma, pair.sigma_um, title, SEQUENTIAL_MAP, (0, None))
         return render_svg(figure)
 
 

@@ -23,6 +23,7 @@ from membrane_ctrl.metrology.vibrations.mode_search import (
 )
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.colours import DIVERGING_MAP
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import is_run
@@ -342,7 +343,7 @@ def _draw_modes(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
         )
         most = float(np.nanmax(np.abs(height)))
         shape.imshow(
-            height, cmap="RdBu_r", vmin=-most, vmax=most, origin="lower", extent=(-1, 1, -1, 1)
+            height, cmap=DIVERGING_MAP, vmin=-most, vmax=most, origin="lower", extent=(-1, 1, -1, 1)
         )
         shape.set(title=f"shape at {mode.frequency_hz:.2f} Hz", xticks=[], yticks=[])
     return write_picture(path, figure)

@@ -56,7 +56,7 @@ async def test_the_page_has_the_column(tmp_path, monkeypatch):
     async with test_page.viewed(tmp_path) as (run, tab):
         await tab.until("document.querySelector('[data-field={COLUMN}]').innerText === '12.34'")
         assert "{LABEL}, °C" in await tab.value("document.body.innerText")
-        chart = "/chart?hold=&signal={COLUMN}&span=10+min&utc=True"
+        chart = "/chart?hold=&signals={COLUMN}&span=10+min&utc=True"
         assert await tab.value(f"fetch('{{chart}}').then(r => r.status)") == 200
 '''
 
