@@ -185,7 +185,8 @@ def test_an_address_that_is_taken_is_named() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(
-            DeviceError, match=rf"port: cannot listen on 127.0.0.1:{port} \(address already in use\)"
+            DeviceError,
+            match=rf"port: cannot listen on 127.0.0.1:{port} \(address already in use\)",
         ):
             server.require_servable(ServiceConfig(port=port))
     server.require_servable(ServiceConfig(host="::1", port=port))

@@ -1,11 +1,11 @@
 """Pictures of the hold: the run at a glance, everything else over time, distributions."""
 
 import io
-import math
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import matplotlib as mpl
@@ -19,6 +19,7 @@ from membrane_ctrl.model.colours import DIVERGING_MAP, SEQUENTIAL_MAP, Colour
 from membrane_ctrl.model.columns import (
     DRAWN,
     ERROR,
+    Plot,
     TelemetryColumn,
     aggregated_of,
     columns_of,
@@ -41,7 +42,9 @@ BLUE, ORANGE, GREEN, RED, VIOLET, GREY = (
     "#cc79a7",
     "#8a8f98",
 )
-WIDTH_IN = 10.5
+# Of a picture over the whole page, and of a panel: two or three stand side by side on a wide page,
+# and a phone shows one at its full width with letters of 9 px.
+WIDTH_IN, PANEL_IN = 10.5, 5.2
 
 _STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -113,11 +116,15 @@ def on_white(colour: Colour) -> str:
 
 @contextmanager
 def make_picture(
-    rows: int = 1, columns: int = 1, height_in: float = 3.0, **subplots: Any
+    rows: int = 1,
+    columns: int = 1,
+    height_in: float = 3.0,
+    width_in: float = WIDTH_IN,
+    **subplots: Any,
 ) -> Iterator[tuple[Figure, Any]]:
     """A figure in the report's style and its axes, as `Figure.subplots` gives them."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+        figure = Figure(figsize=(width_in, height_in), layout="constrained")
         yield figure, figure.subplots(rows, columns, **subplots)
 
 
@@ -134,6 +141,19 @@ def render_svg(figure: Figure) -> Markup:
     svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
     svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg)
     return Markup(svg)
+
+
+def draw_panel(draw: Callable[[Figure, Any], None], height_in: float) -> Markup:
+    """One panel as SVG; `draw` fills its axes."""
+    with make_picture(1, 1, height_in, PANEL_IN) as (figure, axes):
+        draw(figure, axes)
+        return render_svg(figure)
+
+
+def arrange_panels(panels: Iterable[Markup]) -> Markup:
+    """Panels side by side where the page is wide enough, else below each other: HTML."""
+    boxes = Markup("").join(Markup("<div>{}</div>").format(panel) for panel in panels)
+    return Markup("<div class='panels'>{}</div>").format(boxes)
 
 
 def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> dict[str, Column]:
@@ -164,11 +184,23 @@ def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
 
 
 def draw_overview(analysis: Analysis) -> Markup:
-    """Error with its envelope, the band, states, detected events and marks."""
+    """Error with its envelope, the band, states, detected events and marks: HTML with a picture for
+    wide pages and one for phones.
+    """
+    wide, narrow = _draw_overview(analysis, WIDTH_IN, 4.2), _draw_overview(analysis, PANEL_IN, 4.0)
+    return Markup("<div class='on-wide'>{}</div><div class='on-phone'>{}</div>").format(
+        wide, narrow
+    )
+
+
+def _draw_overview(analysis: Analysis, width_in: float, height_in: float) -> Markup:
     level, band_um = broken_at_gaps(analysis.level), analysis.run.config.limits.band_um
     span_s = analysis.ticks.end_s - analysis.ticks.start_s
     time, unit = hours_or_less(level["time_s"], span_s)
-    with make_picture(2, 1, 4.2, sharex=True, height_ratios=[8, 1.1]) as (figure, (plot, lane)):
+    with make_picture(2, 1, height_in, width_in, sharex=True, height_ratios=[8, 1.1]) as (
+        figure,
+        (plot, lane),
+    ):
         plot.axhspan(-band_um, band_um, color=GREEN, alpha=0.09, lw=0)
         ends = level["min_error_um"], level["max_error_um"]
         plot.fill_between(time, *ends, color=GREY, alpha=0.35, lw=0, label="minimum to maximum")
@@ -182,7 +214,7 @@ def draw_overview(analysis: Analysis) -> Markup:
         plot.set_ylim(-3 * band_um, 3 * band_um)
         plot.set(ylabel=plot_title(ERROR), title="The run at a glance")
         _draw_found_events(plot, analysis, span_s)
-        plot.legend(loc="upper right", ncols=3)
+        plot.legend(loc="upper right", ncols=3 if width_in == WIDTH_IN else 1)
         _draw_lane(lane, analysis, span_s)
         lane.set_xlabel(f"time since {analysis.run.origin_utc:%Y-%m-%d %H:%M:%S} UTC, {unit}")
         return render_svg(figure)
@@ -258,16 +290,15 @@ def everything_else(analysis: Analysis) -> Markup:
         for plot in plots_of(*DRAWN)
     }
     shown = {plot: columns for plot, columns in plots.items() if columns and plot != ERROR}
-    rows = max(1, math.ceil(len(shown) / 2))
-    with make_picture(rows, 2, 2.1 * rows, sharex=True, squeeze=False) as (figure, axes):
-        for axis, (plot, columns) in zip(axes.flat, shown.items(), strict=False):
-            _draw_columns(axis, time, level, columns)
-            axis.set_title(plot_title(plot))
-        for axis in axes.flat[len(shown) :]:
-            axis.set_axis_off()
-        for axis in axes[-1]:
-            axis.set_xlabel(unit)
-        return render_svg(figure)
+
+    def draw_plot(axes: Any, plot: Plot, columns: Sequence[TelemetryColumn]) -> None:
+        _draw_columns(axes, time, level, columns)
+        axes.set(title=plot_title(plot), xlabel=unit)
+
+    return arrange_panels(
+        draw_panel(lambda _, axes, each=plot: draw_plot(axes, each, shown[each]), 2.3)
+        for plot in shown
+    )
 
 
 def _has_values(level: Mapping[str, Column], each: TelemetryColumn) -> bool:
@@ -294,50 +325,73 @@ def _draw_columns(
 def draw_distributions(analysis: Analysis) -> Markup:
     """Histogram, Allan deviation, spectrum."""
     reading, true = analysis.reading, analysis.true
-    with make_picture(1, 3, 3.3) as (figure, (histogram, allan, spectrum)):
+    named = [
+        (series, colour, name)
+        for series, colour, name in ((reading, BLUE, "reading"), (true, GREEN, "true centre"))
+        if series is not None
+    ]
+
+    def draw_histogram(_: Figure, plot: Any) -> None:
         edges, counts = analysis.ticks.histogram_um, analysis.ticks.histogram_counts
         merged = counts.reshape(-1, 5).sum(axis=1)
         middle = edges[:-1].reshape(-1, 5).mean(axis=1) + (edges[1] - edges[0]) / 2
         share = 100 * merged / max(1, counts.sum())
-        histogram.bar(middle, share, width=5 * (edges[1] - edges[0]), color=BLUE, lw=0.3, ec=BLUE)
+        plot.bar(middle, share, width=5 * (edges[1] - edges[0]), color=BLUE, lw=0.3, ec=BLUE)
         band_um = analysis.run.config.limits.band_um
         for side in (-band_um, band_um):
-            histogram.axvline(side, color=GREEN, lw=1)
-        histogram.set(title="Single readings", xlabel="setpoint − reading, µm", ylabel="share, %")
-        for series, colour, name in ((reading, BLUE, "reading"), (true, GREEN, "true centre")):
-            if series is None:
-                continue
+            plot.axvline(side, color=GREEN, lw=1)
+        # the first and the last bin count what lies beyond them
+        plot.set(
+            title="Single readings (outermost bars: and beyond)",
+            xlabel="setpoint − reading, µm",
+            ylabel="share, %",
+        )
+
+    def draw_allan(_: Figure, plot: Any) -> None:
+        for series, colour, name in named:
             if series.allan.tau_s.size:
-                allan.loglog(
-                    series.allan.tau_s, series.allan.deviation, "o-", ms=3, color=colour, label=name
-                )
+                tau_s, deviation_um = series.allan.tau_s, series.allan.deviation
+                plot.loglog(tau_s, deviation_um, "o-", ms=3, color=colour, label=name)
+        plot.set(title="Overlapping Allan deviation", xlabel="τ, s", ylabel="µm")
+        _add_legend(plot)
+
+    def draw_spectrum(_: Figure, plot: Any) -> None:
+        for series, colour, name in named:
             frequency_hz, power = power_spectrum.combine_densities(series.spectrum, series.slow)
             if np.isfinite(power).any():
-                spectrum.loglog(frequency_hz, np.sqrt(power), color=colour, lw=0.8, label=name)
-        allan.set(title="Overlapping Allan deviation", xlabel="τ, s", ylabel="µm")
-        spectrum.set(title="Amplitude spectral density", xlabel="Hz", ylabel="µm/√Hz")
-        for plot in (allan, spectrum):
-            if plot.lines:
-                plot.legend(loc="best")
-        return render_svg(figure)
+                plot.loglog(frequency_hz, np.sqrt(power), color=colour, lw=0.8, label=name)
+        plot.set(title="Amplitude spectral density", xlabel="Hz", ylabel="µm/√Hz")
+        _add_legend(plot)
+
+    return arrange_panels(
+        draw_panel(draw, 3.0) for draw in (draw_histogram, draw_allan, draw_spectrum)
+    )
+
+
+def _add_legend(plot: Any) -> None:
+    if plot.lines:
+        plot.legend(loc="best")
 
 
 def pump_history(history: Sequence[PumpSeen], change_max: float) -> Markup:
     """The pump against the newest run's curve over the runs of the bench, and the leak of each."""
     first = next(seen for seen in history if seen.same_curve)
     days = [seen.started_utc for seen in history]
-    with make_picture(1, 2, 2.6) as (figure, (scale, leak)):
-        scale.errorbar(
-            days, [s.scale for s in history], [s.sigma for s in history], fmt="o-", color=BLUE, ms=4
-        )
+
+    def draw_scale(_: Figure, plot: Any) -> None:
+        scales, sigmas = [seen.scale for seen in history], [seen.sigma for seen in history]
+        plot.errorbar(days, scales, sigmas, fmt="o-", color=BLUE, ms=4)
         for limit in (1 - change_max, 1 + change_max):
-            scale.axhline(first.scale * limit, color=RED, lw=0.8, ls="--")
-        scale.set(title="Pump's flow against its curve ± 1 σ")
-        leak.plot(days, [s.leak_um_per_s for s in history], "o-", color=ORANGE, ms=4)
-        leak.set(title="Leak, with any offset of the curve, µm/s")
-        for plot in (scale, leak):
-            plot.tick_params(axis="x", rotation=20)
-        return render_svg(figure)
+            plot.axhline(first.scale * limit, color=RED, lw=0.8, ls="--")
+        plot.set(title="Pump's flow against its curve ± 1 σ")
+        plot.tick_params(axis="x", rotation=20)
+
+    def draw_leak(_: Figure, plot: Any) -> None:
+        plot.plot(days, [seen.leak_um_per_s for seen in history], "o-", color=ORANGE, ms=4)
+        plot.set(title="Leak, with any offset of the curve, µm/s")
+        plot.tick_params(axis="x", rotation=20)
+
+    return arrange_panels(draw_panel(draw, 2.6) for draw in (draw_scale, draw_leak))
 
 
 def draw_stability(shape: shape_review.ShapeReview) -> Markup:
@@ -354,35 +408,35 @@ def draw_stability(shape: shape_review.ShapeReview) -> Markup:
     }
     lines = broken_at_gaps({name: values[::every] for name, values in lines.items()})
     time, unit = hours_or_less(lines["time_s"], span_s)
-    with make_picture(2, 2, 6.2, width_ratios=[1.9, 1]) as (figure, plots):
-        points, sd, loops, drift = plots.ravel()
+
+    def draw_points(_: Figure, plot: Any) -> None:
         for name in shape.points_um:
-            points.plot(time, lines[name], color=_POINT_COLOURS[name], lw=0.9, label=name)
+            plot.plot(time, lines[name], color=_POINT_COLOURS[name], lw=0.9, label=name)
         start = format_span(shape.time_s[0])
-        points.set(
-            title=f"Height at A, B and C since the settled cycle at {start}, µm",
-            xlabel=unit,
-        )
-        points.legend(loc="upper right", ncols=3)
-        _draw_map(
-            figure,
-            sd,
-            shape.sd_um,
-            "Standard deviation of the height, µm",
-            SEQUENTIAL_MAP,
-            (0, None),
-        )
+        plot.set(title=f"Height at A, B, C since the settled cycle at {start}, µm", xlabel=unit)
+        plot.legend(loc="upper right", ncols=3)
+
+    def draw_deviation(figure: Figure, plot: Any) -> None:
+        title = "Standard deviation of the height, µm"
+        _draw_map(figure, plot, shape.sd_um, title, SEQUENTIAL_MAP, (0, None))
         for name, (x, y) in shape_review.POINTS.items():
-            sd.plot(x, y, "o", ms=4, mfc="none", mec="white")
-            sd.annotate(
+            plot.plot(x, y, "o", ms=4, mfc="none", mec="white")
+            plot.annotate(
                 name, (x, y), color="white", fontsize=8, xytext=(4, 3), textcoords="offset points"
             )
-        loops.plot(time, lines["laser"], color=GREY, lw=0.9, label="laser (in the loop)")
-        loops.plot(time, lines["sag"], color=BLUE, lw=0.9, label="sag by the camera")
-        loops.set(title="Change of the centre by laser and by camera, µm", xlabel=unit)
-        loops.legend(loc="upper right", ncols=2)
-        _draw_drift(drift, shape)
-        return render_svg(figure)
+
+    def draw_loops(_: Figure, plot: Any) -> None:
+        plot.plot(time, lines["laser"], color=GREY, lw=0.9, label="laser (in the loop)")
+        plot.plot(time, lines["sag"], color=BLUE, lw=0.9, label="sag by the camera")
+        plot.set(title="Change of the centre by laser and by camera, µm", xlabel=unit)
+        plot.legend(loc="upper right", ncols=2)
+
+    def draw_drift(_: Figure, plot: Any) -> None:
+        _draw_drift(plot, shape)
+
+    return arrange_panels(
+        draw_panel(draw, 3.1) for draw in (draw_points, draw_deviation, draw_loops, draw_drift)
+    )
 
 
 def _draw_drift(plot: Any, shape: shape_review.ShapeReview) -> None:
@@ -401,29 +455,31 @@ def draw_pairs(shape: shape_review.ShapeReview) -> Markup:
     """Height change of cycles 1 and 10 minutes apart, the same less its low terms, and its
     uncertainty.
     """
-    with make_picture(len(shape.pairs), 3, 2.8 * len(shape.pairs), squeeze=False) as (
-        figure,
-        plots,
-    ):
-        for (change, less, sigma), pair in zip(plots, shape.pairs, strict=True):
-            title = f"Change over {pair.lag_s:.0f} s, µm (RMS {pair.rms_um:.3f})"
-            for plot, values, said in (
-                (change, pair.change_um, title),
-                (less, without_terms(pair.change_um, 4), "Less piston, tilt, defocus, µm"),
-            ):
-                most = (
-                    float(np.nanquantile(np.abs(values), 0.99)) or 1e-3
-                )  # a few pixels must not hide the rest
-                _draw_map(figure, plot, values, said, DIVERGING_MAP, (-most, most))
-            if pair.sigma_um is None:
-                sigma.text(
-                    0.5, 0.5, "no covariance was recorded", ha="center", transform=sigma.transAxes
-                )
-                sigma.set_axis_off()
-            else:
-                title = f"Its uncertainty, 1 σ, µm (mean {pair.mean_sigma_um:.4f})"
-                _draw_map(figure, sigma, pair.sigma_um, title, SEQUENTIAL_MAP, (0, None))
-        return render_svg(figure)
+
+    def draw_change(figure: Figure, plot: Any, values: Column, title: str) -> None:
+        # a few pixels must not hide the rest
+        most = float(np.nanquantile(np.abs(values), 0.99)) or 1e-3
+        _draw_map(figure, plot, values, title, DIVERGING_MAP, (-most, most))
+
+    def draw_sigma(figure: Figure, plot: Any, pair: shape_review.CyclePair) -> None:
+        if pair.sigma_um is None:
+            words = "no covariance was recorded"
+            plot.text(0.5, 0.5, words, ha="center", transform=plot.transAxes)
+            plot.set_axis_off()
+            return
+        title = f"Its uncertainty, 1 σ, µm (mean {pair.mean_sigma_um:.4f})"
+        _draw_map(figure, plot, pair.sigma_um, title, SEQUENTIAL_MAP, (0, None))
+
+    panels = []
+    for pair in shape.pairs:
+        title = f"Change over {pair.lag_s:.0f} s, µm (RMS {pair.rms_um:.3f})"
+        less = without_terms(pair.change_um, 4)
+        panels += [
+            draw_panel(partial(draw_change, values=pair.change_um, title=title), 3.0),
+            draw_panel(partial(draw_change, values=less, title="Less piston, tilt, defocus"), 3.0),
+            draw_panel(partial(draw_sigma, pair=pair), 3.0),
+        ]
+    return arrange_panels(panels)
 
 
 def _draw_map(
