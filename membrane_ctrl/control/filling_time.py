@@ -42,8 +42,8 @@ def find_fall_s(sag_mm: float, pressure_pa: float, end_pa: float, leak_um_per_s:
     """
     if not leak_um_per_s > 0.0:
         return math.inf
-    relative_pressure = pressure_pa / end_pa
-    return 0.5 * 1e3 * sag_mm / leak_um_per_s * (relative_pressure ** (2 / 3) - 1.0)
+    relative_sag_squared = float((pressure_pa / end_pa) ** (2 / 3))
+    return 0.5 * 1e3 * sag_mm / leak_um_per_s * (relative_sag_squared - 1.0)
 
 
 def find_filling_s(sag_mm: float, flow_um_per_s: float, leak_um_per_s: float) -> float:

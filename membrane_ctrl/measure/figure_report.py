@@ -12,12 +12,17 @@ from membrane_ctrl.report_pages.blocks import (
     PagePicture,
     PageSection,
     PageTable,
+    PageText,
     ReportPage,
+    TextMark,
 )
 from membrane_ctrl.report_pages.render import render_page
 
-# On the page, these tables come before the pictures; the Zernike terms come after them.
+# On the page, these tables come before the other pictures; the Zernike terms come after them.
 _TABLES_FIRST = 2
+# The picture that shows what a reader came for: the first of these that was drawn.
+_PICTURES_FIRST = ("figure", "residual", "frames")
+_MARKS = {"ok": TextMark.GOOD, "degraded": TextMark.LOOK, "rejected": TextMark.BAD}
 
 
 def write_report(
@@ -49,17 +54,27 @@ def write_report(
     tables = {} if result["figure"] is None else _make_tables(result["figure"])
     pictures = [PagePicture(file.stem, file.read_bytes()) for file in drawn]
     sections = [PageSection(heading, [table]) for heading, table in tables.items()]
+    verdict, reason = str(result["verdict"]), escape_controls(str(result["reason"]))
+    stated = PageText(f"{verdict}: {reason}" if reason else verdict, _MARKS[verdict])
+    pictures.sort(key=_rank_picture)
     page = ReportPage(
         title,
         [
-            PageSection("", [PageLines(safe_lines)]),
+            PageSection("", [stated, *pictures[:1]]),
             *sections[:_TABLES_FIRST],
-            *(PageSection(picture.name, [picture]) for picture in pictures),
+            *(PageSection(picture.name, [picture]) for picture in pictures[1:]),
             *sections[_TABLES_FIRST:],
+            PageSection("As printed", [PageLines(safe_lines)]),
         ],
     )
     write_text_atomic(out / "report.html", render_page(page))
     write_bytes_atomic(out / "report.pdf", pdf_pages(title, safe_lines, tables, pictures))
+
+
+def _rank_picture(picture: PagePicture) -> int:
+    """The order of the pictures: the figure first, the others as they were drawn."""
+    first = _PICTURES_FIRST
+    return first.index(picture.name) if picture.name in first else len(first)
 
 
 def _make_tables(figure: dict[str, Any]) -> dict[str, PageTable]:

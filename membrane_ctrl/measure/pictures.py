@@ -171,7 +171,7 @@ def _map_axes(
 def show_map(
     axes: Any, title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False
 ) -> None:
-    """Draw a map with its colour scale.
+    """Draw a map with its colour scale, its peak to valley, and its RMS about its mean.
 
     `even` centres the scale on 0; a dent far beyond what the rest of the map needs makes it
     logarithmic out there.
@@ -201,6 +201,9 @@ def show_map(
         **scale,
     )
     axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
+    known = values[np.isfinite(values)]
+    figures = f"PV {np.ptp(known):.3g}\nRMS {np.std(known):.3g}"  # in the unit of the title
+    axes.text(0.02, 0.98, figures, transform=axes.transAxes, va="top", fontsize=8)
     axes.figure.colorbar(shown, ax=axes, shrink=0.85)
 
 

@@ -122,8 +122,8 @@ def find_alarms(
                 notice.key.alarm, notice.text, time_s, math.nan, run, False
             )
     if math.isfinite(end_s):  # a run that has ended has no standing alarms
-        for key in list(standing):
-            end_alarm(key, end_s)
+        for remaining in list(standing):
+            end_alarm(remaining, end_s)
     return [*ended, *standing.values()]
 
 

@@ -130,7 +130,11 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
     assert told == pytest.approx(
         1e3 * (figure["numbers"]["sphere_sag_mm"]["value"] - depth), abs=1e-6
     )
-    assert f"<td>power_um</td><td>{told:.6g}</td>" in page
+    number, value = 'data-label="number"', 'data-label="value"'  # for a phone, one cell a line
+    assert f"<td {number}>power_um</td><td {value}>{told:.6g}</td>" in page
+    shown = re.findall(r"<img alt=\"(\w+)\"|<pre>|class=\"(verdict \w+)\"", page)
+    assert [name or mark for name, mark in shown][:3] == ["verdict good", "figure", "residual"]
+    assert page.index('alt="figure"') < page.index("power_um") < page.index("<pre>")
     assert figure["not_given"] == {}
     document = (tmp_path / "report.pdf").read_bytes()
     assert document.startswith(b"%PDF-")

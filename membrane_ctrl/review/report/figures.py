@@ -291,14 +291,11 @@ def everything_else(analysis: Analysis) -> Markup:
     }
     shown = {plot: columns for plot, columns in plots.items() if columns and plot != ERROR}
 
-    def draw_plot(axes: Any, plot: Plot, columns: Sequence[TelemetryColumn]) -> None:
-        _draw_columns(axes, time, level, columns)
+    def draw_plot(_: Figure, axes: Any, plot: Plot) -> None:
+        _draw_columns(axes, time, level, shown[plot])
         axes.set(title=plot_title(plot), xlabel=unit)
 
-    return arrange_panels(
-        draw_panel(lambda _, axes, each=plot: draw_plot(axes, each, shown[each]), 2.3)
-        for plot in shown
-    )
+    return arrange_panels(draw_panel(partial(draw_plot, plot=plot), 2.3) for plot in shown)
 
 
 def _has_values(level: Mapping[str, Column], each: TelemetryColumn) -> bool:
