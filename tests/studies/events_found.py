@@ -41,7 +41,7 @@ def matched(
         ]
         missed += [] if near else [event]
         left = [f for f in left if f not in near]
-    # side effects of an event are no false alarm: a leak step raises the noise, a lost laser ends
+    # side effects of an event are no false alarm: a flow step raises the noise, a lost laser ends
     # in a spike
     return missed, [
         f for f in left if not any(abs(f.time_s - e.time_s) < 900 and _echo(f, e) for e in events)

@@ -28,7 +28,7 @@ def executed(name: str, scratch: Path) -> nbformat.NotebookNode:
     events = [
         Planted("pressure step", 1500.0, 20.0),
         Planted(GLITCH, 2200.0, 8.0),
-        Planted("leak step", 2700.0, 35.0),
+        Planted("flow step", 2700.0, 35.0),
     ]
     if name == "review":
         written(scratch / "logs", 1.0, events)

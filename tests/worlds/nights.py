@@ -43,7 +43,7 @@ SHAPE_PERIOD_S = 4.0
 _SYNC_MINUTES = 10
 DOOR, LEAK, GLITCH, LOST, LATE, JUMP = (
     "pressure step",
-    "leak step",
+    "flow step",
     "laser glitch",
     "laser lost",
     "lateness burst",

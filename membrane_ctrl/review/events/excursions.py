@@ -15,7 +15,7 @@ RAMP_HALF_S = 5
 # An event timed to a second may be detected some seconds after its effect begins.
 TIMED_S = 5.0
 # These are timed to minutes; they explain excursions within their range.
-_TIMED_TO_MINUTES = ("leak step", "noise change")
+_TIMED_TO_MINUTES = ("flow step", "noise change")
 
 
 def find_excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> list[FoundEvent]:

@@ -9,12 +9,14 @@ from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.events import (
     door_steps,
     excursions,
+    flow_steps,
     found_event,
     reading_glitches,
     shape_jumps,
     steps,
+    trim_drifts,
 )
-from membrane_ctrl.run_files import hold_parts, levels
+from membrane_ctrl.run_files import hold_parts
 from membrane_ctrl.run_files.shapes import Shapes
 
 # Columns of the 1 s level used here.
@@ -33,6 +35,7 @@ LEVEL_COLUMNS = (
     "mean_error_um",
     "mean_air_temperature_c",
     "mean_leak_um_per_s",
+    "mean_trim_um",
 )
 _WEATHER = {
     "mean_ambient_pressure_pa": "barometer lost",
@@ -41,11 +44,6 @@ _WEATHER = {
 # A door is 20 Pa; weather within two seconds is a few Pa (gusty: 1.8 Pa, 1 sigma).
 DOOR_LEAST_PA = 6.0
 DOOR_LEAST_SIGMAS = 5.5
-# Means of five minutes resolve a tenth of the leak; a quarter matters to the hold.
-LEAK_LEAST_SHARE = 0.2
-LEAK_LEAST_UM_PER_S = 0.03
-LEAK_LEAST_SIGMAS = 6.0
-LEAK_HALF_MIN = 5
 # Time in which the loop returns the mirror after a door or missing readings.
 DOOR_MOVES_S = 5
 LOST_MOVES_S = 3
@@ -78,7 +76,6 @@ def find_events(
         even = _fill_missing_seconds(level)
         finders: Iterable[Callable[[found_event.Level], list[found_event.FoundEvent]]] = (
             pressure_steps,
-            leak_steps,
             laser_glitches,
             laser_losses,
             weather_losses,
@@ -87,9 +84,27 @@ def find_events(
         )
         for finder in finders:
             found += finder(even)
+        held = _select_held(even)
+        found += flow_steps.find_flow_steps(held)
+        found += trim_drifts.find_trim_drifts(held)
         found += excursions.find_excursions(even, band_um, found)
     found += shape_jumps.shape_jumps(shapes, hold_parts.held_at(level, shapes.time_s))
     return sorted(found, key=lambda event: event.time_s)
+
+
+def list_unjudged(level: found_event.Level) -> tuple[str, ...]:
+    """Kinds of events that a run is too short to show, with the time that each needs."""
+    held_s = float((level["state"] == State.HOLD).sum()) if level["time_s"].size else 0.0
+    needed_s = {
+        f"flow step below {100 * flow_steps.SHORT_LEAST_SHARE:.0f} %": flow_steps.NEEDED_S,
+        "noise change": 60.0 * (2 * SPREAD_HALF_MIN + 1),
+        "drift of laser and optics": trim_drifts.NEEDED_S,
+    }
+    return tuple(
+        f"{name} (needs {time_s / 60:.0f} min of hold)"
+        for name, time_s in needed_s.items()
+        if held_s < time_s
+    )
 
 
 def pressure_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
@@ -104,33 +119,6 @@ def pressure_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
             "pressure step", level, s.row, 1, s.size, "Pa", steps.step_confidence(s.sigmas, places)
         )
         for s in found
-    ]
-
-
-def leak_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
-    """Steps of the holding flow that the weather (the feed-forward) does not explain."""
-    minutes = levels.coarser_level(_select_held(level), 60.0)
-    whole = minutes["rows"] > 0.5 * np.nanmedian(minutes["rows"])
-    leak = minutes["mean_flow_um_per_s"] - np.nan_to_num(minutes["mean_feedforward_um_per_s"])
-    leak = np.where(whole, leak, np.nan)
-    if not np.isfinite(leak).any():
-        return []
-    found = steps.find_steps(
-        leak, half=LEAK_HALF_MIN, skip=1, least=LEAK_LEAST_UM_PER_S, least_sigmas=LEAK_LEAST_SIGMAS
-    )
-    before = [float(np.nanmean(leak[max(0, s.row - LEAK_HALF_MIN) : s.row])) for s in found]
-    return [
-        found_event.event_around(
-            "leak step",
-            minutes,
-            s.row,
-            60,
-            100 * s.size / old,
-            "%",
-            steps.step_confidence(s.sigmas, leak.size),
-        )
-        for s, old in zip(found, before, strict=True)
-        if old > 0 and abs(s.size) >= LEAK_LEAST_SHARE * old
     ]
 
 

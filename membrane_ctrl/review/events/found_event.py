@@ -14,7 +14,7 @@ Level = dict[str, FloatArray]
 class FoundEvent:
     """A detected event."""
 
-    # "pressure step", "leak step", "laser glitch", "laser lost", "optics lost", "barometer lost",
+    # "pressure step", "flow step", "laser glitch", "laser lost", "optics lost", "barometer lost",
     # "thermometer lost", "lateness burst", "noise change", "shape jump" or "excursion"
     kind: str
     time_s: float  # time of the event

@@ -98,7 +98,7 @@ _STATE_COLOURS = {
 _LETTERS_MOST = 40
 _FOUND_COLOURS = {
     "pressure step": VIOLET,
-    "leak step": ORANGE,
+    "flow step": ORANGE,
     "noise change": ORANGE,
     "shape jump": BLUE,
 }

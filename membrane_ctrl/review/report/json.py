@@ -105,6 +105,7 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         },
         "timeline": [each.line for each in make_timeline(analysis)],
         "found": [asdict(event) for event in analysis.found],
+        "unjudged": list(analysis.unjudged),
         "shape": None if analysis.shape is None else _make_shape(analysis.shape),
         "anomalies": [asdict(anomaly) for anomaly in analysis.anomalies],
         "notes": list(run.notes),

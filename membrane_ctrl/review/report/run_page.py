@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from markupsafe import Markup
 
 from membrane_ctrl.model import program
+from membrane_ctrl.model.events import Fault
 from membrane_ctrl.report_pages.blocks import (
     PageBlock,
     PageDrawing,
@@ -35,9 +36,10 @@ _EXAMINE = Markup(
     "<code>membrane-ctrl review {run} --from +{start_s:.0f}s --to +{end_s:.0f}s</code>"
 )
 _NOTHING_FOUND = (
-    "None: no door, leak step, laser glitch or loss, lateness burst, noise change, excursion or "
-    "jump."
+    "None besides what the hold reported: no door, flow step, laser glitch or loss, lateness "
+    "burst, noise change, drift, excursion or jump."
 )
+_REPORTED_MOST = 20
 
 
 def render_report(
@@ -118,7 +120,7 @@ def _list_headlines(analysis: Analysis) -> list[PageBlock]:
 
 def _list_found(analysis: Analysis) -> list[PageBlock]:
     if not analysis.found:
-        return [PageText(_NOTHING_FOUND)]
+        return [PageText(_NOTHING_FOUND), *_list_reported(analysis)]
     name = shlex.quote(analysis.run.name)
     rows = [
         [
@@ -131,7 +133,23 @@ def _list_found(analysis: Analysis) -> list[PageBlock]:
         for event in analysis.found[:_LINES_MOST]
     ]
     table = PageTable(["UTC", "what", "size", "confidence", "look at it"], rows)
-    return [table, *_list_rest(len(analysis.found))]
+    return [table, *_list_rest(len(analysis.found)), *_list_reported(analysis)]
+
+
+def _list_reported(analysis: Analysis) -> list[PageBlock]:
+    """What the hold's own rules reported, and what the run is too short to show."""
+    blocks: list[PageBlock] = []
+    if analysis.unjudged:
+        words = "; ".join(analysis.unjudged)
+        blocks.append(PageText(f"Not judged, as the run is too short: {words}."))
+    reported = [
+        (f"{analysis.run.utc(each.mono_s):%H:%M:%S}", each.event.sentence)
+        for each in make_timeline(analysis)
+        if isinstance(each.event, Fault) or (each.event.opens and each.event.stands)
+    ]
+    if reported:
+        blocks += [PageText("Reported by the hold:"), PageFacts(reported[:_REPORTED_MOST])]
+    return blocks
 
 
 def _tabulate_windows(analysis: Analysis) -> PageTable:

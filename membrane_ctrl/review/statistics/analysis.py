@@ -9,7 +9,7 @@ import numpy as np
 
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
+from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events, list_unjudged
 from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.review.statistics import shape_review
 from membrane_ctrl.review.statistics.anomalies import Anomaly, find_anomalies
@@ -58,6 +58,8 @@ class Analysis:
     leak_um_per_s : tuple
         Median, minimum and maximum of the leak estimate's minutes while held.
     found : tuple of FoundEvent
+    unjudged : tuple of str
+        Kinds of events that the run is too short to show.
     shape : ShapeReview or None
     anomalies : tuple of Anomaly
     """
@@ -72,6 +74,7 @@ class Analysis:
     benefit: Benefit | None
     leak_um_per_s: tuple[float, float, float]
     found: tuple[FoundEvent, ...]
+    unjudged: tuple[str, ...]
     shape: shape_review.ShapeReview | None
     anomalies: tuple[Anomaly, ...]
 
@@ -103,6 +106,7 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
         )
     span_s = (float(seconds["time_s"][0]), float(seconds["time_s"][-1]) + 1.0)
     found, shape = _found_and_shape(run, seconds, start_s, end_s)
+    unjudged = list_unjudged(seconds)
     del seconds  # a month takes a quarter of a GB, and the next steps need more
     ticks = hold_pass(run, span_s, (start_s, end_s))
     level_s = next((w for w in (1.0, 10.0) if (span_s[1] - span_s[0]) / w <= _PICTURE_ROWS), 60.0)
@@ -125,6 +129,7 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
         benefit=benefit,
         leak_um_per_s=leak,
         found=found,
+        unjudged=unjudged,
         shape=shape,
         anomalies=odd,
     )

@@ -48,7 +48,7 @@ _SIGNED = {"Pa", "µm", "%"}
 _OTHER_FOUND: Colour = (255, 150, 150)  # a lost laser's line must differ from that of its fault
 _FOUND_COLOURS = {
     "pressure step": VIOLET,
-    "leak step": ORANGE,
+    "flow step": ORANGE,
     "noise change": ORANGE,
     "shape jump": BLUE,
 }
