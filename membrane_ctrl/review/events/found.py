@@ -86,8 +86,8 @@ def find_events(
             found += finder(even)
         held = _select_held(even)
         found += flow_steps.find_flow_steps(held)
-        found += trim_drifts.find_trim_drifts(held)
         found += excursions.find_excursions(even, band_um, found)
+        found += trim_drifts.find_trim_drifts(held)  # too slow to explain an excursion
     found += shape_jumps.shape_jumps(shapes, hold_parts.held_at(level, shapes.time_s))
     return sorted(found, key=lambda event: event.time_s)
 
