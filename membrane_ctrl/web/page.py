@@ -216,7 +216,7 @@ class WebPage:
             ui.toggle(
                 list(SPANS_S), value=self._span, on_change=lambda e: self._set("_span", e.value)
             ).props('dense no-caps aria-label="time span"')
-            self._select = ui.select(
+            ui.select(
                 {column.name: column.title for column in PUBLISHED},
                 value=self._signals,
                 multiple=True,

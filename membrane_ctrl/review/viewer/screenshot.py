@@ -11,6 +11,7 @@ from pathlib import Path
 
 from rerun.experimental import ViewerClient
 
+from membrane_ctrl.model import errors
 from membrane_ctrl.review.viewer.viewer import (
     CursorTime,
     free_port,
@@ -24,23 +25,29 @@ from membrane_ctrl.review.viewer.viewer import (
 # cores.
 _WAIT_S = 60.0
 _BETWEEN_S = 0.5
+_TOO_SLOW = "the viewer did not answer in time"
+_TRY_AGAIN = "try again when the machine is less busy"
 
 
 def screenshot_of(source: Path | str, at: CursorTime | None = None) -> bytes:
     """PNG of a recording as it opens, at a moment or its end, or of a server's page.
 
-    Raises RuntimeError if the viewer does not start (no Vulkan driver) or its picture keeps
-    changing.
+    Raises RuntimeError if the viewer does not start (no Vulkan driver), does not answer in time, or
+    its picture keeps changing.
     """
     with _start_headless_viewer() as viewer:
-        viewer.open(source if isinstance(source, str) else str(source.resolve()))
-        if isinstance(source, str):
-            pass
-        elif at is None:
-            viewer.set_time(play_state="following")
-        else:
-            place_cursor(viewer, at)
-        return _at_rest(viewer)
+        try:
+            viewer.open(source if isinstance(source, str) else str(source.resolve()))
+            if isinstance(source, str):
+                pass
+            elif at is None:
+                viewer.set_time(play_state="following")
+            else:
+                place_cursor(viewer, at)
+            return _at_rest(viewer)
+        except OSError as error:  # what a connection to the viewer raises, also at a deadline
+            reason = errors.os_reason(error)
+            raise RuntimeError(f"{_TOO_SLOW} ({reason}); {_TRY_AGAIN}") from error
 
 
 def _at_rest(viewer: ViewerClient) -> bytes:
@@ -52,7 +59,7 @@ def _at_rest(viewer: ViewerClient) -> bytes:
             return picture
         before = picture
         time.sleep(_BETWEEN_S)
-    raise RuntimeError(f"the viewer's picture still changes after {_WAIT_S:.0f} s")
+    raise RuntimeError(f"the viewer's picture still changes after {_WAIT_S:.0f} s; {_TRY_AGAIN}")
 
 
 @contextmanager
