@@ -54,7 +54,8 @@ def write_report(
     tables = {} if result["figure"] is None else _make_tables(result["figure"])
     pictures = [PagePicture(file.stem, file.read_bytes()) for file in drawn]
     sections = [PageSection(heading, [table]) for heading, table in tables.items()]
-    verdict, reason = str(result["verdict"]), escape_controls(str(result["reason"]))
+    quality = result["quality"]
+    verdict, reason = str(quality["verdict"]), escape_controls(str(quality["reason"]))
     stated = PageText(f"{verdict}: {reason}" if reason else verdict, _MARKS[verdict])
     pictures.sort(key=_rank_picture)
     page = ReportPage(

@@ -29,6 +29,11 @@ def format_number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
 
 
+def format_signed(value: float, digits: int = 3) -> str:
+    """A number with its sign, to the given digits and without an exponent above 1."""
+    return f"{value:+.{digits}g}" if abs(value) < 10**digits else f"{value:+.0f}"
+
+
 def one_line(text: str) -> str:
     """A person's text in one line: spaces replace line ends and other unprintable characters."""
     return "".join(letter if letter.isprintable() else " " for letter in text)

@@ -96,6 +96,7 @@ _STATE_COLOURS = {
 }
 # Of a mark's text: more would not fit beside its line; the timeline has the full text.
 _LETTERS_MOST = 40
+_SHOWN_BANDS = 3.0  # of the error, at a glance
 _FOUND_COLOURS = {
     "pressure step": VIOLET,
     "flow step": ORANGE,
@@ -211,8 +212,11 @@ def _draw_overview(analysis: Analysis, width_in: float, height_in: float) -> Mar
             plot.plot(
                 time, level["mean_true_error_um"], color=GREEN, lw=0.9, label="true centre (twin)"
             )
-        plot.set_ylim(-3 * band_um, 3 * band_um)
-        plot.set(ylabel=plot_title(ERROR), title="The run at a glance")
+        most_um = _SHOWN_BANDS * band_um
+        plot.set_ylim(-most_um, most_um)
+        largest_um = float(np.nanmax(np.abs(ends), initial=0.0))
+        beyond = f" (up to {largest_um:.3g} µm, beyond the scale)" if largest_um > most_um else ""
+        plot.set(ylabel=plot_title(ERROR), title=f"The run at a glance{beyond}")
         _draw_found_events(plot, analysis, span_s)
         plot.legend(loc="upper right", ncols=3 if width_in == WIDTH_IN else 1)
         _draw_lane(lane, analysis, span_s)

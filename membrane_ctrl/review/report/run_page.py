@@ -19,13 +19,19 @@ from membrane_ctrl.report_pages.blocks import (
     TextMark,
 )
 from membrane_ctrl.report_pages.render import render_page
-from membrane_ctrl.review.formatting import format_number, format_span, format_time_beside
+from membrane_ctrl.review.formatting import (
+    format_number,
+    format_signed,
+    format_span,
+    format_time_beside,
+)
 from membrane_ctrl.review.report import figures
 from membrane_ctrl.review.report.json import make_timeline, make_verdict
 from membrane_ctrl.review.report.pump_history import PumpSeen, pump_change
 from membrane_ctrl.review.statistics import compare, drift, power_spectrum, shape_review
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
+from membrane_ctrl.run_files.held_error import format_in_band
 
 # A month has thousands of lines; the JSON report has them all.
 _LINES_MOST = 200
@@ -157,9 +163,6 @@ def _tabulate_windows(analysis: Analysis) -> PageTable:
     rows = []
     for name, series in ((READING, analysis.reading), (TRUE, analysis.true)):
         for window in () if series is None else series.windows:
-            in_band = format_number(window.in_band)
-            if window.count:
-                in_band = f"{format_number(100 * window.in_band, 6)} %"
             errors_um = (window.mean_um, window.std_um, window.p99_7_um, window.max_um)
             rows.append(
                 [
@@ -167,7 +170,7 @@ def _tabulate_windows(analysis: Analysis) -> PageTable:
                     f"{window.window_s:g} s",
                     f"{window.count}",
                     *map(format_number, errors_um),
-                    in_band,
+                    format_in_band(window.in_band),
                 ]
             )
     band = f"in ±{analysis.run.config.limits.band_um:g} µm"
@@ -346,7 +349,8 @@ def _list_timeline(analysis: Analysis) -> list[PageBlock]:
 def _format_slope(slope: drift.FittedSlope, unit: str) -> str:
     if slope.per_hour != slope.per_hour:
         return "too short to say"
-    text = f"{slope.per_hour:+.3g} {unit} (95 %: {slope.low:+.3g} to {slope.high:+.3g})"
+    rate, low, high = map(format_signed, (slope.per_hour, slope.low, slope.high))
+    text = f"{rate} {unit} (95 %: {low} to {high})"
     return text if slope.is_significant else f"{text}, not significant"
 
 

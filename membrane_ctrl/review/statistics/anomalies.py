@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from membrane_ctrl.model import events
 from membrane_ctrl.review.events.found_event import FoundEvent
-from membrane_ctrl.review.formatting import format_span
+from membrane_ctrl.review.formatting import format_signed, format_span
 from membrane_ctrl.review.statistics import shape_review
 from membrane_ctrl.review.statistics.drift import FittedSlope
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
@@ -121,4 +121,5 @@ def find_anomalies(
 
 
 def _describe_slope(drift: FittedSlope, unit: str) -> str:
-    return f"{drift.per_hour:+.3g} {unit} (95 %: {drift.low:+.3g} to {drift.high:+.3g})"
+    rate, low, high = map(format_signed, (drift.per_hour, drift.low, drift.high))
+    return f"{rate} {unit} (95 %: {low} to {high})"
