@@ -30,7 +30,7 @@ _BAND = {
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class ChartLine:
     """A vertical line of the chart: a mark or an alarm."""
 
     utc_s: float
@@ -39,7 +39,7 @@ class Moment:
 
 
 def make_history_chart(
-    found: Sequence[tuple[str, Series]], utc: bool, moments: Sequence[Moment] = ()
+    found: Sequence[tuple[str, Series]], utc: bool, moments: Sequence[ChartLine] = ()
 ) -> dict[str, Any]:
     """Options of ECharts, as plain data; `history_chart.js` adds what is a function.
 
@@ -49,7 +49,7 @@ def make_history_chart(
         Name and values of each signal, from the top panel to the lowest.
     utc : bool
         Label the times in UTC, else in the machine's local time.
-    moments : sequence of Moment
+    moments : sequence of ChartLine
         Oldest first.
     """
     count = len(found)
@@ -151,7 +151,7 @@ def _make_axis(name: str, gap_px: int) -> dict[str, Any]:
     }
 
 
-def _make_line(moment: Moment, shift_ms: float) -> dict[str, Any]:
+def _make_line(moment: ChartLine, shift_ms: float) -> dict[str, Any]:
     colour = _RED if moment.is_alarm else GREY
     return {
         "xAxis": moment.utc_s * 1e3 + shift_ms,

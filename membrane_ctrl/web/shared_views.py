@@ -24,7 +24,7 @@ from membrane_ctrl.service.work_pools import (
     SESSIONS,
 )
 from membrane_ctrl.web import alarm_history, figure_map
-from membrane_ctrl.web.history_chart import SIGNALS_MOST, Moment, make_history_chart
+from membrane_ctrl.web.history_chart import SIGNALS_MOST, ChartLine, make_history_chart
 from membrane_ctrl.web.made_once import MadeOnce
 from membrane_ctrl.web.tuning_panel import SessionWatch
 
@@ -112,10 +112,10 @@ class SharedViews:
     def _make_chart(self, hold: str, signals: tuple[str, ...], span: str, utc: bool) -> bytes:
         feed, span_s = self._feeds[hold], SPANS_S[span]
         found = [(signal, history(feed, feed.logs, signal, span_s)) for signal in signals]
-        moments = [Moment(utc_s, text) for utc_s, text in marks(feed, feed.logs, span_s)]
+        moments = [ChartLine(utc_s, text) for utc_s, text in marks(feed, feed.logs, span_s)]
         begin_s = datetime.now(UTC).timestamp() - span_s
         moments += [
-            Moment(alarm.began_s, alarm.name.replace("_", " "), is_alarm=True)
+            ChartLine(alarm.began_s, alarm.name.replace("_", " "), is_alarm=True)
             for alarm in self._list_alarms(hold)
             if alarm.is_fault and alarm.began_s > begin_s
         ]

@@ -15,7 +15,7 @@ import pytest
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.service.feed import HoldFeed, Seconds, Series, history, marks, thinned
-from membrane_ctrl.web.history_chart import Moment, make_history_chart
+from membrane_ctrl.web.history_chart import ChartLine, make_history_chart
 
 NOW_S = 1_800_000_000.0
 
@@ -134,7 +134,7 @@ def test_sparklines_and_charts_are_drawn_of_anything() -> None:
     )
     options = make_history_chart([("error_um", series)], True)
     assert options["series"][2]["markLine"]["data"] == [], "earlier marks do not stay"
-    many = [Moment(float(number), "x" * 30) for number in range(30)]
+    many = [ChartLine(float(number), "x" * 30) for number in range(30)]
     marked = make_history_chart([("error_um", series)], True, many)
     lines = marked["series"][2]["markLine"]["data"]
     assert [line["xAxis"] for line in lines] == [1e3 * number for number in range(10, 30)]

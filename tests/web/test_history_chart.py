@@ -9,7 +9,7 @@ import pytest
 
 from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.service.feed import Series
-from membrane_ctrl.web.history_chart import Moment, make_history_chart
+from membrane_ctrl.web.history_chart import ChartLine, make_history_chart
 from membrane_ctrl.web.shared_views import parse_removed, parse_signals
 
 SERIES = Series(np.array([10.0, 11.0]), np.array([-1.0, 0.0]), np.zeros(2), np.array([2.0, 0.5]))
@@ -47,7 +47,7 @@ def test_several_signals_share_the_time_axis_and_the_cursor() -> None:
 
 
 def test_an_alarm_differs_from_a_mark() -> None:
-    moments = [Moment(10.2, "door"), Moment(10.5, "laser lost", is_alarm=True)]
+    moments = [ChartLine(10.2, "door"), ChartLine(10.5, "laser lost", is_alarm=True)]
     options = make_history_chart([("error_um", SERIES)], utc=True, moments=moments)
     mark, alarm = options["series"][2]["markLine"]["data"]
     assert mark["lineStyle"] != alarm["lineStyle"]
