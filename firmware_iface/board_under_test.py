@@ -43,17 +43,17 @@ class BoardUnderTest:
     def _guards(self) -> bool:
         return self._registers.map_version >= 3
 
-    async def _read(self, block: register_map.Block) -> dict[str, float]:
+    async def _read_block(self, block: register_map.Block) -> dict[str, float]:
         return block.decode(await self._link.read_holding(block.address, block.count))
 
-    async def _sensors(self) -> dict[str, float]:
-        return await self._read(self._registers.block("sensors"))
+    async def _read_sensors(self) -> dict[str, float]:
+        return await self._read_block(self._registers.block("sensors"))
 
-    async def _put(self, name: str, values: dict[str, float]) -> None:
+    async def _write_block(self, name: str, values: dict[str, float]) -> None:
         block = self._registers.block(name)
         await self._link.write_registers(block.address, block.encode(values))
 
-    def _command(self, pump: float, vent: float, key: int = 0) -> dict[str, float]:
+    def _make_command(self, pump: float, vent: float, key: int = 0) -> dict[str, float]:
         return {
             "pump_command_fraction": pump,
             "vent_command_fraction": vent,
@@ -61,24 +61,26 @@ class BoardUnderTest:
             "command_key": key or self._key,
         }
 
-    async def _write(self, pump: float, vent: float = 0.0, *, fresh: bool = True) -> None:
+    async def _write_command(self, pump: float, vent: float = 0.0, *, fresh: bool = True) -> None:
         self._heartbeat = (self._heartbeat + fresh) % 2**16
-        await self._put("command", self._command(pump, vent))
+        await self._write_block("command", self._make_command(pump, vent))
 
-    async def _arm(self, period_s: float = PERIOD_S, arm: float = 1.0) -> None:
+    async def _arm_watchdog(self, period_s: float = PERIOD_S, arm: float = 1.0) -> None:
         claim = {"claim_id": self._id, "claim_key": self._key}
-        await self._put("settings", {"watchdog_period_s": period_s, "watchdog_arm": arm, **claim})
+        await self._write_block(
+            "settings", {"watchdog_period_s": period_s, "watchdog_arm": arm, **claim}
+        )
 
-    async def _clear(self, key: int = 0) -> None:
-        await self._put("reset", {"clear_faults": 0xFFFF, "clear_key": key or self._key})
+    async def _clear_faults(self, key: int = 0) -> None:
+        await self._write_block("reset", {"clear_faults": 0xFFFF, "clear_key": key or self._key})
 
-    async def _rest(self) -> None:
+    async def _bring_to_rest(self) -> None:
         """Pump off, faults cleared, watchdog off: the state before and after every check."""
         steps: tuple[Callable[[], Awaitable[None]], ...] = (
-            partial(self._arm, REST_S),
-            self._clear,
-            partial(self._write, 0.0),
-            partial(self._arm, arm=0.0),
+            partial(self._arm_watchdog, REST_S),
+            self._clear_faults,
+            partial(self._write_command, 0.0),
+            partial(self._arm_watchdog, arm=0.0),
         )
         for step in steps:
             try:
@@ -88,8 +90,8 @@ class BoardUnderTest:
             except roles.LinkError:
                 continue  # the check of this feature reports that the board lacks it
 
-    async def _tripped(self, after: str) -> None:
-        found = await self._sensors()
+    async def _expect_trip(self, after: str) -> None:
+        found = await self._read_sensors()
         value = found["pump_readback_fraction"]
         require(value == 0, f"holds the pump at {value:g} after {after}")
         mask = self._registers.fault_mask("watchdog")
@@ -99,14 +101,16 @@ class BoardUnderTest:
             f"does not latch the watchdog fault after {after}",
         )
 
-    async def _refused(self, words: Sequence[int], address: int, what: str, why: str) -> None:
+    async def _expect_refusal(
+        self, words: Sequence[int], address: int, what: str, why: str
+    ) -> None:
         try:
             await self._link.write_registers(address, words)
         except roles.DeviceRefusedError:
             return
         raise ConformanceError(f"accepts {what}, which is outside its {why}")
 
-    async def _busy(self, write: Awaitable[None], what: str) -> None:
+    async def _expect_busy(self, write: Awaitable[None], what: str) -> None:
         """Expect the refusal of a write because another program holds the board."""
         try:
             await write
@@ -116,10 +120,14 @@ class BoardUnderTest:
             raise ConformanceError(f"refuses {what}, but not with exception 6: {error}") from None
         raise ConformanceError(f"accepts {what}")
 
-    def _claim(self, key: int, period_s: float = REST_S, arm: float = 1.0) -> Awaitable[None]:
+    def _claim_as_other(
+        self, key: int, period_s: float = REST_S, arm: float = 1.0
+    ) -> Awaitable[None]:
         """Another program's claim."""
         claim = {"claim_id": self._id ^ 1 or 2, "claim_key": key}
-        return self._put("settings", {"watchdog_period_s": period_s, "watchdog_arm": arm, **claim})
+        return self._write_block(
+            "settings", {"watchdog_period_s": period_s, "watchdog_arm": arm, **claim}
+        )
 
 
 def other_key(key: int) -> int:

@@ -42,7 +42,7 @@ class GuardedCamera:
         """Connect and apply the settings. Raises LinkError."""
         if self._opened:
             self.close()
-        identity: roles.DeviceIdentity = self._call("open", returns=roles.DeviceIdentity)
+        identity: roles.DeviceIdentity = self._call_camera("open", returns=roles.DeviceIdentity)
         self._opened = True
         return identity
 
@@ -52,10 +52,10 @@ class GuardedCamera:
             self.open()
         self._grabbed, self._triggered_s = None, self._now()
         if self._overlaps:
-            self._call("expose", out)
+            self._call_camera("expose", out)
             return
         try:
-            self._grabbed = self._call("grab", out, returns=roles.Frame)
+            self._grabbed = self._call_camera("grab", out, returns=roles.Frame)
         except roles.FrameLostError as error:
             self._grabbed = error
 
@@ -66,11 +66,11 @@ class GuardedCamera:
         triggered_s, self._triggered_s = self._triggered_s, math.nan
         found, self._grabbed = self._grabbed, None
         if self._overlaps:
-            found = self._call("fetch", returns=roles.Frame)
+            found = self._call_camera("fetch", returns=roles.Frame)
         if isinstance(found, roles.FrameLostError):
             raise found
         assert found is not None
-        self._check(found, triggered_s)
+        self._check_frame(found, triggered_s)
         return found
 
     def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
@@ -96,7 +96,7 @@ class GuardedCamera:
         found: dict[str, str] = call_driver(self._name, self.driver, "describe", returns=dict)
         return {"port": self._name, **found}
 
-    def _call(self, method: str, *arguments: object, returns: type[object] = object) -> Any:
+    def _call_camera(self, method: str, *arguments: object, returns: type[object] = object) -> Any:
         try:
             return call_driver(self._name, self.driver, method, *arguments, returns=returns)
         except roles.FrameLostError:
@@ -105,7 +105,7 @@ class GuardedCamera:
             self.close()
             raise
 
-    def _check(self, frame: roles.Frame, triggered_s: float) -> None:
+    def _check_frame(self, frame: roles.Frame, triggered_s: float) -> None:
         """Refuse a frame of another size or type, and one that was
         not exposed after its trigger.
         """

@@ -80,7 +80,9 @@ class CircuitPoller:
         if self._task is not None and not self._task.done():
             return
         first = asyncio.Event()
-        self._task = asyncio.create_task(self._run(first), name=f"interlocks of {self.name}")
+        self._task = asyncio.create_task(
+            self._keep_reading(first), name=f"interlocks of {self.name}"
+        )
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(first.wait(), self.polled.first_s)
 
@@ -115,7 +117,7 @@ class CircuitPoller:
             await self.polled.source.close()
         self._opened = False
 
-    async def _run(self, first: asyncio.Event) -> None:
+    async def _keep_reading(self, first: asyncio.Event) -> None:
         while True:
             begin_s = self._clock()
             await self._read_once()

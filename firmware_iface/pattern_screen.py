@@ -43,7 +43,7 @@ class PatternScreen:
     def open(self) -> DeviceIdentity:
         """Take the display and prepare the patterns. Raises LinkError."""
         self.close()
-        identity: DeviceIdentity = self._call("open", returns=DeviceIdentity)
+        identity: DeviceIdentity = self._call_display("open", returns=DeviceIdentity)
         self._opened = True
         self.linearise(self.response)
         return identity
@@ -52,7 +52,9 @@ class PatternScreen:
         """Prepare all patterns for a display with this response. Raises LinkError."""
         self.response = response
         self._prepared = {
-            pattern: self._call("prepare", response.levels_of(pattern_light(pattern, self._raster)))
+            pattern: self._call_display(
+                "prepare", response.levels_of(pattern_light(pattern, self._raster))
+            )
             for pattern in self._patterns
         }
 
@@ -67,7 +69,7 @@ class PatternScreen:
             self.open()
         if pattern not in self._prepared:
             raise LinkError(f"{self._name}: pattern {pattern.name!r} was not prepared")
-        self._send(self._prepared[pattern])
+        self._send_picture(self._prepared[pattern])
 
     def wait(self) -> None:
         """Return when the pattern is displayed and settled."""
@@ -82,7 +84,7 @@ class PatternScreen:
             raise ValueError(f"image is {levels.shape}, the screen {shape}")
         if not self._opened:
             self.open()
-        self._send(self._call("prepare", levels))
+        self._send_picture(self._call_display("prepare", levels))
 
     def close(self) -> None:
         """Release the display. Never raises."""
@@ -95,11 +97,11 @@ class PatternScreen:
         found: dict[str, str] = call_driver(self._name, self._display, "describe", returns=dict)
         return {"port": self._name, **found, "settle": f"{1000 * self.settle_s:.0f} ms"}
 
-    def _send(self, picture: Any) -> None:
-        self._call("show", picture)
+    def _send_picture(self, picture: Any) -> None:
+        self._call_display("show", picture)
         self._shown_s = self._clock.now()
 
-    def _call(self, method: str, *arguments: Any, returns: type[Any] = object) -> Any:
+    def _call_display(self, method: str, *arguments: Any, returns: type[Any] = object) -> Any:
         try:
             return call_driver(self._name, self._display, method, *arguments, returns=returns)
         except LinkError:

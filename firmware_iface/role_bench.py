@@ -100,7 +100,7 @@ class RoleBench:
                 raise type(error)(f"{role}: {error}") from error
         await self._stop_watchdog()
         self._fed_s, self._commanded = self._clock(), 0.0
-        self._watchdog = asyncio.create_task(self._watch(), name="software watchdog")
+        self._watchdog = asyncio.create_task(self._run_watchdog(), name="software watchdog")
         kinds = ", ".join(f"{role} {identity.kind}" for role, identity in self.identities.items())
         firmware = ", ".join(
             dict.fromkeys(i.firmware for i in self.identities.values() if i.firmware)
@@ -124,9 +124,9 @@ class RoleBench:
         """
         await self._require_watchdog()
         self._answered_s.clear()
-        sensors = asyncio.ensure_future(self._sensors())  # never raises
+        sensors = asyncio.ensure_future(self._read_sensors())  # never raises
         try:
-            pump, vent = await self._actuators()
+            pump, vent = await self._read_actuators()
         finally:
             sample, values = await sensors
         if sample.quality == NO_ANSWER and math.isfinite(values["gauge_pressure_pa"]):
@@ -196,66 +196,68 @@ class RoleBench:
             ):  # one driver's mistake must not leave the next device open
                 await device.close()
 
-    async def _sensors(self) -> tuple[roles.DisplacementSample, dict[str, Any]]:
+    async def _read_sensors(self) -> tuple[roles.DisplacementSample, dict[str, Any]]:
         """The displacement, and the values of the other sensors by
         their field of `BenchReading`.
         """
-        asked = asyncio.gather(*(self._value(role) for role in roles.SENSORS.values()))
-        sample, values = await asyncio.gather(self._sample(), asked)
+        asked = asyncio.gather(*(self._newest_value(role) for role in roles.SENSORS.values()))
+        sample, values = await asyncio.gather(self._newest_sample(), asked)
         return sample, dict(zip(roles.SENSORS, values, strict=True))
 
-    async def _actuators(self) -> tuple[float, float]:
+    async def _read_actuators(self) -> tuple[float, float]:
         """Read-back of pump and vent; NaN for a vent that the bench does not have."""
         vent = self._devices.vent
         if vent is None:
-            return await self._asked("pump", self._devices.pump.pump_fraction()), math.nan
+            return await self._time_answer("pump", self._devices.pump.pump_fraction()), math.nan
         asked = (
-            self._asked("pump", self._devices.pump.pump_fraction()),
-            self._asked("vent", vent.vent_fraction()),
+            self._time_answer("pump", self._devices.pump.pump_fraction()),
+            self._time_answer("vent", vent.vent_fraction()),
         )
         found = await asyncio.gather(*asked, return_exceptions=True)
         _raise_first(found)
         pump_fraction, vent_fraction = (value for value in found if isinstance(value, float))
         return pump_fraction, vent_fraction
 
-    async def _sample(self) -> roles.DisplacementSample:
+    async def _newest_sample(self) -> roles.DisplacementSample:
         """The newest sample; without one, the last counter and time, which then do not advance."""
         laser = self._devices.displacement
         self._last_sample = replace(self._last_sample, displacement_um=math.nan, quality=NO_ANSWER)
         if laser is not None and "displacement" not in self._tasks:
             try:
-                self._last_sample = await self._asked("displacement", laser.displacement())
+                self._last_sample = await self._time_answer("displacement", laser.displacement())
                 self._silent.pop("displacement", None)
             except roles.LinkError as error:
-                self._failed("displacement", error)
+                self._note_failure("displacement", error)
         return self._last_sample
 
-    async def _value(self, role: roles.Role) -> float:
+    async def _newest_value(self, role: roles.Role) -> float:
         """The newest value of a sensor; NaN without one, and while it is reopened."""
         device = self._devices.sensors().get(role.name)
         if device is None or role.name in self._tasks:
             return math.nan
         try:
-            value: float = await self._asked(role.name, getattr(device, role.reads)())
+            value: float = await self._time_answer(role.name, getattr(device, role.reads)())
         except roles.LinkError as error:
-            self._failed(role.name, error)
+            self._note_failure(role.name, error)
             return math.nan
         self._silent.pop(role.name, None)
         return value
 
-    async def _asked(self, role: str, asked: Awaitable[T]) -> T:
+    async def _time_answer(self, role: str, asked: Awaitable[T]) -> T:
         """`answer`, with its time noted."""
         try:
             return await answer(role, asked)
         finally:
             self._answered_s[role] = self._clock()
 
-    def _failed(self, role: str, error: roles.LinkError) -> None:
+    def _note_failure(self, role: str, error: roles.LinkError) -> None:
         self._silent[role] = str(error)
         if isinstance(error, roles.LinkDownError) and role not in self._tasks:
-            self._tasks[role] = asyncio.create_task(self._reopen(role), name=f"open {role} again")
+            self._tasks[role] = asyncio.create_task(
+                self._reopen_sensor(role), name=f"open {role} again"
+            )
 
-    async def _reopen(self, role: str) -> None:
+    async def _reopen_sensor(self, role: str) -> None:
         """Reopen a lost sensor until the same one is back; a different one in its place needs a
         person.
         """
@@ -272,7 +274,7 @@ class RoleBench:
             await asyncio.sleep(_RETRY_S)
         del self._tasks[role]
 
-    async def _watch(self) -> None:
+    async def _run_watchdog(self) -> None:
         """The software watchdog: after any exception of a driver, it retries a quarter of a period
         later.
         """
@@ -302,14 +304,14 @@ class RoleBench:
 
     async def _stop_watchdog(self) -> None:
         task, self._watchdog = self._watchdog, None
-        await _stopped([] if task is None else [task])
+        await _stop_tasks([] if task is None else [task])
 
     async def _stop_reopening(self) -> None:
         tasks, self._tasks = list(self._tasks.values()), {}
-        await _stopped(tasks)
+        await _stop_tasks(tasks)
 
 
-async def _stopped(tasks: list[asyncio.Task[None]]) -> None:
+async def _stop_tasks(tasks: list[asyncio.Task[None]]) -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)

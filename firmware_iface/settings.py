@@ -105,7 +105,7 @@ class Optoncdt1420Config(Section):
     """
 
     @model_validator(mode="after")
-    def _rate(self) -> "Optoncdt1420Config":
+    def _check_rate(self) -> "Optoncdt1420Config":
         rates_khz = (0.25, 0.5, 1.0, 2.0, 4.0)
         if self.rate_khz not in rates_khz:
             raise ValueError(
@@ -257,7 +257,7 @@ class ModbusMapConfig(Section):
     """Content of that register. Set it together with `identity_address`."""
 
     @model_validator(mode="after")
-    def _line(self) -> "ModbusMapConfig":
+    def _check_line(self) -> "ModbusMapConfig":
         for name, pair in (("raw", self.raw), ("value", self.value)):
             if pair is not None and pair[0] == pair[1]:
                 raise ValueError(f"{name} needs two different numbers")

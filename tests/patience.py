@@ -36,7 +36,7 @@ def patient_check(answer_s: float = ANSWER_S) -> Iterator[None]:
     """`check` waits that long; drivers of other packages check their time-outs, which are at most 5
     s.
     """
-    probes = check._probes
+    probes = check._make_probes
 
     async def patient(devices: DevicesConfig, laser: bool) -> list[DeviceProbe]:
         waits = {
@@ -45,7 +45,7 @@ def patient_check(answer_s: float = ANSWER_S) -> Iterator[None]:
         }
         return await probes(devices.model_copy(update={"timeout_s": answer_s, **waits}), laser)
 
-    with patch("membrane_ctrl.commissioning.check._probes", patient):
+    with patch("membrane_ctrl.commissioning.check._make_probes", patient):
         yield
 
 

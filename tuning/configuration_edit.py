@@ -29,7 +29,7 @@ def confirm_and_replace(
     ):
         print(f"{path} is unchanged; --yes saves without asking", file=sys.stderr)
         return False
-    _replace(path, before, after)
+    _replace_file(path, before, after)
     return True
 
 
@@ -66,7 +66,7 @@ def edit_text(text: str, changed: dict[str, dict[str, Any]], path: Path) -> str:
     raise InputError(f"{path}: cannot be edited by a program; {lines}")
 
 
-def _replace(path: Path, before: str, after: str) -> None:
+def _replace_file(path: Path, before: str, after: str) -> None:
     """Write the file a link leads to, with its permissions. Raises InputError also if it has
     changed meanwhile.
     """

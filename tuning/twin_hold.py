@@ -78,7 +78,7 @@ class TwinHold:
         """Run the tick that executes the command. Raises HoldError if it is refused."""
         self._pending = (command,)
         answer = self._advance(1)
-        self._early = _joined(self._early, answer)
+        self._early = _join_news(self._early, answer)
         for event in answer.events:
             if isinstance(event, CommandTaken) and event.refused:
                 raise HoldError(f"refused: {event.refused}")
@@ -86,7 +86,7 @@ class TwinHold:
     def read_news(self) -> News:
         """Return half a second of twin time."""
         early, self._early = self._early, News((), (), ())
-        return _joined(early, self._advance(round(_NEWS_S * self.config.loop.rate_hz)))
+        return _join_news(early, self._advance(round(_NEWS_S * self.config.loop.rate_hz)))
 
     def close(self) -> None:
         """Stop the run."""
@@ -112,5 +112,5 @@ class TwinHold:
         return News(tuple(rows), tuple(events), shapes)
 
 
-def _joined(early: News, late: News) -> News:
+def _join_news(early: News, late: News) -> News:
     return News(early.rows + late.rows, early.events + late.events, early.shapes + late.shapes)

@@ -132,7 +132,7 @@ def surveyed(pump: DrawnPump, limit_um: float = 10.0) -> SurveyedPump:
     )
     rig = HoldRig(link, "benchmark")
     rig.hold(SETTLED_S)
-    map_pump._calmed(rig, limit_um)
+    map_pump._calm_hold(rig, limit_um)
     before, made = len(link.rows), list[PumpSurvey]()
 
     def survey(*given: float) -> PumpSurvey:
@@ -142,7 +142,7 @@ def surveyed(pump: DrawnPump, limit_um: float = 10.0) -> SurveyedPump:
     off, refused = math.nan, ""
     with patch.object(pump_survey, "PumpSurvey", survey):
         try:
-            off = worst_share(map_pump._surveyed(rig, limit_um), plant.pump)
+            off = worst_share(map_pump._survey_pump(rig, limit_um), plant.pump)
         except (ExperimentError, ValueError) as error:
             refused = str(error)
     rows = [row for row in link.rows[before:] if row.state in (State.HOLD, State.TUNE)]

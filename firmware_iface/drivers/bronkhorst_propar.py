@@ -185,7 +185,7 @@ class ProparParameters:
 
     async def number(self, parameter: InstrumentParameter) -> float:
         """A number that arrived `_COPIES` times the same. Raises LinkError."""
-        first, *others = await self._asked(*[parameter] * _COPIES)
+        first, *others = await self._request_values(*[parameter] * _COPIES)
         if any(other != first for other in others):
             came = ", ".join(raw.hex() for raw in (first, *others))
             raise LinkError(f"{self.name}: {parameter.name} differs between copies ({came}); noise")
@@ -193,7 +193,10 @@ class ProparParameters:
 
     async def text(self, parameter: InstrumentParameter) -> str:
         """A text that arrived twice the same. Raises LinkError."""
-        first, second = (await self._asked(parameter))[0], (await self._asked(parameter))[0]
+        first, second = (
+            (await self._request_values(parameter))[0],
+            (await self._request_values(parameter))[0],
+        )
         if first != second:
             raise LinkError(
                 f"{self.name}: {parameter.name} read as {first!r}, then as {second!r}; noise"
@@ -219,7 +222,7 @@ class ProparParameters:
         """Port, settings, manual."""
         return {"port": f"{self.name}, {self._port.settings}", "manual": MANUAL}
 
-    async def _asked(self, *parameters: InstrumentParameter) -> list[bytes]:
+    async def _request_values(self, *parameters: InstrumentParameter) -> list[bytes]:
         """Raw values of several parameters, from one message."""
         what = f"reading {parameters[0].name}"
         answer = await self._transact(make_request(parameters), what)
@@ -239,8 +242,10 @@ class ProparParameters:
     async def _transact(self, data: bytes, what: str) -> bytes:
         """Data of the answer with the question's sequence number; a status other than 0 raises."""
         what = f"{self.name}: {what}"
-        question = self._question(data, what)
-        fence = self._question(make_request([MEASURE]), f"{self.name}: asking again after a loss")
+        question = self._make_question(data, what)
+        fence = self._make_question(
+            make_request([MEASURE]), f"{self.name}: asking again after a loss"
+        )
         answer = await self._exchange.ask(question, self._timeout_s, fence)
         message = split_binary(answer)[0][-1]
         if message.data[0] != STATUS:
@@ -251,7 +256,7 @@ class ProparParameters:
         kind = DeviceRefusedError if code in _REFUSALS else LinkError
         raise kind(f"{what}: status {code} ({STATUS_TEXT.get(code, 'unknown')})")
 
-    def _question(self, data: bytes, what: str) -> exchange.Question:
+    def _make_question(self, data: bytes, what: str) -> exchange.Question:
         self._sequence = (self._sequence + 1) % _SEQUENCES
         frame = binary_frame(ProparMessage(self._sequence, self._node, data))
         return exchange.Question(

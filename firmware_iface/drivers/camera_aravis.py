@@ -84,12 +84,12 @@ class AravisCamera:
             if not self._camera:
                 raise roles.LinkDownError(f"{self._name}: not found; see `membrane-ctrl devices`")
             self._look_whether_ours()
-            identity = self._identity()
-            self._apply()
+            identity = self._read_identity()
+            self._apply_settings()
             self._start_stream()
         except roles.LinkError as error:
             self.close()
-            raise self._told(error, "opening") from None
+            raise self._make_link_error(error, "opening") from None
         self.counts.reconnects += self._opened
         self._opened = True
         return identity
@@ -111,8 +111,8 @@ class AravisCamera:
         try:
             library.call("arv_camera_software_trigger", self._camera)
         except roles.LinkError as error:
-            self._abandon()
-            raise self._told(error, "trigger") from None
+            self._drop_camera()
+            raise self._make_link_error(error, "trigger") from None
         self._pending = time_s, out
         self._sleep(max(0.0, time_s + self.config.exposure_ms / 1000.0 - self._now()))
 
@@ -130,7 +130,7 @@ class AravisCamera:
         buffer = library.call("arv_stream_timeout_pop_buffer", self._stream, timeout_us)
         if not buffer:
             self.counts.missing += 1
-            self._restart()
+            self._restart_stream()
             raise roles.FrameLostError(
                 f"{self._name}: no frame within {self.config.timeout_s:g} s of its trigger"
             )
@@ -142,7 +142,7 @@ class AravisCamera:
                     f"{self._name}: frame not whole (aravis status {status}); cable, packet "
                     "size, other traffic?"
                 )
-            frame = roles.Frame(self._pixels(buffer, out), time_s)
+            frame = roles.Frame(self._copy_pixels(buffer, out), time_s)
         finally:
             library.call("arv_stream_push_buffer", self._stream, buffer)
         self.counts.taken += 1
@@ -155,7 +155,7 @@ class AravisCamera:
             arv.load_aravis().call("g_object_unref", self._camera)
         self._camera = self._pending = None
 
-    def _abandon(self) -> None:
+    def _drop_camera(self) -> None:
         """Drop a camera that does not answer, in a thread,
         as the library takes 10 s to close it.
         """
@@ -179,7 +179,7 @@ class AravisCamera:
             "manual": "GenICam SFNC 2.7; aravis 0.8",
         }
 
-    def _identity(self) -> roles.DeviceIdentity:
+    def _read_identity(self) -> roles.DeviceIdentity:
         words = (
             arv.load_aravis().text(f"arv_camera_get_{word}", self._camera)
             for word in ("vendor_name", "model_name", "device_serial_number")
@@ -199,7 +199,7 @@ class AravisCamera:
         ):
             raise arv.AravisError("another controller", arv.NOT_CONTROLLER)
 
-    def _apply(self) -> None:
+    def _apply_settings(self) -> None:
         call, camera, config = arv.load_aravis().call, self._camera, self.config
         sensor = [ctypes.c_int() for _ in range(2)]
         call("arv_camera_get_sensor_size", camera, *map(ctypes.byref, sensor))
@@ -297,9 +297,9 @@ class AravisCamera:
         if buffer:
             library.call("arv_stream_push_buffer", self._stream, buffer)
         else:
-            self._restart()
+            self._restart_stream()
 
-    def _restart(self) -> None:
+    def _restart_stream(self) -> None:
         """A new stream to the same camera; a new connection if that
         fails (at the next exposure).
         """
@@ -307,9 +307,9 @@ class AravisCamera:
         try:
             self._start_stream()
         except roles.LinkError:
-            self._abandon()
+            self._drop_camera()
 
-    def _pixels(self, buffer: int, out: roles.Pixels | None) -> roles.Pixels:
+    def _copy_pixels(self, buffer: int, out: roles.Pixels | None) -> roles.Pixels:
         """Copy a whole frame's pixels."""
         library = arv.load_aravis()
         found = tuple(
@@ -341,7 +341,7 @@ class AravisCamera:
         np.copyto(out, seen)
         return out
 
-    def _told(self, error: roles.LinkError, doing: str) -> roles.LinkError:
+    def _make_link_error(self, error: roles.LinkError, doing: str) -> roles.LinkError:
         """A link error with the camera's name and the remedy."""
         name, message = self._name, str(error)
         code = error.code if isinstance(error, arv.AravisError) else -1

@@ -77,7 +77,7 @@ class GpioLines:
             await self.close()
         self._request = await self._in_thread(self._request_lines)
         await self.closed_circuits()
-        return DeviceIdentity("GPIO lines", "", "", ", ".join(self._words()))
+        return DeviceIdentity("GPIO lines", "", "", ", ".join(self._list_lines()))
 
     async def closed_circuits(self) -> tuple[bool, ...]:
         """Whether each circuit is closed. Raises LinkError."""
@@ -100,9 +100,9 @@ class GpioLines:
 
     def describe(self) -> dict[str, str]:
         """Chip and lines."""
-        return {"port": self._chip, "register": ", ".join(self._words())}
+        return {"port": self._chip, "register": ", ".join(self._list_lines())}
 
-    def _words(self) -> list[str]:
+    def _list_lines(self) -> list[str]:
         return [f"line {circuit.line} {circuit.wiring}" for circuit in self._circuits]
 
     def _request_lines(self) -> Any:
@@ -145,11 +145,11 @@ class GpioLines:
         try:
             return await answer
         except OSError as error:
-            raise self._refusal(error) from None
+            raise self._explain_refusal(error) from None
         except ValueError as error:  # the chip has no such line
             raise DeviceRefusedError(f"{self._chip}: {error}") from None
 
-    def _refusal(self, error: OSError) -> LinkError:
+    def _explain_refusal(self, error: OSError) -> LinkError:
         what = error.strerror or str(error)
         if error.errno == errno.EBUSY:
             return DeviceRefusedError(

@@ -98,7 +98,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual"
             )
-        await self._reading()  # the first one is confirmed by a second
+        await self._read_values()  # the first one is confirmed by a second
         detail = (
             f"amplifier {self._config.amplifier} of {len(values)}, steps of "
             f"{_STEPS_UM[self._decimals]:g} µm"
@@ -112,7 +112,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
         (no valid answer, or a jump that is ignored until it repeats), LinkDownError (the port is
         gone).
         """
-        quality, displacement_um, passed = await self._reading()
+        quality, displacement_um, passed = await self._read_values()
         if not passed:
             raise roles.LinkError(
                 f"{self._link.name}: jump to {displacement_um:.0f} µm, ignored until it repeats"
@@ -122,7 +122,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
             displacement_um, quality, self._readings, asyncio.get_running_loop().time()
         )
 
-    async def _reading(self) -> tuple[int, float, bool]:
+    async def _read_values(self) -> tuple[int, float, bool]:
         """Quality, displacement and whether the gate passed it."""
         answer = await self._link.query(self._read_command, self._read_answer)
         _raise_refusal(self._link.name, answer[2])

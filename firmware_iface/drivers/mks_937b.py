@@ -59,7 +59,9 @@ class Mks937b(exchange.LineDriver):
 
     async def _begin(self) -> roles.DeviceIdentity:
         config = self._config
-        model, serial, firmware = [await self._asked(command) for command in ("MD?", "SN?", "FV6?")]
+        model, serial, firmware = [
+            await self._query_gauge(command) for command in ("MD?", "SN?", "FV6?")
+        ]
         if config.serial not in ("", serial):
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: serial number {serial}, expected {config.serial}"
@@ -69,7 +71,7 @@ class Mks937b(exchange.LineDriver):
                 f"{self._link.name}: {model} is not a {' or '.join(_MODELS)}"
             )
         module = "ABC"[(config.channel - 1) // 2]
-        kinds = _SENSORS.fullmatch(await self._asked(f"ST{module}?"))
+        kinds = _SENSORS.fullmatch(await self._query_gauge(f"ST{module}?"))
         kind = kinds[1 + (config.channel - 1) % 2] if kinds else "none"
         if kind != _MANOMETER:
             raise roles.DeviceRefusedError(
@@ -77,7 +79,7 @@ class Mks937b(exchange.LineDriver):
                 f"{_MANOMETER}, "
                 "a capacitance manometer"
             )
-        await self._asked("U!PASCAL")
+        await self._query_gauge("U!PASCAL")
         await self._require_pascal()
         await self._reading_pa()  # the gate wants a second reading to confirm the first
         full_pa = math.inf if config.range_pa is None else config.range_pa
@@ -102,21 +104,21 @@ class Mks937b(exchange.LineDriver):
 
     async def _reading_pa(self) -> tuple[float, bool]:
         """The reading, and whether it is far from the two before it."""
-        number = _NUMBER.fullmatch(await self._asked(f"PR{self._config.channel}?"))
+        number = _NUMBER.fullmatch(await self._query_gauge(f"PR{self._config.channel}?"))
         if number is None:
             return math.nan, False
         pressure_pa = float(f"{number[1]}e{number[2]}")
         return pressure_pa, not self._gate.passes(pressure_pa)
 
     async def _require_pascal(self) -> None:
-        unit = await self._asked("U?")
+        unit = await self._query_gauge("U?")
         if unit.upper() != "PASCAL":
             await self._link.close()
             raise roles.LinkDownError(
                 f"{self._link.name}: its unit is {unit}, not PASCAL; leave its front panel alone"
             )
 
-    async def _asked(self, command: str) -> str:
+    async def _query_gauge(self, command: str) -> str:
         """The response. Raises LinkError, DeviceRefusedError (NAK)."""
         answer = await self._link.query(f"{self._to}{command}", self._answer)
         if answer[2]:

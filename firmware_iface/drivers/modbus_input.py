@@ -41,10 +41,10 @@ class ModbusInputs:
         Each bit is a request of its own: a range with addresses that the device does not have would
         be refused.
         """
-        closed = [await self._closed(function, address) for function, address in self._bits]
+        closed = [await self._read_input(function, address) for function, address in self._bits]
         return tuple(closed)
 
-    async def _closed(self, function: BitFunction, address: int) -> bool:
+    async def _read_input(self, function: BitFunction, address: int) -> bool:
         if function == "coil":
             (bit,) = await self._link.read_coils(address, 1)
         else:

@@ -161,15 +161,15 @@ class ModbusValue:
             (number,) = await self._link.read_holding(self._map.version_address, 1)
             version = f"{number / 100:.2f}"
         if self._rest is not None:
-            await self._set(self._rest)
-        await self._get()
+            await self._write_value(self._rest)
+        await self._read_value()
         return DeviceIdentity("Modbus device", "", version, detail, self._map.limits)
 
     async def close(self) -> None:
         """Put an actuator to rest and disconnect. Never raises."""
         if self._rest is not None:
             with contextlib.suppress(LinkError):  # out of reach
-                await self._set(self._rest)
+                await self._write_value(self._rest)
         await self._link.close()
 
     def describe(self) -> dict[str, str]:
@@ -184,7 +184,7 @@ class ModbusValue:
             else {**found, "watchdog": "none known: check what its output does alone"}
         )
 
-    async def _get(self) -> float:
+    async def _read_value(self) -> float:
         read = self._link.read_input if self._map.function == "input" else self._link.read_holding
         value = self._map.decode(await read(self._map.address, self._map.words))
         if not self._map.allows(value):
@@ -195,7 +195,7 @@ class ModbusValue:
             )
         return value
 
-    async def _set(self, value: float) -> None:
+    async def _write_value(self, value: float) -> None:
         words = self._map.encode(value)
         if len(words) == 1:
             await self._link.write_register(self._map.address, words[0])
@@ -206,34 +206,34 @@ class ModbusValue:
         """As `DisplacementSensor`; counter and time are of arrival; a frozen register is not
         detected.
         """
-        value_um = await self._get()
+        value_um = await self._read_value()
         self._samples += 1
         return DisplacementSample(value_um, 0, self._samples, self._clock())
 
     async def gauge_pressure_pa(self) -> float:
         """As `PressureSensor`."""
-        return await self._get()
+        return await self._read_value()
 
     async def ambient_pressure_pa(self) -> float:
         """As `Barometer`."""
-        return await self._get()
+        return await self._read_value()
 
     async def air_temperature_c(self) -> float:
         """As `Thermometer`."""
-        return await self._get()
+        return await self._read_value()
 
     async def set_pump(self, fraction: float) -> None:
         """As `Pump`."""
-        await self._set(fraction)
+        await self._write_value(fraction)
 
     async def pump_fraction(self) -> float:
         """As `Pump`: what its register holds."""
-        return await self._get()
+        return await self._read_value()
 
     async def set_vent(self, fraction: float) -> None:
         """As `Vent`."""
-        await self._set(fraction)
+        await self._write_value(fraction)
 
     async def vent_fraction(self) -> float:
         """As `Vent`: what its register holds."""
-        return await self._get()
+        return await self._read_value()

@@ -132,11 +132,11 @@ class Optoncdt1420:
             with contextlib.suppress(
                 roles.DeviceRefusedError
             ):  # refused together with a half-sent earlier command
-                await self._command("OUTPUT NONE")
-            await self._command("OUTPUT NONE")
+                await self._send_command("OUTPUT NONE")
+            await self._send_command("OUTPUT NONE")
             identity = await self._identify()
-            for setting in self._settings():
-                await self._set(setting)
+            for setting in self._list_settings():
+                await self._write_setting(setting)
             self._port.write(b"OUTPUT RS422\n")  # stream data mixed with this answer are skipped
             self._heard = None
             await self._first_readings()
@@ -146,7 +146,7 @@ class Optoncdt1420:
         self._port.succeeded()
         return identity
 
-    def _settings(self) -> list[str]:
+    def _list_settings(self) -> list[str]:
         return [
             f"MEASRATE {self._config.rate_khz:g}",
             "LASERPOW FULL",
@@ -156,7 +156,7 @@ class Optoncdt1420:
         ]
 
     async def _identify(self) -> roles.DeviceIdentity:
-        text = await self._command("GETINFO")
+        text = await self._send_command("GETINFO")
         fields = dict(re.findall(r"^\s*([\w. -]+?):\s*(.*?)\s*$", text, re.MULTILINE))
         name, measuring_range = fields.get("Name", ""), fields.get("Measuring range", "")
         found = re.match(r"([\d.]+)\s*mm", measuring_range)
@@ -180,17 +180,17 @@ class Optoncdt1420:
             name, serial, version, f"{self._range_mm:g} mm", (min(ends), max(ends))
         )
 
-    async def _set(self, setting: str) -> None:
+    async def _write_setting(self, setting: str) -> None:
         name = setting.split()[0]
-        await self._command(setting)
-        text = await self._command(name)
+        await self._send_command(setting)
+        text = await self._send_command(name)
         found = re.search(rf"^\s*{name} +(.+?)\s*$", text, re.MULTILINE)
         if found is None or _format_rate(found[1]) != _format_rate(setting.split()[1]):
             raise roles.DeviceRefusedError(
                 f"{self._port.name}: set {setting!r}, read back {text.strip()[:60]!r}"
             )
 
-    async def _command(self, command: str) -> str:
+    async def _send_command(self, command: str) -> str:
         """The answer without its prompt. Raises LinkError, DeviceRefusedError."""
         self._heard = b""
         self._port.write(command.encode("ascii") + b"\n")
@@ -198,7 +198,7 @@ class Optoncdt1420:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._config.timeout_s):
                 while not self._heard.rstrip().endswith(_PROMPT):
-                    await self._stirred()
+                    await self._wait_for_bytes()
         if not self._heard.rstrip().endswith(
             _PROMPT
         ):  # it may have arrived while this process was suspended
@@ -228,7 +228,7 @@ class Optoncdt1420:
         """The gate wants a second reading to confirm the first."""
         for _ in range(2):
             await self._wait_for_values()
-            values = self._taken()
+            values = self._take_batches()
             good = values[values <= _RAW_MAX]
             if len(good):
                 self._gate.passes(self._displacement_um(middle_mean(good)))
@@ -254,7 +254,7 @@ class Optoncdt1420:
             ) from error
         self._silent = 0
         self._port.succeeded()
-        values = self._taken()
+        values = self._take_batches()
         good = values[values <= _RAW_MAX]
         if 2 * len(good) <= len(values):
             codes, counts = np.unique(values[values > _RAW_MAX], return_counts=True)
@@ -281,18 +281,18 @@ class Optoncdt1420:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._config.timeout_s):
                 while not self._batches:
-                    await self._stirred()
+                    await self._wait_for_bytes()
         if not self._batches:
             raise roles.LinkError(
                 f"{self._port.name}: no value within {self._config.timeout_s:g} s"
             )
 
-    def _taken(self) -> NDArray[np.int64]:
+    def _take_batches(self) -> NDArray[np.int64]:
         values = np.concatenate(self._batches)
         self._batches.clear()
         return values
 
-    async def _stirred(self) -> None:
+    async def _wait_for_bytes(self) -> None:
         """Wait for bytes or the end of the link. Raises LinkDownError."""
         self._stir.clear()
         await self._stir.wait()

@@ -82,7 +82,7 @@ class PumpBoard:
         """
         identity = await self.identify()
         try:
-            await self._arm()
+            await self._arm_watchdog()
         except roles.LinkError:
             await self._link.close()
             raise
@@ -118,7 +118,7 @@ class PumpBoard:
                 "update the firmware or the program"
             )
         self._registers = register_map.known_maps()[version]
-        found = await self._read(self._registers.block("identity"))
+        found = await self._read_block(self._registers.block("identity"))
         firmware = int(found["firmware_version"])
         return roles.BenchIdentity(
             _KIND,
@@ -133,15 +133,16 @@ class PumpBoard:
             interlocks_fitted=int(found.get("interlocks_fitted", 0)),
         )
 
-    async def _arm(self) -> None:
+    async def _arm_watchdog(self) -> None:
         try:
             await self._write_settings(arm=1.0)
         except roles.DeviceBusyError:
             raise await self._held_by_another() from None
-        settings = await self._read(self._registers.block("settings"))
-        sensors = await self._sensors()
+        settings = await self._read_block(self._registers.block("settings"))
+        sensors = await self._read_sensors()
         set_s = settings["watchdog_period_s"]
-        if (set_s, settings["watchdog_arm"]) != (self._watchdog_s, 1.0) or self._foreign(sensors):
+        as_written = (set_s, settings["watchdog_arm"]) == (self._watchdog_s, 1.0)
+        if not as_written or self._find_foreign_settings(sensors):
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: watchdog set to {self._watchdog_s:g} s and armed, read "
                 f"back as {set_s:g} s, "
@@ -154,7 +155,7 @@ class PumpBoard:
         self._armed, self._busy_writes = True, 0
 
     async def _held_by_another(self) -> roles.DeviceBusyError:
-        sensors = await self._sensors()
+        sensors = await self._read_sensors()
         period_s = sensors["period_in_force_s"]
         return roles.DeviceBusyError(
             f"{self._link.name}: another program holds the board (claim "
@@ -170,7 +171,7 @@ class PumpBoard:
         lost its
         settings: call `open` again).
         """
-        values = await self._sensors()
+        values = await self._read_sensors()
         if self._armed and not values["watchdog_armed"]:
             await self._link.close()
             raise roles.LinkDownError(
@@ -189,11 +190,11 @@ class PumpBoard:
             device_time_s=values["device_time_s"] + values["device_time_fraction_s"],
             watchdog_tripped=bool(values["watchdog_tripped"]),
             latched_faults=int(values["latched_faults"]),
-            foreign=self._foreign(values) if self._armed else 0,
+            foreign=self._find_foreign_settings(values) if self._armed else 0,
             interlock_inputs=int(values.get("interlock_inputs", 0)),
         )
 
-    def _foreign(self, sensors: Mapping[str, float]) -> int:
+    def _find_foreign_settings(self, sensors: Mapping[str, float]) -> int:
         """Which of claim and period in force differ from what this object set; a board without
         claims cannot tell.
         """
@@ -222,7 +223,7 @@ class PumpBoard:
             "command_key": self._claim_key,
         }
         try:
-            await self._write("command", values)
+            await self._write_block("command", values)
         except roles.DeviceBusyError:
             self._busy_writes += 1
             raise
@@ -232,7 +233,7 @@ class PumpBoard:
         """Clear these latched faults of the board; the pump stays off until the next `write`.
         Raises LinkError.
         """
-        await self._write("reset", {"clear_faults": mask, "clear_key": self._claim_key})
+        await self._write_block("reset", {"clear_faults": mask, "clear_key": self._claim_key})
 
     async def stop(self) -> None:
         """Stop the pump of a board that was identified, whoever holds it; the vent stays as it is.
@@ -247,7 +248,7 @@ class PumpBoard:
                 self._registers.register("pump_command_fraction").address, 0
             )
         else:
-            await self._write("stop", {"stop": 1.0})
+            await self._write_block("stop", {"stop": 1.0})
 
     def dead_guards(self) -> tuple[str, ...]:
         """None: the watchdog is the board's own, and its state is in each reading."""
@@ -269,18 +270,18 @@ class PumpBoard:
         self._armed = False
         await self._link.close()
 
-    async def _read(self, block: register_map.Block) -> dict[str, float]:
+    async def _read_block(self, block: register_map.Block) -> dict[str, float]:
         return block.decode(await self._link.read_holding(block.address, block.count))
 
-    async def _sensors(self) -> dict[str, float]:
-        return await self._read(self._registers.block("sensors"))
+    async def _read_sensors(self) -> dict[str, float]:
+        return await self._read_block(self._registers.block("sensors"))
 
     async def _write_settings(self, arm: float) -> None:
         claim = {"claim_id": self._claim_id, "claim_key": self._claim_key}
-        await self._write(
+        await self._write_block(
             "settings", {"watchdog_period_s": self._watchdog_s, "watchdog_arm": arm, **claim}
         )
 
-    async def _write(self, name: str, values: Mapping[str, float]) -> None:
+    async def _write_block(self, name: str, values: Mapping[str, float]) -> None:
         block = self._registers.block(name)
         await self._link.write_registers(block.address, block.encode(values))

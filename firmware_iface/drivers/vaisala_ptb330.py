@@ -79,7 +79,7 @@ class VaisalaPtb330(exchange.LineDriver):
             None,
         )
         identity = await self._opened(self._begin, "\r\nS\r\nECHO OFF\r\n")
-        self._task = asyncio.create_task(self._run(), name="barometer")
+        self._task = asyncio.create_task(self._keep_reading(), name="barometer")
         return identity
 
     async def _begin(self) -> roles.DeviceIdentity:
@@ -88,7 +88,7 @@ class VaisalaPtb330(exchange.LineDriver):
             identity = await self._identify()
             await self._apply_settings()
             self._identity = identity
-            await self._refresh()
+            await self._read_message()
         return identity
 
     async def _known_again(self) -> roles.DeviceIdentity | None:
@@ -97,7 +97,7 @@ class VaisalaPtb330(exchange.LineDriver):
         """
         if self._identity is not None:
             try:
-                await self._refresh()
+                await self._read_message()
             except roles.LinkDownError:
                 raise
             except roles.LinkError:
@@ -124,18 +124,18 @@ class VaisalaPtb330(exchange.LineDriver):
                 f"{self._link.name}: FORM set to {FORMAT!r}, read back {found.strip()!r}"
             )
 
-    async def _run(self) -> None:
+    async def _keep_reading(self) -> None:
         while True:
             await asyncio.sleep(self._period_s)
             try:
-                await self._refresh()
+                await self._read_message()
             except roles.LinkDownError as error:
                 self._down = error
                 return
             except roles.LinkError:
                 pass  # the age of the newest value shows it
 
-    async def _refresh(self) -> None:
+    async def _read_message(self) -> None:
         answer = await self._link.query("SEND", _MESSAGE)
         message = decode_message(answer, self._link.name)
         if self._identity is not None and message.serial != self._identity.serial:

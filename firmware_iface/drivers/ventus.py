@@ -89,7 +89,7 @@ class Ventus(exchange.LineDriver):
             raise ValueError(f"pump fraction = {fraction} is not within 0..1")
         self._commanded_mw = fraction * self._power_max_mw
         writes = {SET_VALUE: self._commanded_mw, ENABLE: float(_ON if fraction > 0 else _OFF)}
-        await self._check(await self._write_and_read(writes, *_STATE))
+        await self._check_state(await self._write_and_read(writes, *_STATE))
 
     async def pump_fraction(self) -> float:
         """Read back the pump's setting.
@@ -97,9 +97,9 @@ class Ventus(exchange.LineDriver):
         Raises LinkError (no valid answer, or the pump reports an error), LinkDownError (the port is
         gone, or the pump has a setting that nobody commanded: open it again).
         """
-        return await self._check(await self._write_and_read({}, *_STATE)) / self._power_max_mw
+        return await self._check_state(await self._write_and_read({}, *_STATE)) / self._power_max_mw
 
-    async def _check(self, state: dict[int, float]) -> float:
+    async def _check_state(self, state: dict[int, float]) -> float:
         """Power in mW if all is as commanded; asked once more before a difference is accepted."""
         if not self._as_commanded(state):
             state = await self._write_and_read({}, *_STATE)

@@ -54,26 +54,26 @@ class Optoncdt1420Emulator(LineDevice):
     def restart(self) -> None:
         """Settings that were not stored are lost, so it does not stream."""
         super().restart()
-        self._stop()
+        self._stop_stream()
         self._register = dict(_DEFAULTS)
         self._counter = 0
 
     def detach(self) -> None:
         """The wire is pulled."""
-        self._stop()
+        self._stop_stream()
         super().detach()
 
     def attach(self, transmit: Transmit) -> None:
         """The wire is plugged in; it goes on streaming if it was."""
         super().attach(transmit)
         if self._register["OUTPUT"] == "RS422":
-            self._start()
+            self._start_stream()
 
     def line(self, text: str) -> None:
         """One command."""
         name, _, value = text.partition(" ")
         if name == "GETINFO":
-            answer = self._about()
+            answer = self._format_identity()
         elif name not in self._register:
             answer = "E210 Unknown command\r\n"
         elif not value:
@@ -82,13 +82,13 @@ class Optoncdt1420Emulator(LineDevice):
             answer = "E236 Value is out of range or the format is invalid\r\n"
         else:
             self._register[name] = value
-            self._stop()
+            self._stop_stream()
             answer = "\r\n"
         self.say(answer.encode("ascii") + b"->")
         if self._register["OUTPUT"] == "RS422" and self._stream is None:
-            self._start()
+            self._start_stream()
 
-    def _about(self) -> str:
+    def _format_identity(self) -> str:
         return (
             f"Name:             {self._name}\r\nSerial:           15030002\r\nOption:        "
             "   000\r\n"
@@ -97,26 +97,26 @@ class Optoncdt1420Emulator(LineDevice):
             "Version:          001.010\r\nHardware-rev:     00\r\nBoot-version:     001.000\r\n"
         )
 
-    def _start(self) -> None:
+    def _start_stream(self) -> None:
         loop = asyncio.get_running_loop()
         self._streamed_s = loop.time()
-        self._stream = loop.call_later(_PERIOD_S, self._portion)
+        self._stream = loop.call_later(_PERIOD_S, self._send_portion)
 
-    def _stop(self) -> None:
+    def _stop_stream(self) -> None:
         if self._stream is not None:
             self._stream.cancel()
             self._stream = None
 
-    def _portion(self) -> None:
+    def _send_portion(self) -> None:
         """Send the measurements since the last portion."""
         loop = asyncio.get_running_loop()
         self._owed += (loop.time() - self._streamed_s) * 1000 * float(self._register["MEASRATE"])
         self._streamed_s = loop.time()
         count, self._owed = int(self._owed), self._owed % 1
         displacement_um = self._displacement_um() if count else math.nan
-        if data := b"".join(self._measurement(displacement_um) for _ in range(count)):
+        if data := b"".join(self._encode_measurement(displacement_um) for _ in range(count)):
             self.stream(data)
-        self._stream = loop.call_later(_PERIOD_S, self._portion)
+        self._stream = loop.call_later(_PERIOD_S, self._send_portion)
 
     def stream(self, data: bytes) -> None:
         """Send measurements."""
@@ -134,7 +134,7 @@ class Optoncdt1420Emulator(LineDevice):
             return NO_PEAK + 1  # peak before the range
         return digital if digital <= 65_520 else NO_PEAK + 2  # peak behind it
 
-    def _measurement(self, displacement_um: float) -> bytes:
+    def _encode_measurement(self, displacement_um: float) -> bytes:
         if not self.frozen:
             self._raw = self.digital(displacement_um)
             self._counter = (self._counter + 1) % 2**18

@@ -50,18 +50,18 @@ class Mks937bEmulator(LineDevice):
                 return f"NAK{_ARGUMENT}"
             self.unit = command[2:].upper()
             return f"ACK{self.unit}"
-        told = self._told(command[:-1]) if command.endswith("?") else None
+        told = self._answer_setting(command[:-1]) if command.endswith("?") else None
         return f"NAK{_SYNTAX}" if told is None else f"ACK{told}"
 
-    def _told(self, name: str) -> str | None:
+    def _answer_setting(self, name: str) -> str | None:
         if len(name) == 3 and name[:2] == "ST" and name[2] in "ABC":
             first = 2 * "ABC".index(name[2])
             return "".join(self.sensors[first : first + 2])
         if len(name) == 3 and name[:2] == "PR" and name[2] in "123456":
-            return self._pressure(self.sensors[int(name[2]) - 1])
+            return self._format_pressure(self.sensors[int(name[2]) - 1])
         return {"MD": self.model, "SN": self.serial, "FV6": "1.27", "U": self.unit}.get(name)
 
-    def _pressure(self, sensor: str) -> str:
+    def _format_pressure(self, sensor: str) -> str:
         if sensor != "CM":
             return "NOGAUGE!"
         if not self.frozen:
@@ -116,7 +116,7 @@ class VaisalaPtb330Emulator(LineDevice):
     def _run(self) -> None:
         self._stream = None
         if self._running:
-            self.say(self._message())
+            self.say(self._format_message())
             self._stream = asyncio.get_running_loop().call_later(_PERIOD_S, self._run)
 
     def line(self, text: str) -> None:
@@ -130,16 +130,16 @@ class VaisalaPtb330Emulator(LineDevice):
     def _answer(self, text: str) -> bytes:
         command, _, rest = text.partition(" ")
         if command.upper() == "SEND":
-            return self._message()
-        return self._words(command.upper(), rest).replace("\n", "\r\n").encode("ascii")
+            return self._format_message()
+        return self._answer_command(command.upper(), rest).replace("\n", "\r\n").encode("ascii")
 
-    def _words(self, command: str, rest: str) -> str:
+    def _answer_command(self, command: str, rest: str) -> str:
         if command == "S":
             self._running = False
         elif command == "VERS":
             return f"{self._model} / 1.01\n"
         elif command == "?":
-            return self._about()
+            return self._format_identity()
         elif command == "ERRS":
             return "PASS\nNo errors\n" if "1" not in self.error_flags else "FAIL\nModule error\n"
         elif command == "ECHO":
@@ -157,7 +157,7 @@ class VaisalaPtb330Emulator(LineDevice):
             return "Unknown command\n"
         return ""
 
-    def _about(self) -> str:
+    def _format_identity(self) -> str:
         modules = "".join(
             f"Module {n}       : {'BARO-1' if n < 4 else 'EMPTY'}\n" for n in range(1, 5)
         )
@@ -171,7 +171,7 @@ class VaisalaPtb330Emulator(LineDevice):
             f"Echo           : {'ON' if self._echo else 'OFF'}\n{modules}"
         )
 
-    def _message(self) -> bytes:
+    def _format_message(self) -> bytes:
         """Table 12 (page 71): number format before a quantity, quoted text as it is, the rest by
         name.
         """
@@ -183,10 +183,10 @@ class VaisalaPtb330Emulator(LineDevice):
             if number := re.fullmatch(r"(\d)\.(\d)", word):
                 digits, decimals = int(number[1]), int(number[2])
             else:
-                text += self._field(word, text, digits, decimals)
+                text += self._format_field(word, text, digits, decimals)
         return text.encode("ascii")
 
-    def _field(self, word: str, so_far: str, digits: int, decimals: int) -> str:
+    def _format_field(self, word: str, so_far: str, digits: int, decimals: int) -> str:
         if word.startswith('"'):
             return word[1:-1]
         width = digits + 1 + decimals

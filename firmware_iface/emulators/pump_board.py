@@ -119,7 +119,7 @@ class BoardState:
         # time of pumping since it changed, or since a person cleared `gauge_lost`
         self._gauge_same_s = 0.0
         self._watch_gauge(0.0)
-        self._protect()
+        self._protect_pump()
 
     @property
     def pump_fraction(self) -> float:
@@ -152,14 +152,14 @@ class BoardState:
         self._now_s = now_s
         self._sample = sample
         if sample.gauge_pressure_pa > GAUGE_PRESSURE_LIMIT_PA:
-            self._latch(self._over_pressure_mask)
+            self._latch_fault(self._over_pressure_mask)
         self._watch_gauge(passed_s)
-        self._protect()
+        self._protect_pump()
         if (
             self._settable["watchdog_arm"]
             and now_s - self._fed_s > self._settable["watchdog_period_s"]
         ):
-            self._latch(self._watchdog_mask)
+            self._latch_fault(self._watchdog_mask)
 
     def _watch_gauge(self, passed_s: float) -> None:
         """Note when the gauge had a value, and for how long of pumping it has repeated it."""
@@ -179,7 +179,7 @@ class BoardState:
         frozen = 0 < stored.gauge_frozen_s < self._gauge_same_s
         return stored.gauge_fitted and (missing or frozen)
 
-    def _protect(self) -> None:
+    def _protect_pump(self) -> None:
         """Stop a pump whose gauge is lost, and latch an open interlock.
 
         Judged with every sample and after every write, so that no command drives the pump even for
@@ -190,9 +190,9 @@ class BoardState:
         if not self._guards:
             return
         if self._settable["pump_command_fraction"] > 0 and self._gauge_lost:
-            self._latch(self._gauge_lost_mask)
+            self._latch_fault(self._gauge_lost_mask)
         if self.stored.interlocks_fitted & ~self._sample.interlock_inputs:
-            self._latch(self._interlock_mask)
+            self._latch_fault(self._interlock_mask)
 
     @property
     def held(self) -> bool:
@@ -205,7 +205,7 @@ class BoardState:
             and self._now_s - self._fed_s <= self._settable["watchdog_period_s"]
         )
 
-    def _latch(self, mask: int) -> None:
+    def _latch_fault(self, mask: int) -> None:
         self._faults |= mask
         # so that nothing moves when the fault is cleared
         self._settable["pump_command_fraction"] = 0.0
@@ -214,7 +214,7 @@ class BoardState:
         """Words of one instant. Raises RegisterRefusal (illegal address) if one of them does not
         exist.
         """
-        values = self._values()
+        values = self._collect_values()
         whole = self._by_span.get((address, count))
         if whole is not None:
             return whole.encode(values)
@@ -245,8 +245,8 @@ class BoardState:
         if disarms and self._settable["pump_command_fraction"] > 0:
             raise RegisterRefusal(ILLEGAL_VALUE)
         if self._claims and target.name == "settings":
-            self._claim(written)
-        self._apply(written, whole_command=target.registers == self._command.registers)
+            self._update_claim(written)
+        self._apply_settings(written, whole_command=target.registers == self._command.registers)
 
     def _check_claim(self, block: str, written: dict[str, float]) -> None:
         key = _KEYS.get(block)
@@ -257,7 +257,7 @@ class BoardState:
         if not written.get("watchdog_arm"):  # only arming makes a claim
             raise RegisterRefusal(ILLEGAL_VALUE)
 
-    def _claim(self, written: dict[str, float]) -> None:
+    def _update_claim(self, written: dict[str, float]) -> None:
         """Arming claims the board, disarming gives it back; a new claim has a whole period from now
         on.
         """
@@ -284,7 +284,7 @@ class BoardState:
             address += register.words
         return make_block("write", "rw", "", found)
 
-    def _apply(self, written: dict[str, float], *, whole_command: bool) -> None:
+    def _apply_settings(self, written: dict[str, float], *, whole_command: bool) -> None:
         arms = bool(written.get("watchdog_arm")) and not self._settable["watchdog_arm"]
         feeds = whole_command and written["heartbeat"] != self._heartbeat_fed
         self._settable |= written
@@ -296,14 +296,14 @@ class BoardState:
             self._settable["pump_command_fraction"] = 0.0
         self._settable["clear_faults"] = 0.0
         if written.get("stop"):
-            self._latch(self._stopped_mask)
+            self._latch_fault(self._stopped_mask)
         if arms or feeds or cleared & self._watchdog_mask:
             self._fed_s = self._now_s
         if cleared & self._gauge_lost_mask:
             self._gauge_same_s = 0.0  # a gauge at rest shows that it works only once the pump runs
-        self._protect()
+        self._protect_pump()
 
-    def _values(self) -> dict[str, float]:
+    def _collect_values(self) -> dict[str, float]:
         sample = self._sample
         whole_s = int(sample.device_time_s)
         return {
@@ -409,7 +409,7 @@ class PumpBoardEmulator:
         `drop_connections`).
         """
         self.state.restart()
-        self._actuate()
+        self._drive_outputs()
 
     def drop_connections(self) -> None:
         """Hang up on all clients."""
@@ -423,13 +423,13 @@ class PumpBoardEmulator:
     def _advance(self) -> None:
         self._sample = self.newest()
         self.state.advance(self._clock(), self._sample)
-        self._actuate()
+        self._drive_outputs()
 
     def newest(self) -> BoardSample:
         """The sample of the sensors now."""
         return self._plant.sample()
 
-    def _actuate(self) -> None:
+    def _drive_outputs(self) -> None:
         outputs = (self.state.pump_fraction, self.state.vent_fraction)
         if outputs != self._actuated:
             self._actuated = outputs
@@ -444,5 +444,5 @@ class PumpBoardEmulator:
         """Carry out a request."""
         self._advance()
         reply = modbus_pdu.answer_request(pdu, self.state)
-        self._actuate()
+        self._drive_outputs()
         return modbus_server.Answer(reply)

@@ -61,7 +61,7 @@ class VentusEmulator(LineDevice):
     def attach(self, transmit: Transmit) -> None:
         """The wire is plugged in."""
         super().attach(transmit)
-        self._act()
+        self._set_flow()
 
     def detach(self) -> None:
         """The wire is pulled: the pump runs on."""
@@ -74,7 +74,7 @@ class VentusEmulator(LineDevice):
         """Back to the stored settings."""
         super().restart()
         self.registers = dict(_DEFAULTS)
-        self._act()
+        self._set_flow()
 
     def line(self, text: str) -> None:
         """One command; anything else is ignored."""
@@ -85,7 +85,7 @@ class VentusEmulator(LineDevice):
             self._read(int(found[3]))
         elif (number := int(found[1])) in self.registers and number not in _VENTUS_READ_ONLY:
             self.registers[number] = float(found[2])
-            self._act()
+            self._set_flow()
 
     def _read(self, number: int) -> None:
         if number in self.registers:
@@ -93,7 +93,7 @@ class VentusEmulator(LineDevice):
             text = f"{value:.3f}" if number in _FLOATS else f"{value:.0f}"
             self.say(f"#R{number},{text}\n".encode("ascii"))
 
-    def _act(self) -> None:
+    def _set_flow(self) -> None:
         fraction = min(max(self._power_mw() / self._power_max_mw, 0.0), 1.0)
         if fraction != self._driven:
             self._driven = fraction
@@ -115,7 +115,7 @@ class VentusEmulator(LineDevice):
                     "ascii"
                 )
             )
-            self._act()
+            self._set_flow()
 
 
 class Instrument:
@@ -168,9 +168,9 @@ class Instrument:
         """A parameter as bytes, big end first; a text has its full length."""
         if parameter.kind == "text":
             return self._texts[parameter].encode().ljust(parameter.chars, b"\0")[: parameter.chars]
-        return struct.pack(_FORMATS[parameter.kind], self._number(parameter))
+        return struct.pack(_FORMATS[parameter.kind], self._read_parameter(parameter))
 
-    def _number(self, parameter: bronkhorst.InstrumentParameter) -> float:
+    def _read_parameter(self, parameter: bronkhorst.InstrumentParameter) -> float:
         if parameter in self._settings:
             return self._settings[parameter]
         measured = self.fraction * self._capacity if self._measured is None else self._measured()
@@ -256,14 +256,14 @@ class ProparDevice(serial_device.SerialDevice):
         if b"\x10\x02" in self._heard:
             messages, self._heard = bronkhorst_propar.split_binary(self._heard)
             for message in messages:
-                self._hear(message, bronkhorst_propar.binary_frame)
+                self._handle_frame(message, bronkhorst_propar.binary_frame)
         while b"\r\n" in self._heard:
             line, self._heard = self._heard.split(b"\r\n", 1)
             ascii_message = bronkhorst_propar.parse_ascii(line)
             if ascii_message is not None:
-                self._hear(ascii_message, bronkhorst_propar.ascii_frame)
+                self._handle_frame(ascii_message, bronkhorst_propar.ascii_frame)
 
-    def _hear(
+    def _handle_frame(
         self,
         message: bronkhorst_propar.ProparMessage,
         frame: Callable[[bronkhorst_propar.ProparMessage], bytes],
@@ -279,9 +279,9 @@ class ProparDevice(serial_device.SerialDevice):
 
     def _answer(self, data: bytes) -> bytes:
         if data[0] == bronkhorst_propar.REQUEST:
-            return self._values(data)
+            return self._answer_request(data)
         if data[0] in (bronkhorst_propar.WRITE, bronkhorst_propar.VALUES):
-            status = self._written(data)
+            status = self._write_parameters(data)
             return (
                 bytes([bronkhorst_propar.STATUS, status, len(data)])
                 if data[0] == bronkhorst_propar.WRITE
@@ -289,7 +289,7 @@ class ProparDevice(serial_device.SerialDevice):
             )
         return bytes([bronkhorst_propar.STATUS, _COMMAND_ERROR, 0])
 
-    def _written(self, data: bytes) -> int:
+    def _write_parameters(self, data: bytes) -> int:
         for process, number, raw in bronkhorst_propar.parse_values(data):
             parameter = _BY_PLACE.get((process, number))
             if parameter is None:
@@ -302,7 +302,7 @@ class ProparDevice(serial_device.SerialDevice):
                 return _VALUE_ERROR
         return 0
 
-    def _values(self, data: bytes) -> bytes:
+    def _answer_request(self, data: bytes) -> bytes:
         """The answer to a request: each value under the indices that the request gave it."""
         answer, at, chained = bytearray([bronkhorst_propar.VALUES]), 1, False
         while at < len(data):

@@ -57,7 +57,7 @@ class SerialDevice:
 
     def hear(self, data: bytes) -> None:
         """Bytes begin to arrive; the device gets them when the last one is in."""
-        self._later(
+        self._call_later(
             asyncio.get_running_loop().time() + len(data) * self.settings.char_s, self.arrived, data
         )
 
@@ -73,13 +73,13 @@ class SerialDevice:
         """Send an answer after the bytes being sent."""
         begin_s = max(asyncio.get_running_loop().time() + delay_s, self._free_s)
         self._free_s = begin_s + len(answer) * self.settings.char_s
-        self._later(self._free_s, self._sent, answer)
+        self._call_later(self._free_s, self._transmit_bytes, answer)
 
-    def _sent(self, data: bytes) -> None:
+    def _transmit_bytes(self, data: bytes) -> None:
         if self._transmit is not None and data:
             self._transmit(data)
 
-    def _later(self, when_s: float, call: Callable[[bytes], None], data: bytes) -> None:
+    def _call_later(self, when_s: float, call: Callable[[bytes], None], data: bytes) -> None:
         def run() -> None:
             self._due.discard(timer)
             call(data)
@@ -157,16 +157,16 @@ class PtyWire:
         if self._ends is None:
             return
         data = os.read(self._ends[0], _READ_BYTES)
-        self._device.hear(self._seen(data))
+        self._device.hear(self._distort_bytes(data))
 
     def _transmit(self, data: bytes) -> None:
         if self._ends is not None:
             with contextlib.suppress(
                 BlockingIOError
             ):  # nobody reads: lost, as on a line without flow control
-                os.write(self._ends[0], self._seen(data))
+                os.write(self._ends[0], self._distort_bytes(data))
 
-    def _seen(self, data: bytes) -> bytes:
+    def _distort_bytes(self, data: bytes) -> bytes:
         """The bytes as the other end receives them: at another baud rate, garbage."""
         assert self._ends is not None
         same = termios.tcgetattr(self._ends[0])[_SPEED] == _read_baud_rate(self._device)

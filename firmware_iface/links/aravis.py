@@ -161,19 +161,21 @@ class Aravis:
 
     def set_double(self, instance: int, name: str, value: float) -> None:
         """Set a property of type double."""
-        self._set(instance, name, _G_TYPE_DOUBLE, "g_value_set_double", value)
+        self._set_property(instance, name, _G_TYPE_DOUBLE, "g_value_set_double", value)
 
     def set_int(self, instance: int, name: str, value: int) -> None:
         """Set a property of type int."""
-        self._set(instance, name, _G_TYPE_INT, "g_value_set_int", value)
+        self._set_property(instance, name, _G_TYPE_INT, "g_value_set_int", value)
 
     def fix_socket_buffer(self, stream: int, size_bytes: int) -> None:
         """Let a GigE Vision stream keep packets of this many bytes while it is busy."""
         kind = self.call("arv_gv_stream_socket_buffer_get_type")
-        self._set(stream, "socket-buffer", kind, "g_value_set_enum", 0)  # ..._FIXED, arvgvstream.h
+        self._set_property(
+            stream, "socket-buffer", kind, "g_value_set_enum", 0
+        )  # ..._FIXED, arvgvstream.h
         self.set_int(stream, "socket-buffer-size", size_bytes)
 
-    def _set(self, instance: int, name: str, kind: int, setter: str, value: float) -> None:
+    def _set_property(self, instance: int, name: str, kind: int, setter: str, value: float) -> None:
         holder = _GValue()
         self.call("g_value_init", ctypes.byref(holder), kind)
         self.call(setter, ctypes.byref(holder), value)

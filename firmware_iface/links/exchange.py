@@ -139,10 +139,10 @@ class SerialExchange:
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
             self._in_flight = asyncio.create_task(self._transact(question, timeout_s, fence, key))
-            self._in_flight.add_done_callback(self._ended)
+            self._in_flight.add_done_callback(self._release_turn)
             return await asyncio.shield(self._in_flight)
 
-    def _ended(self, task: asyncio.Task[bytes]) -> None:
+    def _release_turn(self, task: asyncio.Task[bytes]) -> None:
         self._turn.release()
         if not task.cancelled():
             task.exception()  # after a cancelled caller nobody else retrieves it
@@ -152,11 +152,11 @@ class SerialExchange:
     ) -> bytes:
         try:
             self._require_open(question.what)
-            await self._settle(question.what, timeout_s)
+            await self._wait_for_silence(question.what, timeout_s)
             if key not in self._sure and fence is not None:
-                await self._ask(fence, timeout_s)
-                await self._settle(question.what, timeout_s)
-            answer = await self._ask(question, timeout_s)
+                await self._ask_once(fence, timeout_s)
+                await self._wait_for_silence(question.what, timeout_s)
+            answer = await self._ask_once(question, timeout_s)
         except LinkDownError:
             raise
         except LinkError as error:
@@ -176,7 +176,7 @@ class SerialExchange:
             self.port.succeeded()
         return answer
 
-    async def _settle(self, what: str, timeout_s: float) -> None:
+    async def _wait_for_silence(self, what: str, timeout_s: float) -> None:
         """Wait for the silence that is due."""
         loop = asyncio.get_running_loop()
         give_up_s = loop.time() + 2 * self._quiet_s + timeout_s
@@ -191,7 +191,7 @@ class SerialExchange:
                 )
             await asyncio.sleep(wait_s)
 
-    async def _ask(self, question: Question, timeout_s: float) -> bytes:
+    async def _ask_once(self, question: Question, timeout_s: float) -> bytes:
         self._require_open(question.what)
         if self._echoes:
             self._echoes, self._repeated = False, b""
@@ -214,7 +214,7 @@ class SerialExchange:
             if self._heard == question.data:
                 raise DeviceRefusedError(f"{question.what}: {_ONLY_ECHO}")
             self._abandoned.append(_Abandoned(question, asked_s, self._heard))
-            raise LinkError(f"{question.what}: {self._missing(timeout_s)}")
+            raise LinkError(f"{question.what}: {self._explain_missing_answer(timeout_s)}")
         if answer.exception() is not None:  # its own answer may still come
             self._abandoned.append(_Abandoned(question, asked_s, b""))
             return answer.result()
@@ -228,7 +228,7 @@ class SerialExchange:
         if not self.port.is_open:
             raise LinkDownError(f"{what}: not connected")
 
-    def _missing(self, timeout_s: float) -> str:
+    def _explain_missing_answer(self, timeout_s: float) -> str:
         if slow := self._late.explain():
             return f"no answer within {timeout_s:g} s; {slow}"
         if not self._heard:

@@ -181,7 +181,7 @@ class GuardedModbusTcp:
         `write_registers`.
         """
         what = f"{self.name}: writing {address}"
-        reply = await self._exchange(
+        reply = await self._exchange_pdu(
             lambda client: client.write_register(address, word, device_id=self._unit_id),
             WRITE_SINGLE,
             what,
@@ -199,7 +199,7 @@ class GuardedModbusTcp:
         refused and changed nothing).
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
-        reply = await self._exchange(
+        reply = await self._exchange_pdu(
             lambda client: client.write_registers(address, list(words), device_id=self._unit_id),
             WRITE_MULTIPLE,
             what,
@@ -220,7 +220,7 @@ class GuardedModbusTcp:
             )
             return read(address, count=count, device_id=self._unit_id)
 
-        reply = await self._exchange(send, function_code, what)
+        reply = await self._exchange_pdu(send, function_code, what)
         if len(reply.registers) != count:
             raise LinkError(
                 f"{what}: {len(reply.registers)} registers instead of {count}; {SHORT_REPLY}"
@@ -237,7 +237,7 @@ class GuardedModbusTcp:
             )
             return read(address, count=count, device_id=self._unit_id)
 
-        reply = await self._exchange(send, function_code, what)
+        reply = await self._exchange_pdu(send, function_code, what)
         # the library gives all bits of the bytes that came
         if len(reply.bits) != 8 * bytes_of_bits(count):
             raise LinkError(
@@ -256,7 +256,7 @@ class GuardedModbusTcp:
         if self._in_flight is not None:
             await asyncio.wait([self._in_flight])
 
-    async def _exchange(
+    async def _exchange_pdu(
         self,
         send: Callable[[AsyncModbusTcpClient], Awaitable[ModbusPDU]],
         function_code: int,
@@ -264,10 +264,10 @@ class GuardedModbusTcp:
     ) -> ModbusPDU:
         await self._turn.acquire()  # cancelled while waiting here, a request is never sent
         self._in_flight = asyncio.create_task(self._transact(send, function_code, what))
-        self._in_flight.add_done_callback(self._ended)
+        self._in_flight.add_done_callback(self._release_turn)
         return await asyncio.shield(self._in_flight)
 
-    def _ended(self, task: asyncio.Task[ModbusPDU]) -> None:
+    def _release_turn(self, task: asyncio.Task[ModbusPDU]) -> None:
         self._turn.release()
         if not task.cancelled():
             task.exception()  # for a cancelled caller nobody else retrieves it

@@ -159,11 +159,11 @@ class SerialPort:
         if (wait_s := self.retry_in_s) > 0:
             raise LinkWaitsError(f"{self._port}: next attempt to open in {wait_s:.1f} s")
         self.close()
-        path = self._locate()
+        path = self._locate_port()
         self._back_off.attempted(self._clock())
         self._serial = _open_serial(path, self._port, self._settings)
         self._receiver = receiver
-        asyncio.get_running_loop().add_reader(self._serial.fileno(), self._readable)
+        asyncio.get_running_loop().add_reader(self._serial.fileno(), self._read_available)
 
     def write(self, data: bytes) -> None:
         """Hand over bytes for sending.
@@ -178,7 +178,7 @@ class SerialPort:
         except BlockingIOError:
             written = 0
         except OSError as error:
-            raise self._gone() from error
+            raise self._note_lost_port() from error
         if written != len(data):
             raise LinkError(
                 f"{self._port}: only {written} of {len(data)} bytes could be sent; is the "
@@ -201,7 +201,7 @@ class SerialPort:
         with contextlib.suppress(OSError):
             port.close()
 
-    def _locate(self) -> str:
+    def _locate_port(self) -> str:
         try:
             path = port_path(self._port)
         except LinkDownError:
@@ -212,7 +212,7 @@ class SerialPort:
             raise LinkDownError(f"{self._port}: {_REMEDIES[errno.ENOENT]}")
         return path
 
-    def _readable(self) -> None:
+    def _read_available(self) -> None:
         if self._serial is None or self._receiver is None:
             return
         try:
@@ -224,9 +224,9 @@ class SerialPort:
         if data:
             self._receiver.received(data)
         else:  # end of file on a tty is a hang-up
-            self._gone()
+            self._note_lost_port()
 
-    def _gone(self) -> LinkDownError:
+    def _note_lost_port(self) -> LinkDownError:
         receiver = self._receiver
         self.close()
         error = LinkDownError(f"{self._port}: the port is gone; is the adapter unplugged?")

@@ -129,12 +129,12 @@ def _probe_all(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.
                     "board" if devices.board else "devices", devices.name, problem=str(error)
                 )
             ], []
-        probes = asyncio.run(_probes(devices, not config.by_optics))
+        probes = asyncio.run(_make_probes(devices, not config.by_optics))
         circuits = asyncio.run(interlock_check.probe_interlocks(devices))
         return probes + probe_optics(config), circuits
 
 
-async def _probes(devices: DevicesConfig, laser: bool) -> list[DeviceProbe]:
+async def _make_probes(devices: DevicesConfig, laser: bool) -> list[DeviceProbe]:
     if devices.board is not None:
         return [
             await probe_board(bench.make_pump_board(devices, devices.board), devices.board, laser)
@@ -280,7 +280,7 @@ async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> Device
     """
     try:
         identity = await board.identify()
-        reading, p50_ms, p99_ms = await _timed(board.read)
+        reading, p50_ms, p99_ms = await _time_reads(board.read)
     except roles.LinkError as error:
         return DeviceProbe("board", name, problem=str(error))
     finally:
@@ -318,20 +318,20 @@ async def probe_roles(devices: role_bench.RoleDevices) -> list[DeviceProbe]:
     probes = []
     for role, device in devices.by_role().items():
         read, unit = roles.ROLES[role].reads, roles.ROLES[role].unit
-        probes.append(await _probe(role, device, getattr(device, read), unit))
+        probes.append(await _probe_role(role, device, getattr(device, read), unit))
         if probes[-1].problem:
             await asyncio.sleep(_BACK_OFF_S)
     return probes
 
 
-async def _probe(
+async def _probe_role(
     role: str, device: roles.Device, read: Callable[[], Awaitable[Any]], unit: str
 ) -> DeviceProbe:
     where = device.describe()
     name, notes = where.get("port", ""), where.get("watchdog", "")
     try:
         found = await role_bench.answer(role, device.open())
-        value, p50_ms, p99_ms = await _timed(lambda: role_bench.answer(role, read()))
+        value, p50_ms, p99_ms = await _time_reads(lambda: role_bench.answer(role, read()))
     except roles.LinkError as error:
         return DeviceProbe(role, name, problem=str(error), notes=notes)
     finally:
@@ -360,7 +360,7 @@ async def _probe(
     )
 
 
-async def _timed(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]:
+async def _time_reads(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]:
     """Last value of many reads, and their duration (p50, p99) in ms."""
     took_ms: list[float] = []
     give_up_s = time.monotonic() + _LONGEST_S

@@ -72,12 +72,12 @@ class _Stopped:
 
 def _try_to_stop(devices: DevicesConfig) -> _Stopped:
     try:
-        return asyncio.run(_stop(devices))
+        return asyncio.run(_stop_pump(devices))
     except DeviceError as error:
         return _Stopped(problem=str(error))
 
 
-async def _stop(devices: DevicesConfig) -> _Stopped:
+async def _stop_pump(devices: DevicesConfig) -> _Stopped:
     """Stop the pump at the device. Raises DeviceError."""
     if devices.board is None:
         return await _stop_instrument(devices)
@@ -127,14 +127,14 @@ async def _after_a_run(devices: DevicesConfig) -> str:
         identity = await bench.retry_connecting(board.identify, devices.board)
         if identity.map_version == 1:
             await board.stop()
-        return _describe_reading(devices, await _standing(board, devices.watchdog_s))
+        return _describe_reading(devices, await _read_stopped_board(board, devices.watchdog_s))
     except LinkError as error:
         raise DeviceError(f"{error}; the board's watchdog stops the pump by itself") from None
     finally:
         await board.close()
 
 
-async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
+async def _read_stopped_board(board: PumpBoard, watchdog_s: float) -> BenchReading:
     """Reading of a stopped pump; a pump still running after the watchdog period is stopped, which
     latches.
     """

@@ -222,8 +222,8 @@ class CentreFilter:
     def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
         """One tick: predict, then take what was read. `dt_s` must exceed 0."""
         self._jumped, self._jumped_sensors, self._judged = [], [], given.judged
-        self._predict(given, dt_s)
-        self._clone(given.now_s)
+        self._predict_states(given, dt_s)
+        self._clone_centre(given.now_s)
         for watch in self.memory.watches:
             watch.pull *= math.exp(-dt_s / _SHARE_S)
         pressure_pa, air_c = discard_impossible_weather(
@@ -238,20 +238,22 @@ class CentreFilter:
                 pressure_pa - origin.ambient_pressure_pa,
                 config.barometer_noise_pa**2,
             )
-            self._take(Sensor.BAROMETER, _ONE[_AMBIENT], change_pa, variance, given.now_s)
+            self._use_reading(Sensor.BAROMETER, _ONE[_AMBIENT], change_pa, variance, given.now_s)
         if uses_air and math.isfinite(air_c):
             if math.isnan(origin.air_temperature_c):
                 origin.air_temperature_c = air_c
             change_k, variance = air_c - origin.air_temperature_c, config.thermometer_noise_k**2
-            self._take(Sensor.THERMOMETER, _ONE[_AIR], change_k, variance, given.now_s)
+            self._use_reading(Sensor.THERMOMETER, _ONE[_AIR], change_k, variance, given.now_s)
         if math.isfinite(given.sag_um) and 0.0 <= given.sag_sigma_um < _IMPOSSIBLE:
             self._take_frame(given)
         if math.isfinite(given.laser_um):
             row = self._centre + _ONE[_MOUNT]
-            self._take(Sensor.LASER, row, given.laser_um, config.laser_noise_um**2, given.now_s)
-        return self._estimate(given.now_s)
+            self._use_reading(
+                Sensor.LASER, row, given.laser_um, config.laser_noise_um**2, given.now_s
+            )
+        return self._make_estimate(given.now_s)
 
-    def _predict(self, given: CentreReadings, dt_s: float) -> None:
+    def _predict_states(self, given: CentreReadings, dt_s: float) -> None:
         x, p, config = self.memory.x, self.memory.p, self._config
         follow = lag_step_fraction(dt_s, self._gas_follows_air_s)
         x[_GAS] += self._transit.advance(given.flow_um_per_s, dt_s) - x[_LEAK] * dt_s
@@ -265,10 +267,10 @@ class CentreFilter:
         p[_AIR, _AIR] += dt_s * self._air_walk()
         # without optics no reading tells mount from film, and what was learned of a drift would let
         # the film drift
-        drifts = self.memory.walks[3].factor if self._fresh(Sensor.OPTICS, given.now_s) else 1.0
+        drifts = self.memory.walks[3].factor if self._is_fresh(Sensor.OPTICS, given.now_s) else 1.0
         p[_MOUNT, _MOUNT] += dt_s * drifts * config.mount_walk_um_per_root_s**2
 
-    def _clone(self, now_s: float) -> None:
+    def _clone_centre(self, now_s: float) -> None:
         """Remember the centre of this tick in the oldest clone."""
         memory = self.memory
         memory.count += 1
@@ -299,16 +301,16 @@ class CentreFilter:
         if math.isnan(memory.origin.sag_um):
             memory.origin.sag_um = given.sag_um
         change_um = given.sag_um - memory.origin.sag_um
-        self._take(Sensor.OPTICS, row, change_um, variance, given.now_s, time_s)
+        self._use_reading(Sensor.OPTICS, row, change_um, variance, given.now_s, time_s)
         if (interval_s := time_s - memory.last_frame_s) > 0:
             longer_s = min(interval_s, FRESH_S[Sensor.OPTICS]) - memory.frame_interval_s
             memory.frame_interval_s += _INTERVAL_SHARE * longer_s
         memory.last_frame_s = time_s
         memory.frames += 1
         if memory.frames == LOCK_FRAMES:
-            self._lock()
+            self._lock_figure()
 
-    def _lock(self) -> None:
+    def _lock_figure(self) -> None:
         """Declare the figure seen so far the one to hold: what was uncertain of it is the laser's
         from now on.
 
@@ -321,7 +323,7 @@ class CentreFilter:
             matrix[_PLANT:] -= matrix[_STAND]
             matrix[_STAND] = 0.0
 
-    def _take(
+    def _use_reading(
         self,
         sensor: Sensor,
         row: FloatArray,
@@ -338,25 +340,25 @@ class CentreFilter:
         innovation = float(value - row @ x)
         if abs(innovation) > _IMPOSSIBLE:
             return
-        ph, spread = self._spread(row, variance)
+        ph, spread = self._project_covariance(row, variance)
         squared = innovation**2 / spread
         watch.innovation = innovation / math.sqrt(spread)
-        leads = sensor != Sensor.LASER or not self._fresh(Sensor.OPTICS, now_s)
+        leads = sensor != Sensor.LASER or not self._is_fresh(Sensor.OPTICS, now_s)
         ramp = memory.ramps[sensor] if leads and sensor <= Sensor.OPTICS else None
         runs = ramp is not None and ramp.update(watch.innovation, taken_s, _RUN[sensor])
-        if self._doubted(sensor, squared, taken_s, now_s) and not runs:
+        if self._is_doubtful(sensor, squared, taken_s, now_s) and not runs:
             return
         if watch.far >= _FAR_COUNT:
-            self._open(sensor, innovation, now_s)
+            self._open_jump(sensor, innovation, now_s)
         elif not watch.far:
-            self._learn(
+            self._learn_noise(
                 sensor, 1 - variance / spread, min(now_s - watch.seen_s, FRESH_S[sensor]), leads
             )
         if ramp is not None and runs:
             self._widen_leak(ramp, now_s, math.sqrt(spread))
         if watch.far or runs:
             watch.far = 0
-            ph, spread = self._spread(row, variance)
+            ph, spread = self._project_covariance(row, variance)
         elif squared > _HUBER2:
             spread *= squared / _HUBER2
         gain = ph / spread
@@ -366,7 +368,7 @@ class CentreFilter:
         if sensor in (Sensor.LASER, Sensor.OPTICS):
             watch.pull += abs(float(self._centre @ gain))
 
-    def _learn(self, sensor: Sensor, share: float, dt_s: float, leads: bool) -> None:
+    def _learn_noise(self, sensor: Sensor, share: float, dt_s: float, leads: bool) -> None:
         """Let a good reading correct the noise levels; the centre walks by itself, and by what
         warms the gas.
         """
@@ -396,14 +398,14 @@ class CentreFilter:
         missed = _GAIN_ERROR**2 * self._pressure_gain**2 * self._pressure_walk()
         return self.memory.walks[0].factor * (self._config.centre_walk_um_per_root_s**2 + missed)
 
-    def _spread(self, row: FloatArray, variance: float) -> tuple[FloatArray, float]:
+    def _project_covariance(self, row: FloatArray, variance: float) -> tuple[FloatArray, float]:
         """Covariance of all states with a reading's expectation, and the variance of its
         innovation.
         """
         ph: FloatArray = self.memory.p @ row
         return ph, float(row @ ph) + variance
 
-    def _doubted(self, sensor: Sensor, squared: float, taken_s: float, now_s: float) -> bool:
+    def _is_doubtful(self, sensor: Sensor, squared: float, taken_s: float, now_s: float) -> bool:
         """Whether a reading this far off, in squared sigmas, is not to be used yet: it may be a
         single bad one.
 
@@ -415,12 +417,12 @@ class CentreFilter:
             return False
         watch.far_since_s = watch.far_since_s if watch.far else taken_s
         watch.far += 1
-        waits = sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s)
+        waits = sensor == Sensor.LASER and self._is_fresh(Sensor.OPTICS, now_s)
         return watch.far < _FAR_COUNT or (
             waits and self.memory.watches[Sensor.OPTICS].taken_s <= watch.far_since_s
         )
 
-    def _open(self, sensor: Sensor, innovation: float, now_s: float) -> None:
+    def _open_jump(self, sensor: Sensor, innovation: float, now_s: float) -> None:
         """A sensor has moved and stays there: let the others say whether it moved,
         or what it sees.
         """
@@ -429,35 +431,37 @@ class CentreFilter:
         self._jumped_sensors.append(sensor)
         moved = _ONE[_GAS] + self._centre_since(since_s)
         if sensor == Sensor.THERMOMETER:
-            self._widen(innovation * _ONE[_AIR])
-        elif sensor == Sensor.LASER and self._judged and self._fresh(Sensor.OPTICS, now_s):
-            self._widen(innovation * _ONE[_MOUNT])
+            self._widen_states(innovation * _ONE[_AIR])
+        elif sensor == Sensor.LASER and self._judged and self._is_fresh(Sensor.OPTICS, now_s):
+            self._widen_states(innovation * _ONE[_MOUNT])
         elif sensor == Sensor.BAROMETER:
-            self._widen(
+            self._widen_states(
                 innovation * (_ONE[_AMBIENT] + self._pressure_gain * self._centre_since(since_s))
             )
-            self._widen(self._pressure_gain * innovation * moved)
+            self._widen_states(self._pressure_gain * innovation * moved)
         elif (
             sensor == Sensor.OPTICS
             and self._laser_agrees(now_s)
-            and not self._fresh(sensor, since_s)
+            and not self._is_fresh(sensor, since_s)
         ):
             # they are back, and the mirror has followed the laser's mount meanwhile
-            self._widen(innovation * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT]))
+            self._widen_states(
+                innovation * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT])
+            )
         else:
-            self._widen(innovation * moved)
-            if sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s):
+            self._widen_states(innovation * moved)
+            if sensor == Sensor.LASER and self._is_fresh(Sensor.OPTICS, now_s):
                 self.relock()  # optics that missed it count from where the laser sees the film
             elif sensor == Sensor.OPTICS and self._laser_agrees(now_s):
-                self._widen(_OPTICS_JUMP_SHARE * innovation * _ONE[_STAND])
+                self._widen_states(_OPTICS_JUMP_SHARE * innovation * _ONE[_STAND])
 
     def _laser_agrees(self, now_s: float) -> bool:
-        return self._fresh(Sensor.LASER, now_s) and not self.memory.watches[Sensor.LASER].far
+        return self._is_fresh(Sensor.LASER, now_s) and not self.memory.watches[Sensor.LASER].far
 
     def _centre_since(self, since_s: float) -> FloatArray:
         return np.concatenate([np.zeros(_PLANT), self.memory.times >= since_s])
 
-    def _widen(self, jump: FloatArray) -> None:
+    def _widen_states(self, jump: FloatArray) -> None:
         """The states may have jumped by some such amounts."""
         self.memory.p += jump[:, None] * jump
 
@@ -465,9 +469,9 @@ class CentreFilter:
         """The leak may have changed when the innovations began to run away."""
         jump = (now_s - ramp.since_s) * _ONE[_GAS] - _ONE[_LEAK]
         jump[_PLANT:] = np.maximum(self.memory.times - ramp.since_s, 0.0)
-        self._widen(ramp.slope * sigma_um * jump)
+        self._widen_states(ramp.slope * sigma_um * jump)
 
-    def _fresh(self, sensor: Sensor, now_s: float) -> bool:
+    def _is_fresh(self, sensor: Sensor, now_s: float) -> bool:
         limit_s = FRESH_S[sensor]
         if sensor == Sensor.OPTICS:
             limit_s = min(
@@ -475,7 +479,7 @@ class CentreFilter:
             )
         return now_s - self.memory.watches[sensor].seen_s <= limit_s
 
-    def _estimate(self, now_s: float) -> CentreEstimate:
+    def _make_estimate(self, now_s: float) -> CentreEstimate:
         x = self.memory.x
         drift = float(x[_LEAK])
         if self._gas_follows_air_s > 0:
@@ -484,7 +488,7 @@ class CentreFilter:
         pulls = sum(watch.pull for watch in self.memory.watches)
         return CentreEstimate(
             um=um,
-            sigma_um=math.sqrt(max(0.0, self._spread(self._centre, 0.0)[1])),
+            sigma_um=math.sqrt(max(0.0, self._project_covariance(self._centre, 0.0)[1])),
             mount_um=float(x[_MOUNT]),
             ahead_um=um + self._transit.coming_um(drift),
             due_um_per_s=self._transit.due_um_per_s() - drift,
@@ -492,7 +496,7 @@ class CentreFilter:
             drift_um_per_s=drift,
             sensors=tuple(
                 SensorView(
-                    self._fresh(sensor, now_s),
+                    self._is_fresh(sensor, now_s),
                     watch.innovation,
                     watch.pull / pulls if pulls > 0 else 0.0,
                 )

@@ -79,7 +79,7 @@ class FilmHealth:
         if len(memory.hours) > DAY_HOURS + 1:
             memory.hours.popleft()
         memory.first = memory.first or hour
-        return tuple(self._news(hour, memory.first))
+        return tuple(self._list_changes(hour, memory.first))
 
     def setpoint_moved(self) -> None:
         """The sag has changed: pressures before and after are not comparable."""
@@ -91,7 +91,7 @@ class FilmHealth:
         self.memory.leak_um = 0.0
         self.memory.pressure_pa_s = 0.0
 
-    def _news(self, hour: Hour, first: Hour) -> list[MaintenanceNotice]:
+    def _list_changes(self, hour: Hour, first: Hour) -> list[MaintenanceNotice]:
         leak, most = hour.leak_um_per_s, self._flow_max_um_per_s
         creep = self._creep_per_day()
         found = (

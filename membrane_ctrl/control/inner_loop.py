@@ -205,7 +205,7 @@ class InnerLoop:
         limited_um_per_s = self._limiter.limit(wanted_um_per_s + probe_um_per_s, dt_s)
         if given.estimate is None:
             self._pid.integrate(dt_s)
-        fraction = self._command(limited_um_per_s, dt_s)
+        fraction = self._pump_command(limited_um_per_s, dt_s)
         if probing and math.isfinite(given.displacement_um):
             self.memory.learned = self._drift.step(
                 given.displacement_um, self._curve.flow(fraction), dt_s
@@ -214,11 +214,14 @@ class InnerLoop:
             self._drift.discard_segment()
         if given.estimate is None:
             self.memory.leak.update(
-                self._flow(fraction) - weather_um_per_s, given.displacement_um, filtered_um, dt_s
+                self._pump_flow(fraction) - weather_um_per_s,
+                given.displacement_um,
+                filtered_um,
+                dt_s,
             )
         else:
             self.memory.leak.add_loss(given.estimate.leak_um_per_s, filtered_um, dt_s)
-        return self._output(
+        return self._make_output(
             terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um
         )
 
@@ -266,11 +269,11 @@ class InnerLoop:
             self.memory.setpoint_um = self._ramp.value_um + given.trim_um
         self._feedforward.update(math.nan, math.nan, dt_s)
         self.memory.leak.skip_step()
-        self._spoil()
+        self._discard_learned()
         mean_um_per_s = self._pid.integral_um_per_s
         self._limiter.limit(mean_um_per_s, dt_s)
-        fraction = self._command(self._limiter.flow_um_per_s, dt_s)
-        return self._output(
+        fraction = self._pump_command(self._limiter.flow_um_per_s, dt_s)
+        return self._make_output(
             pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction, filtered_um
         )
 
@@ -291,10 +294,10 @@ class InnerLoop:
         )
         placed_um_per_s = self._limiter.place(flow_um_per_s)
         self._pid.place(placed_um_per_s - weather_um_per_s)
-        self._spoil()
-        fraction = self._command(placed_um_per_s, dt_s)
+        self._discard_learned()
+        fraction = self._pump_command(placed_um_per_s, dt_s)
         if seen:
-            pumped_um_per_s = self._flow(fraction) - weather_um_per_s
+            pumped_um_per_s = self._pump_flow(fraction) - weather_um_per_s
             self.memory.leak.update(
                 pumped_um_per_s, given.displacement_um, self.memory.measured.value, dt_s
             )
@@ -303,7 +306,7 @@ class InnerLoop:
         terms = pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
         filtered_um = self.memory.measured.value if seen else math.nan
         return replace(
-            self._output(terms, weather_um_per_s, flow_um_per_s, fraction, filtered_um),
+            self._make_output(terms, weather_um_per_s, flow_um_per_s, fraction, filtered_um),
             error_um=math.nan,
         )
 
@@ -322,12 +325,12 @@ class InnerLoop:
         """`follow_flow` with a raw pump command, which is output unchanged; whether the pump runs
         is unknown.
         """
-        flow_um_per_s = self._flow(fraction)
+        flow_um_per_s = self._pump_flow(fraction)
         output = self.follow_flow(given, flow_um_per_s, dt_s)
         self._curve.note_stop()
         self.memory.leak.skip_step()
         output = replace(output, feedforward_um_per_s=0.0, leak_um_per_s=math.nan)
-        return replace(output, flow_um_per_s=self._flow(fraction), pump_fraction=fraction)
+        return replace(output, flow_um_per_s=self._pump_flow(fraction), pump_fraction=fraction)
 
     def set_gains(self, loop: LoopConfig) -> None:
         """Take new settings without a bump in the flow."""
@@ -348,14 +351,14 @@ class InnerLoop:
     def _filter_reading(self, displacement_um: float, dt_s: float) -> float:
         return self.memory.measured.update(displacement_um, dt_s, self._loop.measurement_filter_s)
 
-    def _command(self, flow_um_per_s: float, dt_s: float) -> float:
+    def _pump_command(self, flow_um_per_s: float, dt_s: float) -> float:
         """Command for a flow, with what was learned of the pump."""
         return self._curve.command(flow_um_per_s / self._drift.correction, dt_s)
 
-    def _flow(self, fraction: float) -> float:
+    def _pump_flow(self, fraction: float) -> float:
         return self._drift.correction * self._curve.flow(fraction)
 
-    def _spoil(self) -> None:
+    def _discard_learned(self) -> None:
         self.memory.learned = False
         self._drift.discard_segment()
 
@@ -403,7 +406,7 @@ class InnerLoop:
         self.memory.shaped_um = shaped_um
         return shaped_um, speed_um_per_s
 
-    def _output(
+    def _make_output(
         self,
         terms: pid.PidTerms,
         feedforward: float,
@@ -421,7 +424,7 @@ class InnerLoop:
             d_um_per_s=terms.d_um_per_s,
             feedforward_um_per_s=feedforward,
             flow_wanted_um_per_s=wanted,
-            flow_um_per_s=self._flow(fraction),
+            flow_um_per_s=self._pump_flow(fraction),
             pump_fraction=fraction,
             saturated=not 0.0 <= wanted <= self._limiter.flow_max_um_per_s,
             leak_um_per_s=self.memory.leak.leak_um_per_s,

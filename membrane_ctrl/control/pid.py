@@ -69,7 +69,7 @@ class Pid:
 
     def place(self, integral_um_per_s: float) -> None:
         """Set the integrator, within its range, and forget the last error."""
-        self.memory.integral_um_per_s = self._clamped(integral_um_per_s)
+        self.memory.integral_um_per_s = self._clamp_flow(integral_um_per_s)
         self.memory.error_um = 0.0
         self.memory.rate_um_per_s = 0.0
 
@@ -77,34 +77,34 @@ class Pid:
         """P, I and D for the (filtered) error and the rate of the filtered measurement."""
         self.memory.error_um = error_um
         self.memory.rate_um_per_s = measured_rate_um_per_s
-        return self._terms()
+        return self._compute_terms()
 
     def integrate(self, dt_s: float) -> None:
         """Advance the integrator by the last error, back-calculated where the terms leave the
         pump's range.
         """
-        wanted_um_per_s = self._terms().sum_um_per_s
-        back_um_per_s = self._clamped(wanted_um_per_s) - wanted_um_per_s
+        wanted_um_per_s = self._compute_terms().sum_um_per_s
+        back_um_per_s = self._clamp_flow(wanted_um_per_s) - wanted_um_per_s
         drive_um_per_s = self.gains.kp_per_s * self.memory.error_um + back_um_per_s
         integral_um_per_s = self.memory.integral_um_per_s + drive_um_per_s * dt_s / self.gains.ti_s
-        self.memory.integral_um_per_s = self._clamped(integral_um_per_s)
+        self.memory.integral_um_per_s = self._clamp_flow(integral_um_per_s)
 
     def set_gains(self, gains: PidGains) -> None:
         """Change the gains and let the integrator take up the difference, so that the sum does not
         jump.
         """
-        before = self._terms()
+        before = self._compute_terms()
         self.gains = gains
-        self.memory.integral_um_per_s = self._clamped(
-            self.memory.integral_um_per_s + before.sum_um_per_s - self._terms().sum_um_per_s
+        self.memory.integral_um_per_s = self._clamp_flow(
+            self.memory.integral_um_per_s + before.sum_um_per_s - self._compute_terms().sum_um_per_s
         )
 
-    def _terms(self) -> PidTerms:
+    def _compute_terms(self) -> PidTerms:
         kp, td_s = self.gains.kp_per_s, self.gains.td_s
         memory = self.memory
         return PidTerms(
             kp * memory.error_um, memory.integral_um_per_s, -kp * td_s * memory.rate_um_per_s
         )
 
-    def _clamped(self, flow_um_per_s: float) -> float:
+    def _clamp_flow(self, flow_um_per_s: float) -> float:
         return min(max(flow_um_per_s, 0.0), self.flow_max_um_per_s)

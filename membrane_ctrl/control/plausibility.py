@@ -235,7 +235,7 @@ class PlausibilityCheck:
         if laser_present and not blind and all(map(math.isfinite, means)):
             memory.age_s += dt_s
             memory.readings += 1
-            self._judge(means, dt_s)
+            self._judge_means(means, dt_s)
         return memory.faulty
 
     def _take_laser(self, displacement_um: float, dt_s: float) -> None:
@@ -257,7 +257,7 @@ class PlausibilityCheck:
         """By how much optics may lag behind the laser because the film moves."""
         return self._figure_lag_s * abs(self.memory.speed_um_per_s.value)
 
-    def _judge(self, means: tuple[float, float, float], dt_s: float) -> None:
+    def _judge_means(self, means: tuple[float, float, float], dt_s: float) -> None:
         memory = self.memory
         if not are_means_known(memory.age_s, memory.readings):
             return

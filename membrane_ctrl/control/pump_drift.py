@@ -143,12 +143,12 @@ class PumpDrift:
         used = memory.whole and bool(np.isfinite(memory.sums).all())
         if used:
             centre, flow = memory.sums.tolist()
-            self._learn(centre, flow * complex(self._path[0]))
-        self._follow()
+            self._learn_segment(centre, flow * complex(self._path[0]))
+        self._follow_drift()
         self._next_segment()
         return used
 
-    def _learn(self, centre: complex, expected: complex) -> None:
+    def _learn_segment(self, centre: complex, expected: complex) -> None:
         """Compare a segment's motion with that expected of the configured curve."""
         memory = self.memory
         memory.count += 1
@@ -177,7 +177,7 @@ class PumpDrift:
         )
         memory.scatter += share * (off**2 - memory.scatter)
 
-    def _follow(self) -> None:
+    def _follow_drift(self) -> None:
         memory = self.memory
         known, step = memory.known, _RATE_PER_S * SEGMENT_S
         if abs(known.scale - memory.correction) > _SURE * known.sigma:

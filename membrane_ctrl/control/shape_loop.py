@@ -142,11 +142,11 @@ class ShapeLoop:
                 self.memory.seen_s = estimate.time_s
             refusal = distrust
             if refusal == NO_REASON:
-                refusal = self._refusal(now_s, estimate, displacement_um, settled)
+                refusal = self._find_refusal(now_s, estimate, displacement_um, settled)
             if refusal != NO_REASON:
-                self._refuse(refusal)
+                self._refuse_estimate(refusal)
             elif estimate is not None:
-                self._admit(estimate)
+                self._admit_estimate(estimate)
             if self.memory.state == telemetry.ShapeState.TRACKING:
                 self._move_trim(now_s, dt_s)
         return self.output(now_s)
@@ -162,7 +162,7 @@ class ShapeLoop:
             now_s - self.memory.admitted_s,
         )
 
-    def _refusal(
+    def _find_refusal(
         self,
         now_s: float,
         estimate: shape_estimate.ShapeEstimate | None,
@@ -197,13 +197,13 @@ class ShapeLoop:
             return make_reason(ShapeCode.LASER_MOVED, moved)
         return NO_REASON
 
-    def _refuse(self, reason: Reason) -> None:
+    def _refuse_estimate(self, reason: Reason) -> None:
         """Hold the trim for a reason."""
         if self.memory.state != telemetry.ShapeState.WAITING:
             self.memory.state = telemetry.ShapeState.SUSPENDED
         self.memory.reason = reason
 
-    def _admit(self, estimate: shape_estimate.ShapeEstimate) -> None:
+    def _admit_estimate(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Use an estimate: for the reference first, then for the drift, unless camera and laser
         disagree.
         """
@@ -230,7 +230,7 @@ class ShapeLoop:
                 f"camera and laser disagree by {apart_um:+.1f} µm: check the laser's mount, or "
                 "lock again"
             )
-            self._refuse(make_reason(ShapeCode.DISAGREE, apart))
+            self._refuse_estimate(make_reason(ShapeCode.DISAGREE, apart))
             return
         memory.admitted_s = estimate.time_s
         memory.change = change

@@ -90,7 +90,7 @@ class CentreEstimation:
         """Whether the mirror is held without a laser: the optics see it."""
         if self.memory.estimate is None or self._filter is None:
             return False
-        return self._filter.frames >= LOCK_FRAMES and self._follows(Sensor.OPTICS)
+        return self._filter.frames >= LOCK_FRAMES and self._follows_sensor(Sensor.OPTICS)
 
     @property
     def blind(self) -> bool:
@@ -171,9 +171,9 @@ class CentreEstimation:
             estimate.jumped_sensors,
             inputs.now_s,
             context.dt_s,
-            has_laser=self._follows(Sensor.LASER),
+            has_laser=self._follows_sensor(Sensor.LASER),
         )
-        if self._follows(Sensor.OPTICS):
+        if self._follows_sensor(Sensor.OPTICS):
             sigma_um = math.hypot(estimate.sigma_um, self._stand.sigma_um)
             self.memory.estimate = replace(estimate, sigma_um=sigma_um)
         return news
@@ -189,7 +189,7 @@ class CentreEstimation:
     def _note_blindness(self, now_s: float) -> None:
         """Note since when neither laser nor optics correct the estimate."""
         memory = self.memory
-        if self._follows(Sensor.LASER) or self._follows(Sensor.OPTICS):
+        if self._follows_sensor(Sensor.LASER) or self._follows_sensor(Sensor.OPTICS):
             memory.blind_since_s = math.nan
         elif math.isnan(memory.blind_since_s):
             memory.blind_since_s = now_s
@@ -285,13 +285,13 @@ class CentreEstimation:
             )
         ]
 
-    def _follows(self, sensor: Sensor) -> bool:
+    def _follows_sensor(self, sensor: Sensor) -> bool:
         estimate = self.memory.estimate
         return estimate is not None and estimate.sensors[sensor].fresh
 
     def _report_sensors_in_use(self, now_s: float, jumped: Collection[str]) -> list[Event]:
         """Report the sensors once they have stood for a second, and every jump."""
-        seeing = tuple(int(sensor) for sensor in Sensor if self._follows(sensor))
+        seeing = tuple(int(sensor) for sensor in Sensor if self._follows_sensor(sensor))
         memory = self.memory
         if seeing == memory.reported_sensors:
             memory.sensors_changed_s = math.nan

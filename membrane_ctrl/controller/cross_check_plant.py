@@ -56,14 +56,14 @@ class ConfigFindings:
     def error(self, wrong: bool, field: str, why: str, remedy: str) -> None:
         """Add an error on the field if `wrong`."""
         if wrong:
-            self.found.append(ConfigFinding("error", field, self._value(field), why, remedy))
+            self.found.append(ConfigFinding("error", field, self._find_value(field), why, remedy))
 
     def warn(self, wrong: bool, field: str, why: str, remedy: str) -> None:
         """Add a warning on the field if `wrong`."""
         if wrong:
-            self.found.append(ConfigFinding("warning", field, self._value(field), why, remedy))
+            self.found.append(ConfigFinding("warning", field, self._find_value(field), why, remedy))
 
-    def _value(self, field: str) -> str:
+    def _find_value(self, field: str) -> str:
         value: Any = self._config
         for name in field.split("."):
             value = value[int(name)] if name.isdigit() else getattr(value, name)

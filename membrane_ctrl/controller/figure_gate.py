@@ -114,7 +114,7 @@ class FigureGate:
             return
         self.memory.defect = self._find_defect(figure, now_s, laser_um)
         if self.memory.defect is None:
-            self._accept(figure, laser_um)
+            self._accept_figure(figure, laser_um)
 
     def _find_defect(
         self, figure: ShapeEstimate, now_s: float, laser_um: float
@@ -140,7 +140,7 @@ class FigureGate:
             return FigureDefect.JUMP
         return None
 
-    def _accept(self, figure: ShapeEstimate, laser_um: float) -> None:
+    def _accept_figure(self, figure: ShapeEstimate, laser_um: float) -> None:
         self.accepted = figure
         self.memory.repeats = (
             self.memory.repeats + 1 if figure.sag_um == self.memory.newest_sag_um else 0

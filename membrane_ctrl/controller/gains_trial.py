@@ -74,7 +74,7 @@ class GainsTrial:
     def keep(self) -> None:
         """Keep the present gains."""
         self.memory.good = self.memory.tried
-        self._end()
+        self._end_trial()
 
     def is_overdue(self, now_s: float) -> bool:
         """The trial has ended without `keep`."""
@@ -83,8 +83,8 @@ class GainsTrial:
     def revert(self) -> None:
         """Restore the last good settings."""
         self.memory.tried = self.memory.good
-        self._end()
+        self._end_trial()
 
-    def _end(self) -> None:
+    def _end_trial(self) -> None:
         self.memory.until_s = math.nan
         self.memory.setpoint_step_um = math.nan

@@ -75,9 +75,9 @@ class Interlocks:
         self.judged_mask = self.open_mask
         if state == State.LOWER:
             self.judged_mask &= ~memory.standby_mask
-        return [self._event(place) for place in _iterate_set_bits(changed)]
+        return [self._make_event(place) for place in _iterate_set_bits(changed)]
 
-    def _event(self, place: int) -> Event:
+    def _make_event(self, place: int) -> Event:
         if not self.open_mask >> place & 1:
             return InterlockClosed(self._names[place])
         return InterlockOpened(

@@ -122,7 +122,9 @@ class Observer:
                 memory.last_advance_s = now_s
                 memory.stamp = stamp
         uses_laser = not self._by_optics
-        self.laser_um = self._gate(reading, fresh=memory.last_advance_s == now_s and uses_laser)
+        self.laser_um = self._gate_displacement(
+            reading, fresh=memory.last_advance_s == now_s and uses_laser
+        )
         same_s = memory.laser_repeats.same_s(self.laser_um, now_s)
         self._laser_same_s = same_s if math.isfinite(self.laser_um) else 0.0
         self.figures.judge_figure(now_s, inputs.estimate, self.moving_laser_um)
@@ -195,7 +197,7 @@ class Observer:
             gauge_pressure_pa=gauge_pa,
             gauge_same_s=self._gauge_same_s(gauge_pa, now_s),
             gauge_jumps=self.memory.gauge_jumps.count,
-            pump_mismatch=self._mismatch(reading),
+            pump_mismatch=self._pump_mismatch(reading),
             watchdog_tripped=reading.watchdog_tripped if reading else False,
             board_faults=reading.latched_faults if reading else 0,
             foreign=reading.foreign if reading else 0,
@@ -212,7 +214,7 @@ class Observer:
             return False
         return self._by_optics or reading.displacement_quality != NO_ANSWER
 
-    def _gate(self, reading: BenchReading | None, fresh: bool) -> float:
+    def _gate_displacement(self, reading: BenchReading | None, fresh: bool) -> float:
         """The displacement if it is finite, good, new, and within reach of the last good one; else
         NaN.
         """
@@ -230,7 +232,7 @@ class Observer:
         same_s = self.memory.gauge_repeats.same_s(gauge_pa, now_s)
         return same_s if abs(gauge_pa) > _SLACK_PA else 0.0
 
-    def _mismatch(self, reading: BenchReading | None) -> float:
+    def _pump_mismatch(self, reading: BenchReading | None) -> float:
         """Distance of the read-back from the nearer of the last two commands: a tick of transport
         is no mismatch.
         """

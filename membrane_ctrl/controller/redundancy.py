@@ -87,7 +87,7 @@ class RedundancyWatch:
         self.memory.reported.append(sensor)
         left = [other for other in FilmSensor if present.get(other, False)]
         lost = f"the {sensor.value} {_IS[sensor]} lost"
-        message = f"{lost}; {self._describe(left)}. Find out why before another sensor fails"
+        message = f"{lost}; {self._describe_bounds(left)}. Find out why before another sensor fails"
         return [Maintenance(name_notice(sensor), message)]
 
     def _report_return(self, sensor: FilmSensor, now_s: float) -> list[Event]:
@@ -100,7 +100,7 @@ class RedundancyWatch:
         del self.memory.present_again_since_s[sensor]
         return [MaintenanceOver(name_notice(sensor), f"the {sensor.value} {_IS[sensor]} back")]
 
-    def _describe(self, left: Collection[FilmSensor]) -> str:
+    def _describe_bounds(self, left: Collection[FilmSensor]) -> str:
         """What still bounds the true displacement, with the distances of the protection table."""
         followed = [sensor for sensor in left if sensor is not FilmSensor.GAUGE]
         if not left:

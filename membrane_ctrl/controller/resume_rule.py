@@ -59,7 +59,7 @@ class ResumeRule:
         """
         self.memory.never |= _needs_a_person(levels, observation)
         listed = fault.may_resume and fault.name in self._config.faults
-        self.possible = listed and not self.memory.never and self._left(now_s)
+        self.possible = listed and not self.memory.never and self._has_resumes_left(now_s)
         self.clear_mask = observation.board_faults if self.possible else 0
         if not self.possible:
             self.memory.clear_since_s = math.nan
@@ -68,15 +68,15 @@ class ResumeRule:
         gone = not (silent or self.clear_mask or fault.broken(observation, self._limits))
         if gone and observation.reading_age_s > 0.0:
             return False  # a single lost answer proves nothing
-        return self._waited(gone, now_s)
+        return self._has_waited(gone, now_s)
 
-    def _left(self, now_s: float) -> bool:
+    def _has_resumes_left(self, now_s: float) -> bool:
         """Whether the day's resumes are not used up."""
         while self.memory.resumed_s and now_s - self.memory.resumed_s[0] > DAY_S:
             self.memory.resumed_s.popleft()
         return len(self.memory.resumed_s) < self._config.most_per_day
 
-    def _waited(self, gone: bool, now_s: float) -> bool:
+    def _has_waited(self, gone: bool, now_s: float) -> bool:
         if not gone:
             self.memory.clear_since_s = math.nan
             return False

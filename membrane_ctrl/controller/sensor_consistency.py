@@ -182,7 +182,7 @@ class SensorConsistency:
         events = self._doubt_sag(state) + self._notice_drift(state)
         events += self._watch_redundancy(inputs.now_s, state, held)
         if state not in safety.ESTIMATED:
-            return events + self._rest()
+            return events + self._reset_comparisons()
         moves = state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um
         if moves:
             self.memory.growth.note_ramp()
@@ -207,7 +207,7 @@ class SensorConsistency:
             faulty = FaultySensor.NONE
         if faulty == FaultySensor.LASER and self.memory.faulty_sensor != FaultySensor.LASER:
             self.memory.laser_verdicts.add(inputs.now_s, _VERDICTS_MAX)
-        events += self._judge(faulty)
+        events += self._judge_sensor(faulty)
         if moves or state == State.SETTLE:
             return events
         self.memory.gas_excess = self.memory.growth.step(
@@ -248,14 +248,14 @@ class SensorConsistency:
             events.append(PumpLearned(*scales))
         return events
 
-    def _rest(self) -> list[Event]:
+    def _reset_comparisons(self) -> list[Event]:
         """Reset: the mirror is not held, or not yet at its setpoint."""
         self.memory.laser_fault_s = 0.0
         self.laser_moved = False
         self.memory.growth.note_ramp()
         self.memory.gas_excess = ""
         self._plausibility.reset()
-        return self._judge(FaultySensor.NONE)
+        return self._judge_sensor(FaultySensor.NONE)
 
     @property
     def _optics_alone(self) -> bool:
@@ -381,7 +381,7 @@ class SensorConsistency:
             )
         ]
 
-    def _judge(self, faulty: FaultySensor) -> list[Event]:
+    def _judge_sensor(self, faulty: FaultySensor) -> list[Event]:
         repeats = self.memory.repeats >= _REPEATS
         seen = (
             str(self._plausibility.changes)

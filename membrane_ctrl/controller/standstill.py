@@ -142,7 +142,7 @@ class Standstill:
             memory.read_s = now_s
         memory.silent_s = now_s - memory.read_s
         if max(commanded) > 0.0:
-            self._forget()
+            self._forget_observations()
             return
         if not link_up:
             memory.on_since_s = math.nan  # commands sent meanwhile have not arrived
@@ -152,7 +152,7 @@ class Standstill:
         self._look_at_readback(now_s, reading.pump_fraction)
         self._look_at_mirror(now_s, reading)
 
-    def _forget(self) -> None:
+    def _forget_observations(self) -> None:
         """The pump is commanded on: nothing that was observed counts."""
         memory = self.memory
         memory.blocks.clear()
@@ -198,9 +198,9 @@ class Standstill:
         if len(memory.blocks) > _WEATHER_BLOCKS:
             memory.blocks.popleft()
         memory.open_block = OpenBlock(now_s + _BLOCK_S)
-        memory.inflow = self._rise()
+        memory.inflow = self._find_rise()
 
-    def _rise(self) -> str:
+    def _find_rise(self) -> str:
         """Rise beyond the weather's in both laser and gauge; if one is missing,
         the other decides.
         """

@@ -43,7 +43,7 @@ def has_folder() -> bool:
         with tempfile.TemporaryFile(dir=folder):
             return True
     except OSError as error:
-        _note(f"{folder or 'the cache'}: {error.strerror or error}")
+        _print_note(f"{folder or 'the cache'}: {error.strerror or error}")
         return False
 
 
@@ -52,7 +52,7 @@ def _store_code(dispatcher: Any) -> None:
     try:
         dispatcher.enable_caching()
     except (RuntimeError, OSError) as error:  # no folder suits Numba
-        _note(str(error))
+        _print_note(str(error))
         return
     code_cache = dispatcher._cache
     save = code_cache.save_overload
@@ -61,12 +61,12 @@ def _store_code(dispatcher: Any) -> None:
         try:
             save(*arguments)
         except OSError as error:
-            _note(f"{error.filename or os.environ[_FOLDER]}: {error.strerror or error}")
+            _print_note(f"{error.filename or os.environ[_FOLDER]}: {error.strerror or error}")
 
     code_cache.save_overload = save_if_possible
 
 
-def _note(why: str) -> None:
+def _print_note(why: str) -> None:
     if os.environ.get(_NOTED):
         return
     os.environ[_NOTED] = "1"

@@ -71,19 +71,21 @@ class ArrayShape:
     ) -> CoreSchema:
         """Schema of the array as base64 text."""
         encoder = core_schema.plain_serializer_function_ser_schema(
-            self._encode, return_schema=core_schema.str_schema(), when_used="json"
+            self._encode_array, return_schema=core_schema.str_schema(), when_used="json"
         )
-        return core_schema.no_info_plain_validator_function(self._decode, serialization=encoder)
+        return core_schema.no_info_plain_validator_function(
+            self._decode_array, serialization=encoder
+        )
 
-    def _encode(self, array: NDArray[Any]) -> str:
-        if not self._fits(array.shape) or array.dtype != self.dtype:
+    def _encode_array(self, array: NDArray[Any]) -> str:
+        if not self._has_shape(array.shape) or array.dtype != self.dtype:
             raise ValueError(
                 f"an array {array.dtype.str}{array.shape} where {self.dtype}{self.shape} is "
                 "declared"
             )
         return base64.b64encode(np.ascontiguousarray(array).data).decode()
 
-    def _decode(self, data: object) -> NDArray[Any]:
+    def _decode_array(self, data: object) -> NDArray[Any]:
         if not isinstance(data, str):
             raise ValueError("an array is a text in base64")
         try:
@@ -95,7 +97,7 @@ class ArrayShape:
         except ValueError:
             raise ValueError(f"{values.size} numbers where {self.shape} are declared") from None
 
-    def _fits(self, shape: tuple[int, ...]) -> bool:
+    def _has_shape(self, shape: tuple[int, ...]) -> bool:
         if len(shape) != len(self.shape):
             return False
         return all(length in (given, -1) for given, length in zip(shape, self.shape, strict=True))

@@ -175,7 +175,7 @@ class _FrameSlots:
         return self._pixels[index % len(self._pixels)]
 
     def head(self, index: int) -> FrameHead | None:
-        fields = _HEAD.unpack_from(self._buffer, self._start(index))
+        fields = _HEAD.unpack_from(self._buffer, self._slot_offset(index))
         sequence, time_s, displacement_um, cycle, pattern = fields
         if not sequence == self.after(index) == self.before(index) == index + 1:
             return None
@@ -186,19 +186,19 @@ class _FrameSlots:
     def set_head(self, head: FrameHead) -> None:
         pattern = head.pattern.encode("ascii")
         fields = (head.index + 1, head.time_s, head.displacement_um, head.cycle, pattern)
-        _HEAD.pack_into(self._buffer, self._start(head.index), *fields)
+        _HEAD.pack_into(self._buffer, self._slot_offset(head.index), *fields)
 
     def before(self, index: int) -> int:
-        return self._words[self._start(index) // 8]
+        return self._words[self._slot_offset(index) // 8]
 
     def set_before(self, index: int) -> None:
-        self._words[self._start(index) // 8] = index + 1
+        self._words[self._slot_offset(index) // 8] = index + 1
 
     def after(self, index: int) -> int:
-        return self._words[(self._start(index) + self._stride) // 8 - 1]
+        return self._words[(self._slot_offset(index) + self._stride) // 8 - 1]
 
     def set_after(self, index: int) -> None:
-        self._words[(self._start(index) + self._stride) // 8 - 1] = index + 1
+        self._words[(self._slot_offset(index) + self._stride) // 8 - 1] = index + 1
 
     def written(self) -> int:
         return self._words[0]
@@ -210,7 +210,7 @@ class _FrameSlots:
         self._pixels.clear()
         self._words.release()
 
-    def _start(self, index: int) -> int:
+    def _slot_offset(self, index: int) -> int:
         return _ALIGN_BYTES + (index % len(self._pixels)) * self._stride
 
 

@@ -67,16 +67,16 @@ def serve_bench(spec: BenchSpec, ready: Connection) -> None:
     if spec.speed <= 1.0:
         # it stands for devices with processors of their own; faster, it may use a whole core
         priority.raise_priority()
-    asyncio.run(_serve(spec, ready))
+    asyncio.run(_serve_bench(spec, ready))
 
 
-async def _serve(spec: BenchSpec, ready: Connection) -> None:
+async def _serve_bench(spec: BenchSpec, ready: Connection) -> None:
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(child.STOP, stop.set)
     with _truth_writer(spec.truth) as writer:
         try:
             bench = LiveBench(spec, writer)
-            served, started = await _listening(bench, spec)
+            served, started = await _listen_as_devices(bench, spec)
         except (ValueError, errors.InputError) as error:
             ready.send(BenchReport(error=str(error)))
             return
@@ -100,7 +100,7 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
             await served.stop()
 
 
-async def _listening(
+async def _listen_as_devices(
     bench: "LiveBench", spec: BenchSpec
 ) -> tuple[pump_board.PumpBoardEmulator | lab.Lab, DevicesConfig | None]:
     """The emulated board or instruments, and the addresses of the latter. Raises OSError."""

@@ -78,7 +78,7 @@ def test_the_watch_sees_safe_levels_that_stay_on_the_first(monkeypatch: pytest.M
 def test_the_watch_sees_a_board_without_a_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
     from firmware_iface.emulators.pump_board import BoardState
 
-    monkeypatch.setattr(BoardState, "_latch", lambda self, mask: None)
+    monkeypatch.setattr(BoardState, "_latch_fault", lambda self, mask: None)
     assert run_case(case_called("process stopped for ever"), at("hold"), 1).violations
 
 

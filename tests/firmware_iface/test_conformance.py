@@ -144,23 +144,23 @@ class HalfKey(BoardState):
 class ShowsKey(BoardState):
     """Lets everybody read the key."""
 
-    def _values(self) -> dict[str, float]:
-        return super()._values() | {"command_key": self._claim_key}
+    def _collect_values(self) -> dict[str, float]:
+        return super()._collect_values() | {"command_key": self._claim_key}
 
 
 class ClaimFeeds(BoardState):
     """Feeds its watchdog with every claim."""
 
-    def _claim(self, written: dict[str, float]) -> None:
-        super()._claim(written)
+    def _update_claim(self, written: dict[str, float]) -> None:
+        super()._update_claim(written)
         self._fed_s = self._now_s
 
 
 class StopsForATick(BoardState):
     """Forgets that it was stopped."""
 
-    def _latch(self, mask: int) -> None:
-        super()._latch(mask & ~self._stopped_mask)
+    def _latch_fault(self, mask: int) -> None:
+        super()._latch_fault(mask & ~self._stopped_mask)
 
 
 class NoGaugeGuard(BoardState):
@@ -191,17 +191,17 @@ class VentsWithoutGauge(BoardState):
 class NoLatch(BoardState):
     """Stops the pump while the cause lasts, without a latched fault."""
 
-    def _protect(self) -> None:
-        super()._protect()
+    def _protect_pump(self) -> None:
+        super()._protect_pump()
         self._faults = 0
 
 
 class NoInterlock(BoardState):
     """Reports its interlock inputs, and does nothing."""
 
-    def _latch(self, mask: int) -> None:
+    def _latch_fault(self, mask: int) -> None:
         if mask != self._interlock_mask:
-            super()._latch(mask)
+            super()._latch_fault(mask)
 
 
 class StopsWithoutCause(BoardState):
@@ -215,8 +215,8 @@ class StopsWithoutCause(BoardState):
 class OddSettings(BoardState):
     """Has a time-out that no board may have."""
 
-    def _values(self) -> dict[str, float]:
-        return super()._values() | {"gauge_timeout_s": 0.05}
+    def _collect_values(self) -> dict[str, float]:
+        return super()._collect_values() | {"gauge_timeout_s": 0.05}
 
 
 class OtherMap(BoardState):

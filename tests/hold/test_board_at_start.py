@@ -66,7 +66,7 @@ async def test_a_board_without_faults_is_accepted(board: PumpBoardEmulator) -> N
 async def test_a_latched_board_is_refused_and_standby_waits_for_it(
     board: PumpBoardEmulator,
 ) -> None:
-    board.state._latch(OVER_PRESSURE)
+    board.state._latch_fault(OVER_PRESSURE)
     with pytest.raises(DeviceError, match=f"latched faults {OVER_PRESSURE:#x}.*--clear-faults"):
         await identified(board, options())
     assert f"{OVER_PRESSURE:#x}" in (await identified(board, options(standby=True))).latched
@@ -77,7 +77,7 @@ async def test_a_latched_board_is_refused_and_standby_waits_for_it(
 async def test_the_watchdogs_own_trip_is_cleared_only_if_the_resume_rule_names_it(
     board: PumpBoardEmulator,
 ) -> None:
-    board.state._latch(WATCHDOG)
+    board.state._latch_fault(WATCHDOG)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("link_lost",))
     found = await identified(board, options(), ("watchdog_tripped",))
@@ -89,7 +89,7 @@ async def test_the_watchdogs_own_trip_is_cleared_only_if_the_resume_rule_names_i
 async def test_the_watchdog_beside_another_fault_is_not_cleared(
     board: PumpBoardEmulator, other: int
 ) -> None:
-    board.state._latch(WATCHDOG | other)
+    board.state._latch_fault(WATCHDOG | other)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("watchdog_tripped",))
 
@@ -101,7 +101,7 @@ async def test_a_watchdog_that_stopped_a_venting_board_is_not_cleared(
     was.
     """
     board.state._settable["vent_command_fraction"] = 1.0
-    board.state._latch(WATCHDOG)
+    board.state._latch_fault(WATCHDOG)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("watchdog_tripped",))
 
@@ -110,11 +110,11 @@ async def test_starts_that_clear_the_watchdog_count_as_resumes(
     board: PumpBoardEmulator, tmp_path: Path
 ) -> None:
     for _ in range(2):
-        board.state._latch(WATCHDOG)
+        board.state._latch_fault(WATCHDOG)
         assert (
             await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))
         ).cleared
-    board.state._latch(WATCHDOG)
+    board.state._latch_fault(WATCHDOG)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))
 
@@ -122,7 +122,7 @@ async def test_starts_that_clear_the_watchdog_count_as_resumes(
 async def test_the_watchdog_is_not_cleared_if_it_cannot_be_counted(
     board: PumpBoardEmulator, tmp_path: Path
 ) -> None:
-    board.state._latch(WATCHDOG)
+    board.state._latch_fault(WATCHDOG)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path / "nowhere"))
 

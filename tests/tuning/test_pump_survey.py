@@ -171,8 +171,8 @@ def test_a_survey_holds_the_mirror_on_what_it_knows_so_far(tmp_path: Path) -> No
     """
     pump = ForeignPump("root", 29.4, 0.25, 0.45)
     link, rig, _ = started(tmp_path, ForeignPlant(pump, 25, 1.0, 2.0, laser_um=0.4))
-    map_pump._calmed(rig, 10.0)
-    assert worst_share(map_pump._surveyed(rig, 10.0), pump) < 0.03
+    map_pump._calm_hold(rig, 10.0)
+    assert worst_share(map_pump._survey_pump(rig, 10.0), pump) < 0.03
     late = [
         row for row in link.rows[len(link.rows) // 2 :] if row.state in (State.HOLD, State.TUNE)
     ]
@@ -276,7 +276,7 @@ def test_a_visit_ends_while_the_hold_can_still_catch_the_mirror(
     leak: float, delay_s: float, least_um: float
 ) -> None:
     survey = survey_of([0.3, 0.6], [leak - 0.2, leak + 0.2], leak, delay_s)
-    steps = survey._visit(Level(0.6))
+    steps = survey._plan_visit(Level(0.6))
     run = next(i for i, step in enumerate(steps) if step.fraction == 0.6 and step.until_um is None)
     assert {step.fraction for step in steps[run + 1 :]} == {0.0}
     assert steps[-1].until_um == pytest.approx(least_um)
@@ -314,7 +314,7 @@ def test_visits_in_a_row_wait_for_the_gas_of_each_other(delay_s: float, known: b
     full, leak, high = 13.0, 2.7, 0.55
     fractions = [0.1, 0.25, high, 1.0][: 4 if known else 3]
     survey = survey_of(fractions, [full * f for f in fractions], leak, delay_s)
-    lowest_um, highest_um = furthest_um(4 * survey._visit(Level(1.0)), full, leak, delay_s)
+    lowest_um, highest_um = furthest_um(4 * survey._plan_visit(Level(1.0)), full, leak, delay_s)
     assert lowest_um > -7.0
     assert highest_um < 7.0
 
@@ -326,8 +326,10 @@ def test_while_no_command_lifts_the_mirror_first_pulses_go_on() -> None:
     assert max(step.until_um or 0.0 for step in survey.steps()) <= 2.0
     survey._rounds = 40 - 1  # in the end it looks further all the same, but waits for nothing
     survey._wanted = {Level(0.3)}
-    assert [step.duration_s for step in survey._visit(Level(0.3)) if step.fraction > 0.6] == [2.4]
-    assert max(step.until_um or 0.0 for step in survey._visit(Level(0.3))) <= 3.0
+    assert [step.duration_s for step in survey._plan_visit(Level(0.3)) if step.fraction > 0.6] == [
+        2.4
+    ]
+    assert max(step.until_um or 0.0 for step in survey._plan_visit(Level(0.3))) <= 3.0
 
 
 @pytest.mark.parametrize(
@@ -376,7 +378,7 @@ def test_the_levels_with_the_largest_errors_are_visited_first() -> None:
         0.06,
     ]  # of the smaller ones that of the leak
     survey._wanted = set(survey.fit.levels)
-    assert [level.fraction for level in survey._visits()[:2]] == [0.6, 0.8]
+    assert [level.fraction for level in survey._plan_visits()[:2]] == [0.6, 0.8]
 
 
 @pytest.mark.parametrize(
@@ -389,7 +391,9 @@ def test_the_levels_with_the_largest_errors_are_visited_first() -> None:
 def test_a_rise_through_the_leak_is_followed_further_than_one_below_it(
     flows: list[float], finer: bool
 ) -> None:
-    assert (0.053 in survey_of([0.045, 0.061, 0.2], flows, 0.57)._finer(True)) == finer
+    assert (
+        0.053 in survey_of([0.045, 0.061, 0.2], flows, 0.57)._list_finer_fractions(True)
+    ) == finer
 
 
 @pytest.mark.parametrize(("leak", "finer"), [(0.4, True), (12.0, False)])
@@ -399,7 +403,7 @@ def test_a_kink_that_the_hold_sees_is_followed(leak: float, finer: bool) -> None
     """
     survey = survey_of([0.242, 0.322, 0.422, 0.567, 1.0], [0.0, 0.226, 2.106, 4.83, 13.0], leak)
     survey._branches[True].sigmas[1:] = 0.02
-    assert (0.282 in survey._finer(True)) == finer
+    assert (0.282 in survey._list_finer_fractions(True)) == finer
 
 
 @pytest.mark.parametrize(
@@ -445,7 +449,7 @@ def test_the_guard_of_a_round_knows_how_late_the_pump_is(
         performed=performed,
     )
     with pytest.raises(ValueError, match="enough"):
-        map_pump._surveyed(rig, 10.0)  # type: ignore[arg-type]
+        map_pump._survey_pump(rig, 10.0)  # type: ignore[arg-type]
     assert given[0].late_s == pytest.approx(max(0.4, late_s + 0.1))
 
 
@@ -455,7 +459,7 @@ def test_slow_gains_begin_at_the_mean_flow_of_a_loop_that_swings(tmp_path: Path)
     _, rig, _ = started(tmp_path, ForeignPlant(pump, 3161, 1.0, 2.7, laser_um=0.3))
     for _ in range(3):  # at any moment of the swing
         rig.hold(11.3)
-        map_pump._calmed(rig, 10.0)
+        map_pump._calm_hold(rig, 10.0)
         rows = rig.ticks(20.0)
         assert rig.loop.kp_per_s == map_pump._CAUTIOUS["kp_per_s"]
         assert max(abs(row.truth_displacement_um) for row in rows) < 10.0
@@ -465,7 +469,7 @@ def test_slow_gains_begin_at_the_mean_flow_of_a_loop_that_swings(tmp_path: Path)
 @pytest.mark.parametrize(("last", "up"), [(1.0, 0.55), (3.5, 0.4)])
 def test_a_weak_pump_gets_more_than_the_largest_command_so_far(last: float, up: float) -> None:
     """Which did not lift the mirror: it sank until its guard ended the round, nine times."""
-    assert survey_of([0.2, 0.4], [0.5, last], 1.2)._up() == pytest.approx(up)
+    assert survey_of([0.2, 0.4], [0.5, last], 1.2)._lifting_fraction() == pytest.approx(up)
 
 
 class Standing:
@@ -497,9 +501,9 @@ class Standing:
 
 def test_a_round_begins_only_when_the_mirror_is_back_at_the_end_of_its_ramp() -> None:
     back = Standing(-9.0, 0.5)
-    assert map_pump._returned(back)  # type: ignore[arg-type]
+    assert map_pump._wait_for_return(back)  # type: ignore[arg-type]
     assert back.at_um > -2.0
-    assert not map_pump._returned(Standing(-9.0, 0.0))  # type: ignore[arg-type]
+    assert not map_pump._wait_for_return(Standing(-9.0, 0.0))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -511,7 +515,7 @@ def test_a_curve_that_ends_near_the_leak_does_not_hold_the_mirror_meanwhile(
     pump = PumpConfig.model_validate(
         {"curve_fraction": [0.1, 0.9], "curve_um_per_s": [least, full]}
     )
-    assert map_pump._holds(replace(flat_map(pump), leak_um_per_s=2.46)) == holds
+    assert map_pump._reaches_leak(replace(flat_map(pump), leak_um_per_s=2.46)) == holds
 
 
 @pytest.mark.parametrize(("above_um", "back"), [(5.0, True), (-5.0, False)])
@@ -565,7 +569,7 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
         around=lambda held: operating_point.OperatingPoint(1.2, 0.3, 5.0, 0.5),
         perform=lambda seconds: (done_s.append(seconds) or record, None),
     )
-    monkeypatch.setattr(map_pump, "_returned", lambda rig: True)
+    monkeypatch.setattr(map_pump, "_wait_for_return", lambda rig: True)
     monkeypatch.setattr(operating_point, "require_room", lambda around: None)
     monkeypatch.setattr(experiments, "make_spec", lambda kind, around, seconds: seconds)
     bent = {gain: told for gain, _, told in seen}
@@ -580,10 +584,10 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
         fit_quality, "find_bent_curve", lambda record, found: ["bent"] * bent[found.model.gain]
     )
     if kept:
-        assert map_pump._checked(rig, 0.3) == seen[-1][:2]  # type: ignore[arg-type]
+        assert map_pump._measure_gain(rig, 0.3) == seen[-1][:2]  # type: ignore[arg-type]
     else:
         with pytest.raises(ValueError, match="contradict the curve"):
-            map_pump._checked(rig, 0.3)  # type: ignore[arg-type]
+            map_pump._measure_gain(rig, 0.3)  # type: ignore[arg-type]
     assert done_s == lasted_s
 
 
@@ -643,7 +647,7 @@ def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
     wrong = PumpConfig(
         curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, full), flow_full_um_per_s=full
     )
-    monkeypatch.setattr(map_pump, "_surveyed", lambda rig, limit_um: flat_map(wrong))
+    monkeypatch.setattr(map_pump, "_survey_pump", lambda rig, limit_um: flat_map(wrong))
     before = rig.loop, rig.pump
     if strength == 1.0:
         done, _ = map_pump.map_pump(folder, rig)
@@ -665,8 +669,8 @@ def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
 def test_gains_too_fast_for_the_measured_actuator_become_slower() -> None:
     loop = LoopConfig(feedforward_barometer=False)
     quick, late = flat_map(PumpConfig()), replace(flat_map(PumpConfig()), delay_s=1.2, lag_s=0.3)
-    assert map_pump._safe(loop, quick) == loop
-    safe = map_pump._safe(loop, late)
+    assert map_pump._make_safe_gains(loop, quick) == loop
+    safe = map_pump._make_safe_gains(loop, late)
     model = PlantModel(1.0, 1.2, 0.3, 1.24)
     assert compute_margins(Gains.of(safe), model, 0.02).ms < 1.75
     assert not compute_margins(Gains.of(loop), model, 0.02).ms < 1.75
@@ -686,7 +690,7 @@ def test_the_limit_of_the_flow_comes_with_the_curve_unless_somebody_set_a_lower_
 ) -> None:
     loop = LoopConfig(flow_max_um_per_s=limit, flow_rate_limit_um_per_s2=rate_limit)
     pump = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, full))
-    freed = map_pump._freed(loop, PumpConfig(), pump)
+    freed = map_pump._free_flow_limit(loop, PumpConfig(), pump)
     assert freed == loop.model_copy(update={"flow_max_um_per_s": after})
     found = cross_check(Config(loop=freed, pump=pump))
     assert not [each for each in found if each.severity == "error" and "flow" in each.field]
@@ -710,7 +714,7 @@ def test_a_leak_above_the_configured_flow_is_held_on_the_measured_curve(
         stall_fraction=0.1,
     )
     rig.pump = rig.pump.model_copy(update={"probe_um": 0.1, "change_max": 0.3})
-    monkeypatch.setattr(map_pump, "_surveyed", lambda rig, limit_um: flat_map(true))
+    monkeypatch.setattr(map_pump, "_survey_pump", lambda rig, limit_um: flat_map(true))
     done, folder = map_pump.map_pump(folder, rig)
     assert (done.found.pump.probe_um, done.found.pump.change_max) == (0.1, 0.3)
     assert folder.config.loop.flow_max_um_per_s == rig.loop.flow_max_um_per_s == 15.9

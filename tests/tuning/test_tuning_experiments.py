@@ -58,7 +58,7 @@ class Constant:
 def run(rig: Rig, experiment: Experiment, around: OperatingPoint) -> tuple[Record, Finished]:
     """An experiment about 0 inside its guard."""
     guard = ExcursionGuard(experiment, around, 0.0, 1 / rig.dt_s)
-    return rig._run(guard, around.holding_flow_um_per_s)
+    return rig._run_experiment(guard, around.holding_flow_um_per_s)
 
 
 def relay_after_hold(bench: TwinBench, case: Case) -> tuple[Rig, Record, Finished, float]:

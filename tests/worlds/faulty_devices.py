@@ -60,9 +60,9 @@ class SerialDevice(serial_device.SerialDevice):
 
     def hear(self, data: bytes) -> None:
         if self.faults.echo:
-            self._later(
+            self._call_later(
                 asyncio.get_running_loop().time() + len(data) * self.settings.char_s,
-                self._sent,
+                self._transmit_bytes,
                 data,
             )
         super().hear(data)

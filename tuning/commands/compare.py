@@ -19,10 +19,20 @@ def compare_sessions(a: SessionFolder, b: SessionFolder) -> str:
     for each in (a, b):
         each.require_done("design")
     files = [gains_file.load_gains(each.file_path("gains.toml")) for each in (a, b)]
-    return "\n".join([*_plants(a, b, files), "", *_gains(files), "", *_crossed(a, b, files)])
+    return "\n".join(
+        [
+            *_tabulate_plants(a, b, files),
+            "",
+            *_tabulate_gains(files),
+            "",
+            *_tabulate_crossed(a, b, files),
+        ]
+    )
 
 
-def _plants(a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile]) -> list[str]:
+def _tabulate_plants(
+    a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile]
+) -> list[str]:
     head = (
         "| plant | k | +- | dead time s | lag s | delay +- s | leak µm/s | laser µm | least std "
         "µm |"
@@ -39,7 +49,7 @@ def _plants(a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile
     return lines
 
 
-def _gains(files: list[gains_file.GainsFile]) -> list[str]:
+def _tabulate_gains(files: list[gains_file.GainsFile]) -> list[str]:
     """Table of the loop settings that differ."""
     left, right = (gains.loop.model_dump() for gains in files)
     lines = ["| setting | A | B |", "|---|---:|---:|"]
@@ -49,7 +59,9 @@ def _gains(files: list[gains_file.GainsFile]) -> list[str]:
     return lines
 
 
-def _crossed(a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile]) -> list[str]:
+def _tabulate_crossed(
+    a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile]
+) -> list[str]:
     head = "| gains of | on plant and weather of | std µm | / least | Ms | load peak µm |"
     lines = [head, "|---|---" + "|---:" * 4 + "|"]
     for place, each in (("A", a), ("B", b)):

@@ -70,7 +70,7 @@ def run_step(step: str, options: TuneOptions) -> int:
         folder = connection.find_session(options, None)
         with convert_write_errors(folder.path, DeviceError):
             _run_anywhere(step, folder, options)
-            _report(step, folder, Progress())
+            _report_step(step, folder, Progress())
     else:
         fresh = step == "characterise" and options.session is None
         with connection.open_on_hold(options, fresh) as (folder, rig, progress):
@@ -99,9 +99,9 @@ def _run_steps(
                 )
                 return
             candidate = chosen
-        _announce(progress, options, step, steps[number + 1 :])
+        _announce_step(progress, options, step, steps[number + 1 :])
         _run_on_hold(step, folder, rig, options, progress, candidate)
-        _report(step, folder, progress)
+        _report_step(step, folder, progress)
         if step == "identify":
             identify.require_known_pump(folder)
 
@@ -147,7 +147,7 @@ def _run_anywhere(step: str, folder: SessionFolder, options: TuneOptions) -> Non
             preview.run_preview(folder)
 
 
-def _report(step: str, folder: SessionFolder, progress: Progress) -> None:
+def _report_step(step: str, folder: SessionFolder, progress: Progress) -> None:
     """Update the report and print the step's result in one line."""
     page.write_report(folder)
     progress.print_line(f"{step}: {_MODULES[step].describe_result(folder)}")
@@ -175,7 +175,7 @@ def _note_verified(folder: SessionFolder, logs: Path, reason: str, again: bool =
     journal.append_entry(logs, entry)
 
 
-def _announce(progress: Progress, options: TuneOptions, step: str, after: list[str]) -> None:
+def _announce_step(progress: Progress, options: TuneOptions, step: str, after: list[str]) -> None:
     """Show the step and the time that it and the later ones are expected to take."""
     planned = {
         "characterise": options.plan.typical_s,

@@ -30,11 +30,11 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
         return _save_estimator(
             path, newest_session(logs) if name is None else open_session(name), config, yes
         )
-    folder, shape_s = _named(name, logs)
+    folder, shape_s = _find_session(name, logs)
     keys: tuple[str, ...] = GAIN_KEYS
     gains, pump = config.loop, config.pump
     if shape_s is None or folder.is_done("verify") or map_pump.has_pump_map(folder):
-        gains, pump = _kept(folder), folder.config.pump
+        gains, pump = _load_kept_gains(folder), folder.config.pump
         same = config
         if map_pump.has_pump_map(folder) and config.pump == map_pump.load_pump_map(folder).before:
             keys = (*keys, "flow_max_um_per_s")  # comes with the curve
@@ -99,7 +99,7 @@ def _save_estimator(path: Path, folder: SessionFolder, config: schema.Config, ye
     return errors.Exit.DONE
 
 
-def _named(name: Path | None, logs: Path) -> tuple[SessionFolder, float | None]:
+def _find_session(name: Path | None, logs: Path) -> tuple[SessionFolder, float | None]:
     """A session, by default the one whose gains were kept last; and the time constant of the shape
     loop it kept.
 
@@ -115,7 +115,7 @@ def _named(name: Path | None, logs: Path) -> tuple[SessionFolder, float | None]:
     return open_session(logs / "tuning" / newest.session), shape_s
 
 
-def _kept(folder: SessionFolder) -> schema.LoopConfig:
+def _load_kept_gains(folder: SessionFolder) -> schema.LoopConfig:
     """The gains that the session kept: verified, or with a curve of the pump.
 
     Raises InputError if there are none, or they were rolled back.

@@ -40,7 +40,7 @@ class DisturbanceModel:
         dt_s = self.rest.dt_s
         pump = closed_loop.pump_response(model, w_rad_per_s, dt_s)
         total = self.rest.moving_psd(w_rad_per_s)
-        for weather, used, gain, filter_s in self._channels(loop):
+        for weather, used, gain, filter_s in self._list_channels(loop):
             lag = 1 / (1 + 1j * w_rad_per_s * weather.lag_s)
             reaction = (
                 gain * pump / (1 + 1j * w_rad_per_s * filter_s) if used else np.zeros_like(pump)
@@ -52,12 +52,12 @@ class DisturbanceModel:
     def feedforward_psd(self, w_rad_per_s: Series, loop: LoopConfig) -> Series:
         """Two-sided spectrum of the flow that the loop's feed-forward asks for, (µm/s)^2 s."""
         total = np.zeros_like(w_rad_per_s)
-        for weather, used, gain, filter_s in self._channels(loop):
+        for weather, used, gain, filter_s in self._list_channels(loop):
             rate = gain * w_rad_per_s / np.abs(1 + 1j * w_rad_per_s * filter_s) if used else 0.0
             total = total + rate**2 * (weather.psd(w_rad_per_s) + weather.noise**2 * self.rest.dt_s)
         return total
 
-    def _channels(self, loop: LoopConfig) -> list[tuple[WeatherGain, bool, float, float]]:
+    def _list_channels(self, loop: LoopConfig) -> list[tuple[WeatherGain, bool, float, float]]:
         """Each weather sensor with its feed-forward: whether it is used, its gain and filter."""
         channels = (
             (
@@ -87,10 +87,12 @@ def observe_disturbance(
     weather = fit_weather(record, model, loop.gas_follows_air_s)
     rest = fit_noise(weather.rest_um, record.dt_s, loop.gas_follows_air_s)
     found = DisturbanceModel(rest, weather.barometer, weather.air)
-    return replace(found, unsteady=_unsteady(record.filled_displacement_um(), found, model, loop))
+    return replace(
+        found, unsteady=_std_uncertainty(record.filled_displacement_um(), found, model, loop)
+    )
 
 
-def _unsteady(
+def _std_uncertainty(
     read_um: Series, found: DisturbanceModel, model: plant_model.PlantModel, loop: LoopConfig
 ) -> float:
     """Relative standard error of the centre's standard deviation, for this record and one more like

@@ -144,7 +144,7 @@ def run_experiments(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FUL
     operating_point.require_room(
         around
     )  # without room a relay would only report that it was stopped
-    relays, finished = _relays(rig, around, plan)
+    relays, finished = _run_relays(rig, around, plan)
     found = identify_plant(relays)
     around, gain = replace(around, late_s=found.model.delay_s), found.model.gain
     whole = relays
@@ -171,7 +171,7 @@ def fit_experiments(done: Experiments) -> Characterised:
     return Characterised(done, found, judge_fit(done.record, found, checked))
 
 
-def _relays(
+def _run_relays(
     rig: ExperimentRig, around: operating_point.OperatingPoint, plan: Plan
 ) -> tuple[Record, Finished]:
     """Relays until the gain is known, or the data ask for the pump's map, each followed by a hold.
@@ -198,17 +198,17 @@ def _relays(
         if not finished.completed and _too_strong(found):
             raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}", pump_suspected=True)
         around = replace(around, late_s=found.model.delay_s)
-        if _enough(done, plan) and (
+        if _has_enough(done, plan) and (
             found.sigma.gain <= _GAIN_SIGMA * found.model.gain or find_bent_curve(done, found)
         ):
             break
-    if done is None or not _enough(done, plan):
+    if done is None or not _has_enough(done, plan):
         stopped_near = finished.end is ExperimentEnd.STOPPED_BY_GUARD
         raise ExperimentError(finished.reason + (f": {LARGER_LIMIT}" if stopped_near else ""))
     return done, finished
 
 
-def _enough(relays: Record, plan: Plan) -> bool:
+def _has_enough(relays: Record, plan: Plan) -> bool:
     return relays.duration_s >= plan.relay_s
 
 

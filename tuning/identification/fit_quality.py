@@ -85,7 +85,7 @@ def judge_fit(
     record: Record, identified: Identified, validation: Validation | None = None
 ) -> FitQuality:
     """Verdict on a record and its fit."""
-    refused, degraded = _faults(record, identified)
+    refused, degraded = _list_findings(record, identified)
     if validation is not None and validation.innovation_ratio > _WORSE_MAX:
         worse = (
             f"new data are predicted {validation.innovation_ratio:.1f} times worse than those of "
@@ -108,7 +108,9 @@ def judge_fit(
     return FitQuality(verdict, texts, any(finding.pump_suspected for finding in findings))
 
 
-def _faults(record: Record, identified: Identified) -> tuple[list[FitFinding], list[FitFinding]]:
+def _list_findings(
+    record: Record, identified: Identified
+) -> tuple[list[FitFinding], list[FitFinding]]:
     """Findings that forbid a proposal, and those that only widen its error bars."""
     model, sigma = identified.model, identified.sigma
     refused: list[FitFinding] = []

@@ -32,7 +32,7 @@ def fit_local_level(values: FloatArray, times_s: FloatArray) -> LocalLevel:
         raise ValueError(f"{values.size} values are too few to tell noise from drift: 20 at least")
     steps_s = np.diff(times_s)
     cycle_s = float(np.median(steps_s))
-    fits = [_likelihood(values, steps_s / cycle_s, float(ratio)) for ratio in _RATIOS]
+    fits = [_log_likelihood(values, steps_s / cycle_s, float(ratio)) for ratio in _RATIOS]
     likely = np.array([fit[0] for fit in fits])
     best = int(np.argmax(likely))
     seen = bool(likely[best] - likely[0] > _DROP)
@@ -41,7 +41,7 @@ def fit_local_level(values: FloatArray, times_s: FloatArray) -> LocalLevel:
     return LocalLevel(math.sqrt(variance), float(_RATIOS[chosen]) * variance / cycle_s, seen)
 
 
-def _likelihood(values: FloatArray, steps: FloatArray, ratio: float) -> tuple[float, float]:
+def _log_likelihood(values: FloatArray, steps: FloatArray, ratio: float) -> tuple[float, float]:
     """Log likelihood and noise variance for a ratio; the first value
     only initialises the filter.
     """

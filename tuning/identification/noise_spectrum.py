@@ -103,7 +103,7 @@ def fit_noise(series: Series, dt_s: float, slow_s: float) -> Noise:
         raise ValueError(
             f"{series.size * dt_s:.0f} s of hold are too short: {2 * SLOWEST_S:.0f} s at least"
         )
-    w, power, count = _periodogram(np.diff(series), dt_s)
+    w, power, count = _compute_periodogram(np.diff(series), dt_s)
     white = np.abs(1 - np.exp(-1j * w * dt_s)) ** 2
     walks = [np.full(w.size, dt_s), *([dt_s / (1 + (w * slow_s) ** 2)] if slow_s > 0 else [])]
     slowest_s = SLOWEST_S / (2 * math.pi)
@@ -112,20 +112,20 @@ def fit_noise(series: Series, dt_s: float, slow_s: float) -> Noise:
     basis = np.array(
         [white, *walks, *(white / dt_s / (1 + (w * tau_s) ** 2) ** 2 for tau_s in taus_s)]
     )
-    likely, usual = _prior(taus_s, first)
+    likely, usual = _make_prior(taus_s, first)
     walk = float(np.mean(power[:8])) / dt_s
     guess = [
         float(power @ count / count.sum()) / 2,
         *[walk] * len(walks),
         *(walk * taus_s**2 / taus_s.size),
     ]
-    intensities = np.exp(_likeliest(basis, power, count, likely, usual, np.log(guess)))
+    intensities = np.exp(_maximise_likelihood(basis, power, count, likely, usual, np.log(guess)))
     fast, slow = (*intensities[1:first].tolist(), 0.0)[:2]
     coloured = tuple(zip(taus_s.tolist(), intensities[first:].tolist(), strict=True))
     return Noise(math.sqrt(intensities[0]), fast, slow, slow_s, dt_s, coloured)
 
 
-def _prior(taus_s: Series, first: int) -> tuple[Series, Series]:
+def _make_prior(taus_s: Series, first: int) -> tuple[Series, Series]:
     """Rows R and values r: R x logs - r are independent and of unit variance; `first` logs are
     free.
     """
@@ -134,7 +134,7 @@ def _prior(taus_s: Series, first: int) -> tuple[Series, Series]:
     return np.hstack((np.zeros((len(rows), first)), rows)), rows @ (2 * np.log(taus_s))
 
 
-def _likeliest(
+def _maximise_likelihood(
     basis: Series, power: Series, count: Series, likely: Series, usual: Series, start: Series
 ) -> Series:
     """Logarithms of the intensities; Whittle's likelihood with its information matrix."""
@@ -142,11 +142,11 @@ def _likeliest(
     def cost(logs: Series) -> tuple[float, Series]:
         spectrum = np.exp(logs) @ basis
         off = likely @ logs - usual
-        slope = _shares(logs, basis) @ (count * (1 - power / spectrum)) + likely.T @ off
+        slope = _compute_shares(logs, basis) @ (count * (1 - power / spectrum)) + likely.T @ off
         return float(count @ (np.log(spectrum) + power / spectrum) + off @ off / 2), slope
 
     def information(logs: Series) -> Series:
-        shares = _shares(logs, basis)
+        shares = _compute_shares(logs, basis)
         return np.asarray(shares * count @ shares.T + likely.T @ likely)
 
     found = minimize(
@@ -160,12 +160,12 @@ def _likeliest(
     return np.asarray(np.maximum(found, math.log(FLOOR)), dtype=float)
 
 
-def _shares(logs: Series, basis: Series) -> Series:
+def _compute_shares(logs: Series, basis: Series) -> Series:
     parts = np.exp(logs)[:, None] * basis
     return np.asarray(parts / parts.sum(axis=0))
 
 
-def _periodogram(increments: Series, dt_s: float) -> tuple[Series, Series, Series]:
+def _compute_periodogram(increments: Series, dt_s: float) -> tuple[Series, Series, Series]:
     """Angular frequencies from the slowest that matters to Nyquist, tapered power per sample,
     independent ones.
     """

@@ -138,7 +138,7 @@ def identify_plant(record: Record) -> Identified:
     covariance[1, 1] += record.dt_s**2 / 12
     return Identified(
         model=plant_model.PlantModel(*(float(v) for v in q[:4])),
-        sigma=_sigma(covariance),
+        sigma=_make_sigma(covariance),
         covariance=covariance[:4, :4],
         noise=NoiseModel(float(q[4]), float(q[5])),
         pressure_gain_um_per_pa=float(q[6]) if q.size > 6 else 0.0,
@@ -157,7 +157,7 @@ def _best_fit(errors: Callable[[Series], Series], record: Record) -> OptimizeRes
     high = [np.inf, _DEAD_TIME_MAX_S, _LAG_MAX_S, np.inf, _BETA_MAX, _BETA_MAX] + [np.inf] * len(
         extra
     )
-    starts = [_start(record, dead_time_s, extra) for dead_time_s in _STARTS_S]
+    starts = [_find_start(record, dead_time_s, extra) for dead_time_s in _STARTS_S]
     return least_squares(
         errors,
         min(starts, key=lambda start: float(np.sum(errors(start) ** 2))),
@@ -168,7 +168,7 @@ def _best_fit(errors: Callable[[Series], Series], record: Record) -> OptimizeRes
     )
 
 
-def _start(record: Record, dead_time_s: float, extra: list[float]) -> Series:
+def _find_start(record: Record, dead_time_s: float, extra: list[float]) -> Series:
     """Best gain and leak for a dead time, by linear least squares on the prefiltered record."""
     unit = plant_model.PlantModel(1.0, dead_time_s, _LAG_START_S, 0.0)
     x = np.diff(
@@ -182,7 +182,7 @@ def _start(record: Record, dead_time_s: float, extra: list[float]) -> Series:
     return np.array([gain, dead_time_s, _LAG_START_S, leak, _BETA_START, _GAMMA_START, *extra])
 
 
-def _sigma(covariance: Series) -> Sigma:
+def _make_sigma(covariance: Series) -> Sigma:
     total = covariance[1, 1] + covariance[2, 2] + 2 * covariance[1, 2]
     gain, dead, lag, leak, delay = np.sqrt(np.maximum([*np.diag(covariance)[:4], total], 0.0))
     return Sigma(float(gain), float(dead), float(lag), float(delay), float(leak))

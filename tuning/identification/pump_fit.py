@@ -158,7 +158,7 @@ class _Mirror:
         """Flows behind an actuator; with `flows` also how far delay and lag are off, if those
         flowed.
         """
-        gram, cost = self._gram((delay_s, lag_s, white), changes, flows)
+        gram, cost = self._gram_matrix((delay_s, lag_s, white), changes, flows)
         here = np.delete(np.delete(gram, _OFF, axis=0), _OFF, axis=1)
         variance, values, covariance = _least_squares(here, self._rows)
         cost += self._rows * math.log(variance)
@@ -192,7 +192,7 @@ class _Mirror:
             flows, covariance, float(found.values[count]), best.delay_s, best.lag_s, *kept
         )
 
-    def _gram(
+    def _gram_matrix(
         self, at: tuple[float, float, float], changes: float, flows: FloatArray | None
     ) -> tuple[FloatArray, float]:
         """Products of the columns levels, leak, pressure, delay, lag, height; and the likelihood's
@@ -206,7 +206,7 @@ class _Mirror:
                 if flows is None
                 else flows[[*block.columns, self._levels]]
             )
-            columns = _whitened(block, at, given, self._has_pressure)
+            columns = _whiten_columns(block, at, given, self._has_pressure)
             gram, logarithm = _without_own(
                 columns, block.leak.shape[1], at[2], (self._noise_um, changes)
             )
@@ -254,7 +254,7 @@ def _blocks(run: PumpRun, levels: Sequence[Level]) -> _Blocks:
     )
 
 
-def _arrived(paths: FloatArray, delay_s: float, lag_s: float) -> FloatArray:
+def _delay_paths(paths: FloatArray, delay_s: float, lag_s: float) -> FloatArray:
     """Paths behind the actuator; what flows at the beginning had flowed forever."""
     from scipy.signal import lfilter
 
@@ -268,7 +268,7 @@ def _arrived(paths: FloatArray, delay_s: float, lag_s: float) -> FloatArray:
     return np.asarray(lfilter([1 - keep], [1, -keep], given - given[0], axis=0))
 
 
-def _whitened(
+def _whiten_columns(
     block: _Blocks, at: tuple[float, float, float], flows: FloatArray, has_pressure: bool
 ) -> FloatArray:
     """Columns levels, before, leak, pressure, delay, lag, height, differenced so that the noise is
@@ -283,13 +283,16 @@ def _whitened(
     count = block.displacement_um.size
     given = block.paths @ flows[:, None]
     slopes = [
-        (_arrived(given, delay_s + more_s, lag_s + slower_s) - _arrived(given, delay_s, lag_s))
+        (
+            _delay_paths(given, delay_s + more_s, lag_s + slower_s)
+            - _delay_paths(given, delay_s, lag_s)
+        )
         / _SLOPE_S
         for more_s, slower_s in ((_SLOPE_S, 0.0), (0.0, _SLOPE_S))
     ]
     columns = np.column_stack(
         (
-            _arrived(block.paths, delay_s, lag_s)[-count:],
+            _delay_paths(block.paths, delay_s, lag_s)[-count:],
             block.leak,
             block.pressure_pa if has_pressure else np.zeros(count),
             *(slope[-count:] for slope in slopes),

@@ -96,22 +96,22 @@ class Surveyed:
             points.pop()
         xs, ys = np.array(points).T
         table: dict[str, object] = {
-            "curve_fraction": _tuple(xs),
-            "curve_um_per_s": _tuple(isotonic_regression(ys).x),
+            "curve_fraction": _round_values(xs),
+            "curve_um_per_s": _round_values(isotonic_regression(ys).x),
         }
         if self.hysteretic:
             more = np.maximum(np.interp(xs, above[0], above[1]), isotonic_regression(ys).x)
             more[-1] = ys[-1]
-            table["curve_falling_um_per_s"] = _tuple(
+            table["curve_falling_um_per_s"] = _round_values(
                 np.maximum.accumulate(np.minimum(more, ys[-1]))
             )
         pump = PumpConfig.model_validate(
             {**table, "start_fraction": begin, "stall_fraction": stall}
         )
         return PumpMap(
-            _tuple(rising.fractions),
-            _tuple(rising.flows),
-            _tuple(rising.sigmas),
+            _round_values(rising.fractions),
+            _round_values(rising.flows),
+            _round_values(rising.sigmas),
             pump,
             leak,
             self.fit.delay_s,
@@ -120,7 +120,7 @@ class Surveyed:
             self.done,
         )
 
-    def _further(self, off: float = 2.0) -> str:
+    def _advise_runs(self, off: float = 2.0) -> str:
         """What makes the flows known better; the errors are `off` times too large.
 
         Runs twice as long see a flow 1.4 times as well (measured, on pumps of a second world), in a
@@ -146,7 +146,7 @@ class Surveyed:
         if not self.fit.levels:
             if not self.held:
                 raise ValueError(_ASTRAY)
-            raise ValueError(f"the experiments were stopped too early: {self._further()}")
+            raise ValueError(f"the experiments were stopped too early: {self._advise_runs()}")
         fractions, flows, sigmas = self.rising.columns
         leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
         if is_stuck(self.fit, self.rising):
@@ -181,7 +181,7 @@ class Surveyed:
                 f"the flow {where if top else 'at every command'} is not known to "
                 f"{_USEFUL_SHARE:.0%} after "
                 f"{self.duration_s / 60:.0f} minutes of experiments: "
-                f"{self._further(float(sigmas[unknown]) / (_USEFUL_SHARE * self.full_um_per_s))}"
+                f"{self._advise_runs(float(sigmas[unknown]) / (_USEFUL_SHARE * self.full_um_per_s))}"
             )
         part = slice(low, top + 1)
         return Branch(fractions[part], flows[part], sigmas[part]), low == 0
@@ -219,5 +219,5 @@ def is_stuck(fit: PumpFit, rising: Branch) -> bool:
     return bool((flows + 3 * sigmas < matters_um_per_s).all())
 
 
-def _tuple(values: FloatArray) -> tuple[float, ...]:
+def _round_values(values: FloatArray) -> tuple[float, ...]:
     return tuple(round(value, 4) for value in values.tolist())

@@ -112,7 +112,7 @@ class PumpSurvey:
             self.fit = fit_pump(
                 self.runs, self.fit if self._rounds > 3 and self.fit.levels else None
             )
-            self._branches = {rising: self._branch(rising) for rising in (True, False)}
+            self._branches = {rising: self._make_branch(rising) for rising in (True, False)}
 
     def steps(self) -> tuple[PumpStep, ...]:
         """The next round; empty when the curve is known, or cannot be known better in the time."""
@@ -127,19 +127,20 @@ class PumpSurvey:
                 max(1.0, 1.5 * self.laser_um), _FIRST_RISE * self.limit_um
             )  # shows in the noise
             # after a round that sank, at once: it sinks further until the first gas arrives
-            down = [_for(0.0, 20.0, -1.5 * rise_um)] if self._longer <= 1.0 else []
+            down = [_make_step(0.0, 20.0, -1.5 * rise_um)] if self._longer <= 1.0 else []
             lengths_s = np.clip(
                 self._longer * np.array(_FIRST_PULSES_S), _SHORTEST_S, _LONGEST_S
             ).tolist()
             pulses = (
-                (*down, _for(first, longest_s, rise_um), _for(0.0, 0.5)) for longest_s in lengths_s
+                (*down, _make_step(first, longest_s, rise_um), _make_step(0.0, 0.5))
+                for longest_s in lengths_s
             )
             return tuple(step for pulse in pulses for step in pulse)
-        self._want()
+        self._add_levels()
         made: list[PumpStep] = []
         left_s = _ROUND_S
-        for level in self._visits():
-            visit = self._visit(level)
+        for level in self._plan_visits():
+            visit = self._plan_visit(level)
             left_s -= self._lasts_s(level)
             if made and (left_s < 0 or len(made) + len(visit) > 90):
                 break
@@ -158,7 +159,7 @@ class PumpSurvey:
     @property
     def holding(self) -> float:
         """The command that balances the leak, once there is one above and one below it."""
-        fractions, flows = self._sure()
+        fractions, flows = self._list_known_flows()
         leak = self.fit.leak_um_per_s
         between = flows.size > 0 and flows[0] <= leak < flows[-1]
         return float(np.interp(leak, flows, fractions)) if between else self.holding_fraction
@@ -175,7 +176,7 @@ class PumpSurvey:
         at = np.flatnonzero(branch.fractions == level.fraction)
         return float(branch.sigmas[at[0]]) if at.size else math.inf
 
-    def _branch(self, rising: bool) -> Branch:
+    def _make_branch(self, rising: bool) -> Branch:
         """One branch, from no flow at command 0; its flows never fall, and are as smooth as they
         look.
         """
@@ -214,30 +215,30 @@ class PumpSurvey:
                 return True
         return False
 
-    def _want(self) -> None:
+    def _add_levels(self) -> None:
         """Add levels: scouts first, then where the curve bends or jumps, then those reached from
         above.
         """
         if not self._wanted:
             low, high = self.holding_fraction, min(level.fraction for level in self.fit.levels)
-            self._wanted |= {Level(_rounded(high + share * (1 - high))) for share in _SCOUTS} | {
-                Level(high)
-            }
-            self._wanted |= {Level(_rounded(low * share)) for share in _SCOUTS}
-        seen = all(level in self.fit.levels for level in self._wanted if self._reachable(level))
+            self._wanted |= {
+                Level(_round_fraction(high + share * (1 - high))) for share in _SCOUTS
+            } | {Level(high)}
+            self._wanted |= {Level(_round_fraction(low * share)) for share in _SCOUTS}
+        seen = all(level in self.fit.levels for level in self._wanted if self._is_reachable(level))
         if seen:
-            self._wanted |= {Level(f) for f in self._finer(True)}
+            self._wanted |= {Level(f) for f in self._list_finer_fractions(True)}
         if any(not level.rising for level in self._wanted):
-            self._wanted |= {Level(f, False) for f in self._finer(False)}
+            self._wanted |= {Level(f, False) for f in self._list_finer_fractions(False)}
         if seen:
             self._wanted |= {Level(f, False) for f in self._from_above()}
 
     @property
     def done(self) -> bool:
         """Every level wanted so far is known."""
-        return all(self.known(level) for level in self._wanted if self._reachable(level))
+        return all(self.known(level) for level in self._wanted if self._is_reachable(level))
 
-    def _finer(self, rising: bool) -> list[float]:
+    def _list_finer_fractions(self, rising: bool) -> list[float]:
         """Commands between those of a branch, where it bends or jumps."""
         fractions, flows, sigmas = self._branches[rising].columns
         full = self.full_um_per_s
@@ -254,7 +255,7 @@ class PumpSurvey:
                 and flows[i + 1] > JUMP_SHARE * full
                 and high - low > edge
             ):
-                found.append(_rounded((low + high) / 2))
+                found.append(_round_fraction((low + high) / 2))
         if not rising:
             return found
         leak_um_per_s = self.fit.leak_um_per_s
@@ -264,7 +265,7 @@ class PumpSurvey:
             sure = off > _SURE * math.hypot(sigmas[i], sigmas[i + 1])
             here = about and sure and off > _BENT_LEAKS * leak_um_per_s and high - low > _EDGE
             if here or (off > _BENT_SHARE * full and high - low > _NEAREST):
-                found.append(_rounded((low + high) / 2))
+                found.append(_round_fraction((low + high) / 2))
         return found
 
     def _from_above(self) -> list[float]:
@@ -272,26 +273,26 @@ class PumpSurvey:
         for the stall.
         """
         fractions, flows, _ = self._branches[True].columns
-        reached = np.array([f for f in fractions.tolist() if self._reachable(Level(f))])
+        reached = np.array([f for f in fractions.tolist() if self._is_reachable(Level(f))])
         found = [
             float(reached[np.argmin(np.abs(flows[: reached.size] - s * self.full_um_per_s))])
             for s in (0.3, 0.6)
         ]
         start = self.start()
         if start is not None:
-            found += [_rounded(start[1] / 2), start[1]]
+            found += [_round_fraction(start[1] / 2), start[1]]
         if self.hysteretic():
             found += reached[1:-1].tolist()
         return [f for f in found if f > 0]
 
-    def _visits(self) -> list[Level]:
+    def _plan_visits(self) -> list[Level]:
         """Levels to visit in the next round: new ones once, small ones first, then others as often
         as they ask for.
 
         A round reaches only the first of them. Where the leak's error keeps every level from being
         known, those with the largest error of their own must be among them.
         """
-        wanted = sorted(level for level in self._wanted if self._reachable(level))
+        wanted = sorted(level for level in self._wanted if self._is_reachable(level))
         fresh = [level for level in wanted if level not in self.fit.levels]
         wide = max(_KNOWN_SHARE * self.full_um_per_s, 1e-3)
         worst = sorted(
@@ -309,12 +310,12 @@ class PumpSurvey:
     @property
     def _scarce(self) -> bool:
         """No flow is known, or, in the rounds of the first pulses, none that lifts the mirror."""
-        flows = self._sure()[1]
+        flows = self._list_known_flows()[1]
         return not flows.any() or (
             self._rounds < 3 * _FIRST_ROUNDS and flows.max() <= self.fit.leak_um_per_s
         )
 
-    def _sure(self) -> tuple[FloatArray, FloatArray]:
+    def _list_known_flows(self) -> tuple[FloatArray, FloatArray]:
         """Commands whose flows are known to a third, and the flows."""
         if not self.runs:
             return np.empty(0), np.empty(0)
@@ -322,72 +323,76 @@ class PumpSurvey:
         sure = (sigmas < 0.3 * np.maximum(flows, 0.3 * self.fit.leak_um_per_s)) & (fractions > 0)
         return fractions[sure], flows[sure]
 
-    def _guess(self, fraction: float) -> float:
+    def _guess_flow(self, fraction: float) -> float:
         """Flow that a command may have, rather too large: beyond the largest known one like a
         square.
         """
-        fractions, flows = (np.append(0.0, column) for column in self._sure())
+        fractions, flows = (np.append(0.0, column) for column in self._list_known_flows())
         if fraction <= fractions[-1] or not flows[-1]:
             return float(np.interp(fraction, fractions, flows))
         none = float(fractions[flows < 0.02 * flows[-1]].max(initial=0.0))
         return float(1.3 * flows[-1] * ((fraction - none) / (fractions[-1] - none)) ** 2)
 
-    def _least(self, fraction: float) -> float:
+    def _least_flow(self, fraction: float) -> float:
         """Flow that a command has at least: that of the largest smaller one that is known."""
-        fractions, flows = (np.append(0.0, column) for column in self._sure())
+        fractions, flows = (np.append(0.0, column) for column in self._list_known_flows())
         return float(flows[fractions <= fraction][-1])
 
-    def _visit(self, level: Level) -> list[PumpStep]:
+    def _plan_visit(self, level: Level) -> list[PumpStep]:
         """From where the mirror may be to the level's run, and until its gas has arrived."""
-        leak, travel_um, up = max(self.fit.leak_um_per_s, 0.05), self._travel_um, self._up()
-        run = _for(level.fraction, self._run_s(level))
+        leak, travel_um, up = (
+            max(self.fit.leak_um_per_s, 0.05),
+            self._travel_um,
+            self._lifting_fraction(),
+        )
+        run = _make_step(level.fraction, self._run_s(level))
         up_s = (
-            60.0 if self._least(up) > leak else _FIRST_PULSES_S[-1]
+            60.0 if self._least_flow(up) > leak else _FIRST_PULSES_S[-1]
         )  # what an unknown command gives is not awaited
-        if self._net(level) > 0:
+        if self._net_flow(level) > 0:
             late_s = self.fit.delay_s + self.fit.lag_s
             late_um, caught_um = (
                 leak * late_s,
                 _CAUGHT * self._share * self.limit_um,
             )  # sinks before an answer
-            bottom_um = -0.5 * travel_um - min(1.0, 0.1 * self._net(level))
-            above = [] if level.rising else [_for(self._higher(level), 0.1)]
+            bottom_um = -0.5 * travel_um - min(1.0, 0.1 * self._net_flow(level))
+            above = [] if level.rising else [_make_step(self._higher_fraction(level), 0.1)]
             # where nothing is known to lift it meanwhile it begins higher, so that its gas can be
             # awaited
-            sinks_um = late_um + (leak - self._least(level.fraction)) * run.duration_s
+            sinks_um = late_um + (leak - self._least_flow(level.fraction)) * run.duration_s
             least_um = min(bottom_um + late_um, 0.0)
             start_um = max(least_um, min(sinks_um - caught_um, _HIGHEST * self.limit_um))
             first = [
-                _for(up, up_s, bottom_um + start_um - least_um - 0.5),
-                _for(0.0, 60.0, start_um),
+                _make_step(up, up_s, bottom_um + start_um - least_um - 0.5),
+                _make_step(0.0, 60.0, start_um),
             ]
-            wait = [_for(0.0, max(0.1, late_s))] if start_um >= sinks_um - caught_um else []
+            wait = [_make_step(0.0, max(0.1, late_s))] if start_um >= sinks_um - caught_um else []
             # a short run lifts it less than the leak takes meanwhile: the hold must catch it within
             # the limit
             until_um = min(late_um - caught_um, 0.0)
-            wait.append(_for(0.0, max(0.3, self.fit.answer_s - late_s * len(wait)), until_um))
+            wait.append(_make_step(0.0, max(0.3, self.fit.answer_s - late_s * len(wait)), until_um))
             return [*first, *above, run, *wait]
-        lifts_um = max(self._net(Level(up)), 0.0) * self.fit.answer_s
+        lifts_um = max(self._net_flow(Level(up)), 0.0) * self.fit.answer_s
         top_um = max(0.5 * travel_um - lifts_um, -0.2 * travel_um)
-        pause = [_for(0.0, 0.3)] if level.rising else []
-        return [_for(0.0, 60.0, 0.5 * travel_um), _for(up, up_s, top_um), *pause, run]
+        pause = [_make_step(0.0, 0.3)] if level.rising else []
+        return [_make_step(0.0, 60.0, 0.5 * travel_um), _make_step(up, up_s, top_um), *pause, run]
 
     @property
     def _travel_um(self) -> float:
         return _TRAVEL_UM * self._share * self.limit_um / 10.0
 
-    def _net(self, level: Level) -> float:
-        return self._guess(level.fraction) - self.fit.leak_um_per_s
+    def _net_flow(self, level: Level) -> float:
+        return self._guess_flow(level.fraction) - self.fit.leak_um_per_s
 
-    def _reachable(self, level: Level) -> bool:
+    def _is_reachable(self, level: Level) -> bool:
         """The shortest pulse of it leaves the mirror within its limit."""
-        return self._net(level) * _PULSE_S <= 1.3 * self.limit_um
+        return self._net_flow(level) * _PULSE_S <= 1.3 * self.limit_um
 
     def _run_s(self, level: Level) -> float:
-        fresh, net = level not in self.fit.levels, self._net(level)
+        fresh, net = level not in self.fit.levels, self._net_flow(level)
         longest_s, way_um = _LONGEST_S, self._travel_um
         if fresh:
-            sinks_um_per_s = self.fit.leak_um_per_s - self._least(
+            sinks_um_per_s = self.fit.leak_um_per_s - self._least_flow(
                 level.fraction
             )  # the guess may be wrong
             longest_s = min(
@@ -399,12 +404,12 @@ class PumpSurvey:
     def _lasts_s(self, level: Level) -> float:
         leak = max(self.fit.leak_um_per_s, 0.05)
         return (
-            self._run_s(level) * (1 + max(self._net(level), 0.0) / leak)
+            self._run_s(level) * (1 + max(self._net_flow(level), 0.0) / leak)
             + self.fit.answer_s
             + self._travel_um / leak
         )
 
-    def _higher(self, level: Level) -> float:
+    def _higher_fraction(self, level: Level) -> float:
         """A larger command, from which a level is reached: beyond any hysteresis."""
         return min(1.0, level.fraction + _ABOVE)
 
@@ -425,7 +430,7 @@ class PumpSurvey:
             held,
         ).map()
 
-    def _up(self) -> float:
+    def _lifting_fraction(self) -> float:
         """The smallest known command that lifts the mirror well; if none does,
         the first that may.
         """
@@ -433,13 +438,13 @@ class PumpSurvey:
         lifts = fractions[flows - 2 * sigmas > 1.5 * self.fit.leak_um_per_s]
         if lifts.size:
             return float(lifts[0])
-        may = (_rounded(f) for f in np.linspace(fractions[-1], 1.0, 9).tolist())
-        return next((f for f in may if self._net(Level(f)) > self.fit.leak_um_per_s), 1.0)
+        may = (_round_fraction(f) for f in np.linspace(fractions[-1], 1.0, 9).tolist())
+        return next((f for f in may if self._net_flow(Level(f)) > self.fit.leak_um_per_s), 1.0)
 
 
-def _for(fraction: float, duration_s: float, until_um: float | None = None) -> PumpStep:
+def _make_step(fraction: float, duration_s: float, until_um: float | None = None) -> PumpStep:
     return PumpStep(fraction=fraction, duration_s=duration_s, until_um=until_um)
 
 
-def _rounded(fraction: float) -> float:
+def _round_fraction(fraction: float) -> float:
     return round(fraction, 3)

@@ -68,12 +68,12 @@ class Record:
     def part(self, start_s: float, stop_s: float) -> Record:
         """The samples from `start_s` up to, but excluding, `stop_s`."""
         cut = slice(round(start_s / self.dt_s), round(stop_s / self.dt_s))
-        return Record(self.dt_s, *(column[cut] for column in self._columns()))
+        return Record(self.dt_s, *(column[cut] for column in self._list_columns()))
 
     def every(self, ticks: int) -> Record:
         """One reading of so many, and the mean flow until the next one."""
         whole = len(self) // ticks * ticks
-        flow_um_per_s, *read = (column[:whole] for column in self._columns())
+        flow_um_per_s, *read = (column[:whole] for column in self._list_columns())
         means_um_per_s = flow_um_per_s.reshape(-1, ticks).mean(axis=1)
         return Record(ticks * self.dt_s, means_um_per_s, *(column[::ticks] for column in read))
 
@@ -81,7 +81,7 @@ class Record:
         """Join this record and its continuation. Raises ValueError for different sample times."""
         if any(part.dt_s != self.dt_s for part in later):
             raise ValueError("records of different sample times cannot be joined")
-        columns = zip(*(part._columns() for part in (self, *later)), strict=True)
+        columns = zip(*(part._list_columns() for part in (self, *later)), strict=True)
         return Record(self.dt_s, *(np.concatenate(parts) for parts in columns))
 
     def filled_displacement_um(self) -> Series:
@@ -94,9 +94,9 @@ class Record:
     def sha256(self) -> str:
         """Hash of the data, which identifies the origin of gains."""
         digest = hashlib.sha256(np.float64(self.dt_s).tobytes())
-        for column in self._columns():
+        for column in self._list_columns():
             digest.update(np.ascontiguousarray(column).tobytes())
         return digest.hexdigest()
 
-    def _columns(self) -> tuple[Series, ...]:
+    def _list_columns(self) -> tuple[Series, ...]:
         return tuple(getattr(self, name) for name in COLUMNS)

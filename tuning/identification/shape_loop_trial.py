@@ -61,7 +61,7 @@ def try_time_constant(
     tracking = float(np.mean([row.shape_state == ShapeState.TRACKING for row in rows]))
     gaps = compute_gaps_um([*earlier, *during], assumed)
     error_before_um, error_um = (
-        _predicted(*gaps, memory_s, len(during)) for memory_s in (before_s, after_s)
+        _prediction_error(*gaps, memory_s, len(during)) for memory_s in (before_s, after_s)
     )
     reason = ""
     if len(during) < LEAST_CYCLES or tracking < _TRACKING_LEAST:
@@ -80,7 +80,7 @@ def try_time_constant(
     return OuterTrial(before_s, after_s, error_before_um, error_um, tracking, reason)
 
 
-def _predicted(times_s: Series, gaps_um: Series, memory_s: float, last: int) -> float:
+def _prediction_error(times_s: Series, gaps_um: Series, memory_s: float, last: int) -> float:
     """Rms error with which a tracker predicts the last gaps, each from those before it."""
     tracker = DriftTracker()
     tracker.begin(float(times_s[0]))

@@ -94,7 +94,7 @@ def fit_weather(
     variances = np.array(
         [n.white**2 * share / per_block for n, share in zip(noises, shares, strict=True)]
     )
-    gains, sigmas = _regress(z, columns, variances, per_block)
+    gains, sigmas = _regress_gains(z, columns, variances, per_block)
     found = [
         WeatherGain(float(g), float(s), noise.fast, noise.white, lag_s, noise.coloured)
         for g, s, noise, (_, lag_s) in zip(gains, sigmas, noises, channels, strict=True)
@@ -107,7 +107,7 @@ def fit_weather(
     )
 
 
-def _regress(
+def _regress_gains(
     z: Series, columns: list[Series], variances: Series, per_block: int
 ) -> tuple[Series, Series]:
     """Gains and their standard errors, with the best-fitting beta of the noise."""

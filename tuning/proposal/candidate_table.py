@@ -30,14 +30,15 @@ def format_cells(rows: tuple[Candidate, ...]) -> list[tuple[str, ...]]:
     present = next((row for row in rows if row.name == PRESENT), None)
     ordered = sorted(rows, key=lambda row: row is not present)
     return [
-        (row.name, *_gains(row), *_figures(row), describe_change(row, present)) for row in ordered
+        (row.name, *_format_gains(row), *_format_figures(row), describe_change(row, present))
+        for row in ordered
     ]
 
 
 def format_markdown(rows: tuple[Candidate, ...]) -> str:
     """The candidates as a Markdown table, with all margins."""
     heads = (*HEADS, *MARGIN_HEADS)
-    margins = {row.name: _margins(row) for row in rows}
+    margins = {row.name: _format_margins(row) for row in rows}
     lines = [
         heads,
         ("---", *["---:"] * (len(heads) - 1)),
@@ -92,18 +93,18 @@ def describe_change(row: Candidate, present: Candidate | None) -> str:
     )
 
 
-def _gains(row: Candidate) -> tuple[str, ...]:
+def _format_gains(row: Candidate) -> tuple[str, ...]:
     gains = row.gains
     return f"{gains.kp_per_s:.3f}", f"{gains.ti_s:.2f}", f"{gains.filter_s:.2f}"
 
 
-def _figures(row: Candidate) -> list[str]:
+def _format_figures(row: Candidate) -> list[str]:
     if row.predicted is None:
         return ["unstable", "", "", ""]
-    return [_figure(row, name, digits) for name, digits in _DIGITS.items()]
+    return [_format_figure(row, name, digits) for name, digits in _DIGITS.items()]
 
 
-def _figure(row: Candidate, name: str, digits: int) -> str:
+def _format_figure(row: Candidate, name: str, digits: int) -> str:
     value = float(getattr(row.figures, name))
     if math.isnan(value):
         return "not known"
@@ -111,7 +112,7 @@ def _figure(row: Candidate, name: str, digits: int) -> str:
     return f"{value:.{digits}f}{sigma}"
 
 
-def _margins(row: Candidate) -> tuple[str, ...]:
+def _format_margins(row: Candidate) -> tuple[str, ...]:
     m, p = row.margins, row.predicted
     predicted = (f"{row.ratio:.2f}", f"{p.flow_std_um_per_s:.2f}") if p is not None else ("", "")
     margins = (

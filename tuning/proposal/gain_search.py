@@ -70,7 +70,9 @@ def search_max_ki(
 ) -> closed_loop.Gains:
     """PI with the largest K / Ti at a sensitivity below `ms`: best against a step of the leak."""
     start = make_simc_gains(model, dt_s, filter_s)
-    return _search(model, dt_s, start, ms, lambda gains: -math.log(gains.kp_per_s / gains.ti_s))
+    return _search_gains(
+        model, dt_s, start, ms, lambda gains: -math.log(gains.kp_per_s / gains.ti_s)
+    )
 
 
 def search_least_variance(
@@ -110,10 +112,10 @@ def search_least_variance(
     starts = (
         make_simc_gains(model, dt_s, filter_s, 1.2) for filter_s in _FILTERS_S if filter_s >= dt_s
     )
-    return min((_search(model, dt_s, start, demands.ms, cost) for start in starts), key=cost)
+    return min((_search_gains(model, dt_s, start, demands.ms, cost) for start in starts), key=cost)
 
 
-def _search(
+def _search_gains(
     model: plant_model.PlantModel,
     dt_s: float,
     start: closed_loop.Gains,

@@ -57,9 +57,9 @@ class ModelBench:
         self._weather = self._transition @ self._weather + self._kicks @ self._rng.standard_normal(
             self._weather.size
         )
-        return self._read()
+        return self._read_sample()
 
-    def _read(self) -> BenchSample:
+    def _read_sample(self) -> BenchSample:
         of, walks = self._disturbance, self._walks
         true_um = self._driven.way_um - self._leaked_um + float(walks.centre @ self._weather)
         self.true_um.append(true_um)

@@ -47,10 +47,12 @@ def predict_loop(
     centre = np.abs(sensitivity) ** 2 * moving + np.abs(1 - sensitivity) ** 2 * noise
     flow = np.abs(closed_loop.controller_response(gains, w) * sensitivity) ** 2 * (moving + noise)
     change = flow * np.abs(2 * np.sin(w * dt_s / 2)) ** 2
-    return Predicted(*(math.sqrt(_variance(spectrum, w)) for spectrum in (centre, flow, change)))
+    return Predicted(
+        *(math.sqrt(_integrate_variance(spectrum, w)) for spectrum in (centre, flow, change))
+    )
 
 
-def _variance(psd: FloatArray, w: FloatArray) -> float:
+def _integrate_variance(psd: FloatArray, w: FloatArray) -> float:
     return float(np.trapezoid(psd * w, np.log(w))) / math.pi
 
 
@@ -78,13 +80,13 @@ def linearise_limits(
     for _ in range(_ROUNDS):
         sensitivity = 1 / (1 + closed_loop.loop_response(gains, plant, w, dt_s))
         flow = np.abs(controller * sensitivity) ** 2 * (moving + noise) + forward
-        variance = _variance(flow, w)
-        share, rest = _clipped(
+        variance = _integrate_variance(flow, w)
+        share, rest = _clip_changes(
             math.sqrt(variance), model.holding_flow_um_per_s, loop.flow_max_um_per_s
         )
         if share > 1 - 1e-3:
             break
-        memory_s = _variance(flow**2, w) / variance**2
+        memory_s = _integrate_variance(flow**2, w) / variance**2
         plant = replace(model, gain=model.gain * share)
         added = rest * memory_s / (1 + (w * memory_s / 2) ** 2)
         moving = (
@@ -94,7 +96,7 @@ def linearise_limits(
     return plant, moving
 
 
-def _clipped(std: float, mean: float, most: float) -> tuple[float, float]:
+def _clip_changes(std: float, mean: float, most: float) -> tuple[float, float]:
     """What limits of 0 and `most` leave of a Gaussian's small changes, and the variance that they
     add.
 

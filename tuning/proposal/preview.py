@@ -37,13 +37,15 @@ def preview_loop(
     """Hold on the fitted twin in its weather, and once more without
     weather for a step of the leak.
     """
-    true_um = _held(loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s)
+    true_um = _simulate_hold(
+        loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s
+    )
     noise = replace(
         disturbance.rest, white=disturbance.rest.white * 1e-3, fast=0.0, slow=0.0, coloured=()
     )
     calm = DisturbanceModel(noise, None, None)
     stepped = ModelBench(model, calm, pump, seed, (_SETTLE_S, load_step_um_per_s))
-    answer_um = _held(loop, pump, model, stepped, 120.0)
+    answer_um = _simulate_hold(loop, pump, model, stepped, 120.0)
     away = np.flatnonzero(np.abs(answer_um) > load_step.RECOVERED_UM)
     return Preview(
         std_um=float(true_um.std()),
@@ -53,7 +55,7 @@ def preview_loop(
     )
 
 
-def _held(
+def _simulate_hold(
     loop: LoopConfig,
     pump: PumpConfig,
     model: plant_model.PlantModel,

@@ -20,11 +20,11 @@ def write_recording(folder: SessionFolder) -> None:
     path = resolve_user_path(folder.file_path("session.rrd"))
     part = path.with_name(f".{path.name}.part")
     part.unlink(missing_ok=True)
-    stream.save(part, default_blueprint=_blueprint())
+    stream.save(part, default_blueprint=_make_blueprint())
     if folder.is_done("characterise"):
-        _experiments(stream, folder)
+        _log_experiments(stream, folder)
     if folder.is_done("observe"):
-        _record(stream, "before", record_file.load_record(folder.file_path("quiet.npz")))
+        _log_record(stream, "before", record_file.load_record(folder.file_path("quiet.npz")))
     if folder.is_done("design"):
         markdown = folder.read_candidates()
         stream.log(
@@ -35,40 +35,40 @@ def write_recording(folder: SessionFolder) -> None:
         stream.log("candidates/std_um", rr.BarChart(stds), static=True)
         stream.log("candidates/ms", rr.BarChart([row.margins.ms for row in rows]), static=True)
     if folder.file_path("verify.npz").exists():
-        _record(stream, "after", record_file.load_record(folder.file_path("verify.npz")))
+        _log_record(stream, "after", record_file.load_record(folder.file_path("verify.npz")))
     stream.flush()
     stream.disconnect()
     move_file(part, path)
 
 
-def _experiments(stream: rr.RecordingStream, folder: SessionFolder) -> None:
+def _log_experiments(stream: rr.RecordingStream, folder: SessionFolder) -> None:
     record = characterise.load_experiments(folder).record
-    _record(stream, "experiment", record)
+    _log_record(stream, "experiment", record)
     if not folder.is_done("identify"):
         return
     found = identify.load_identified(folder).identified
     time_s = np.arange(len(record)) * record.dt_s
-    _series(
+    _log_series(
         stream, "fit/pump_share_um", time_s, plant_model.compute_pump_share_um(record, found.model)
     )
-    _series(stream, "residual/prediction_error_um", time_s[1:], found.residual_um)
+    _log_series(stream, "residual/prediction_error_um", time_s[1:], found.residual_um)
 
 
-def _record(stream: rr.RecordingStream, name: str, record: Record) -> None:
+def _log_record(stream: rr.RecordingStream, name: str, record: Record) -> None:
     time_s = np.arange(len(record)) * record.dt_s
-    _series(stream, f"{name}/flow_um_per_s", time_s, record.flow_um_per_s)
-    _series(stream, f"{name}/displacement_um", time_s, record.displacement_um)
+    _log_series(stream, f"{name}/flow_um_per_s", time_s, record.flow_um_per_s)
+    _log_series(stream, f"{name}/displacement_um", time_s, record.displacement_um)
     if record.has_barometer:
-        _series(stream, f"{name}/ambient_pressure_pa", time_s, record.ambient_pressure_pa)
+        _log_series(stream, f"{name}/ambient_pressure_pa", time_s, record.ambient_pressure_pa)
 
 
-def _series(stream: rr.RecordingStream, path: str, time_s: AnyArray, values: AnyArray) -> None:
+def _log_series(stream: rr.RecordingStream, path: str, time_s: AnyArray, values: AnyArray) -> None:
     good = np.isfinite(values)
     index = rr.TimeColumn(_TIMELINE, duration=time_s[good])
     stream.send_columns(path, indexes=[index], columns=rr.Scalars.columns(scalars=values[good]))
 
 
-def _blueprint() -> rrb.Blueprint:
+def _make_blueprint() -> rrb.Blueprint:
     def plot(name: str, *paths: str) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(name=name, origin="/", contents=[f"+ /{path}" for path in paths])
 

@@ -46,7 +46,7 @@ class Rig:
         flows: list[float] = []
         samples: list[experiment.BenchSample] = []
         for _ in range(round(duration_s / self.dt_s)):
-            out = self._loop.step(self._given(target_um), self.dt_s)
+            out = self._loop.step(self._make_loop_input(target_um), self.dt_s)
             flows.append(out.flow_um_per_s)
             samples.append(self._last)
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
@@ -55,9 +55,11 @@ class Rig:
     def perform(self, spec: ExperimentSpec) -> tuple[Record, experiment.Finished]:
         """Run an experiment about 0 until it finishes; the loop can hold afterwards."""
         begun = trial.begin_trial(spec, self._config, self._pump, 0.0)
-        return self._run(trial.Trial(begun, self._config.rate_hz), spec.holding_flow_um_per_s)
+        return self._run_experiment(
+            trial.Trial(begun, self._config.rate_hz), spec.holding_flow_um_per_s
+        )
 
-    def _run(
+    def _run_experiment(
         self, guard: experiment.Experiment, holding_flow_um_per_s: float
     ) -> tuple[Record, experiment.Finished]:
         flows: list[float] = []
@@ -65,9 +67,11 @@ class Rig:
         while True:
             wanted = guard.step(self._last, self.dt_s)
             if isinstance(wanted, experiment.Finished):
-                self._loop.resume_at_mean(self._given(0.0), holding_flow_um_per_s, self.dt_s)
+                self._loop.resume_at_mean(
+                    self._make_loop_input(0.0), holding_flow_um_per_s, self.dt_s
+                )
                 return Record.from_samples(self.dt_s, flows, samples), wanted
-            out = self._loop.follow_flow(self._given(0.0), wanted, self.dt_s)
+            out = self._loop.follow_flow(self._make_loop_input(0.0), wanted, self.dt_s)
             flows.append(out.flow_um_per_s)
             samples.append(self._last)
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
@@ -76,7 +80,7 @@ class Rig:
         """Operating point of an experiment, from the hold before it."""
         return make_operating_point(held, self._config, self._pump, limit_um)
 
-    def _given(self, target_um: float) -> inner_loop.LoopInput:
+    def _make_loop_input(self, target_um: float) -> inner_loop.LoopInput:
         now = self._last
         return inner_loop.LoopInput(
             target_um, 0.0, now.displacement_um, now.ambient_pressure_pa, now.air_temperature_c

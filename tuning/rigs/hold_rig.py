@@ -132,19 +132,19 @@ class HoldRig:
         """End the experiment that runs, perhaps that of a session that was killed, and discard its
         ticks.
         """
-        self._take()
+        self._take_news()
         if self._state != telemetry.State.TUNE:
             return
         self._link.send_command(Command("hold", self._who, "tuning session interrupted"))
         while not self._rows or self._rows[-1].state == telemetry.State.TUNE:
             self._rows.clear()
-            self._take()
+            self._take_news()
         while self._rows[0].state == telemetry.State.TUNE:
             self._rows.popleft()
 
     def catch_up(self) -> None:
         """Discard the ticks so far: while a person thinks, nothing is recorded."""
-        self._take()
+        self._take_news()
         self._rows.clear()
 
     def record(self, rows: Sequence[telemetry.TelemetryRow]) -> Record:
@@ -194,19 +194,19 @@ class HoldRig:
 
     def _next_held(self) -> telemetry.TelemetryRow:
         while not self._rows:
-            self._take()
+            self._take_news()
         row = self._rows[0]
         if row.state not in _HELD:
             raise HoldError(
                 "the mirror is not held (state "
-                f"{telemetry.State(int(row.state)).name.lower()}): {self._why()}; "
+                f"{telemetry.State(int(row.state)).name.lower()}): {self._explain_state()}; "
                 "start or resume the hold, then repeat this step"
             )
         self._progress(self.dt_s)
         self.seen(row)
         return self._rows.popleft()
 
-    def _take(self) -> None:
+    def _take_news(self) -> None:
         news = self._link.read_news()
         self._state = news.rows[-1].state if news.rows else self._state
         self._rows.extend(
@@ -221,9 +221,9 @@ class HoldRig:
             found = [event for event in self._events if isinstance(event, events.ExperimentEnded)]
             if found:
                 return found[-1]
-            self._take()
+            self._take_news()
         raise HoldError("the hold did not report the end of the experiment")
 
-    def _why(self) -> str:
+    def _explain_state(self) -> str:
         said = [event.why for event in self._events if isinstance(event, events.StateEntered)]
         return said[-1] if said else "no reason was given"

@@ -54,10 +54,10 @@ class TicksByFigures:
             or self._waiting[-1].mono_s - self._waiting[0].mono_s > _FIGURE_LATE_S
         ):
             row = self._waiting.popleft()
-            done.append(replace(row, displacement_um=self._at(row.mono_s)))
+            done.append(replace(row, displacement_um=self._figure_at(row.mono_s)))
         return done
 
-    def _at(self, time_s: float) -> float:
+    def _figure_at(self, time_s: float) -> float:
         while len(self._shown) > 1 and self._shown[1][0] <= time_s:
             self._shown.popleft()
         (before_s, before_um), (after_s, after_um) = (

@@ -83,13 +83,13 @@ def map_pump(
     """
     before = rig.pump
     try:
-        _calmed(rig, limit_um)
-        found = _surveyed(rig, limit_um)
+        _calm_hold(rig, limit_um)
+        found = _survey_pump(rig, limit_um)
         watched = before.model_dump(include={"probe_um", "change_max"})
         found = replace(found, pump=found.pump.model_copy(update=watched))
-        loop = _safe(_freed(rig.good[0], before, found.pump), found)
+        loop = _make_safe_gains(_free_flow_limit(rig.good[0], before, found.pump), found)
         rig.set_gains(loop, "the measured curve of the pump", _MAP_S, pump=found.pump)
-        gain, sigma = _checked(rig, found.delay_s + found.lag_s)
+        gain, sigma = _measure_gain(rig, found.delay_s + found.lag_s)
     except (experiments.ExperimentError, ValueError) as error:
         rig.go_back()
         raise errors.RejectedError(f"pump map: {error}") from None
@@ -101,7 +101,7 @@ def map_pump(
     return done, session
 
 
-def _calmed(rig: HoldRig, limit_um: float) -> None:
+def _calm_hold(rig: HoldRig, limit_um: float) -> None:
     """Cautious gains from the mean flow, with which an experiment gives the mirror back.
 
     Without a bump they would begin at the flow of a moment: of a loop that swings on an actuator
@@ -118,7 +118,7 @@ def _calmed(rig: HoldRig, limit_um: float) -> None:
     )
 
 
-def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
+def _survey_pump(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
     _brought_back(rig)
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
     holding = PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s)
@@ -138,21 +138,23 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
             raise ValueError(finished.reason)
         with contextlib.suppress(ValueError):  # none yet
             found = survey.result()
-            if _holds(found):
-                loop = _freed(*rig.good, found.pump).model_copy(update=_CAUTIOUS)
-                rig.set_gains(_slowed(loop, found, _SLOWER), "pump map", _MAP_S, pump=found.pump)
+            if _reaches_leak(found):
+                loop = _free_flow_limit(*rig.good, found.pump).model_copy(update=_CAUTIOUS)
+                rig.set_gains(
+                    _slow_gains(loop, found, _SLOWER), "pump map", _MAP_S, pump=found.pump
+                )
         # a hold that swings may do; one that stays away ends every round at once
         held = _brought_back(rig) or run.fraction.size * rig.dt_s > _AT_ONCE_S
     return survey.result(held)
 
 
-def _holds(found: pump_map.PumpMap) -> bool:
+def _reaches_leak(found: pump_map.PumpMap) -> bool:
     """Whether a curve that is not finished already reaches from below the leak to well above it."""
     curve = PumpCurve(found.pump)
     return curve.least_flow_um_per_s < found.leak_um_per_s < found.pump.flow_full_um_per_s / _LIFTS
 
 
-def _freed(
+def _free_flow_limit(
     loop: schema.LoopConfig, before: schema.PumpConfig, pump: schema.PumpConfig
 ) -> schema.LoopConfig:
     """The loop with the flow of the measured pump, unless its limit was below what the pump was
@@ -165,7 +167,7 @@ def _freed(
     return loop.model_copy(update={"flow_max_um_per_s": most_um_per_s})
 
 
-def _safe(loop: schema.LoopConfig, found: pump_map.PumpMap) -> schema.LoopConfig:
+def _make_safe_gains(loop: schema.LoopConfig, found: pump_map.PumpMap) -> schema.LoopConfig:
     """The gains, or slower ones (SIMC with the delay as time constant) if they lack margin on this
     actuator.
     """
@@ -173,17 +175,19 @@ def _safe(loop: schema.LoopConfig, found: pump_map.PumpMap) -> schema.LoopConfig
     margins = compute_margins(closed_loop.Gains.of(loop), model, 1 / loop.rate_hz)
     if margins.stable and margins.ms <= MS_MAX:
         return loop
-    return _slowed(loop, found, _SLOW)
+    return _slow_gains(loop, found, _SLOW)
 
 
-def _slowed(loop: schema.LoopConfig, found: pump_map.PumpMap, share: float) -> schema.LoopConfig:
+def _slow_gains(
+    loop: schema.LoopConfig, found: pump_map.PumpMap, share: float
+) -> schema.LoopConfig:
     late_s = found.delay_s + found.lag_s + loop.measurement_filter_s + 0.5 / loop.rate_hz
     return loop.model_copy(
         update={"kp_per_s": share / late_s, "ti_s": 4 * late_s / share, "td_s": 0.0}
     )
 
 
-def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
+def _measure_gain(rig: HoldRig, late_s: float) -> tuple[float, float]:
     """The gain of the mirror on the curve in force, and its error, from steps of the flow.
 
     Steps that contradict the curve, or see little in their weather, are repeated for twice as long.
@@ -191,7 +195,7 @@ def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
     holding flow; one that they do not know contradicts nothing.
     """
     for steps_s in _CHECKS_S:
-        _returned(rig)
+        _wait_for_return(rig)
         rig.hold(_CHECK_AFTER_S)
         around = replace(rig.around(rig.hold(_CHECK_BEFORE_S)), late_s=late_s)
         operating_point.require_room(around)
@@ -214,22 +218,22 @@ def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
 
 
 def _brought_back(rig: HoldRig) -> bool:
-    """`_returned`; if slow gains leave it above in strong weather, with those that held the mirror
+    """`_wait_for_return`; if slow gains leave it above in strong weather, with those that held the mirror
     before.
 
     From above a faster loop only stops the pump; from below it would drive a stuck one.
     """
-    if _returned(rig):
+    if _wait_for_return(rig):
         return True
     rows = rig.ticks(_BACK_S)
     if np.mean(rig.record(rows).filled_displacement_um()) < rows[-1].target_um + rows[-1].trim_um:
         return False
     own = rig.good[0].model_dump(include=set(_CAUTIOUS))
     rig.set_gains(rig.loop.model_copy(update=own), "pump map", _MAP_S)
-    return _returned(rig)
+    return _wait_for_return(rig)
 
 
-def _returned(rig: HoldRig) -> bool:
+def _wait_for_return(rig: HoldRig) -> bool:
     """Hold until the mirror is back where it is to stand, at the end of its ramp; not if three
     minutes are over.
     """

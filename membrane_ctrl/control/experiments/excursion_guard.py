@@ -83,7 +83,7 @@ class ExcursionGuard:
             return self.memory.ended or Finished(ExperimentEnd.READING_LOST, lost)
         off_um = self._motion.position_um - self._centre_um
         if self.memory.ended is None:
-            found = self._guarded(off_um, measurement, dt_s)
+            found = self._guard_step(off_um, measurement, dt_s)
             if self._raw or not isinstance(found, Finished):
                 return found
             self.memory.ended = found
@@ -94,7 +94,7 @@ class ExcursionGuard:
         back_um_per_s = self._around.holding_flow_um_per_s - PULL_PER_S * off_um
         return min(max(back_um_per_s, 0.0), self._around.full_flow_um_per_s)
 
-    def _guarded(self, off_um: float, measurement: BenchSample, dt_s: float) -> float | Finished:
+    def _guard_step(self, off_um: float, measurement: BenchSample, dt_s: float) -> float | Finished:
         coming_um = off_um + self._motion.coast_s * self._motion.speed_um_per_s
         if max(abs(off_um), abs(coming_um)) > self._bound_um:
             return Finished(

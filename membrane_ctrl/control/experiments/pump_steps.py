@@ -42,14 +42,14 @@ class PumpSteps:
         self._motion.update(measurement.displacement_um, dt_s)
         memory = self.memory
         memory.in_step_s += dt_s
-        if self._over():
+        if self._is_step_over():
             memory.steps_done += 1
             memory.in_step_s = 0.0
         if memory.steps_done == len(self._steps):
             return experiment.Finished(experiment.ExperimentEnd.COMPLETED, "pump mapped")
         return self._steps[memory.steps_done].fraction
 
-    def _over(self) -> bool:
+    def _is_step_over(self) -> bool:
         """Whether the present step is."""
         now, off_um = (
             self._steps[self.memory.steps_done],

@@ -98,7 +98,7 @@ class Relay:
             memory.at_centre_s = memory.time_s
         around = self._around
         if memory.direction * off_um > self._threshold_um:
-            self._switch()
+            self._switch_relay()
         elif memory.since_switch_s > _PATIENCE_S:
             way = "rise" if memory.rises else "sink"
             open_bleed = describe_bleed_remedy(
@@ -115,7 +115,7 @@ class Relay:
             around.holding_flow_um_per_s + memory.direction * half.amplitude_um_per_s
         )
 
-    def _switch(self) -> None:
+    def _switch_relay(self) -> None:
         """Reverse; adapt the flow of the previous half cycle, whose overshoot is now known."""
         memory = self.memory
         half, before = (memory.up, memory.down) if memory.rises else (memory.down, memory.up)
