@@ -177,11 +177,12 @@ class Surveyed:
                 f"{'beyond' if beyond else 'below'} a command of "
                 f"{fractions[top if beyond else low]:.2f}"
             )
+            too_large = float(sigmas[unknown]) / (_USEFUL_SHARE * self.full_um_per_s)
             raise ValueError(
                 f"the flow {where if top else 'at every command'} is not known to "
                 f"{_USEFUL_SHARE:.0%} after "
                 f"{self.duration_s / 60:.0f} minutes of experiments: "
-                f"{self._advise_runs(float(sigmas[unknown]) / (_USEFUL_SHARE * self.full_um_per_s))}"
+                f"{self._advise_runs(too_large)}"
             )
         part = slice(low, top + 1)
         return Branch(fractions[part], flows[part], sigmas[part]), low == 0

@@ -218,8 +218,8 @@ def _measure_gain(rig: HoldRig, late_s: float) -> tuple[float, float]:
 
 
 def _brought_back(rig: HoldRig) -> bool:
-    """`_wait_for_return`; if slow gains leave it above in strong weather, with those that held the mirror
-    before.
+    """Wait for the mirror's return, as `_wait_for_return` does; if slow gains leave it above in
+    strong weather, with those that held the mirror before.
 
     From above a faster loop only stops the pump; from below it would drive a stuck one.
     """
