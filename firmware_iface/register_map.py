@@ -18,7 +18,7 @@ SCHEMA = "membrane-registers/1"
 # struct code and length in 16-bit words; big-endian structs give the big word first
 _TYPES = {"u16": ("H", 1), "u32": ("I", 2), "i32": ("i", 2), "f32": ("f", 2)}
 _RANGES = {"u16": (0, 2**16 - 1), "u32": (0, 2**32 - 1), "i32": (-(2**31) + 1, 2**31 - 1)}
-# an integer has no NaN; the most negative one has no positive twin and is the customary stand-in
+# an integer has no NaN; the most negative one has no positive twin and is the customary substitute
 I32_NO_VALUE = -(2**31)
 _SUFFIXES = {"s": "_s", "um": "_um", "Pa": "_pa", "degC": "_c", "fraction": "_fraction", "1": ""}
 _ADDRESSES = 2**16

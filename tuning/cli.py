@@ -57,7 +57,7 @@ ShortOption = Annotated[
 WaitOption = Annotated[bool, typer.Option("--wait", help="Wait until the mirror is held.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 TakeOverOption = Annotated[
-    bool, typer.Option("--take-over", help="Take command from whoever has it.")
+    bool, typer.Option("--take-over", help="Take command from the client that has it.")
 ]
 
 _STEPS = {

@@ -13,7 +13,7 @@ _WALK_RAD_PER_S = 1.0
 
 
 def derive_estimator_levels(session: folder.SessionFolder) -> dict[str, float]:
-    """What the session measured of `[estimator]`: the pump, and noise and unrest of the sensors
+    """What the session measured of `[estimator]`: the pump, and noise and drift of the sensors
     that are there.
     """
     model, seen = load_identified(session).identified.model, load_disturbance(session)

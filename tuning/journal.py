@@ -48,7 +48,7 @@ class GainsEntry:
     session: str
     author: str
     reason: str
-    before: LoopConfig  # gains before and with it; after "taken_back" the former are in force again
+    before: LoopConfig  # gains before and with it; after "taken_back" the former are in use again
     after: LoopConfig
     traded: Traded | None = None
     # time constant of the shape loop before and after, if that was tried

@@ -174,7 +174,7 @@ def of_case(case: str, seeds: int, duration_s: float) -> list[Figure]:
 
 
 def told_wrong(draws: int, duration_s: float) -> list[Figure]:
-    """Everything that the filter is told is wrong by up to 30 %."""
+    """Every setting of the filter is wrong by up to 30 %."""
     nominal_um = steady("all", 1, duration_s)["std_um"]
     stds_um = [robust(draw, duration_s) for draw in range(draws)]
     return [

@@ -56,7 +56,7 @@ class GpioCircuit:
 
 
 class GpioLines:
-    """Circuits at the lines of one GPIO chip; `gpiod` is the package, or a stand-in for it."""
+    """Circuits at the lines of one GPIO chip; `gpiod` is the package, or a simulation of it."""
 
     def __init__(self, chip: str, circuits: Sequence[GpioCircuit], gpiod: Any = None) -> None:
         self._gpiod = load_gpiod() if gpiod is None else gpiod

@@ -195,7 +195,7 @@ class PumpBoard:
         )
 
     def _find_foreign_settings(self, sensors: Mapping[str, float]) -> int:
-        """Which of claim and period in force differ from what this object set; a board without
+        """Which of the board's claim and period differ from what this object set; a board without
         claims cannot tell.
         """
         if self._registers.map_version == 1:
@@ -236,8 +236,9 @@ class PumpBoard:
         await self._write_block("reset", {"clear_faults": mask, "clear_key": self._claim_key})
 
     async def stop(self) -> None:
-        """Stop the pump of a board that was identified, whoever holds it; the vent stays as it is.
-        Raises LinkError.
+        """Stop the pump of an identified board, even if another program holds it. Raises LinkError.
+
+        The vent stays as it is.
 
         A board of map version 2 latches it as a fault. One of version 1 gets pump 0 without a
         heartbeat, which neither feeds nor arms its watchdog: its holder may run the pump again with

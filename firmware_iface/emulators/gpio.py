@@ -1,4 +1,4 @@
-"""A stand-in for the package `gpiod`: GPIO chips with contacts that a test opens,
+"""A simulation of the package `gpiod`: GPIO chips with contacts that a test opens,
 closes or cuts.
 """
 
@@ -7,7 +7,7 @@ from typing import Literal
 
 
 class EmulatedGpio:
-    """A stand-in for the package `gpiod`: chips with lines whose electrical levels a test sets.
+    """A simulation of the package `gpiod`: chips with lines whose electrical levels a test sets.
 
     Attributes
     ----------

@@ -151,7 +151,7 @@ class SerialPort:
         return max(self._back_off.remaining_s(now_s), self._absent_until_s - now_s, 0.0)
 
     def open(self, receiver: Receiver) -> None:
-        """Open anew, as the only user of the port.
+        """Open the port again, as its only user.
 
         Raises LinkDownError (not there, busy, not permitted, or not yet time for the next attempt),
         DeviceRefusedError (several adapters have this USB identity).

@@ -164,7 +164,7 @@ def calibrate(
     run: Annotated[Path | None, typer.Option(help="--live: run folder of the hold.")] = None,
     socket: Annotated[Path | None, typer.Option(help="--live: control port of the hold.")] = None,
     take_over: Annotated[
-        bool, typer.Option("--take-over", help="--live: take command from whoever has it.")
+        bool, typer.Option("--take-over", help="--live: take command from the client that has it.")
     ] = False,
 ) -> int:
     """Calibrate the optics: one geometry with its covariance, from sets at several pressures."""

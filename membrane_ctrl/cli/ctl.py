@@ -16,7 +16,7 @@ from membrane_ctrl.model.numbers import parse_number
 
 WhyOption = Annotated[str, typer.Option(help="Reason, recorded with the command.")]
 TakeOverOption = Annotated[
-    bool, typer.Option("--take-over", help="Take command from whoever has it.")
+    bool, typer.Option("--take-over", help="Take command from the client that has it.")
 ]
 RunOption = Annotated[Path | None, typer.Option(help="The run's folder.")]
 SocketOption = Annotated[

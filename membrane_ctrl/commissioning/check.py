@@ -274,7 +274,9 @@ def _describe_geometry(config: Config) -> str:
 
 
 async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> DeviceProbe:
-    """Probe the board, whoever controls it, without writing: claim and watchdog are unaffected.
+    """Probe the board without writing, also while another program controls it.
+
+    Claim and watchdog are unaffected.
 
     `laser`: whether the bench must have one.
     """

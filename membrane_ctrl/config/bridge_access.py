@@ -22,7 +22,7 @@ def bridge_accesses(doors: DoorsConfig) -> list[BridgeAccess]:
     found = []
     if doors.mqtt is not None:
         mqtt = doors.mqtt
-        who = "whoever the broker lets publish there (its access list)"
+        who = "everyone whom the broker lets publish there (its access list)"
         where = f"MQTT by the broker {mqtt.host}:{mqtt.port}"
         found.append(BridgeAccess("doors.mqtt", where, who, mqtt.username is None))
     if doors.opcua is not None:

@@ -102,8 +102,8 @@ class ConsoleView:
     faults: int  # faults so far in the run
     last_fault: str  # the newest of them, with its time
     too_tight: bool  # the leak is too small for the band
-    gains: str  # in force, with the countdown of a trial
-    flow_most_um_per_s: float  # with the curve in force
+    gains: str  # in use, with the countdown of a trial
+    flow_most_um_per_s: float  # with the present curve
     notices: tuple[str, ...]  # a sentence each; neither of faults nor of locks
     events: tuple[events.EventLine, ...]  # the last ones, oldest first
     shape: ShapeView

@@ -32,7 +32,7 @@ class CentreReadings:
     sag_um: float = math.nan
     sag_sigma_um: float = math.nan
     sag_time_s: float = math.nan
-    # a third witness will tell whether a jump of the laser was its mount's or the film's
+    # a third sensor will show whether a jump of the laser was its mount's or the film's
     judged: bool = True
 
 

@@ -36,7 +36,7 @@ class DriftTracker(StateNode):
         self.rate_um_per_s = 0.0
 
     def drift_at(self, time_s: float, memory_s: float) -> float:
-        """Value in µm expected at a time (not before the last reading's); a rate is believed for
+        """Value in µm expected at a time (not before the last reading's); a rate is used for
         one memory.
         """
         return self.value_um + self.rate_um_per_s * min(time_s - self.time_s, memory_s)

@@ -56,7 +56,7 @@ class FilmHealth:
         self.memory = memory or FilmHealthState()
 
     def set_pump(self, flow_max_um_per_s: float) -> None:
-        """The pump in force gives this much from now on."""
+        """Take this as the largest flow of the pump from here on."""
         self._flow_max_um_per_s = flow_max_um_per_s
 
     def step(

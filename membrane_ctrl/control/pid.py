@@ -50,7 +50,7 @@ class PidState(StateNode):
 
 
 class Pid:
-    """PI(D) with the gains in force.
+    """PI(D) with the present gains.
 
     The integrator stays between 0, as the pump removes no gas, and `flow_max_um_per_s`.
     """

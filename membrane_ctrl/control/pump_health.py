@@ -28,7 +28,7 @@ class PumpHealth:
         self.memory = memory or PumpHealthState()
 
     def set_pump(self, change_max: float) -> None:
-        """Another curve is in force, with this limit of its drift."""
+        """Start again with another curve, and this limit of its drift."""
         self._change_max = change_max
 
     def step(self, known: PumpScale) -> tuple[bool, tuple[MaintenanceNotice, ...]]:

@@ -131,7 +131,7 @@ class ShapeLoop:
         """One tick.
 
         The estimate is given only when new; `settled`: the inner loop holds its setpoint;
-        `distrust`: why the camera must not be believed, if so.
+        `distrust`: why the camera must not be used, if so.
         """
         if not settled:
             self.memory.settled_since_s = math.inf

@@ -25,15 +25,16 @@ from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.model.events import (
     Event,
-    HeldBy,
     Maintenance,
     MaintenanceOver,
+    SensorsUsed,
 )
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import StateNode
 from membrane_ctrl.model.telemetry import ShapeState, State
 
-_STAND_SHARE = 0.25  # of the band: a growth of the optics' stand that may be this large is told
+# Share of the band: a growth of the camera mount that may be this large is reported
+_MOUNT_SHARE = 0.25
 # a sensor that comes and goes within this, as a slower camera does at first, is not reported
 _STANDS_S = 1.5
 # So long may the estimate be held by pump, gas and weather alone, beyond the time in which a sensor
@@ -77,8 +78,8 @@ class CentreEstimation:
         )
         self._tracks = config.shape.mode == "track"
         self._mount_drift = MountDrift(config.shape, self.memory.mount_drift)
-        self._stand = CameraMountGrowth(config.estimator, self.memory.stand)
-        self._stand_most_um = _STAND_SHARE * config.limits.band_um
+        self._camera_mount = CameraMountGrowth(config.estimator, self.memory.stand)
+        self._mount_growth_max_um = _MOUNT_SHARE * config.limits.band_um
 
     @property
     def estimate(self) -> CentreEstimate | None:
@@ -140,21 +141,21 @@ class CentreEstimation:
             self._filter, figures.accepted, context.dt_s, shape, consistency
         )
         reading = inputs.reading
-        self._stand.step(
+        self._camera_mount.step(
             weather_limits.discard_impossible_weather(math.nan, reading.air_temperature_c)[1]
             if reading
             else math.nan,
             context.dt_s,
         )
         if self._filter.frames < LOCK_FRAMES:
-            self._stand.lock()
+            self._camera_mount.lock()
         readings = CentreReadings(
             now_s=inputs.now_s,
             flow_um_per_s=flow_um_per_s,
             laser_um=laser_um,
             ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,
             air_temperature_c=reading.air_temperature_c if reading else math.nan,
-            sag_um=figure.sag_um - self._stand.um if figure else math.nan,
+            sag_um=figure.sag_um - self._camera_mount.um if figure else math.nan,
             sag_sigma_um=figure.sag_sigma_um if figure else math.nan,
             sag_time_s=figure.time_s if figure else math.nan,
             judged=consistency.compares_sensors,
@@ -174,7 +175,7 @@ class CentreEstimation:
             has_laser=self._follows_sensor(Sensor.LASER),
         )
         if self._follows_sensor(Sensor.OPTICS):
-            sigma_um = math.hypot(estimate.sigma_um, self._stand.sigma_um)
+            sigma_um = math.hypot(estimate.sigma_um, self._camera_mount.sigma_um)
             self.memory.estimate = replace(estimate, sigma_um=sigma_um)
         return news
 
@@ -210,7 +211,7 @@ class CentreEstimation:
         memory.agreed_mount.reset(context.trim_um)
         memory.slowly_agreed_mount.reset(context.trim_um)
         self._mount_drift.start(context.trim_um)
-        self._stand.lock()
+        self._camera_mount.lock()
         return begun
 
     def _find_sag_zero_um(self, context: TickContext) -> float:
@@ -264,26 +265,25 @@ class CentreEstimation:
         return None if unusable else figure
 
     def _report_mount_growth(self) -> list[Event]:
-        """Report once that the optics may be off by the growth of their stand, and once that a new
-        lock ended it.
+        """Report once that the camera mount's growth may be an error of the figure, and its end by a
+        new lock.
         """
-        sigma_um, warmed_k = self._stand.sigma_um, self._stand.warmed_k
+        sigma_um, warmed_k = self._camera_mount.sigma_um, self._camera_mount.warmed_k
         memory = self.memory
-        far = sigma_um > self._stand_most_um / (2 if memory.mount_growth_reported else 1)
+        far = sigma_um > self._mount_growth_max_um / (2 if memory.mount_growth_reported else 1)
         if far == memory.mount_growth_reported:
             return []
         memory.mount_growth_reported = far
-        stands = f"the optics' stand is {warmed_k:+.1f} K from the reference"
+        warming = f"the camera mount is {warmed_k:+.1f} K from the reference"
         if not far:
-            return [MaintenanceOver("stand_growth", stands)]
-        anew = (
-            "calibrate the optics anew" if self._by_optics else "`ctl shape off` and `on` accept it"
+            return [MaintenanceOver("camera_mount_growth", warming)]
+        remedy = (
+            "calibrate the optics again"
+            if self._by_optics
+            else "`ctl shape off` and `on` accept it"
         )
-        return [
-            Maintenance(
-                "stand_growth", f"{stands}: the figure may be off by {sigma_um:.1f} µm; {anew}"
-            )
-        ]
+        error = f"the figure may be off by {sigma_um:.1f} µm"
+        return [Maintenance("camera_mount_growth", f"{warming}: {error}; {remedy}")]
 
     def _follows_sensor(self, sensor: Sensor) -> bool:
         estimate = self.memory.estimate
@@ -305,4 +305,4 @@ class CentreEstimation:
             return []
         memory.reported_sensors = seeing
         memory.sensors_changed_s = math.nan
-        return [HeldBy(tuple(Sensor(n).name.lower() for n in seeing), tuple(jumped))]
+        return [SensorsUsed(tuple(Sensor(n).name.lower() for n in seeing), tuple(jumped))]

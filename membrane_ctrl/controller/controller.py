@@ -2,7 +2,7 @@
 test are alike.
 
 The order is fixed: the inputs become an observation; the safety table judges it; only then the
-state's handler runs, and a safe level in force overrules its output. Every path through a tick ends
+state's handler runs, and an active safe level overrules its output. Every path through a tick ends
 here.
 """
 
@@ -89,8 +89,8 @@ class Controller:
             self._context.trial = trial.Trial(memory.context.trial_memory, config.loop.rate_hz)
         self._resume = resume_rule.ResumeRule(config.resume, config.limits, memory.resume)
         self._consistency = sensor_consistency.SensorConsistency(config, memory.consistency)
-        self._holders = centre_estimation.CentreEstimation(config, memory.holders)
-        self._holders.set_gains(in_force.loop)
+        self._estimation = centre_estimation.CentreEstimation(config, memory.holders)
+        self._estimation.set_gains(in_force.loop)
         self._consistency.set_gains(in_force.loop, in_force.pump)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
@@ -116,7 +116,7 @@ class Controller:
 
     @property
     def pump_config(self) -> PumpConfig:
-        """The pump's curve in force."""
+        """The pump's present curve."""
         return self._context.pump_config
 
     @property
@@ -143,7 +143,7 @@ class Controller:
             self.state,
             context.dt_s,
             hold_status.hold_status(
-                context, last, self._holders.held_by_optics, self._may_follow_optics()
+                context, last, self._estimation.held_by_optics, self._may_follow_optics()
             ),
         )
         stand = context.standstill
@@ -161,7 +161,7 @@ class Controller:
             locked=describe_locks(context.locks, _LOCKS_SHOWN),
             laser_gauge_apart=consistency.laser_gauge_apart,
             gas_excess=consistency.gas_excess,
-            held_by_optics=self._holders.held_by_optics or context.observer.optics_replace_laser,
+            held_by_optics=self._estimation.held_by_optics or context.observer.optics_replace_laser,
             displacement_valid=self._displacement_suffices(),
             unseen_film=self._explain_unseen_film(),
             open_interlocks=context.interlocks.judged_mask,
@@ -172,8 +172,8 @@ class Controller:
         self._apply_verdict(verdict, events)
         self._consider_resuming(observation)
         shape = self._step_shape(inputs, events)
-        events += self._holders.step(inputs, self.state, context, last, shape.state, consistency)
-        if (estimate := self._holders.estimate) is not None:
+        events += self._estimation.step(inputs, self.state, context, last, shape.state, consistency)
+        if (estimate := self._estimation.estimate) is not None:
             shape = replace(shape, trim_um=estimate.mount_um)
         context.laser_doubted = bool(consistency.laser_fault_text)
         context.estimate = estimate if self.state in (State.SETTLE, State.HOLD) else None
@@ -204,11 +204,11 @@ class Controller:
         must not replace a lost laser.
         """
         if self._config.by_optics:
-            return not self._holders.optics_left_out
+            return not self._estimation.optics_left_out
         return (
             self._shape.on
             and not self._consistency.camera_fault_text
-            and not self._holders.optics_left_out
+            and not self._estimation.optics_left_out
         )
 
     def _displacement_suffices(self) -> bool:
@@ -220,21 +220,21 @@ class Controller:
         """
         context, observer = self._context, self._context.observer
         if self.state == State.TUNE and not self._config.by_optics:
-            return math.isfinite(observer.laser_um) or self._holders.held_by_optics
+            return math.isfinite(observer.laser_um) or self._estimation.held_by_optics
         if self.state == State.MANUAL or context.paused:
             return math.isfinite(observer.guard_um)
-        if self._holders.blind:
+        if self._estimation.blind:
             return False
-        estimated = self.state in (State.SETTLE, State.HOLD) and self._holders.held_by_optics
+        estimated = self.state in (State.SETTLE, State.HOLD) and self._estimation.held_by_optics
         return math.isfinite(observer.displacement_um) or estimated
 
     def _explain_unseen_film(self) -> str:
         """Why a bench without a laser cannot be held by its optics; empty if it can."""
         if not self._config.by_optics:
             return ""
-        if self._holders.optics_left_out:
+        if self._estimation.optics_left_out:
             return "the sag jumps again and again"
-        if self._holders.blind:
+        if self._estimation.blind:
             return "the figures do not fit the estimate"
         return self._context.observer.figures.explain_unseen().text
 
@@ -361,7 +361,7 @@ class Controller:
             context.loop.set_pump(pump)
         context.loop_config, context.pump_config = loop, pump
         context.loop.set_gains(loop)
-        self._holders.set_gains(loop)
+        self._estimation.set_gains(loop)
         self._consistency.set_gains(loop, pump)
         self._shape.set_memory(self._gains.present.shape_time_constant_s)
         self._step_setpoint()

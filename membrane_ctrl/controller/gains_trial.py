@@ -19,7 +19,7 @@ class GainsInForce(StateNode):
 
 @dataclass(slots=True)
 class GainsState(StateNode):
-    """The settings in force, and those that a trial goes back to."""
+    """The present settings, and those that a trial restores."""
 
     good: GainsInForce
     tried: GainsInForce

@@ -86,7 +86,7 @@ def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
     """Decide on an `unlock`.
 
     Without a word it removes the sender's own lock, if there is exactly one. With a word it removes
-    the lock of that word, whoever set it. A bridge removes none: nobody has read the word.
+    the lock of that word, whoever its author is. A bridge removes none: nobody has read the word.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ VENTED_FRACTION = 0.5
 
 @dataclass(slots=True)
 class SafeLevelsState(StateNode):
-    """The level in force, and the time of the first level that is used up."""
+    """The active level, and the time of the first level that is used up."""
 
     safe_level: SafeLevel = SafeLevel.NONE
     since_s: float = 0.0
@@ -30,7 +30,7 @@ class SafeLevelsState(StateNode):
 
 
 class SafeLevels:
-    """The safe action in force, and since when."""
+    """The active safe level, and since when it acts."""
 
     def __init__(self, config: StatesConfig, memory: SafeLevelsState | None = None) -> None:
         self.memory = memory or SafeLevelsState()
@@ -42,7 +42,7 @@ class SafeLevels:
 
     @property
     def safe_level(self) -> SafeLevel:
-        """The level in force."""
+        """The active level."""
         return self.memory.safe_level
 
     def enter(self, safe_level: SafeLevel, now_s: float) -> None:

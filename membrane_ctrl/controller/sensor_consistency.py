@@ -101,7 +101,7 @@ class SensorConsistency:
     Attributes
     ----------
     laser_moved : bool
-        From this tick on the laser is believed in its new place; the shape loop must lock anew.
+        From this tick on the laser is used in its new place; the shape loop must lock again.
     """
 
     def __init__(self, config: Config, memory: SensorConsistencyState | None = None) -> None:
@@ -234,7 +234,7 @@ class SensorConsistency:
         return self._plausibility.judges
 
     def set_gains(self, loop: LoopConfig, pump: PumpConfig) -> None:
-        """Judge by the gains and the curve that are now in force."""
+        """Judge by these gains and this curve."""
         self._health.set_pump(loop.flow_most_um_per_s(pump))
         self._pump.set_pump(pump.change_max)
 
@@ -405,7 +405,7 @@ class SensorConsistency:
         seen = (
             str(self._plausibility.changes)
             if self._plausibility.watching
-            else "compared anew from here on"
+            else "compared again from here on"
         )
         return [Plausibility(faulty, seen)]
 

@@ -1,4 +1,4 @@
-"""Data that the states' handlers share: filled by commands and the tick, told as the tick's
+"""Data that the states' handlers share: filled by commands and the tick, reported as the tick's
 telemetry row.
 """
 

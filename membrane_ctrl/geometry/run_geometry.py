@@ -65,7 +65,7 @@ def read_configured_geometry(config: Config) -> RunGeometry:
 
 
 def read_run_geometry(run_dir: Path | None, config: Config) -> RunGeometry:
-    """The geometry in force of a started run, from its folder."""
+    """The geometry in use of a started run, from its folder."""
     return _read_if_present(None if run_dir is None else run_dir / GEOMETRY_COPY, config)
 
 

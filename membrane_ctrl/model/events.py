@@ -255,7 +255,11 @@ class Plausibility(
         return self._template if self.stands else "Laser and camera agree again[ ({readings})]"
 
 
-class HeldBy(Event, kind="held_by", sentence="The mirror is held by {sensors}[; jumped: {jumped}]"):
+class SensorsUsed(
+    Event,
+    kind="sensors_used",
+    sentence="The centre is estimated from {sensors}[; jumped: {jumped}]",
+):
     """Which sensors the estimate of the centre follows now, and which of them have jumped, with the
     distance.
     """

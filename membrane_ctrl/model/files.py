@@ -176,7 +176,7 @@ def scratch_folder(folder: Path, prefix: str) -> Iterator[Path]:
 
 
 def sync_data(path: Path) -> None:
-    """Sync a file's content to disk, whoever wrote it. Raises OSError."""
+    """Sync a file's content to disk, whatever process wrote it. Raises OSError."""
     with open_plain(path) as file:
         os.fdatasync(file.fileno())
 

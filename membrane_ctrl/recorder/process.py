@@ -27,7 +27,7 @@ from membrane_ctrl.recorder.thumbnails import Thumbnails
 # Rings are emptied this often; the ring of ticks must hold a few intervals.
 POLL_S = 0.25
 # A recorder silent for this long is replaced: half of the rings' capacity, so that the next one
-# still finds everything. A disk that needs longer for one second of a run is as good as gone.
+# still finds everything. A disk that needs longer for one second of a run is treated as lost.
 _ROUND_S = 30.0
 
 

@@ -36,7 +36,7 @@ UTC = "utc"
 OUTSIDE_CLASS = 1
 LAYOUT = ".layout.rbl"  # the blueprint's own file, during the recording
 
-# A disk that needs longer than this for a second of data (tens of kB) is as good as gone.
+# A disk that needs longer than this for a second of data (tens of kB) is treated as lost.
 _FLUSH_TIMEOUT_S = 5.0
 
 # Held by the module, so that no destructor runs.

@@ -45,7 +45,7 @@ class RunEntry:
     size_mb: float
     marks: int  # annotations
     kept: bool  # the folder has a file `.keep` and is never pruned
-    geometry: str  # hash of the last one in force; empty without a camera
+    geometry: str  # hash of the last one in use; empty without a camera
     held_s: float = math.nan  # these are the parts of a run as `hold_parts.HoldParts` tells them
     faults_s: float = math.nan
     paused_s: float = math.nan

@@ -36,7 +36,7 @@ _BACK_WITHIN_S = 60.0
 class HoldParts(StateNode):
     """Parts of a run's ticks, over blocks that come in their order.
 
-    `held` is the settled hold; `faults`: a safe level is in force; `paused`; `moving`: in
+    `held` is the settled hold; `faults`: a safe level acts; `paused`; `moving`: in
     `hold`, the setpoint on its way, or not yet settled after that or after what let the mirror go.
     """
 

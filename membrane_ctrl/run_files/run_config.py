@@ -64,7 +64,7 @@ def _copy_value(value: Any) -> Any:
 
 
 def exact_config(folder: Path) -> Config:
-    """`config.toml` as it was in force. Raises InputError if this version does not understand all
+    """`config.toml` as it was in use. Raises InputError if this version does not understand all
     of it.
     """
     return toml_file.load_toml(folder / "config.toml", Config, follow=False)
@@ -93,7 +93,7 @@ def read_config(folder: Path, notes: list[str]) -> Config:
 def _config_damage(path: Path) -> list[str]:
     try:
         text = files.read_text(path)
-    except (OSError, ValueError):  # reported by whoever reads it
+    except (OSError, ValueError):  # reported when it is read
         return []
     if not text:
         return ["config.toml: empty; all defaults are used"]

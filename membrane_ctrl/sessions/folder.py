@@ -222,7 +222,7 @@ class SessionFolder:
 def based_on(
     session: SessionFolder, before: schema.LoopConfig, pump: schema.PumpConfig
 ) -> SessionFolder:
-    """The session, begun anew on other gains and another curve of the pump, which are in force."""
+    """Restart the session on other gains and another curve of the pump, which are in use."""
     session.begin_step(STEPS[0])
     head = replace(session.head, before=before)
     config = session.config.model_copy(update={"loop": before, "pump": pump})

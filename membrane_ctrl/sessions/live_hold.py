@@ -87,7 +87,8 @@ class LiveHold:
     run_dir : path
         The run's folder.
     take_over : bool
-        Take command from whoever has it: at once with a `session`, else with the first command.
+        Take command from the client that has it: at once with a `session`, else with the
+        first command.
     session : str
         Claim command for a session of this name, until `close`; empty: only watch, or command like
         any client.

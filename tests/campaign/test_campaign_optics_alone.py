@@ -24,7 +24,7 @@ from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.metrology.phase import pattern_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import LiveTracker
-from membrane_ctrl.model.events import Fault, HeldBy
+from membrane_ctrl.model.events import Fault, SensorsUsed
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.optics.camera import TwinOptics
@@ -101,7 +101,7 @@ def test_rendered_frames_alone_start_settle_and_hold_a_mirror_through_another_an
         rows.append(tick.row)
         events += tick.events
     assert rows[-1].state == State.HOLD
-    held = [event.sensors for event in events if isinstance(event, HeldBy)]
+    held = [event.sensors for event in events if isinstance(event, SensorsUsed)]
     assert held[0] == ("optics", "barometer", "thermometer")
     assert [event.name for event in events if isinstance(event, Fault)] == [
         "film_unseen"

@@ -313,7 +313,7 @@ def test_what_cannot_wait_a_second() -> None:
     assert all(from_dict({"kind": kind}).notable for kind in kinds)
     assert not any(
         from_dict({"kind": kind}).notable
-        for kind in ("why", "shape", "held_by", "pump", "vibrations")
+        for kind in ("why", "shape", "sensors_used", "pump", "vibrations")
     )
     assert from_dict({"kind": "acquisition", "state": "retrying"}).notable
     assert not from_dict({"kind": "acquisition", "state": "running"}).notable

@@ -13,7 +13,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
-from membrane_ctrl.model.events import Fault, HeldBy, Why
+from membrane_ctrl.model.events import Fault, SensorsUsed, Why
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
@@ -60,7 +60,7 @@ def told(ticks: list[VirtualTick]) -> list[str]:
         ", ".join(event.sensors)
         for tick in ticks
         for event in tick.events
-        if isinstance(event, HeldBy)
+        if isinstance(event, SensorsUsed)
     ]
 
 

@@ -23,10 +23,10 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.model.events import (
     CommandTaken,
     Fault,
-    HeldBy,
     Maintenance,
     MaintenanceOver,
     Plausibility,
+    SensorsUsed,
     ShapeLoopState,
 )
 from membrane_ctrl.model.telemetry import SafeLevel, State
@@ -100,7 +100,7 @@ def test_a_bench_without_a_laser_starts_settles_and_holds_its_sag() -> None:
     ticks = held(28.0)
     assert states(ticks) == [State.CHECK, State.INFLATE, State.SETTLE, State.HOLD]
     assert not told(ticks, Fault)
-    assert [event.sensors for event in told(ticks, HeldBy)] == [
+    assert [event.sensors for event in told(ticks, SensorsUsed)] == [
         ("optics", "barometer", "thermometer")
     ]
     held_um = true_um(ticks, 18.0)
@@ -348,7 +348,7 @@ def _judge_knock(um: float, until_s: float) -> None:
     assert not told(ticks, Fault)
     moved_um = np.abs(true_um(ticks, 38.0) - true_um(ticks, 30.0, 38.0).mean())
     assert moved_um.max() < 0.3
-    jumps = [jump for event in told(ticks, HeldBy) for jump in event.jumped]
+    jumps = [jump for event in told(ticks, SensorsUsed) for jump in event.jumped]
     assert [jump.split()[0] for jump in jumps] == ["laser"]
     assert float(jumps[0].split()[1]) == pytest.approx(um, abs=4.5)
     liars = [event.faulty for event in told(ticks, Plausibility)]
@@ -635,9 +635,9 @@ def test_a_camera_mount_warming_by_1_k_per_hour_is_reported_and_bounded(
     assert abs(moved_um) < most_um
     assert abs(moved_um) < 2.0 * ticks[-1].row.estimate_sigma_um
     (notice,) = told(ticks, Maintenance)
-    assert notice.name == "stand_growth"
+    assert notice.name == "camera_mount_growth"
     assert notice.message.startswith(
-        "the optics' stand is +1.3 K from the reference: the figure may be off by 0.5 µm;"
+        "the camera mount is +1.3 K from the reference: the figure may be off by 0.5 µm;"
     )
     assert growing.um > 0.7
 
@@ -657,8 +657,8 @@ def test_known_thermal_growth_of_the_camera_mount_does_not_move_the_mirror() -> 
     assert growing.um == pytest.approx(2.0, abs=0.1)
     before_um = true_um(ticks, 14.0, 18.0).mean()
     assert true_um(ticks, 26.0, 30.0).mean() == pytest.approx(before_um, abs=0.2)
-    assert [event.name for event in told(ticks, Maintenance)] == ["stand_growth"]
-    assert [event.name for event in told(ticks, MaintenanceOver)] == ["stand_growth"]
+    assert [event.name for event in told(ticks, Maintenance)] == ["camera_mount_growth"]
+    assert [event.name for event in told(ticks, MaintenanceOver)] == ["camera_mount_growth"]
     sigma_um = {round(tick.row.mono_s, 2): tick.row.estimate_sigma_um for tick in ticks}
     assert sigma_um[29.0] == pytest.approx(1.0, abs=0.1)
     assert sigma_um[33.0] < 0.2

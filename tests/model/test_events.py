@@ -15,8 +15,8 @@ from membrane_ctrl.model.events import (
     CommandTaken,
     Fault,
     FaultySensor,
-    HeldBy,
     Plausibility,
+    SensorsUsed,
     StateEntered,
 )
 from membrane_ctrl.model.port_events import CommanderChanged
@@ -103,8 +103,8 @@ def test_codes_come_back_as_their_class_and_count_among_the_numbers() -> None:
 
 
 def test_lists_are_restored_unchanged() -> None:
-    held = HeldBy(("laser", "optics"), ("laser +12 µm",))
+    held = SensorsUsed(("laser", "optics"), ("laser +12 µm",))
     assert from_dict(json.loads(json.dumps(held.to_dict()))) == held
-    assert held.sentence == "The mirror is held by laser, optics; jumped: laser +12 µm"
+    assert held.sentence == "The centre is estimated from laser, optics; jumped: laser +12 µm"
     for sensors in ("laser", [1], {"laser": 1}):
-        assert isinstance(from_dict({"kind": "held_by", "sensors": sensors}), UnknownEvent)
+        assert isinstance(from_dict({"kind": "sensors_used", "sensors": sensors}), UnknownEvent)

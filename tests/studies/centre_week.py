@@ -16,7 +16,7 @@ from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, Twi
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
-from membrane_ctrl.model.events import Event, Fault, HeldBy, Maintenance, Plausibility
+from membrane_ctrl.model.events import Event, Fault, Maintenance, Plausibility, SensorsUsed
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.bench_events import DailyTemperature, LaserDrift, LeakChange, PressureWeather
 from membrane_ctrl.sim.plant import Plant
@@ -223,13 +223,13 @@ class _Week:
         if isinstance(event, Maintenance):
             self.day.notices.append(f"{now_s:.0f} s {event.name}")
         last = self._open[-1][0] if self._open else None
-        if isinstance(event, HeldBy) and last:
+        if isinstance(event, SensorsUsed) and last:
             last.held_by.append(
                 "; ".join(filter(None, (", ".join(event.sensors), ", ".join(event.jumped))))
             )
         if isinstance(event, Plausibility) and last:
             last.liars.append(event.faulty)
-        if isinstance(event, HeldBy | Plausibility) and not last:
+        if isinstance(event, SensorsUsed | Plausibility) and not last:
             self.day.notices.append(f"{now_s:.0f} s {event}")
 
 

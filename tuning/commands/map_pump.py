@@ -13,7 +13,7 @@ from tuning.steps import map_pump
 
 
 def run_map_pump(options: TuneOptions) -> int:
-    """Measure the pump's curve and apply it; the session begins anew on it."""
+    """Measure the pump's curve and apply it; the session restarts on it."""
     with connection.open_on_hold(options) as (folder, rig, progress):
         folder = measure_pump(folder, rig, options.limit_um, progress)
     return conclude(folder, options)

@@ -77,9 +77,9 @@ def map_pump(
 ) -> tuple[MappedPump, folder.SessionFolder]:
     """Measure the pump's curve, apply it on trial, check it with steps of the flow, and keep it.
 
-    The session begins anew on it. The gains stay if they suit the measured actuator; else they
+    The session restarts on it. The gains stay if they suit the measured actuator; else they
     become slower ones that do. Raises RejectedError with what to do if there is no curve, or the
-    steps contradict it; the former curve and gains are then in force.
+    steps contradict it; the former curve and gains are then restored.
     """
     before = rig.pump
     try:
@@ -188,7 +188,7 @@ def _slow_gains(
 
 
 def _measure_gain(rig: HoldRig, late_s: float) -> tuple[float, float]:
-    """The gain of the mirror on the curve in force, and its error, from steps of the flow.
+    """The gain of the mirror on the present curve, and its error, from steps of the flow.
 
     Steps that contradict the curve, or see little in their weather, are repeated for twice as long.
     Raises ValueError if the longest find a gain far from 1, or one that differs above and below the

@@ -36,5 +36,5 @@ class ExperimentSpec(Section):
     holding_flow_um_per_s: Annotated[float, Field(gt=0, le=100)]  # mean of the hold before
     laser_um: Annotated[float, Field(ge=0, le=20)]  # standard deviation of a reading
     gain: Annotated[float, Field(ge=0.02, le=50)] = 1.0  # k, of what was identified so far
-    late_s: Annotated[float, Field(ge=0, le=10)] = 0.4  # delay and lag, likewise
+    late_s: Annotated[float, Field(ge=0, le=10)] = 0.4  # delay and lag, of the plant
     steps: Annotated[tuple[PumpStep, ...], Field(max_length=90)] = ()  # of the pump map

@@ -67,7 +67,7 @@ class PumpSums:
 
 
 def _flow_limits(run: Run) -> tuple[Column, Column]:
-    """Times from which a largest flow was in force, and those flows: they change with a curve of
+    """Times from which a largest flow applied, and those flows: they change with a curve of
     the pump.
     """
     found = [(-math.inf, run.config)]

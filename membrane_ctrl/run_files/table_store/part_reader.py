@@ -1,4 +1,4 @@
-"""Reads a finished part, column by column of each row group, whoever wrote it.
+"""Reads a finished part, column by column of each row group, whatever program wrote it.
 
 Nothing is decoded on trust: the footer is compared with the manifest's copy, the sizes of pages are
 added up before Arrow takes memory for them, and each column is checked against its checksum. A
