@@ -265,8 +265,8 @@ class CentreEstimation:
         return None if unusable else figure
 
     def _report_mount_growth(self) -> list[Event]:
-        """Report once that the camera mount's growth may be an error of the figure, and its end by a
-        new lock.
+        """Report once that the camera mount's growth may be an error of the figure, and its end by
+        a new lock.
         """
         sigma_um, warmed_k = self._camera_mount.sigma_um, self._camera_mount.warmed_k
         memory = self.memory
