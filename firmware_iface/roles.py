@@ -24,6 +24,8 @@ FOREIGN_CLAIM, FOREIGN_PERIOD = 1, 2
 ACTUATORS = ("pump", "vent")
 # One lost packet destroys a frame; three in a row are not an accident
 TRIES = 3
+Levels = NDArray[np.uint8]  # of a display, or an 8-bit camera
+Pixels = Levels | NDArray[np.uint16]
 
 
 class LinkError(Exception):
@@ -367,10 +369,6 @@ class Pattern:
         """
         coarser = f"_of_{self.period_mm:g}mm" if self.period_mm else ""
         return f"{self.axis}_{self.role}_{self.index}{coarser}" if self.axis else self.role
-
-
-Levels = NDArray[np.uint8]  # of a display, or an 8-bit camera
-Pixels = Levels | NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,20 @@ _STEP = (
     "Readings farther than this from both previous ones are rejected. Raise it at low tick rates."
 )
 BOARD_INPUTS = 16
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Micrometres = Annotated[float, Field(ge=-1e7, le=1e7)]  # ten metres
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]
+Distance = Annotated[float, Field(ge=-1e4, le=1e4)]
+Word = Annotated[int, Field(ge=0, le=0xFFFF)]
+Port = Annotated[str, Field(min_length=1, description=_PORT)]
+ModbusUrl = Annotated[str, Field(pattern=MODBUS_URL_PATTERN, description=_LINK)]
+UnitId = Annotated[int, Field(ge=1, le=247, description=_UNIT)]
+Serial = Annotated[str, Field(max_length=80, description=_SERIAL)]
+Timeout = Annotated[float, Field(gt=0, le=5, description=_TIMEOUT)]
+Baud = Annotated[int, Field(ge=300, le=1_000_000, description=_BAUD)]
+Direction = Annotated[Literal[-1, 1], Field(description=_DIRECTION)]
+StepMax = Annotated[float, Field(gt=0, le=10_000, description=_STEP)]
+Driver = Field(discriminator="driver")
 
 
 class Section(BaseModel):
@@ -67,21 +81,6 @@ def _list_kinds(annotation: Any) -> set[Any]:
         if inner or isinstance(annotation, type) or annotation is Any
         else set()
     )
-
-
-Fraction = Annotated[float, Field(ge=0, le=1)]
-Micrometres = Annotated[float, Field(ge=-1e7, le=1e7)]  # ten metres
-Number = Annotated[float, Field(ge=-1e12, le=1e12)]
-Distance = Annotated[float, Field(ge=-1e4, le=1e4)]
-Word = Annotated[int, Field(ge=0, le=0xFFFF)]
-Port = Annotated[str, Field(min_length=1, description=_PORT)]
-ModbusUrl = Annotated[str, Field(pattern=MODBUS_URL_PATTERN, description=_LINK)]
-UnitId = Annotated[int, Field(ge=1, le=247, description=_UNIT)]
-Serial = Annotated[str, Field(max_length=80, description=_SERIAL)]
-Timeout = Annotated[float, Field(gt=0, le=5, description=_TIMEOUT)]
-Baud = Annotated[int, Field(ge=300, le=1_000_000, description=_BAUD)]
-Direction = Annotated[Literal[-1, 1], Field(description=_DIRECTION)]
-StepMax = Annotated[float, Field(gt=0, le=10_000, description=_STEP)]
 
 
 class Optoncdt1420Config(Section):
@@ -294,7 +293,6 @@ class ExternalConfig(ExternalSection):
     timeout_s: Timeout = 0.2
 
 
-Driver = Field(discriminator="driver")
 DisplacementDriver = Annotated[
     Optoncdt1420Config | KeyenceDlRs1aConfig | ModbusMapConfig | ExternalConfig, Driver
 ]

@@ -19,6 +19,7 @@ _UNIT, _SQUARE = (
     1.1e-5,
     1e-6,
 )  # of the squared length, from rounding to five digits, and of the cosine
+Share = Annotated[float, Field(ge=0, le=0.5)]
 
 
 def _check_distortion(numbers: tuple[float, ...]) -> tuple[float, ...]:
@@ -322,9 +323,6 @@ class OpticsConfig(Section):
                 "from O' each way"
             )
         return self
-
-
-Share = Annotated[float, Field(ge=0, le=0.5)]
 
 
 class DisturbancesConfig(Section):

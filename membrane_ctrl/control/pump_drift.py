@@ -47,6 +47,7 @@ _KEEPS = math.exp(-SEGMENT_S / _RATE_LASTS_S)
 _PASSES = np.array([[1.0, SEGMENT_S], [0.0, _KEEPS]])  # of scale and rate, in a segment
 _WANDERS = np.diag([WALK_PER_SQRT_S**2 * SEGMENT_S, RATE_PER_S**2 * (1 - _KEEPS**2)])
 _SIGN_SEED = 0b1010_0110_1011_1001
+_Pair = Annotated[ComplexArray, ArrayShape((2,), "<c16")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +58,6 @@ class PumpScale(StateNode):
 
     scale: float = 1.0
     sigma: float = SIGMA_FIRST
-
-
-_Pair = Annotated[ComplexArray, ArrayShape((2,), "<c16")]
 
 
 @dataclass(slots=True)

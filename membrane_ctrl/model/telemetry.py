@@ -25,6 +25,8 @@ ROW_BYTES = _STRUCT.size
 # already taken most.
 SETTLED_AFTER_S = 5.0
 COLUMN: dict[str, int] = {name: place for place, name in enumerate(FIELDS)}
+_values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us per tick
+Rows = FloatArray
 
 
 class State(IntEnum):
@@ -97,12 +99,6 @@ class TelemetryRow(ColumnValues):
     def unpack(cls, message: bytes) -> "TelemetryRow":
         """Decode the row of `pack`. Raises struct.error."""
         return cls(*_STRUCT.unpack(message))
-
-
-_values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us per tick
-
-
-Rows = FloatArray
 
 
 def unpack_rows(messages: Sequence[bytes]) -> Rows:

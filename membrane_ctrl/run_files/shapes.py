@@ -56,6 +56,7 @@ MAPS = {
     "uncertainty": "noise of a cycle, 1σ",
 }
 MAP_PX = 96  # far finer than what the terms can change over
+Map = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,9 +201,6 @@ def _to_matrix(cells: pa.ChunkedArray, width: int) -> Column:
     return np.asarray(rows.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(
         -1, width
     )
-
-
-Map = NDArray[np.float32]
 
 
 def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
