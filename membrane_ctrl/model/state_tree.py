@@ -107,7 +107,7 @@ _ADAPTERS: dict[type[StateNode], TypeAdapter[Any]] = {}
 
 
 def _make_adapter(kind: type[StateNode]) -> TypeAdapter[Any]:
-    """The encoder and decoder of a tree, made once: that takes as long as many ticks."""
+    """Return the encoder and decoder of a tree, made once: that takes as long as many ticks."""
     if kind not in _ADAPTERS:
         _ADAPTERS[kind] = TypeAdapter(kind)
     return _ADAPTERS[kind]
@@ -146,13 +146,16 @@ def decode_state(data: bytes, kind: type[T], most_bytes: int) -> T:
     StateError
         A value is missing, unknown, of another type or outside its bounds.
     """
+    # 1. The size, before anything is parsed
     if len(data) > most_bytes:
         raise StateError(f"{len(data)} bytes where at most {most_bytes} are expected")
+    # 2. Every value against its declared type and bounds; unknown fields are refused
     try:
         node: T = _make_adapter(kind).validate_json(data)
     except ValidationError as error:
         raise StateError(_describe_first_error(error)) from None
-    # a missing field would have got its default
+    # 3. No field is missing: it would have got its default. What this program writes for the tree
+    # must be what was read
     found, expected = _parse_json(data), _parse_json(encode_state(node))
     if found != expected:
         where = next(_find_missing(found, expected, ""), "not the values that this program writes")
@@ -161,12 +164,12 @@ def decode_state(data: bytes, kind: type[T], most_bytes: int) -> T:
 
 
 def _parse_json(data: bytes) -> Any:
-    """The values of JSON; NaN as a text, which equals itself."""
+    """Return the values of JSON; NaN as a text, which equals itself."""
     return json.loads(data, parse_constant=str)
 
 
 def _describe_first_error(error: ValidationError) -> str:
-    """The first wrong value of many: its place, what is wrong, and the value."""
+    """Return the first wrong value of many: its place, what is wrong, and the value."""
     first = error.errors(include_url=False)[0]
     place = ".".join(str(part) for part in first["loc"])
     return f"{place or 'the whole'}: {first['msg']} ({str(first['input'])[:40]})"
@@ -186,8 +189,9 @@ def _find_missing(found: Any, expected: Any, place: str) -> Iterator[str]:
 
 
 def to_plain(node: StateNode) -> dict[str, Any]:
-    """The tree as dicts, lists and numbers, for people and for tests;
-    arrays are lists of numbers.
+    """Return the tree as dicts, lists and numbers, for people and for tests.
+
+    Arrays are lists of numbers, enums their names.
     """
     plain: dict[str, Any] = _make_adapter(type(node)).dump_python(node)
     return {name: _with_lists(value) for name, value in plain.items()}
@@ -204,8 +208,9 @@ def _with_lists(value: Any) -> Any:
 
 
 def describe_tree(node: StateNode) -> list[str]:
-    """The tree for people: a line `place  value` for each value; a large array is one line with its
-    range.
+    """Return the tree for people: a line `place  value` for each value.
+
+    An array of more than eight numbers is one line with its shape and range.
     """
     return [
         f"{place:<48} {text}"
@@ -214,6 +219,7 @@ def describe_tree(node: StateNode) -> list[str]:
 
 
 def _list_leaves(value: Any, place: str) -> Iterator[tuple[str, str]]:
+    """Yield place and text of each value; lists of values are one text, lists of nodes are not."""
     if isinstance(value, np.ndarray) and value.size > _SHOWN_NUMBERS:
         shape = " x ".join(str(length) for length in value.shape)
         finite = value[np.isfinite(value)]
@@ -230,7 +236,7 @@ def _list_leaves(value: Any, place: str) -> Iterator[tuple[str, str]]:
 
 
 def find_differences(one: StateNode, other: StateNode, within: float = 0.0) -> list[str]:
-    """Where two trees of the same kind differ; NaN equals NaN.
+    """Return where two trees of the same kind differ; NaN equals NaN.
 
     Parameters
     ----------
@@ -249,6 +255,7 @@ def find_differences(one: StateNode, other: StateNode, within: float = 0.0) -> l
 
 
 def _find_differences(one: Any, other: Any, place: str, within: float) -> Iterator[str]:
+    """Yield the places that differ: go down into dicts and lists of the same length in step."""
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         one, other = one.tolist(), other.tolist()
     if isinstance(one, Mapping) and isinstance(other, Mapping):
