@@ -1,5 +1,6 @@
-"""One estimate of the mirror's centre from everything that sees it: a Kalman filter with a memory.
-Pure.
+"""Sensor fusion: one estimate of the mirror's centre, by a Kalman filter with delayed readings.
+
+Pure. docs/explanation/estimator.md derives it.
 
     centre  c = z + g_p p + g_T T_gas           z: the gas in the mirror, as height of the centre
     dz/dt   = q - leak                          q: the pump's flow, after dead time and lag
@@ -154,7 +155,13 @@ class CentreFilter:
         return self.memory.frames
 
     def set_gains(self, loop: LoopConfig) -> None:
-        """Take what barometer and thermometer mean for the centre."""
+        """Set how pressure and temperature of the air move the centre.
+
+        Parameters
+        ----------
+        loop : LoopConfig
+            Gains in µm/Pa and µm/K, the lag of the gas behind the air, and which sensors are used.
+        """
         self._pressure_gain = loop.barometer_gain_um_per_pa
         self._warmth_gain = loop.temperature_gain_um_per_k
         self._gas_follows_air_s = loop.gas_follows_air_s
@@ -171,19 +178,24 @@ class CentreFilter:
         mount_um: float,
         sag_zero_um: float = math.nan,
     ) -> None:
-        """Begin at a displacement, a flow that balances the leak, and a known displacement of the
-        laser's mount.
+        """Begin at a displacement, a flow that balances the leak, and a known mount.
 
-        `sag_zero_um`: the sag at displacement 0, of a bench without a laser; otherwise the first
-        frames lock it.
+        Parameters
+        ----------
+        displacement_um : float
+            The laser's reading.
+        flow_um_per_s : float
+            Mean flow of the pump, the first value of the leak.
+        mount_um : float
+            Known displacement of the laser's mount.
+        sag_zero_um : float
+            The sag at displacement 0, of a bench without a laser; NaN: the first frames lock it.
         """
         config, memory = self._config, self.memory
         memory.start_afresh()
-        memory.x[_GAS], memory.x[_LEAK], memory.x[_MOUNT] = (
-            displacement_um - mount_um,
-            flow_um_per_s,
-            mount_um,
-        )
+        memory.x[_GAS] = displacement_um - mount_um
+        memory.x[_LEAK] = flow_um_per_s
+        memory.x[_MOUNT] = mount_um
         variances = (
             config.laser_noise_um**2,
             _LEAK_STD_UM_PER_S**2,
@@ -212,20 +224,38 @@ class CentreFilter:
         memory.watches[Sensor.OPTICS] = SensorWatch()
 
     def blame_optics(self, mount_um: float) -> None:
-        """The optics were wrong: what the mount has moved from there was the centre's motion. They
-        lock anew.
+        """Undo what wrong optics did to the mount, and lock them again.
+
+        What the mount has moved from `mount_um` was the centre's motion: it is added to the gas and
+        to all clones of the centre.
         """
         x = self.memory.x
         x += (x[_MOUNT] - mount_um) * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT])
         self.relock()
 
     def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
-        """One tick: predict, then take what was read. `dt_s` must exceed 0."""
-        self._jumped, self._jumped_sensors, self._judged = [], [], given.judged
+        """Run one tick: predict, then use each reading that is new.
+
+        Parameters
+        ----------
+        given : CentreReadings
+            Readings of the tick; NaN for what was not read.
+        dt_s : float
+            Time since the last tick, above 0.
+
+        Returns
+        -------
+        CentreEstimate
+        """
+        self._jumped = []
+        self._jumped_sensors = []
+        self._judged = given.judged
         self._predict_states(given, dt_s)
         self._clone_centre(given.now_s)
+        # The sensors' weights fade
         for watch in self.memory.watches:
             watch.pull *= math.exp(-dt_s / _SHARE_S)
+        # Weather first, as changes since the first values; then a late frame; the laser last
         pressure_pa, air_c = discard_impossible_weather(
             given.ambient_pressure_pa, given.air_temperature_c
         )
@@ -234,15 +264,14 @@ class CentreFilter:
         if uses_pressure and math.isfinite(pressure_pa):
             if math.isnan(origin.ambient_pressure_pa):
                 origin.ambient_pressure_pa = pressure_pa
-            change_pa, variance = (
-                pressure_pa - origin.ambient_pressure_pa,
-                config.barometer_noise_pa**2,
-            )
+            change_pa = pressure_pa - origin.ambient_pressure_pa
+            variance = config.barometer_noise_pa**2
             self._use_reading(Sensor.BAROMETER, _ONE[_AMBIENT], change_pa, variance, given.now_s)
         if uses_air and math.isfinite(air_c):
             if math.isnan(origin.air_temperature_c):
                 origin.air_temperature_c = air_c
-            change_k, variance = air_c - origin.air_temperature_c, config.thermometer_noise_k**2
+            change_k = air_c - origin.air_temperature_c
+            variance = config.thermometer_noise_k**2
             self._use_reading(Sensor.THERMOMETER, _ONE[_AIR], change_k, variance, given.now_s)
         if math.isfinite(given.sag_um) and 0.0 <= given.sag_sigma_um < _IMPOSSIBLE:
             self._take_frame(given)
@@ -254,19 +283,23 @@ class CentreFilter:
         return self._make_estimate(given.now_s)
 
     def _predict_states(self, given: CentreReadings, dt_s: float) -> None:
+        """Advance states and covariance by one tick: x <- F x, p <- F p F^T + Q."""
         x, p, config = self.memory.x, self.memory.p, self._config
+        # States: the arriving flow less the leak moves the gas; the gas follows the air
         follow = lag_step_fraction(dt_s, self._gas_follows_air_s)
         x[_GAS] += self._transit.advance(given.flow_um_per_s, dt_s) - x[_LEAK] * dt_s
         x[_WARMTH] += follow * (x[_AIR] - x[_WARMTH])
+        # F p F^T: the same two row operations on p and on its transpose (a view)
         for matrix in (p, p.T):
             matrix[_GAS] -= dt_s * matrix[_LEAK]
             matrix[_WARMTH] += follow * (matrix[_AIR] - matrix[_WARMTH])
+        # Q: the random walks
         p[_GAS, _GAS] += dt_s * self._centre_walk()
         p[_LEAK, _LEAK] += dt_s * config.leak_walk_um_per_s_per_root_s**2
         p[_AMBIENT, _AMBIENT] += dt_s * self._pressure_walk()
         p[_AIR, _AIR] += dt_s * self._air_walk()
-        # without optics no reading tells mount from film, and what was learned of a drift would let
-        # the film drift
+        # Without optics no reading distinguishes mount from film, and a learned drift of the mount
+        # would let the film drift
         drifts = self.memory.walks[3].factor if self._is_fresh(Sensor.OPTICS, given.now_s) else 1.0
         p[_MOUNT, _MOUNT] += dt_s * drifts * config.mount_walk_um_per_root_s**2
 
@@ -278,21 +311,23 @@ class CentreFilter:
             return
         slot = memory.count // self._every % CLONES
         memory.times[slot] = now_s
+        # Its row and column of the covariance are those of c = (self._centre) x
         slot += _PLANT
         memory.p[slot] = memory.p[:, slot] = self._centre @ memory.p
         memory.p[slot, slot] = self._centre @ memory.p[slot]
         memory.x[slot] = self._centre @ memory.x
 
     def _take_frame(self, given: CentreReadings) -> None:
+        """Use a figure's sag: a reading of the centre at the time at which the frame was taken."""
         memory = self.memory
         times, time_s = memory.times, given.sag_time_s
-        before, after = (
-            np.where(times <= time_s, times, -np.inf),
-            np.where(times > time_s, times, np.inf),
-        )
+        # The clones just before and just after that time
+        before = np.where(times <= time_s, times, -np.inf)
+        after = np.where(times > time_s, times, np.inf)
         early, late = int(before.argmax()), int(after.argmin())
         if not math.isfinite(before[early]) or time_s > given.now_s:
             return  # older than the memory, or from the future
+        # Its expectation: the centre then, linear between the two, less the optics' zero
         row = _ONE[_PLANT + early] - _ONE[_STAND]
         if math.isfinite(after[late]):
             share = float((time_s - times[early]) / (times[late] - times[early]))
@@ -302,6 +337,7 @@ class CentreFilter:
             memory.origin.sag_um = given.sag_um
         change_um = given.sag_um - memory.origin.sag_um
         self._use_reading(Sensor.OPTICS, row, change_um, variance, given.now_s, time_s)
+        # The mean interval of frames decides when the optics count as lost
         if (interval_s := time_s - memory.last_frame_s) > 0:
             longer_s = min(interval_s, FRESH_S[Sensor.OPTICS]) - memory.frame_interval_s
             memory.frame_interval_s += _INTERVAL_SHARE * longer_s
@@ -311,8 +347,7 @@ class CentreFilter:
             self._lock_figure()
 
     def _lock_figure(self) -> None:
-        """Declare the figure seen so far the one to hold: what was uncertain of it is the laser's
-        from now on.
+        """Make the mean figure since lock the one to hold: its uncertainty becomes the laser's.
 
         A change of coordinates: with e the error of `stand`, the centre becomes c - e, the mount's
         displacement mount + e.
@@ -332,10 +367,22 @@ class CentreFilter:
         now_s: float,
         taken_s: float = math.nan,
     ) -> None:
-        """Use one reading, whose expectation is a row times the states, by how well it fits."""
+        """Use one reading, weighted by how well it fits.
+
+        Parameters
+        ----------
+        sensor : Sensor
+        row : (71,)
+            The reading's expectation is this row times the states.
+        value, variance : float
+            The reading, in its own unit, and the variance stated for it.
+        now_s, taken_s : float
+            Time of the tick, and when the reading was taken if that was earlier.
+        """
         taken_s = now_s if math.isnan(taken_s) else taken_s
         memory = self.memory
         watch, x, p = memory.watches[sensor], memory.x, memory.p
+        # The innovation, in units of its own standard deviation
         variance *= memory.noises[sensor].factor
         innovation = float(value - row @ x)
         if abs(innovation) > _IMPOSSIBLE:
@@ -343,9 +390,12 @@ class CentreFilter:
         ph, spread = self._project_covariance(row, variance)
         squared = innovation**2 / spread
         watch.innovation = innovation / math.sqrt(spread)
+        # A run of innovations to one side is a change of the leak; the laser shows one only without
+        # optics, as its mount drifts
         leads = sensor != Sensor.LASER or not self._is_fresh(Sensor.OPTICS, now_s)
         ramp = memory.ramps[sensor] if leads and sensor <= Sensor.OPTICS else None
         runs = ramp is not None and ramp.update(watch.innovation, taken_s, _RUN[sensor])
+        # A reading far off waits for more of its kind; if they come, the sensor has jumped
         if self._is_doubtful(sensor, squared, taken_s, now_s) and not runs:
             return
         if watch.far >= _FAR_COUNT:
@@ -354,6 +404,9 @@ class CentreFilter:
             self._learn_noise(
                 sensor, 1 - variance / spread, min(now_s - watch.seen_s, FRESH_S[sensor]), leads
             )
+        # After a jump or a run the states may have changed: widen them, then use the reading in
+        # full.
+        # Otherwise a reading beyond three sigmas counts less (Huber)
         if ramp is not None and runs:
             self._widen_leak(ramp, now_s, math.sqrt(spread))
         if watch.far or runs:
@@ -361,6 +414,7 @@ class CentreFilter:
             ph, spread = self._project_covariance(row, variance)
         elif squared > _HUBER2:
             spread *= squared / _HUBER2
+        # Kalman update: gain K = P h / s, x <- x + K innovation, P <- P - K (P h)^T
         gain = ph / spread
         x += gain * innovation
         p -= gain[:, None] * ph
@@ -369,22 +423,25 @@ class CentreFilter:
             watch.pull += abs(float(self._centre @ gain))
 
     def _learn_noise(self, sensor: Sensor, share: float, dt_s: float, leads: bool) -> None:
-        """Let a good reading correct the noise levels; the centre walks by itself, and by what
-        warms the gas.
+        """Let a good reading correct the noise levels of the walks that it shows.
+
+        `share` of the innovation's variance is the states', the rest the reading's own noise.
         """
         walks: tuple[tuple[LearnedFactor, float], ...] = ()
         if sensor > Sensor.OPTICS:
             walks = ((self.memory.walks[sensor - 1], 1.0),)
         elif leads:
+            # The centre walks by itself, and with the temperature of the gas: in proportion
             by_air = (
                 self._air_walk()
                 * (self._warmth_gain * lag_step_fraction(dt_s, self._gas_follows_air_s)) ** 2
             )
-            own = (centre := self._centre_walk()) / (centre + by_air)
+            centre = self._centre_walk()
+            own = centre / (centre + by_air)
             walks = ((self.memory.walks[0], own), (self.memory.walks[2], 1 - own))
         else:
-            # a laser beside the optics shows its mount: drift that is not its walk would count as
-            # its noise
+            # A laser beside the optics shows its mount: drift that is not learned as the mount's
+            # walk would count as the laser's noise
             walks = ((self.memory.walks[3], 1.0),)
         self.memory.noises[sensor].learn(self.memory.watches[sensor].innovation, share, dt_s, walks)
 
@@ -395,12 +452,15 @@ class CentreFilter:
         return self.memory.walks[2].factor * self._config.air_walk_k_per_root_s**2
 
     def _centre_walk(self) -> float:
+        # The configured gain of the barometer may be off by a share: that part of the pressure's
+        # walk
+        # is not predicted
         missed = _GAIN_ERROR**2 * self._pressure_gain**2 * self._pressure_walk()
         return self.memory.walks[0].factor * (self._config.centre_walk_um_per_root_s**2 + missed)
 
     def _project_covariance(self, row: FloatArray, variance: float) -> tuple[FloatArray, float]:
-        """Covariance of all states with a reading's expectation, and the variance of its
-        innovation.
+        """Return P h (71,), the covariance of the states with a reading's expectation, and the
+        innovation's variance h^T P h + r.
         """
         ph: FloatArray = self.memory.p @ row
         return ph, float(row @ ph) + variance
@@ -423,8 +483,10 @@ class CentreFilter:
         )
 
     def _open_jump(self, sensor: Sensor, innovation: float, now_s: float) -> None:
-        """A sensor has moved and stays there: let the others say whether it moved,
-        or what it sees.
+        """Widen the states by a sensor's jump: did the sensor move, or what it measures?
+
+        The states along which the jump is possible get its square as variance, so that the next
+        readings of all sensors decide.
         """
         since_s = self.memory.watches[sensor].far_since_s
         self._jumped.append(f"{sensor.name.lower()} {innovation:+.3g}")
@@ -444,14 +506,14 @@ class CentreFilter:
             and self._laser_agrees(now_s)
             and not self._is_fresh(sensor, since_s)
         ):
-            # they are back, and the mirror has followed the laser's mount meanwhile
+            # The optics return after a gap, in which the mirror followed the laser's mount
             self._widen_states(
                 innovation * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT])
             )
         else:
             self._widen_states(innovation * moved)
             if sensor == Sensor.LASER and self._is_fresh(Sensor.OPTICS, now_s):
-                self.relock()  # optics that missed it count from where the laser sees the film
+                self.relock()  # the optics missed it: their zero is where the laser shows the film
             elif sensor == Sensor.OPTICS and self._laser_agrees(now_s):
                 self._widen_states(_OPTICS_JUMP_SHARE * innovation * _ONE[_STAND])
 
@@ -459,14 +521,15 @@ class CentreFilter:
         return self._is_fresh(Sensor.LASER, now_s) and not self.memory.watches[Sensor.LASER].far
 
     def _centre_since(self, since_s: float) -> FloatArray:
+        """Return a row with 1 for each clone of the centre made at or after a time."""
         return np.concatenate([np.zeros(_PLANT), self.memory.times >= since_s])
 
     def _widen_states(self, jump: FloatArray) -> None:
-        """The states may have jumped by some such amounts."""
+        """Add the variance of a possible jump of the states, (71,)."""
         self.memory.p += jump[:, None] * jump
 
     def _widen_leak(self, ramp: InnovationRamp, now_s: float, sigma_um: float) -> None:
-        """The leak may have changed when the innovations began to run away."""
+        """Add the variance of a leak that changed when the innovations began to run away."""
         jump = (now_s - ramp.since_s) * _ONE[_GAS] - _ONE[_LEAK]
         jump[_PLANT:] = np.maximum(self.memory.times - ramp.since_s, 0.0)
         self._widen_states(ramp.slope * sigma_um * jump)
