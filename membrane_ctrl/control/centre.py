@@ -404,8 +404,7 @@ class CentreFilter:
             self._learn_noise(
                 sensor, 1 - variance / spread, min(now_s - watch.seen_s, FRESH_S[sensor]), leads
             )
-        # After a jump or a run the states may have changed: widen them, then use the reading in
-        # full.
+        # After a jump or a run the states may have changed: widen them, then use the whole reading.
         # Otherwise a reading beyond three sigmas counts less (Huber)
         if ramp is not None and runs:
             self._widen_leak(ramp, now_s, math.sqrt(spread))
@@ -452,9 +451,8 @@ class CentreFilter:
         return self.memory.walks[2].factor * self._config.air_walk_k_per_root_s**2
 
     def _centre_walk(self) -> float:
-        # The configured gain of the barometer may be off by a share: that part of the pressure's
-        # walk
-        # is not predicted
+        # The barometer's configured gain may be off by a share: that part of the pressure's walk is
+        # not predicted
         missed = _GAIN_ERROR**2 * self._pressure_gain**2 * self._pressure_walk()
         return self.memory.walks[0].factor * (self._config.centre_walk_um_per_root_s**2 + missed)
 
