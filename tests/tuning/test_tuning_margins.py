@@ -32,7 +32,7 @@ from tuning.proposal.gain_search import (
     search_max_ki,
 )
 from tuning.proposal.lower_bound import compute_least_std_um
-from tuning.proposal.prediction import _clipped, predict_loop
+from tuning.proposal.prediction import _clip_changes, predict_loop
 from tuning.proposal.preview import preview_loop
 from tuning.proposal.tuning_rules import make_amigo_gains, make_lambda_gains, make_simc_gains
 
@@ -277,7 +277,7 @@ def test_what_limits_leave_of_a_gaussian(std: float, mean: float, most: float) -
         lambda at: np.clip(at + std * z, 0.0, most).mean() - mean, -60.0, 60.0
     )
     after = np.clip(before + std * z, 0.0, most)
-    share, rest = _clipped(std, mean, most)
+    share, rest = _clip_changes(std, mean, most)
     assert share == pytest.approx(np.mean(after * z) / std, abs=0.005)
     assert rest == pytest.approx(after.var() - (share * std) ** 2, rel=0.03, abs=0.005)
 
