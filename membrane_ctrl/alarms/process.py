@@ -208,7 +208,9 @@ class Watcher:
     def report_orphan(self, now_s: float) -> None:
         """Report that the control process ended without an "end" event."""
         text = (
-            "the control process ended without a report; the board's watchdog has stopped the pump"
+            "the control process ended without a report: look whether the pump runs. A board's "
+            "watchdog stops its pump; on a bench of single instruments the last flow continues "
+            "until `membrane-ctrl safe` runs"
         )
         self._book.take_sign(Sign("control_gone", True, "critical", text), now_s)
         self._send_due(now_s)

@@ -229,8 +229,8 @@ class StatesConfig(Section):
     check_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     """Longest wait for those readings. Raise it for sensors that warm up."""
     actuator_test: bool = True
-    """Try vent and pump before a hold: the film must respond within 3 s and 5 s. Leave it on, except
-    to debug a bench."""
+    """Try vent and pump before a hold: the film must respond within 3 s and 5 s. Leave it on,
+    except to debug a bench."""
     inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0
     """Longest inflation; a fill from flat takes two hours. Change it to twice the fill time of your
     mirror.

@@ -1,5 +1,6 @@
-"""The commands of a running hold, who may send them and in which states:
-one table for every user.
+"""The commands of a running hold, the role that each needs and the states in which it is allowed.
+
+The control port checks the role, the tick the state.
 """
 
 import math

@@ -281,7 +281,7 @@ class Controller:
             case "setpoint" if math.isfinite(self.memory.setpoint_back_um):  # it stays
                 self.memory.setpoint_back_um = command.value
             case "gains":
-                assert command.loop is not None  # checked by `refusal`
+                assert command.loop is not None  # checked by `explain_refusal`
                 self._gains.begin(command.loop, command, context.now_s)
                 self._set_gains(command.loop)
             case "keep":

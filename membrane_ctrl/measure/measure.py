@@ -119,7 +119,7 @@ def _evaluate(measurement: Measurement, options: MeasureOptions) -> _Outcome:
     except errors.InputError as error:
         reason = name_lens_fold(measurement, str(error), explains=True)
         raise errors.InputError(reason) from None
-    measurement = results.degrade_doubtful(measurement, bars)
+    measurement = results.apply_doubts(measurement, bars)
     contradicted = bars is not None and bool(bars.statement.doubts)
     reason = name_lens_fold(measurement, measurement.reason, explains=contradicted)
     measurement = replace(measurement, reason=reason)

@@ -118,7 +118,7 @@ def error_bars(
     return ErrorBars(seen.budget, statement, seen.doubts, grid, cell_slope, zonal_um)
 
 
-def degrade_doubtful(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
+def apply_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
     """The measurement with the verdict that its error bars allow.
 
     A doubt degrades an `ok`, and so does a geometry that rim or slopes contradict. Slopes that

@@ -39,11 +39,11 @@ class RecorderSpec:
     run_name: str  # of the `.rrd` segments
     clock: RunClock
     config: Config
-    inputs: RingAddress  # the ticks (`tick.pack_tick`)
+    inputs: RingAddress  # the ticks (`tick_codec.pack_tick`)
     events: RingAddress  # the last one has the kind "end"
     shapes: RingAddress | None = None
     frames: FrameAddress | None = None  # for thumbnails
-    snapshots: RingAddress | None = None  # of the controller (`tick.pack_snapshot`)
+    snapshots: RingAddress | None = None  # of the controller (`tick_codec.pack_snapshot`)
     # earlier recorders of this run that died; this one continues where they stopped
     resumes: int = 0
     flush_s: float = 1.0 - POLL_S  # between writes; a power cut may lose this plus one poll

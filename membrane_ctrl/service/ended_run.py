@@ -88,6 +88,11 @@ class EndedRun:
         return self.folder.name
 
     @property
+    def is_regular(self) -> bool:
+        """Whether a person or the run's duration ended it."""
+        return self.kind in (EndKind.STOPPED, EndKind.FINISHED)
+
+    @property
     def cause(self) -> str:
         """Why it ended, and who ended it."""
         match self.kind:

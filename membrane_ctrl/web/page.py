@@ -393,8 +393,9 @@ class WebPage:
         state = seen.state_name
         self._name.set_text(" ".join(part for part in (self._hold, seen.name or "no hold") if part))
         self._state.set_text(state)
-        ended_well = silent and state != "fault"
-        colour = "grey" if ended_well else _COLOURS.get(state, "warning")
+        is_regular = seen.ended is None or seen.ended.is_regular
+        rests = silent and state != "fault" and is_regular
+        colour = "grey" if rests else _COLOURS.get(state, "warning")
         if colour != self._coloured:
             self._coloured = colour
             self._state.props(

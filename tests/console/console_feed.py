@@ -114,5 +114,5 @@ FAULT = {
     "limit": "must be up",
     "safe_level": "pump_off",
     "latching": True,
-    "remedy": "check cable, power and address; the board's watchdog has stopped the pump",
+    "remedy": "check cable, power and address; a board's watchdog stops its pump",
 }

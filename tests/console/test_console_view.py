@@ -290,7 +290,7 @@ def test_plain_events() -> None:
     assert event_line(event(12.345, "fault", **FAULT)) == (
         "     12.3 s  Fault link_lost: the link to the pump board is down (link down). Do: "
         "check cable, power and "
-        "address; the board's watchdog has stopped the pump. Limit: must be up; safe level pump_off"
+        "address; a board's watchdog stops its pump. Limit: must be up; safe level pump_off"
     )
     assert (
         event_line(event(1.0, "state", state="hold", why="settled"))

@@ -79,6 +79,7 @@ def test_the_cause_is_what_the_record_shows(
 ) -> None:
     ended = read_ended_run(write_run(tmp_path, events))
     assert ended.kind is kind
+    assert ended.is_regular == (kind in (EndKind.STOPPED, EndKind.FINISHED))
     assert cause in ended.headline
     assert (ended.pump_fraction, ended.vent_fraction) == pytest.approx((0.3, 0.0))
     assert ended.lines()[-1] == (

@@ -121,7 +121,7 @@ def measured_errors(
     measurement = measure_set(folder)
     _, outline = light_and_rim(measurement)
     bars = results.error_bars(measurement, None, outline)
-    measurement = results.degrade_doubtful(measurement, bars)
+    measurement = results.apply_doubts(measurement, bars)
     contradicted = bars is not None and bool(bars.statement.doubts)
     reason = name_lens_fold(measurement, measurement.reason, contradicted)
     flagged = tuple(f"{item['file']}: {item['reason']}" for item in measurement.flagged_files())

@@ -3,9 +3,9 @@ that leaves.
 
 The sensitivities are those of the budget of `measure`, computed once, with the first full cycle.
 Each cycle then asks some of its points what light each frame had and where the film was (see
-`frames.evidence`), takes the effect out, and states what is left. Errors that all cycles share
-count for one figure, not for a change since the reference cycle: the first one near the film's
-present displacement.
+`frame_checks.frame_evidence`), takes the effect out, and states what is left. Errors that all
+cycles share count for one figure, not for a change since the reference cycle: the first one near
+the film's present displacement.
 """
 
 import math

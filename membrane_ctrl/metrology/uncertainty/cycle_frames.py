@@ -57,7 +57,8 @@ def estimate_frame_errors(
         wave = np.exp(
             1j * (shifts_rad[axis][:, None] + phase_rad[axis] + told_um[axis][:, None] * slope)
         )
-        # level, swing, step, film, the display's harmonics (`frames.evidence`), and the frame
+        # level, swing, step, film, the display's harmonics (`frame_checks.frame_evidence`), and
+        # the frame
         table = np.empty((len(frames), _COLUMNS + 1, level.size))
         table[:, 0], table[:, 1], table[:, 2] = level, swing * wave.real, swing * wave.imag
         table[:, 3] = (slope.mean() - slope) * table[:, 2]
