@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import re
 from pathlib import Path
 
@@ -16,9 +17,11 @@ from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.config.toml_file import dump_toml, load_toml
-from membrane_ctrl.control_port.server import metrics_text
+from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.service.feed import HoldSeen
+from membrane_ctrl.service.metrics import render_metrics
 from membrane_ctrl.sim.lab import Lab
 
 EXAMPLES = sorted(Path(__file__).parents[1].glob("membrane_ctrl/examples/*.toml"))
@@ -194,7 +197,9 @@ def test_a_preset_refuses_what_its_device_does_not_have(
 def test_the_dashboard_asks_for_metrics_that_exist() -> None:
     dashboard = json.loads(EXAMPLES[0].with_name("grafana.json").read_text())
     status = RunStatus(TelemetryRow(*(0.0 for _ in FIELDS)))
-    served = set(re.findall(r"^(membrane_\w+)", metrics_text(status, 1, 0), re.MULTILINE))
+    seen = HoldSeen("run", status=status_table(status), seen_s=math.inf, problem="")
+    text = render_metrics({"": seen}).decode()
+    served = set(re.findall(r"^(membrane_\w+)", text, re.MULTILINE))
     panels = dashboard["panels"]
     asked = [target["expr"] for panel in panels for target in panel["targets"]]
     asked.append(dashboard["templating"]["list"][1]["query"]["query"])

@@ -22,13 +22,16 @@ RunOption = Annotated[Path | None, typer.Option(help="The run's folder.")]
 SocketOption = Annotated[
     Path | None, typer.Option(help="The hold's socket; logs/control.sock by default.")
 ]
-TlsOption = Annotated[
-    str, typer.Option(metavar="HOST:PORT", help="Connect over TLS, with the certificate below.")
+HostOption = Annotated[
+    str,
+    typer.Option(metavar="URL", help="Ask a service, such as https://bench2.lab:7480/."),
 ]
-CertificateOption = Annotated[Path | None, typer.Option(help="With --tls: your certificate.")]
-KeyOption = Annotated[Path | None, typer.Option(help="With --tls: its key.")]
+TokenOption = Annotated[
+    Path | None,
+    typer.Option(help="With --host: file with a token; else the variable MEMBRANE_CTRL_TOKEN."),
+]
 AuthorityOption = Annotated[
-    Path | None, typer.Option(help="With --tls: the CA of the hold's certificate.")
+    Path | None, typer.Option(help="With --host: the CA of the service's certificate.")
 ]
 
 
@@ -103,9 +106,8 @@ def _make_common_fields(
     take_over: TakeOverOption = False,
     run: RunOption = None,
     socket: SocketOption = None,
-    tls: TlsOption = "",
-    certificate: CertificateOption = None,
-    key: KeyOption = None,
+    host: HostOption = "",
+    token_file: TokenOption = None,
     authority: AuthorityOption = None,
     json: JsonOption = False,
 ) -> tuple[dict[str, Any], Any, bool]:
@@ -113,12 +115,10 @@ def _make_common_fields(
     and whether to print the answer as JSON.
     """
     from membrane_ctrl.control_port.ctl import Where
+    from membrane_ctrl.control_port.service_client import ServiceAddress, read_token
 
-    return (
-        {"why": why, "take_over": take_over},
-        Where(socket, run, tls, certificate, key, authority),
-        json,
-    )
+    service = ServiceAddress(host, read_token(token_file), authority) if host else None
+    return {"why": why, "take_over": take_over}, Where(socket, run, service=service), json
 
 
 def _add_command(action: str, does: str, own: Callable[..., dict[str, Any]]) -> None:

@@ -64,9 +64,6 @@ def load_configuration(path: Path | None) -> "Config":
     folder = path.resolve().parent
     if optics.geometry_file is not None:
         optics = _resolve_beside(optics, folder, "geometry_file")
-    if port.tls is not None:
-        tls = _resolve_beside(port.tls, folder, "certificate_file", "key_file", "client_ca_file")
-        port = port.model_copy(update={"tls": tls})
     alarms = _resolve_beside(alarms, folder, "urls_file", "escalation_urls_file")
     doors = config.doors
     if doors.mqtt is not None:

@@ -213,18 +213,12 @@ def _what_would_happen(config: Config) -> dict[str, str]:
 
 
 def _describe_port(port: PortConfig) -> str:
-    """Where the control port would listen. Raises InputError for unusable certificates or group."""
+    """Where the control port would listen. Raises InputError for an unknown group."""
     if not port.enabled:
         return "off"
     if port.group is not None:
         sockets.group_id(port.group)
-    ways = [port.socket or f"{SOCKET_NAME} beside the run folders"]
-    if port.tls is not None:
-        sockets.server_context(port.tls)
-        ways.append(f"TLS on {port.tls.host}:{port.tls.port}")
-    if port.metrics_port is not None:
-        ways.append(f"metrics on 127.0.0.1:{port.metrics_port}")
-    return ", ".join(ways)
+    return port.socket or f"{SOCKET_NAME} beside the run folders"
 
 
 def _describe_package(needed: NeededPackage) -> dict[str, str]:

@@ -15,21 +15,6 @@ Seconds = Annotated[float, Field(ge=0, le=1e6)]
 Limit = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
-class TlsConfig(Section):
-    """The port on TCP, with a certificate on either side (docs/reference/control-port.md)."""
-
-    host: str = "127.0.0.1"
-    """Address to listen on. Change it to let other machines connect."""
-    port: Annotated[int, Field(ge=0, le=65535)] = 7470
-    """TCP port; 0: any free one, named in the event `port`. Change it if another program has it."""
-    certificate_file: str
-    """The hold's certificate. Set it to a file beside the configuration or elsewhere."""
-    key_file: str
-    """The key of that certificate. Set it to a file that only the hold can read."""
-    client_ca_file: str
-    """CA whose certificates are accepted; their OU is the role. Set it to your laboratory's CA."""
-
-
 class PortConfig(Section):
     """Where a running hold listens."""
 
@@ -51,10 +36,6 @@ class PortConfig(Section):
     """Silence after which another may command without --take-over. Change it to the pace of your
     shifts.
     """
-    tls: TlsConfig | None = None
-    metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """Port of the Prometheus metrics, on 127.0.0.1 only; absent: none. Set it to monitor the hold.
-    """
 
     def socket_in(self, logs_dir: Path) -> Path:
         """The socket's file of a hold with its runs in `logs_dir`."""
@@ -68,21 +49,19 @@ class FleetHold(Section):
     """Name in lists."""
     socket: str | None = None
     """Socket file of a hold on this machine."""
-    tls: str = ""
-    """HOST:PORT of a hold elsewhere, with the three files below."""
-    certificate_file: str | None = None
-    """Our certificate."""
-    key_file: str | None = None
-    """Its key."""
+    url: str = ""
+    """Address of the service that has the hold, such as https://bench2.lab:7480/."""
+    hold: str = ""
+    """Name of the hold there. Set it where that service has several."""
+    token_file: str | None = None
+    """File with a token of that service; without it, the variable MEMBRANE_CTRL_TOKEN."""
     authority_file: str | None = None
-    """CA of the hold's certificate."""
+    """CA of the service's certificate. Set it if the system does not know it."""
 
     @model_validator(mode="after")
     def _one_place(self) -> "FleetHold":
-        if bool(self.socket) == bool(self.tls):
-            raise ValueError("give either socket or tls")
-        if self.tls and not (self.certificate_file and self.key_file and self.authority_file):
-            raise ValueError("tls needs certificate_file, key_file and authority_file")
+        if bool(self.socket) == bool(self.url):
+            raise ValueError("give either socket or url")
         return self
 
 

@@ -11,7 +11,6 @@ import contextlib
 import errno
 import math
 import socket
-import ssl
 import struct
 import time
 from collections.abc import Callable, Iterator
@@ -32,7 +31,7 @@ class PortClient:
     Parameters
     ----------
     connection : socket
-        Connected, plain or TLS; the client closes it.
+        Connected; the client closes it.
     where : str
         The address, for messages.
     notice : callable
@@ -98,32 +97,6 @@ class PortClient:
                 return cls.unix(path, notice, left_s)
             raise DeviceError(f"{path}: {os_reason(error)}") from None
         return cls(connection, str(path), notice, until_s)
-
-    @classmethod
-    def tls(
-        cls,
-        host: str,
-        port: int,
-        context: ssl.SSLContext,
-        notice: Callable[[str], None],
-        answer_s: float = ANSWER_S,
-    ) -> PortClient:
-        """Connect over TCP; the context holds our certificate (`sockets.client_context`). Times as
-        for `unix`.
-        """
-        where = f"{host}:{port}"
-        until_s = time.monotonic() + answer_s
-        try:
-            plain = socket.create_connection((host, port), answer_s)
-        except OSError as error:
-            raise DeviceError(f"{where}: {os_reason(error)}") from None
-        try:
-            plain.settimeout(max(0.001, until_s - time.monotonic()))  # of the whole handshake
-            secured = context.wrap_socket(plain, server_hostname=host)
-        except OSError as error:
-            plain.close()
-            raise DeviceError(f"{where}: {_tls_reason(error)}") from None
-        return cls(secured, where, notice, until_s)
 
     def ask(self, **request: Any) -> Message:
         """Send a request (`protocol.Request`) and return its answer. Raises DeviceError if none
@@ -198,10 +171,8 @@ class PortClient:
 
     def _read_greeting(self, until_s: float) -> Message:
         line = self._read_line(until_s)
-        if (
-            line is None
-        ):  # the hold records the reason; with TLS it is usually a refused certificate
-            raise DeviceError(f"{self._where}: no greeting; with TLS, check the certificate")
+        if line is None:  # the hold records the reason
+            raise DeviceError(f"{self._where}: no greeting; see the events of the hold")
         try:
             return answers.check_greeting(answers.decode(line))
         except answers.AnswerError as error:
@@ -253,24 +224,11 @@ class PortClient:
             raise DeviceError(
                 f"{self._where}: the hold does not answer; is it stopped or overloaded?"
             ) from None
-        except OSError as error:  # TLS: a refused certificate shows only when reading
-            refused = isinstance(error, ssl.SSLError)
-            reason = f"{_tls_reason(error)}; check the certificate" if refused else os_reason(error)
-            raise DeviceError(f"{self._where}: {reason}") from None
+        except OSError as error:
+            raise DeviceError(f"{self._where}: {os_reason(error)}") from None
 
 
 def _kernel_time(seconds: float) -> bytes:
     """A time as `SO_SNDTIMEO` takes it: seconds and microseconds; zero would mean no limit."""
     fraction, whole = math.modf(max(seconds, 0.001))
     return struct.pack("ll", int(whole), int(1e6 * fraction))
-
-
-def _tls_reason(error: OSError) -> str:
-    """Why there is no secure connection, in words."""
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return f"the hold's certificate is not trusted: {error.verify_message}"
-    if isinstance(error, TimeoutError):
-        return "no TLS answer; is it a hold's TLS port?"
-    if isinstance(error, ssl.SSLError):
-        return f"no TLS connection ({str(error.reason or 'broken off').lower().replace('_', ' ')})"
-    return os_reason(error)

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import time
 import tomllib
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -11,9 +12,9 @@ from typing import Any
 
 from membrane_ctrl.config.port import SOCKET_NAME, FleetConfig
 from membrane_ctrl.config.toml_file import load_toml, read_toml
-from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.commander import CommandSession
+from membrane_ctrl.control_port.service_client import ServiceAddress, ServiceClient, read_token
 from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.model import errors, files, plain_json, run_status, terminal
 from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
@@ -30,17 +31,16 @@ class Where:
 
     socket: Path | None = None
     run: Path | None = None
-    tls: str = ""  # HOST:PORT
-    certificate: Path | None = None
-    key: Path | None = None
-    authority: Path | None = None
     logs: Path = Path("logs")
+    service: ServiceAddress | None = None  # the hold is behind this service
 
 
 def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
     """Send a request to a running hold. Raises InputError for a refusal, DeviceError without an
     answer.
     """
+    if where.service is not None:
+        return _ask_service(request, where.service, as_json)
     action = request["do"]
     with connected(where) as client:
         answer = client.ask(**request)
@@ -50,18 +50,49 @@ def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
             raise errors.InputError(f"refused: {answer.get('refused')}")
         if action == "watch":
             return _watch(client, answer["status"], request["period_s"], as_json)
-        if as_json:
-            print(json.dumps(answer))
-        elif action == "status":
+        if action == "status" and not as_json:
             print("\n".join(status_lines(answer["status"])))
-        else:
-            state = f"; the state was {answer['state']}" if "state" in answer else ""
-            lock = f": word {answer['lock']['word']}" if "lock" in answer else ""
-            print(f"{action}: done{lock}{state}", file=sys.stderr)
+            return errors.Exit.DONE
+    return _print_answer(action, answer, as_json)
+
+
+def _print_answer(action: str, answer: dict[str, Any], as_json: bool) -> int:
+    """Print what the hold answered to a command that it obeyed."""
+    if as_json:
+        print(json.dumps(answer))
+    else:
+        state = f"; the state was {answer['state']}" if "state" in answer else ""
+        lock = f": word {answer['lock']['word']}" if "lock" in answer else ""
+        print(f"{action}: done{lock}{state}", file=sys.stderr)
     if answer.get("problem"):
         print(f"{action}: NOT STORED, only this run knows: {answer['problem']}", file=sys.stderr)
         return errors.Exit.DEVICE_FAILED
     return errors.Exit.DONE
+
+
+def _ask_service(request: dict[str, Any], address: ServiceAddress, as_json: bool) -> int:
+    """Send a request to a hold behind a service. Raises as `ctl`."""
+    client, action = ServiceClient(address), request["do"]
+    if action == "watch":
+        while (state := client.read_state()).in_contact:
+            _print_watched(state.status, as_json)
+            time.sleep(request["period_s"])
+        print("the run is over", file=sys.stderr)
+        return errors.Exit.DONE
+    if action != "status":
+        answer = client.send_command(request)
+        if not answer["ok"]:
+            raise errors.InputError(f"refused: {answer.get('refused')}")
+        return _print_answer(action, answer, as_json)
+    state = client.read_state()
+    if as_json:
+        print(state.model_dump_json())
+    elif state.in_contact:
+        print("\n".join(status_lines(state.status)))
+    else:
+        lines = [state.reason] if state.ended is None else state.ended.lines
+        print("\n".join(terminal.one_line(line) for line in lines))
+    return errors.Exit.DONE if state.in_contact else errors.Exit.DEVICE_FAILED
 
 
 def fleet(file: Path) -> dict[str, Where]:
@@ -75,10 +106,13 @@ def fleet(file: Path) -> dict[str, Where]:
     found = {}
     for hold in load_toml(file, FleetConfig).holds:
         socket = beside(hold.socket)
-        files = (beside(hold.certificate_file), beside(hold.key_file), beside(hold.authority_file))
-        found[hold.name] = Where(
-            socket, None, hold.tls, *files, logs=socket.parent if socket else Path("logs")
-        )
+        if socket is not None:
+            found[hold.name] = Where(socket, logs=socket.parent)
+            continue
+        token = read_token(beside(hold.token_file))
+        address = ServiceAddress(hold.url, token, beside(hold.authority_file), hold.hold)
+        ServiceClient(address)  # an address that cannot be is named before anything is asked
+        found[hold.name] = Where(service=address)
     return found
 
 
@@ -101,6 +135,8 @@ def fleet_status(file: Path, as_json: bool) -> int:
 
 def _status_of(where: Where) -> dict[str, Any]:
     try:
+        if where.service is not None:
+            return _status_of_service(where.service)
         with connected(where, notice=lambda _: None, answer_s=_FLEET_S / 2) as client:
             client.patience(_FLEET_S / 2)
             answer = client.ask(do="status")
@@ -109,6 +145,11 @@ def _status_of(where: Where) -> dict[str, Any]:
     except Exception as error:  # whatever one hold causes, the others are listed
         return {"problem": f"{type(error).__name__}: {error}"}
     return dict(answer["status"]) if answer.get("ok") else {"problem": str(answer.get("refused"))}
+
+
+def _status_of_service(address: ServiceAddress) -> dict[str, Any]:
+    state = ServiceClient(address, _FLEET_S / 2).read_state()
+    return state.status if state.in_contact else {"problem": state.reason}
 
 
 def fleet_line(status: dict[str, Any]) -> str:
@@ -233,8 +274,6 @@ def connected(
 
     Connection and greeting take `answer_s` at most.
     """
-    if where.tls:
-        return _connect_tls(where, notice, answer_s)
     path = socket_path(where)
     if where.socket is None and where.run is None and not path.exists():
         raise errors.DeviceError(
@@ -245,16 +284,6 @@ def connected(
         client.close()
         raise errors.InputError(f"{where.run}: is not running; {client.greeting['run']} is")
     return client
-
-
-def _connect_tls(where: Where, notice: Callable[[str], None], answer_s: float) -> PortClient:
-    host, _, port = where.tls.rpartition(":")
-    if not host or not port.isdigit():
-        raise errors.InputError(f"--tls {where.tls}: expected HOST:PORT")
-    if where.certificate is None or where.key is None or where.authority is None:
-        raise errors.InputError("--tls needs --certificate, --key and --authority")
-    context = sockets.client_context(where.certificate, where.key, where.authority)
-    return PortClient.tls(host, int(port), context, notice, answer_s)
 
 
 def socket_path(where: Where) -> Path:

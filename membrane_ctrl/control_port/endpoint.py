@@ -1,57 +1,27 @@
-"""A listening socket in the control process that admits few clients at a time and reopens after a
-failure.
+"""The listening socket in the control process, which admits few clients at a time and reopens after
+a failure.
 
-`asyncio.start_server` would accept all connections at once; here each waits for the one before, so
-that a flood costs the ticks at most twenty handshakes a second.
-
-A peer that has not identified itself (no handshake, no request) is a stranger. The number of
-strangers is limited, in total and per address: the longest waiting one makes room for a newcomer,
-so that nobody can block the queue. An address that connects too often is refused at once.
+`asyncio.start_unix_server` would accept all connections at once; here each waits for the one
+before, so that a flood costs the ticks at most twenty new clients a second.
 """
 
 import asyncio
 import socket
 import struct
-from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable
 
 from membrane_ctrl.model import durations, events, port_events
 
 BACKLOG = 64  # connections that may wait; the kernel refuses more
 _INSIDE_MOST = 32
-_STRANGERS_MOST, _STRANGERS_EACH = 16, 4
 _PAUSE_S = 0.05
-# Per address: a person's terminal and a script or two; a flood gets a tenth of the handshakes
-_BURST, _PER_S = 10.0, 2.0
-_TURN_AWAY_S = 0.005  # each costs 50 us: a hundredth of a processor
-_ADDRESSES_MOST = 1024  # addresses remembered
 _LEAVE_S = 2.0  # then the run ends without waiting for clients
 _AGAIN_S = 1.0
 _RESET = struct.pack(
     "ii", 1, 0
 )  # SO_LINGER: a refused connection leaves nothing behind in the kernel
 
-LetIn = Callable[[], object]
-Welcome = Callable[[socket.socket, LetIn], Awaitable[None]]
-
-
-class Turns:
-    """How often an address may connect: a token bucket each; forgets the address absent longest."""
-
-    def __init__(self, now: Callable[[], float]) -> None:
-        self._now = now
-        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
-
-    def take(self, address: str) -> bool:
-        """Whether the address may connect now; counts the connection if so."""
-        now_s = self._now()
-        left, since_s = self._left.pop(address, (_BURST, now_s))
-        left = min(_BURST, left + _PER_S * (now_s - since_s))
-        may = left >= 1.0
-        self._left[address] = (left - may, now_s)
-        if len(self._left) > _ADDRESSES_MOST:
-            self._left.popitem(last=False)
-        return may
+Welcome = Callable[[socket.socket], Awaitable[None]]
 
 
 class Endpoint:
@@ -64,7 +34,7 @@ class Endpoint:
     listener : socket
         Bound, listening, non-blocking; the endpoint closes it.
     welcome : callable
-        Serves one connection to its end; calls its second argument once the peer is identified.
+        Serves one connection to its end.
     tell : callable
         Records an event.
     refused : callable
@@ -85,7 +55,6 @@ class Endpoint:
         self._tell = tell
         self._refused = refused
         self._inside: set[asyncio.Task[None]] = set()
-        self._strangers: dict[asyncio.Task[None], str] = {}  # their addresses, in order of arrival
         self._task: asyncio.Task[None] | None = None
 
     def open(self) -> None:
@@ -104,10 +73,9 @@ class Endpoint:
     async def _keep(self) -> None:
         """Accept forever; report failures and retry."""
         failures = 0
-        turns = Turns(asyncio.get_running_loop().time)
         while True:
             try:
-                came_in = await self._accept(turns)
+                await self._accept()
             except Exception as error:
                 failures += 1
                 again_s = durations.pause_s(failures, _AGAIN_S)
@@ -117,55 +85,22 @@ class Endpoint:
             if failures:
                 failures = 0
                 self._tell(port_events.PortOpen(self._name))
-            await asyncio.sleep(_PAUSE_S if came_in else _TURN_AWAY_S)
+            await asyncio.sleep(_PAUSE_S)
 
-    async def _accept(self, turns: Turns) -> bool:
-        connection, peer = await asyncio.get_running_loop().sock_accept(self._listener)
-        address = (
-            str(peer[0]) if isinstance(peer, tuple) else ""
-        )  # clients of a socket file have none
-        if address and not turns.take(address):
-            self._turn_away(connection, address, "connects too often")
-            return False
-        if not self._room_for(address):
-            self._turn_away(connection, address, "too many connections")
-            return True
+    async def _accept(self) -> None:
+        connection, _ = await asyncio.get_running_loop().sock_accept(self._listener)
+        if len(self._inside) >= _INSIDE_MOST:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+            connection.close()
+            self._refused(self._name, "too many connections")
+            return
         task = asyncio.create_task(self._look_after(connection), name=f"port {self._name} client")
         self._inside.add(task)
-        if address:  # the kernel identifies the others
-            self._strangers[task] = address
-        task.add_done_callback(self._gone)
-        return True
-
-    def _turn_away(self, connection: socket.socket, address: str, reason: str) -> None:
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
-        connection.close()
-        self._refused(f"{self._name}:{address}", reason)
-
-    def _room_for(self, address: str) -> bool:
-        """Whether a newcomer may enter; drops the longest waiting stranger of a crowded address if
-        needed.
-        """
-        each = Counter(self._strangers.values())
-        crowded = each[address] >= _STRANGERS_EACH
-        if not crowded and len(self._strangers) < _STRANGERS_MOST:
-            return len(self._inside) < _INSIDE_MOST
-        most = address if crowded else each.most_common(1)[0][0]
-        task = next(task for task, other in self._strangers.items() if other == most)
-        del self._strangers[task]
-        task.cancel()
-        self._refused(f"{self._name}:{most}", "did not identify itself, and others wait")
-        return len(self._inside) <= _INSIDE_MOST
-
-    def _gone(self, task: asyncio.Task[None]) -> None:
-        self._inside.discard(task)
-        self._strangers.pop(task, None)
+        task.add_done_callback(self._inside.discard)
 
     async def _look_after(self, connection: socket.socket) -> None:
-        task = asyncio.current_task()
-        assert task is not None
         try:
-            await self._welcome(connection, lambda: self._strangers.pop(task, None))
+            await self._welcome(connection)
         except Exception as error:  # one client's error must not affect the others
             self._tell(port_events.PortFailed(self._name, f"{type(error).__name__}: {error}"))
         finally:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import select
 import socket
-import ssl
 import time
 
 # The longest line of a hold is the answer to `status`: some 5 kB, and at most 16 kB with every
@@ -32,7 +31,7 @@ class LineReader:
     Parameters
     ----------
     connection : socket
-        Plain or TLS, in blocking mode; its time-out is set for each read.
+        In blocking mode; its time-out is set for each read.
     """
 
     def __init__(self, connection: socket.socket) -> None:
@@ -78,8 +77,7 @@ class LineReader:
         """Whether a read would return at once: something has arrived, or the peer has gone."""
         if b"\n" in self._unread:
             return True
-        secured = isinstance(self._connection, ssl.SSLSocket) and self._connection.pending() > 0
-        return secured or bool(select.select([self._connection], [], [], 0.0)[0])
+        return bool(select.select([self._connection], [], [], 0.0)[0])
 
     def _receive(self, until_s: float) -> bytes:
         left_s = until_s - time.monotonic()

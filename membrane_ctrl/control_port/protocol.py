@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
-import ssl
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -161,7 +160,6 @@ _LINE_S = 5.0  # to complete a line
 _CHUNK_BYTES = 4096  # read at once: at most a few hundred short lines, 0.3 ms
 # A reader this far behind is dropped: a 10 Hz watcher after a minute
 _UNREAD_BYTES = 1 << 20
-_HANDSHAKE_S = 3.0
 
 
 class SlowReaderError(ConnectionError):
@@ -176,22 +174,13 @@ class Wire:
         self._part = b""  # of a line that is not complete yet
 
     @classmethod
-    async def on(cls, connection: socket.socket, context: ssl.SSLContext | None = None) -> Wire:
-        """Take over an accepted connection. Raises OSError (ssl.SSLError among them) if the
-        handshake fails.
-        """
+    async def on(cls, connection: socket.socket) -> Wire:
+        """Take over an accepted connection. Raises OSError."""
         loop = asyncio.get_running_loop()
         reader = asyncio.StreamReader(limit=MESSAGE_BYTES, loop=loop)
         protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
-        secured = {"ssl": context, "ssl_handshake_timeout": _HANDSHAKE_S} if context else {}
-        transport, _ = await loop.connect_accepted_socket(lambda: protocol, connection, **secured)  # type: ignore[arg-type]
+        transport, _ = await loop.connect_accepted_socket(lambda: protocol, connection)
         return cls(reader, asyncio.StreamWriter(transport, protocol, reader, loop))
-
-    @property
-    def certificate(self) -> dict[str, Any]:
-        """The peer's certificate, as from `ssl.SSLSocket.getpeercert`."""
-        found: dict[str, Any] | None = self._writer.get_extra_info("peercert")
-        return found or {}
 
     async def lines(self) -> list[bytes] | None:
         """The complete lines that have arrived, at least one; None when the peer has gone.
@@ -239,14 +228,6 @@ class Wire:
             raise SlowReaderError("does not read its messages")
         self._writer.write(encode(message))
 
-    async def until(self, end: bytes) -> bytes:
-        """Read up to `end`. Raises asyncio's LimitOverrunError or IncompleteReadError."""
-        return await self._reader.readuntil(end)
-
-    def send_bytes(self, data: bytes) -> None:
-        """Send an answer that is not a line."""
-        self._writer.write(data)
-
     async def close(self) -> None:
         """Send remaining data if possible without waiting, and end."""
         self._writer.close()
@@ -276,9 +257,7 @@ FREE = frozenset({"status", "watch", "unlock", "mark", "release", "quiet"}) | SA
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """The peer of a connection: `unix:NAME` or `tls:NAME`,
-    as given by the system or a certificate.
-    """
+    """The peer of a connection: `unix:NAME`, as given by the system."""
 
     who: str
     role: Role
@@ -310,7 +289,7 @@ def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
     Parameters
     ----------
     peer : Peer
-        Of the connection, as the system or a certificate identifies it.
+        Of the connection, as the system identifies it.
     on_behalf : OnBehalf or None
         What the request itself states.
 

@@ -20,7 +20,7 @@ from membrane_ctrl.config import port, schema, toml_file
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.commander import Commander, CommandSession
-from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
+from membrane_ctrl.control_port.endpoint import Endpoint, Refusals
 from membrane_ctrl.control_port.protocol import FREE, Peer, Sender, may_not
 from membrane_ctrl.control_port.request_intake import ReadingTurns
 from membrane_ctrl.control_port.safety_commands import is_safety_command
@@ -28,8 +28,7 @@ from membrane_ctrl.control_port.session import PortSession
 from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.controller import commands, cross_check_plant, tick
 from membrane_ctrl.instruments.lock_store import draw_word
-from membrane_ctrl.model import errors, events, port_events, telemetry
-from membrane_ctrl.model.columns import COLUMNS
+from membrane_ctrl.model import errors, events, port_events
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.run_status import RunStatus
 
@@ -38,7 +37,6 @@ from membrane_ctrl.model.run_status import RunStatus
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
 _ANSWER_S = 5.0
 _STORE_S = 0.7  # for the disk to confirm a lock: a safety command is answered within a second
-_EXPIRED = "the certificate has expired"
 _OVER = "the run is over"
 
 
@@ -107,18 +105,13 @@ class Port:
     async def open(self) -> AsyncIterator[None]:
         """Accept clients for the duration of a `with` block."""
         listeners = self._listeners
-        asked: list[tuple[str, socket.socket, Welcome]] = []
+        endpoint: Endpoint | None = None
         if listeners.unix is not None:
-            asked.append(("unix", listeners.unix.socket, self._welcome_unix))
-        if listeners.tls is not None:
-            asked.append(("tls", listeners.tls.socket, self._welcome_tls))
-        if listeners.metrics is not None:
-            asked.append(("metrics", listeners.metrics, self._welcome_metrics))
-        endpoints = [Endpoint(*each, self._tell, self._turned_away) for each in asked]
-        for endpoint in endpoints:
+            endpoint = Endpoint(
+                "unix", listeners.unix.socket, self._welcome_unix, self._tell, self._turned_away
+            )
             endpoint.open()
-        if endpoints:
-            self._tell(port_events.PortAddresses(**listeners.addresses))
+            self._tell(port_events.PortAddresses(str(listeners.path)))
         try:
             yield
         finally:
@@ -128,7 +121,7 @@ class Port:
                     future.set_result(_OVER)
             while self._waiting:  # noqa: ASYNC110  an answer is sent in the same step that takes it from here
                 await asyncio.sleep(0.0)
-            for endpoint in endpoints:
+            if endpoint is not None:
                 await endpoint.close()
 
     def status(self) -> dict[str, Any]:
@@ -143,40 +136,18 @@ class Port:
             "clients": len(self._sessions),
         }
 
-    def metrics(self) -> str:
-        """The status for Prometheus."""
-        return metrics_text(self._status, len(self._sessions), self._refusals.count)
-
     def _turned_away(self, who: str, reason: str) -> None:
         self._refusals.record(who, "", reason)
 
-    async def _welcome_metrics(self, connection: socket.socket, let_in: LetIn) -> None:
-        await serve_metrics(connection, self.metrics)
-
-    async def _welcome_unix(self, connection: socket.socket, let_in: LetIn) -> None:
+    async def _welcome_unix(self, connection: socket.socket) -> None:
         assert self._listeners.unix is not None
         peer = self._listeners.unix.peer(connection)
         await self._serve(await protocol.Wire.on(connection), peer)
 
-    async def _welcome_tls(self, connection: socket.socket, let_in: LetIn) -> None:
-        assert self._listeners.tls is not None
-        try:
-            wire = await protocol.Wire.on(connection, self._listeners.tls.context)
-        except OSError as error:  # certificate missing, expired or foreign; no TLS at all; too slow
-            self._refusals.record("tls:unknown", "", f"handshake: {error}")
-            return
-        let_in()
-        tls, certificate = self._listeners.tls, wire.certificate
-        await self._serve(wire, tls.peer(certificate), tls.lasts_s(certificate))
-
-    async def _serve(self, wire: protocol.Wire, peer: Peer, lasts_s: float | None = None) -> None:
+    async def _serve(self, wire: protocol.Wire, peer: Peer) -> None:
         self._make_room(peer)
         session = PortSession(wire, peer, self.status, self._turns)
         self._sessions.append(session)
-        loop = asyncio.get_running_loop()
-        expiry = (
-            None if lasts_s is None else loop.call_later(lasts_s, self._turn_out, session, _EXPIRED)
-        )
         greeting = {
             "membrane_ctrl": protocol.VERSION,
             "run": self._run,
@@ -193,8 +164,6 @@ class Port:
                 self._tell(
                     port_events.CommanderChanged(None, ended.describe(), "its connection is closed")
                 )
-            if expiry is not None:
-                expiry.cancel()
 
     def _turn_out(self, session: PortSession, reason: str) -> None:
         self._refusals.record(session.peer.who, "", reason)
@@ -406,62 +375,3 @@ class Port:
 # carry the units (`membrane_error_um`), as in alarms and telemetry. Counts that only grow have
 # other names, as
 # Prometheus wants it.
-
-_REQUEST_S = 2.0
-COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
-
-
-def metrics_text(status: RunStatus, clients: int, refused: int) -> str:
-    """The status in Prometheus' text format, version 0.0.4; `clients` and `refused` count those of
-    the port.
-    """
-    lines: list[str] = []
-
-    def add(name: str, kind: str, *samples: tuple[str, float], about: str = "") -> None:
-        if about:
-            lines.append(f"# HELP membrane_{name} {about}")
-        lines.append(f"# TYPE membrane_{name} {kind}")
-        lines.extend(f"membrane_{name}{labels} {_number(value)}" for labels, value in samples)
-
-    add("port_clients", "gauge", ("", clients))
-    add("port_refused_total", "counter", ("", refused))
-    add("locks", "gauge", ("", len(status.locks)))
-    add("recording_ok", "gauge", ("", not status.recording_problems))
-    row = status.row
-    if row is not None:
-        add(
-            "in_state",
-            "gauge",
-            *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in telemetry.State),
-        )
-        for each in COLUMNS.values():
-            counter = COUNTERS.get(each.name)
-            about = f"{each.title}: {each.description}"
-            kind = "counter" if counter else "gauge"
-            add(counter or each.name, kind, ("", getattr(row, each.name)), about=about)
-    return "\n".join(lines) + "\n"
-
-
-def _number(value: float) -> str:
-    return "NaN" if math.isnan(value) else repr(float(value))
-
-
-async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> None:
-    """Answer one HTTP request: `GET /metrics`, or 404."""
-    wire = await protocol.Wire.on(connection)
-    try:
-        with contextlib.suppress(
-            TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError
-        ):
-            async with asyncio.timeout(_REQUEST_S):
-                head = await wire.until(b"\r\n\r\n")
-            found = head.split(b"\r\n")[0].split(b" ")[:2] == [b"GET", b"/metrics"]
-            body = (text() if found else "only /metrics is here\n").encode()
-            kind = "text/plain; version=0.0.4; charset=utf-8"
-            wire.send_bytes(
-                f"HTTP/1.1 {'200 OK' if found else '404 Not Found'}\r\nContent-Type: {kind}\r\n"
-                f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode()
-                + body
-            )
-    finally:
-        await wire.close()

@@ -291,10 +291,6 @@ def judge_alarms(config: Config, say: ConfigFindings) -> None:
             say.error(
                 rule.raise_at >= most[rule.field], f"alarms.rules.{index}.raise_at", why, "lower it"
             )
-    port = config.port
-    if port.tls is not None and port.metrics_port is not None:
-        why = "port.tls.port is the same"
-        say.error(port.metrics_port == port.tls.port, "port.metrics_port", why, "choose another")
 
 
 def judge_gauge(config: Config, say: ConfigFindings) -> None:

@@ -4,14 +4,10 @@ from membrane_ctrl.model.event_base import Event, LogLevel
 from membrane_ctrl.model.notices import GLITCH_S, Topic
 
 
-class PortAddresses(
-    Event, kind="port", sentence="Control port open[ on {socket}][, TLS {tls}][, metrics {metrics}]"
-):
+class PortAddresses(Event, kind="port", sentence="Control port open[ on {socket}]"):
     """Where the control port listens."""
 
     socket: str | None = None
-    tls: str | None = None
-    metrics: str | None = None
 
 
 class PortFailed(

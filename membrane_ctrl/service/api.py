@@ -15,15 +15,7 @@ from typing import Annotated, Any, Literal
 from fastapi import Body, Depends, FastAPI, HTTPException, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from membrane_ctrl.control_port.outcome import Outcome
-from membrane_ctrl.control_port.protocol import Peer, may_not
-from membrane_ctrl.control_port.status import alarm_lines, lock_lines
-from membrane_ctrl.model import errors
-from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
-from membrane_ctrl.model.program import program_identity
-from membrane_ctrl.review import catalogue
-from membrane_ctrl.service.access import WebUser, on_behalf, outranks
-from membrane_ctrl.service.api_models import (
+from membrane_ctrl.control_port.api_models import (
     CommandAnswer,
     CommandBody,
     ConfigurationAnswer,
@@ -38,6 +30,14 @@ from membrane_ctrl.service.api_models import (
     StatesAnswer,
     UserAnswer,
 )
+from membrane_ctrl.control_port.outcome import Outcome
+from membrane_ctrl.control_port.protocol import Peer, may_not
+from membrane_ctrl.control_port.status import alarm_lines, lock_lines
+from membrane_ctrl.model import errors
+from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
+from membrane_ctrl.model.program import program_identity
+from membrane_ctrl.review import catalogue
+from membrane_ctrl.service.access import WebUser, on_behalf, outranks
 from membrane_ctrl.service.ended_run import REPORT_NAME, EndedRun
 from membrane_ctrl.service.feed import SIGNALS, HoldFeed, HoldSeen, history
 from membrane_ctrl.service.hold_starter import HoldStarter, StartOptions

@@ -9,7 +9,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -136,12 +136,12 @@ class HoldFeed:
     @property
     def logs(self) -> Path | None:
         """Folder of the runs, if it is on this machine."""
-        return None if self._where.tls else self._where.logs
+        return None if self._where.service else self._where.logs
 
     @property
     def folder(self) -> Path | None:
         """Folder of the run, if it is on this machine."""
-        if self._where.tls or not self.seen.name:
+        if self._where.service or not self.seen.name:
             return None
         return self._where.run or self._where.logs / self.seen.name
 
@@ -186,26 +186,36 @@ class HoldFeed:
 
     def _follow(self) -> None:
         while not self._ending.is_set():
-            try:
-                with connected(self._where, self._events.append, ANSWER_S) as client:
-                    self._client = client
-                    self._watch(client)
-                    problem = (
-                        "the run has ended" if self.seen.status else "the connection was closed"
-                    )
-            except errors.CommandError as error:
-                problem = "; ".join(error.lines) if self._has_socket() else _NO_HOLD
-            except (
-                Exception
-            ) as error:  # whatever this hold causes, its feed tries again and the others continue
-                problem = f"{type(error).__name__}: {error}"
-            self.seen = replace(self.seen, problem=problem, role="read")
+            self._try_to_follow(self._follow_connection)
             self.update_ended_run()
             self._ending.wait(_AGAIN_S)
 
+    def _follow_connection(self) -> None:
+        """Follow the hold on one connection, until it ends. Raises DeviceError without a hold."""
+        if not self._has_socket():
+            raise errors.DeviceError(_NO_HOLD)
+        with connected(self._where, self._events.append, ANSWER_S) as client:
+            self._client = client
+            self._watch(client)
+        ended = "the run has ended" if self.seen.status else "the connection was closed"
+        raise errors.DeviceError(ended)
+
+    def _try_to_follow(self, follow: Callable[[], None]) -> None:
+        """Follow, and keep the reason if that is impossible or has ended."""
+        try:
+            follow()
+        except errors.CommandError as error:
+            problem = "; ".join(error.lines)
+        # whatever this hold causes, its feed tries again and the others continue
+        except Exception as error:
+            problem = f"{type(error).__name__}: {error}"
+        else:
+            return
+        self.seen = replace(self.seen, problem=problem, role="read")
+
     def _has_socket(self) -> bool:
         """Whether a hold is or was there: one that ends removes its socket file."""
-        return bool(self._where.tls) or socket_path(self._where).exists()
+        return socket_path(self._where).exists()
 
     def update_ended_run(self) -> None:
         """Without a hold, read how the newest run ended, whenever its files have changed."""

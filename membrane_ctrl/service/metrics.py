@@ -14,8 +14,8 @@ from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.service.feed import HoldSeen
 
 METRICS_TYPE = CONTENT_TYPE_LATEST
-# columns that only grow, as Prometheus names counters, without their suffix `_total`
-_COUNTERS = {"tick": "ticks", "missed_ticks": "missed_ticks"}
+# columns that only grow, as Prometheus names counters
+_COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
 _LABELS = ("hold",)
 
 
@@ -48,16 +48,17 @@ class _HoldCollector(Collector):
         yield from (states, locks, recording)
         for column in COLUMNS.values():
             about = f"{column.title}: {column.description}"
-            counter = _COUNTERS.get(column.name)
-            metric: GaugeMetricFamily | CounterMetricFamily
-            if counter is None:
-                metric = GaugeMetricFamily(f"membrane_{column.name}", about, labels=_LABELS)
-            else:
-                metric = CounterMetricFamily(f"membrane_{counter}", about, labels=_LABELS)
+            family = CounterMetricFamily if column.name in _COUNTERS else GaugeMetricFamily
+            metric = family(f"membrane_{metric_name(column.name)}", about, labels=_LABELS)
             for name, status in known.items():
                 value = (status.get("row") or {}).get(column.name)
                 metric.add_metric([name], math.nan if value is None else float(value))
             yield metric
+
+
+def metric_name(column: str) -> str:
+    """Return how the metric of a telemetry column is called, without the prefix `membrane_`."""
+    return _COUNTERS.get(column, column)
 
 
 def render_metrics(holds: Mapping[str, HoldSeen]) -> bytes:

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import math
 import os
-import ssl
 import sys
 import time
 from functools import partial
@@ -18,7 +17,6 @@ from nicegui import Client, app, ui
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from membrane_ctrl.config.service import ServiceConfig
-from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.service_link import link_key, publish_address, read_or_make_secret
 from membrane_ctrl.model import errors, files
@@ -30,9 +28,11 @@ from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.idle_end import IdleEnd
+from membrane_ctrl.service.listening import require_certificate, require_free_address
 from membrane_ctrl.service.login import with_login
 from membrane_ctrl.service.path_dispatch import PathDispatch
 from membrane_ctrl.service.public_address import public_address
+from membrane_ctrl.service.service_feed import make_feed
 from membrane_ctrl.service.tokens import TokenBook, tokens_file
 from membrane_ctrl.service.work_pools import REPORT_FILES, PoolFullError
 from membrane_ctrl.web.page import WebPage
@@ -70,9 +70,8 @@ def require_servable(page: ServiceConfig) -> None:
     that is taken.
     """
     if page.certificate_file is not None and page.key_file is not None:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        sockets.load_pair(context, Path(page.certificate_file), Path(page.key_file))
-    sockets.listen_tcp(page.host, page.port, "port").close()
+        require_certificate(Path(page.certificate_file), Path(page.key_file))
+    require_free_address(page.host, page.port)
 
 
 def serve(holds: dict[str, Where], page: ServiceConfig, idle_s: float = math.inf) -> None:
@@ -100,7 +99,7 @@ def serve(holds: dict[str, Where], page: ServiceConfig, idle_s: float = math.inf
     os.nice(max(0, _NICE - os.nice(0)))
     with contextlib.closing(starter), publish_address(logs, address.base_url, not accounts.users):
         _run_server(
-            {name: HoldFeed(where) for name, where in holds.items()},
+            {name: make_feed(where) for name, where in holds.items()},
             page,
             accounts,
             starter,

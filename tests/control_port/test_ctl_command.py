@@ -195,9 +195,12 @@ def test_nobody_there_is_one_line_and_exit_code_4(
 
 @pytest.mark.parametrize(
     "arguments",
-    [["--tls", "nowhere"], ["--tls", "bench:7470"], ["--jsn"]],
-    ids=["address", "certificate", "typo"],
+    [["--host", "nowhere"], ["--host", "http://bench:7480/"], ["--jsn"]],
+    ids=["address", "plain text", "typo"],
 )
-def test_bad_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_usage_is_exit_code_2(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MEMBRANE_CTRL_TOKEN", "token")
     assert run(["ctl", "status", *arguments]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

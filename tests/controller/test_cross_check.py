@@ -113,13 +113,9 @@ FIELDS: list[tuple[str, Any, Any]] = [
     ("shape.trim_rate_max_um_per_s", 10.0, 1.0),
     ("shape.disagreement_max_um", 500.0, 100.0),
     ("alarms.silent_s", 1.0, 5.0),
-    ("port.metrics_port", 7470, 9464),
 ]
 MORE: dict[str, dict[str, Any]] = {
     "alarms.silent_s": {"loop.rate_hz": 1.5, "loop.measurement_filter_s": 1.0},
-    "port.metrics_port": {
-        "port.tls": {"certificate_file": "a", "key_file": "b", "client_ca_file": "c"}
-    },
 }
 
 

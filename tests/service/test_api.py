@@ -14,12 +14,12 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from membrane_ctrl.control_port.api_models import StateAnswer
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.api import make_api
-from membrane_ctrl.service.api_models import StateAnswer
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
 from tests.service.test_ended_run import FAULT, write_run

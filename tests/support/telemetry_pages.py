@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.control_port.server import COUNTERS
 from membrane_ctrl.doors.names import TABLE, table_lines
 from membrane_ctrl.model.columns import (
     EVERY_COLUMN,
@@ -25,6 +24,7 @@ from membrane_ctrl.model.columns import (
     plot_title,
     plots_of,
 )
+from membrane_ctrl.service.metrics import metric_name
 
 _ROOT = Path(__file__).parents[2]
 TELEMETRY = _ROOT / "docs" / "reference" / "telemetry.md"
@@ -122,7 +122,7 @@ def dashboard_text() -> str:
         panel["id"] = number
         panel["gridPos"] |= place
     dashboard = {
-        "description": "Grafana dashboard for the metrics ([port] metrics_port): import it, choose the data "  # noqa: E501
+        "description": "Grafana dashboard for the metrics of `membrane-ctrl serve`: import it, choose the data "  # noqa: E501
         "source",
         "title": "membrane mirror",
         "uid": "membrane-mirror",
@@ -151,7 +151,7 @@ def _plot_panel(plot: Plot) -> dict[str, Any]:
 
 
 def _metric(each: TelemetryColumn) -> str:
-    return f"membrane_{COUNTERS.get(each.name, each.name)}{{}}"
+    return f"membrane_{metric_name(each.name)}{{}}"
 
 
 def _panel(

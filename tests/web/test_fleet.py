@@ -13,6 +13,7 @@ import pytest
 
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.control_port.ctl import Where, fleet
+from membrane_ctrl.control_port.service_client import ServiceAddress
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.service.feed import HoldFeed
@@ -58,19 +59,17 @@ def test_files_are_beside_the_fleet_file(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / "fleet.toml").write_text(
         '[[holds]]\nname = "here"\nsocket = "runs/control.sock"\n[[holds]]\nname = '
-        '"far"\ntls = "bench2.lab:7470"\n'
-        'certificate_file = "me.pem"\nkey_file = "/etc/me.key"\nauthority_file = "lab.pem"\n'
+        '"far"\nurl = "https://bench2.lab:7480/"\n'
+        'token_file = "token"\nauthority_file = "/etc/lab.pem"\n'
     )
+    (tmp_path / "lab" / "token").write_text("abc\n")
     monkeypatch.chdir(tmp_path)
     lab = tmp_path / "lab"
     found = fleet(Path("lab/fleet.toml"))
     assert found["here"] == Where(lab / "runs" / "control.sock", logs=lab / "runs")
     far = found["far"]
-    assert (far.tls, far.certificate, far.key) == (
-        "bench2.lab:7470",
-        lab / "me.pem",
-        Path("/etc/me.key"),
-    )
+    address = ServiceAddress("https://bench2.lab:7480/", "abc", Path("/etc/lab.pem"))
+    assert far.service == address
     assert HoldFeed(far).logs is None, "its runs are on its host"
     assert HoldFeed(found["here"]).logs == lab / "runs"
 
@@ -80,11 +79,11 @@ def test_files_are_beside_the_fleet_file(tmp_path: Path, monkeypatch: pytest.Mon
     [
         ("", "holds"),
         ("holds = []\n", "holds"),
-        ('[[holds]]\nname = "a"\n', "give either socket or tls"),
-        ('[[holds]]\nname = "a"\nsocket = "s"\ntls = "b:1"\n', "give either socket or tls"),
+        ('[[holds]]\nname = "a"\n', "give either socket or url"),
+        ('[[holds]]\nname = "a"\nsocket = "s"\nurl = "https://b/"\n', "give either socket or url"),
         (
-            '[[holds]]\nname = "a"\ntls = "b:1"\n',
-            "tls needs certificate_file, key_file and authority_file",
+            '[[holds]]\nname = "a"\nurl = "http://far/"\ntoken_file = "fleet.toml"\n',
+            "no token",
         ),
         (
             '[[holds]]\nname = "a"\nsocket = "s"\n[[holds]]\nname = "a"\nsocket = "t"\n',

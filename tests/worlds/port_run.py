@@ -17,7 +17,7 @@ from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control_port.protocol import Peer
 from membrane_ctrl.control_port.server import Port, RunHooks
-from membrane_ctrl.control_port.sockets import Listeners, UnixListener, listeners_for
+from membrane_ctrl.control_port.sockets import Listeners, UnixListener
 from membrane_ctrl.controller.commands import Command, explain_refusal
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.model.events import Event, EventLine
@@ -57,9 +57,7 @@ class PortRun:
         port_config = config or PortConfig()
         self.listener = NamedListener(self.path)
         self._stack.callback(self.listener.close)
-        more = port_config.model_copy(update={"socket": str(folder / "unused.sock")})
-        others = listeners_for(more, folder, self._stack)
-        self.listeners = Listeners(self.listener, others.tls, others.metrics, self.path)
+        self.listeners = Listeners(self.listener, self.path)
         self.outcomes: dict[int, Future[str]] = {}  # of storing locks, by number of the command
         hooks = RunHooks(
             self._ask,

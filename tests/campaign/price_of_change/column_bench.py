@@ -23,7 +23,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import ConsoleModel
 from membrane_ctrl.console.view import ConsolePage
 from membrane_ctrl.control_port.ctl import Where, status_lines
-from membrane_ctrl.control_port.server import metrics_text, status_table
+from membrane_ctrl.control_port.server import status_table
 from membrane_ctrl.doors.mqtt import discovery
 from membrane_ctrl.doors.names import Door, values
 from membrane_ctrl.model.run_status import RunStatus
@@ -32,6 +32,7 @@ from membrane_ctrl.recorder.blueprint import run_blueprint
 from membrane_ctrl.review.viewer.blueprints import ReviewBlueprint
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.service.feed import HoldFeed, HoldSeen
+from membrane_ctrl.service.metrics import render_metrics
 
 WIDTH, HEIGHT = 200, 60
 
@@ -101,13 +102,14 @@ def main() -> None:
     column, entity, *runs = sys.argv[1:]
     row = row_with(column, 12.34)
     status = RunStatus().after_row(row)
+    seen = HoldSeen("a-run", status=status_table(status), seen_s=math.inf, problem="")
     print(
         json.dumps(
             {
                 "console": console_page(row),
                 "ctl": status_lines({"run": "a-run", **status_table(status)}),
                 "bridge": bridge_values(status, column),
-                "metrics": metrics_text(status, 0, 0),
+                "metrics": render_metrics({"": seen}).decode(),
                 "viewer": viewer_plots(entity),
                 "recorded": [recorded(Path(run), column) for run in runs],
             }

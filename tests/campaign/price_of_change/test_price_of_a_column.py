@@ -122,7 +122,7 @@ def test_bridges_and_metrics_have_it(shown: dict[str, Any]) -> None:
     assert shown["bridge"]["value"] == 12.34
     entity = shown["bridge"]["entity"]
     assert (entity["unit_of_measurement"], entity["device_class"]) == ("°C", "temperature")
-    assert f"membrane_{COLUMN} 12.34\n" in shown["metrics"]
+    assert f'membrane_{COLUMN}{{hold=""}} 12.34\n' in shown["metrics"]
 
 
 def test_documents_and_dashboard_have_it(source: ChangedSource) -> None:

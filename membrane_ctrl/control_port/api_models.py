@@ -1,7 +1,7 @@
 """What the interface for programs answers and takes, as schemas (OpenAPI).
 
-The client (`api_client`) checks the answers of another service against the same models: it may be
-another program, a damaged service or a hostile one.
+The client (`service_client`) checks the answers of another service against the same models: it may
+be another program, a damaged service or a hostile one.
 """
 
 from __future__ import annotations

@@ -1,0 +1,209 @@
+"""`ctl --host`, and services that follow others: real services and strange ones."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.cli import run as command
+from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.service_client import (
+    TOKEN_VARIABLE,
+    ServiceAddress,
+    ServiceClient,
+    read_token,
+)
+from membrane_ctrl.model.errors import DeviceError, Exit, InputError
+from membrane_ctrl.service.service_feed import ServiceFeed, make_feed
+from membrane_ctrl.service.tokens import add_token, revoke_token, tokens_file
+from membrane_ctrl.web.fleet_panel import fleet_rows
+from tests.web.test_page import served
+from tests.worlds.port_run import keep_ticking, port_run
+
+
+@pytest.fixture
+def token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    made = add_token(tokens_file(), "ops", "operate")
+    monkeypatch.setenv(TOKEN_VARIABLE, made)
+    return made
+
+
+@pytest.mark.real_time
+async def test_a_person_and_another_service_reach_a_hold_through_its_service(
+    tmp_path: Path, token: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    async with port_run(logs) as run, served(logs) as link:
+        ticks = asyncio.create_task(keep_ticking(run))
+        url = link.partition("?")[0]
+
+        async def ctl(*words: str) -> tuple[int, str, str]:
+            code = await asyncio.to_thread(command, ["ctl", *words, "--host", url])
+            said = capsys.readouterr()
+            return code, said.out, said.err
+
+        try:
+            async with asyncio.timeout(120.0):
+                while (await ctl("status"))[0] != Exit.DONE:  # noqa: ASYNC110
+                    await asyncio.sleep(0.2)
+            code, out, _ = await ctl("status")
+            assert out.startswith("the-run: hold")
+            assert json.loads((await ctl("status", "--json"))[1])["run"] == "the-run"
+            code, _, err = await ctl("setpoint", "--why", "test", "--", "-2.5")
+            assert (code, err.startswith("setpoint: done")) == (Exit.DONE, True)
+            code, _, err = await ctl("gains", "kp_per_s = 0.5")
+            assert code == Exit.BAD_INPUT
+            assert "gains needs the role tune; ops has operate" in err
+            code, _, err = await ctl("manual", "1e9")
+            assert code == Exit.BAD_INPUT
+            code, _, err = await ctl("stop", "--why", "from afar")
+            assert (code, err.startswith("stop: done")) == (Exit.DONE, True)
+            said = [(each.kind, each.who, each.why) for each in run.asked]
+            assert [each for each in said if each[0] != "manual"] == [
+                ("setpoint", "token:ops", "test"),
+                ("stop", "token:ops", "from afar"),
+            ]
+            assert run.asked[0].value == -2.5
+            feed = make_feed(Where(service=ServiceAddress(url, token)))
+            assert isinstance(feed, ServiceFeed)
+            await asyncio.to_thread(feed.follow_once)
+            assert (feed.seen.name, feed.seen.role, feed.seen.state_name) == (
+                "the-run",
+                "operate",
+                "hold",
+            )
+            assert feed.logs is None, "its runs are there"
+            outcome = await asyncio.to_thread(feed.ask, {"do": "mark", "text": "door"})
+            assert outcome.text == "mark: done"
+            revoke_token(tokens_file(), "ops")
+            code, _, err = await ctl("status")
+            assert (code, "the token is unknown there, or revoked" in err) == (2, True)
+        finally:
+            ticks.cancel()
+
+
+@pytest.mark.parametrize(
+    ("url", "says"),
+    [
+        ("bench2.lab:7480", "write it like https"),
+        ("ftp://bench2.lab/", "write it like https"),
+        ("https:///", "write it like https"),
+        ("https://a:99999/", "write it like https"),
+        ("http://bench2.lab:7480/", "the token would cross the network; use https"),
+    ],
+)
+def test_an_address_that_cannot_be_is_refused(url: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        ServiceClient(ServiceAddress(url, "token"))
+    ServiceClient(ServiceAddress("http://127.0.0.1:7480/mirror/", "token"))
+
+
+@pytest.mark.parametrize("content", ["", "\n", "a\nb", "\u00e4", "x\x00"])
+def test_a_token_file_with_something_else(tmp_path: Path, content: str) -> None:
+    (tmp_path / "token").write_text(content)
+    with pytest.raises(InputError, match="no token; make one there"):
+        read_token(tmp_path / "token")
+    with pytest.raises(InputError, match="no such file"):
+        read_token(tmp_path / "none")
+
+
+def test_without_a_file_the_token_is_in_a_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(TOKEN_VARIABLE, " abc\n")
+    assert read_token(None) == "abc"
+    monkeypatch.delenv(TOKEN_VARIABLE)
+    with pytest.raises(InputError, match=TOKEN_VARIABLE):
+        read_token(None)
+
+
+def http(body: bytes, status: str = "200 OK") -> bytes:
+    return f"HTTP/1.1 {status}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body
+
+
+def state_with(**changed: object) -> bytes:
+    state: dict[str, object] = {
+        "hold": "",
+        "run": "r",
+        "state": "hold",
+        "in_contact": True,
+        "reason": "",
+        "alarms": [],
+        "locks": [],
+        "error_um": 0.1,
+        "status": {},
+        "ended": None,
+    }
+    return http(json.dumps(state | changed).encode())
+
+
+ANSWERS = {
+    "nothing": b"",
+    "no HTTP": b"\x00\xff" * 100 + b"\r\n",
+    "another protocol": b"SSH-2.0-OpenSSH_9\r\n",
+    "no JSON": http(b"<html>"),
+    "a list": http(b"[]"),
+    "a field is missing": http(b'{"hold": ""}'),
+    "a wrong type": state_with(alarms="no list"),
+    "not finite": http(b'{"error_um": NaN}'),
+    "deep": http(b"[" * 2000 + b"]" * 2000),
+    "huge": http(b'{"run": "' + b"x" * 1_100_000 + b'"}'),
+    "a text too long": state_with(run="x" * 3000),
+    "a wrong status": state_with(status={"state": 5}),
+    "many": state_with(alarms=["x"] * 3000),
+    "an error": http(b'{"detail": "\\u001b[2J"}', "500 Oops"),
+    "a redirect": http(b"", "302 Found"),
+}
+
+
+@asynccontextmanager
+async def strange_service(answer: bytes, hold_s: float = 0.0) -> AsyncIterator[str]:
+    """A server that answers each request with these bytes."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            await reader.readuntil(b"\r\n\r\n")
+            writer.write(answer)
+            await writer.drain()
+            await asyncio.sleep(hold_s)
+        except (OSError, asyncio.IncompleteReadError):
+            pass
+        finally:
+            writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    async with server:
+        port = server.sockets[0].getsockname()[1]
+        yield f"http://127.0.0.1:{port}/"
+
+
+@pytest.mark.parametrize("name", ANSWERS)
+async def test_garbage_is_one_line_and_one_red_row(name: str) -> None:
+    async with strange_service(ANSWERS[name]) as url:
+        feed = make_feed(Where(service=ServiceAddress(url, "token")))
+        assert isinstance(feed, ServiceFeed)
+        feed._role = "operate"  # who we are there is known
+        await asyncio.to_thread(feed._try_to_follow, feed.follow_once)
+        (row,) = fleet_rows({"far": feed})
+        assert row["state"] == "no contact"
+        assert row["error"] is None
+        says = str(row["says"])
+        assert says.startswith(url.rstrip("/"))
+        assert says.isprintable()
+        assert len(says) < 500
+        with pytest.raises(DeviceError):
+            await asyncio.to_thread(ServiceClient(ServiceAddress(url, "t")).read_state)
+
+
+async def test_who_is_silent_is_left_at_the_deadline() -> None:
+    async with strange_service(b"", hold_s=30.0) as url:
+        client = ServiceClient(ServiceAddress(url, "token"), answer_s=0.3)
+        with pytest.raises(DeviceError, match=r"no answer within 0\.3 s"):
+            await asyncio.to_thread(client.read_state)
+    with pytest.raises(DeviceError, match="no service is listening"):
+        await asyncio.to_thread(client.read_state)
