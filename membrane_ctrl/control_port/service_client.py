@@ -77,7 +77,9 @@ def read_token(file: Path | None) -> str:
         source = str(file)
         try:
             token = files.read_text(file, follow=True)
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise errors.InputError(f"{file}: {errors.os_reason(error)}") from None
+        except ValueError as error:
             raise errors.InputError(f"{file}: {error}") from None
     token = token.strip()
     if not token or not token.isascii() or not token.isprintable():

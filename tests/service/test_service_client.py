@@ -56,7 +56,7 @@ async def test_a_person_and_another_service_reach_a_hold_through_its_service(
             code, out, _ = await ctl("status")
             assert out.startswith("the-run: hold")
             assert json.loads((await ctl("status", "--json"))[1])["run"] == "the-run"
-            code, _, err = await ctl("setpoint", "--why", "test", "--", "-2.5")
+            code, _, err = await ctl("setpoint", "-2.5", "--why", "test")
             assert (code, err.startswith("setpoint: done")) == (Exit.DONE, True)
             code, _, err = await ctl("gains", "kp_per_s = 0.5")
             assert code == Exit.BAD_INPUT
@@ -164,8 +164,12 @@ ANSWERS = {
 @asynccontextmanager
 async def strange_service(answer: bytes, hold_s: float = 0.0) -> AsyncIterator[str]:
     """A server that answers each request with these bytes."""
+    serving: set[asyncio.Task[None]] = set()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        serving.add(task)
         try:
             await reader.readuntil(b"\r\n\r\n")
             writer.write(answer)
@@ -179,7 +183,12 @@ async def strange_service(answer: bytes, hold_s: float = 0.0) -> AsyncIterator[s
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
     async with server:
         port = server.sockets[0].getsockname()[1]
-        yield f"http://127.0.0.1:{port}/"
+        try:
+            yield f"http://127.0.0.1:{port}/"
+        finally:
+            for task in serving:
+                task.cancel()
+            await asyncio.gather(*serving, return_exceptions=True)
 
 
 @pytest.mark.parametrize("name", ANSWERS)

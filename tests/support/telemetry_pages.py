@@ -110,12 +110,9 @@ def dashboard_text() -> str:
             if any(each.published for each in columns_of(plot))
         ),
         _panel(
-            "Control port",
+            "Hold and locks",
             "timeseries",
-            [
-                ("membrane_port_clients{}", "clients"),
-                ("increase(membrane_port_refused_total{}[5m])", "refused in 5 minutes"),
-            ],
+            [("membrane_hold_up{}", "hold runs"), ("membrane_locks{}", "locks")],
         ),
     ]
     for number, (panel, place) in enumerate(zip(panels, _places(panels), strict=True), 1):
