@@ -11,10 +11,10 @@ from membrane_ctrl.cli.options import load_configuration
 TEXT = """
 [optics]
 geometry_file = "geometry.toml"
-[port.tls]
-certificate_file = "keys/bench.pem"
-key_file = "/etc/bench.key"
-client_ca_file = "~/lab.pem"
+[doors.opcua]
+users_file = "keys/users"
+certificate_file = "/etc/bench.pem"
+key_file = "~/bench.key"
 [alarms]
 urls_file = "urls"
 """
@@ -28,11 +28,12 @@ def test_each_file_is_a_path_from_the_configurations_folder(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     config = load_configuration(Path("lab/bench.toml"))
-    assert config.port.tls is not None
+    opcua = config.doors.opcua
+    assert opcua is not None
     assert config.optics.geometry_file == tmp_path / "lab" / "geometry.toml"
-    assert config.port.tls.certificate_file == str(tmp_path / "lab" / "keys" / "bench.pem")
-    assert config.port.tls.key_file == "/etc/bench.key"
-    assert config.port.tls.client_ca_file == str(tmp_path / "home" / "lab.pem")
+    assert opcua.users_file == str(tmp_path / "lab" / "keys" / "users")
+    assert opcua.certificate_file == "/etc/bench.pem"
+    assert opcua.key_file == str(tmp_path / "home" / "bench.key")
     assert (config.alarms.urls_file, config.alarms.escalation_urls_file) == (
         str(tmp_path / "lab" / "urls"),
         None,
