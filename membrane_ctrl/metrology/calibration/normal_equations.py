@@ -25,16 +25,28 @@ from membrane_ctrl.model.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Equations:
-    """The equations of one set, linearised at its unknowns."""
+    """The equations of one set, linearised at its unknowns.
 
-    # (LOCAL + COMMON + 1, squared): J^T W J of the prediction's derivatives, with the residual as
-    # one more column: normal matrix, right side and sum of squares in one
+    Attributes
+    ----------
+    sums : (LOCAL + COMMON + 1, LOCAL + COMMON + 1) array
+        J^T W J of the prediction's derivatives, with the residual as one more column: normal
+        matrix, right side and sum of squares in one.
+    residual_mm : (2, n) array
+        Seen minus predicted screen points.
+    trust : RobustWeights
+        Weights of the points.
+    residual_rms_mm : float
+        RMS of one component, each point counting by its weight.
+    elsewhere : tuple of arrays
+        Of each screen elsewhere, (MOVED + LOCAL + COMMON + 1, squared): its own unknowns first,
+        which `sums` eliminates.
+    """
+
     sums: FloatArray
-    residual_mm: FloatArray  # (2, n): seen minus predicted screen points
-    trust: RobustWeights  # the points' weights
-    residual_rms_mm: float  # RMS of one component, each point counting by its weight
-    # of each screen elsewhere, (MOVED + LOCAL + COMMON + 1, squared): its own unknowns first, which
-    # `sums` eliminates
+    residual_mm: FloatArray
+    trust: RobustWeights
+    residual_rms_mm: float
     elsewhere: tuple[FloatArray, ...] = ()
 
     @property
@@ -44,18 +56,21 @@ class Equations:
 
     def local_step(self, common_step: FloatArray) -> FloatArray:
         """Step (LOCAL,) of the set's own unknowns that goes with one of the common ones."""
-        own, mixed = (
-            self.sums[: forward_model.LOCAL, : forward_model.LOCAL],
-            self.sums[: forward_model.LOCAL, forward_model.LOCAL :],
-        )
-        return np.asarray(np.linalg.solve(own, mixed[:, -1] - mixed[:, :-1] @ common_step))
+        local = forward_model.LOCAL
+        own = self.sums[:local, :local]
+        mixed = self.sums[:local, local:-1]
+        right = self.sums[:local, -1]
+        return np.asarray(np.linalg.solve(own, right - mixed @ common_step))
 
     def moved(self, local_step: FloatArray, common_step: FloatArray) -> list[FloatArray]:
         """Steps (MOVED,) of the screens elsewhere that go with those."""
-        step, own = np.append(local_step, common_step), slice(set_phases.MOVED)
-        right = [sums[own, -1] - sums[own, set_phases.MOVED : -1] @ step for sums in self.elsewhere]
-        pairs = zip(self.elsewhere, right, strict=True)
-        return [np.asarray(np.linalg.solve(sums[own, own], each)) for sums, each in pairs]
+        moved = set_phases.MOVED
+        step = np.append(local_step, common_step)
+        steps = []
+        for sums in self.elsewhere:
+            right = sums[:moved, -1] - sums[:moved, moved:-1] @ step
+            steps.append(np.asarray(np.linalg.solve(sums[:moved, :moved], right)))
+        return steps
 
     def reduced(self) -> FloatArray:
         """Schur complement over the set's own unknowns, (COMMON + 1, squared)."""
@@ -63,10 +78,12 @@ class Equations:
 
 
 def eliminate_first(sums: FloatArray, first: int) -> FloatArray:
-    """Schur complement over the first unknowns."""
+    """Schur complement over the first unknowns: D - B^T A^-1 B of [[A, B], [B^T, D]]."""
+    own = sums[:first, :first]
     mixed = sums[:first, first:]
-    left = sums[first:, first:] - mixed.T @ np.linalg.solve(sums[:first, :first], mixed)
-    return np.asarray((left + left.T) / 2)
+    others = sums[first:, first:]
+    complement = others - mixed.T @ np.linalg.solve(own, mixed)
+    return np.asarray((complement + complement.T) / 2)
 
 
 def linearise_set(
@@ -78,29 +95,65 @@ def linearise_set(
     references: References,
     trust: RobustWeights,
 ) -> Equations:
-    """Linearise one set; `common` (COMMON,) are parameters and ring."""
-    root = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
-    residual, elsewhere = np.empty_like(phases.screen_mm), []
+    """Linearise one set.
+
+    Parameters
+    ----------
+    bench : BenchGeometry
+        The bench at the present parameters.
+    turns : list of Poses
+        Derivatives of the poses by their parameters.
+    phases : SetPhases
+        Screen points of the set.
+    state : SetState
+        Its own unknowns.
+    common : (COMMON,) array
+        Parameters and ring.
+    references : References
+        What laser and ring are known by.
+    trust : RobustWeights
+        Weights of the points.
+
+    Returns
+    -------
+    Equations
+    """
+    # The laser, the ring and other observations beside the fringes.
     rows = reference_rows(phases, state, common, references)
     sums = rows.T @ rows
+
+    # The fringes, for each place of the screen.
+    root_weights = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
+    residual_mm = np.empty_like(phases.screen_mm)
+    elsewhere = []
     for k, there, poses, some in forward_model.screen_views(bench, turns, phases, state.elsewhere):
+        # Numbers of the place, of which the last two are depth and motion of the film.
         move = state.elsewhere[k - 1] if k else np.array([0.0, state.motion_mm])
-        seen, film_mm = phases.subset(some), (move[-1], move[-2])
+        deeper_mm, motion_mm = move[-2], move[-1]
         parts = forward_model.linearise_points(
-            there, poses, seen, state.surface, state.vertex_z_mm, *film_mm
+            there,
+            poses,
+            phases.subset(some),
+            state.surface,
+            state.vertex_z_mm,
+            motion_mm,
+            deeper_mm,
         )
-        found, residual[:, some] = _sum_fringes(parts, root[some], k > 0)
+        found, residual_mm[:, some] = _sum_fringes(parts, root_weights[some], k > 0)
         if k:
-            told, sigmas = phases.elsewhere[k - 1].known(references.laser_sigma_um)
-            hand = np.hstack([np.eye(set_phases.MOVED), (told - move)[:, None]]) / sigmas[:, None]
+            # What is known of the screen's move; then its own unknowns are eliminated.
+            known, sigmas = phases.elsewhere[k - 1].known(references.laser_sigma_um)
+            by_hand = np.hstack([np.eye(set_phases.MOVED), (known - move)[:, None]])
+            by_hand /= sigmas[:, None]
             own = np.append(np.arange(set_phases.MOVED), len(found) - 1)
-            found[np.ix_(own, own)] += hand.T @ hand
+            found[np.ix_(own, own)] += by_hand.T @ by_hand
             elsewhere.append(found)
             found = eliminate_first(found, set_phases.MOVED)
         sums = sums + found
+
     weights = trust.weights / phases.sigma_mm**2
-    rms = float(np.sqrt(np.mean(residual**2 @ weights) / np.sum(weights)))
-    return Equations(sums, residual, trust, rms, tuple(elsewhere))
+    rms_mm = float(np.sqrt(np.mean(residual_mm**2 @ weights) / np.sum(weights)))
+    return Equations(sums, residual_mm, trust, rms_mm, tuple(elsewhere))
 
 
 def _sum_fringes(
@@ -108,25 +161,35 @@ def _sum_fringes(
 ) -> tuple[FloatArray, FloatArray]:
     """Sums of points, those of a moved screen with its own unknowns first, and their residuals (2,
     n).
+
+    `root` (n,) are the square roots of the points' weights.
     """
-    first = set_phases.MOVED if moved else 0
-    sums, left = np.zeros((first + forward_model.LOCAL + COMMON + 1,) * 2), np.empty((2, root.size))
-    keep = np.append(np.arange(first + forward_model.COLUMNS), len(sums) - 1)
+    own = set_phases.MOVED if moved else 0
+    size = own + forward_model.LOCAL + COMMON + 1
+    sums = np.zeros((size, size))
+    residual_mm = np.empty((2, root.size))
+    # The columns that fringes have; the last one is the residual.
+    columns = np.append(np.arange(own + forward_model.COLUMNS), size - 1)
     for part in parts:
-        left[:, part.place] = part.residual_mm
+        residual_mm[:, part.place] = part.residual_mm
         derivatives = part.derivatives
         if moved:
-            motion = derivatives[:, forward_model.MOTION].copy()
-            derivatives[:, forward_model.MOTION] = 0.0  # its own
-            columns = [
-                derivatives[:, forward_model.COLUMNS :],
-                forward_model.depth_derivative(motion)[:, None],
-                motion[:, None],
-            ]
-            derivatives = np.concatenate(
-                [*columns, derivatives[:, : forward_model.COLUMNS]], axis=1
-            )
-        for rows, miss in zip(derivatives, part.residual_mm, strict=True):
-            weighed = np.vstack([rows, miss]) * root[part.place]
-            sums[np.ix_(keep, keep)] += weighed @ weighed.T
-    return sums, left
+            derivatives = _put_moves_first(derivatives)
+        # x and then y: the rows of all unknowns and the residual, times the root of the weights.
+        for of_axis, residual in zip(derivatives, part.residual_mm, strict=True):
+            weighed = np.vstack([of_axis, residual]) * root[part.place]
+            sums[np.ix_(columns, columns)] += weighed @ weighed.T
+    return sums, residual_mm
+
+
+def _put_moves_first(derivatives: FloatArray) -> FloatArray:
+    """Derivatives (2, MOVED + COLUMNS, m) with the unknowns of a moved screen first.
+
+    Those are its poses, and depth and motion of the film, which had another motion then.
+    """
+    motion = derivatives[:, forward_model.MOTION].copy()
+    derivatives[:, forward_model.MOTION] = 0.0
+    poses = derivatives[:, forward_model.COLUMNS :]
+    depth = forward_model.depth_derivative(motion)
+    of_set = derivatives[:, : forward_model.COLUMNS]
+    return np.concatenate([poses, depth[:, None], motion[:, None], of_set], axis=1)

@@ -25,75 +25,111 @@ from membrane_ctrl.metrology.tracking.light_kernels import light_left, light_wav
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, Singles
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
-# last change of height at the rim, of which a seventh is left: 0.4 nm there, 0.04 of the terms
+# Last change of height at the rim, of which a seventh is left: 0.4 nm there, 0.04 nm of the terms.
 TOLERANCE_MM = 3e-6
 _MAX_STEPS = 10
 _MAX_MATRICES = 2  # new ones for a frame: one that needs more is lost
 # Largest last change of a frame that is not lost: at the rim, where it is ten times that of the
 # terms. Steps shrink slowly where the weights of many bins change with them.
 _SETTLED_MM = 1e-5
-_ALL_ADU = np.float32(1e6)  # a reach beyond which no bin is
-_ASTRAY_MM = 2.0  # a step beyond which nothing is linear
-# at the rim; between two exact traces phases follow their derivatives: 0.3 nm off at most
+_ALL_ADU = np.float32(1e6)  # reach that includes all bins
+_ASTRAY_MM = 2.0  # steps beyond this are too far from linear
+# Change at the rim up to which phases follow their derivatives from the last exact trace: they are
+# 0.3 nm off at most.
 _LINEAR_MM = 1e-3
-_SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
+_SLOW = 0.3  # a step that is longer than this share of the last one requires a new matrix
 Shifts = tuple[float, float]  # phase steps of x and y
 _UNKNOWNS = PARAMETERS + 3 * ZERNIKE_TERMS
-# Of the unknowns that turn each wave
+# First unknown of each wave: phi_x, phi_y (both the surface's), A, B_x and B_y.
 _STARTS = 0, 0, PARAMETERS, PARAMETERS + ZERNIKE_TERMS, PARAMETERS + 2 * ZERNIKE_TERMS
 # Squares along the mirror's diameter whose errors count as independent: 2.3 fringes each. In
-# smaller ones light that wanders leaves more than it does in all.
+# smaller ones slow changes of light leave more than they do in all.
 _BLOCKS = 14
+_EVERY = 3  # residuals between those of which the median is taken
 
 
 @dataclass(frozen=True)
 class FrameFit:
-    """Solution of one frame."""
+    """Solution of one frame.
+
+    Attributes
+    ----------
+    surface : Surface
+        The surface.
+    light : (3, terms) array
+        Relative change of level and swings against the scene's, as Noll terms.
+    residual_adu : (n,) array
+        Light less the model's.
+    weights : (n,) array
+        1, falling to 0 for outliers.
+    converged : bool
+        Whether the last step was small.
+    bands : (2 k,) array
+        Relative amplitudes of the rows' waves.
+    """
 
     surface: Surface
-    # (3, terms): relative change of level and swings against the scene's, as Noll terms
     light: FloatArray
-    residual_adu: Singles  # (n,): light less the model's
-    weights: Singles  # (n,): 1, falling to 0 for outliers
+    residual_adu: Singles
+    weights: Singles
     converged: bool
-    bands: FloatArray = field(
-        default_factory=lambda: np.zeros(0)
-    )  # (2 k,): relative amplitudes of the rows' waves
+    bands: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def scale_adu(self) -> float:
         """Robust sigma of the residual."""
-        return 1.4826 * float(np.median(np.abs(self.residual_adu[::3])))
+        return 1.4826 * float(np.median(np.abs(self.residual_adu[::_EVERY])))
 
 
 class FrameFitter:
-    """Fits frame after frame of a scene; a `jacobian` (2, parameters, 3, N) of the same bins and
-    surface need not be made."""
+    """Fits frame after frame of a scene.
+
+    Parameters
+    ----------
+    scene : CrossedScene
+        What the reference shows of the bins.
+    bands : Bands
+        Bands of the backlight.
+    jacobian : (2, parameters, 3, N) array, optional
+        Planes of the phases' derivatives, if they are known of the same bins and surface.
+    """
 
     def __init__(self, scene: CrossedScene, bands: Bands, jacobian: Singles | None = None) -> None:
-        self.scene, self.bands = scene, bands
+        self.scene = scene
+        self.bands = bands
         self._cells = scene.cells
-        self.jacobian = (
-            self._cells.planes(scene.jacobian(scene.surface)) if jacobian is None else jacobian
-        )
+        if jacobian is None:
+            jacobian = self._cells.planes(scene.jacobian(scene.surface))
+        self.jacobian = jacobian
         self._basis = self._cells.planes(scene.basis)
         self.light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
         self._base = _reduce_phase(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
         self._out = np.empty((4, scene.index.size), np.float32)
-        self._slow, self._pull = (
-            self._cells.blocks(*self.jacobian, self._basis),
-            np.empty((4, PARAMETERS)),
-        )
+        self._slow = self._cells.blocks(*self.jacobian, self._basis)
+        self._pull = np.empty((4, PARAMETERS))
         self._response = scene.response.astype(np.float32)
 
     def fit(
         self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach_adu: Singles
     ) -> FrameFit:
-        """Fit a frame, means `seen_adu` (n,) over the bins, from the last solution.
+        """Fit a frame from the last solution.
 
-        From a residual of `reach_adu` (n,) on a bin has no weight; 0 leaves it out.
+        Parameters
+        ----------
+        seen_adu : (n,) array
+            Means of the frame over the bins.
+        shifts_rad : (float, float)
+            Phase steps of x and y.
+        start : FrameFit
+            The last solution.
+        reach_adu : (n,) array
+            Residual from which a bin has no weight; 0 leaves it out.
+
+        Returns
+        -------
+        FrameFit
         """
         if self._inverse is not None and len(self._inverse) != _UNKNOWNS + len(self.bands.waves):
             self._inverse = None
@@ -113,34 +149,41 @@ class FrameFitter:
     def _descend(
         self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach: Singles, patient: bool
     ) -> FrameFit:
-        """Take steps until they vanish, lead astray or need too many matrices; small steps may if
-        `patient`.
+        """Take steps until they vanish, lead astray or need too many matrices.
+
+        With `patient`, small steps may need more of them.
         """
-        shape, light, change, matrices = start.surface, start.light.copy(), math.inf, 0
+        shape = start.surface
+        light = start.light.copy()
+        change = math.inf
+        matrices = 0
+        # Each frame has bands of other amplitudes: without a first estimate, many bins would be
+        # outliers.
         bands = np.zeros(len(self.bands.waves))
-        if bands.size:  # each frame has others: without them, much would be an outlier at first
+        if bands.size:
             self._evaluate(seen_adu, shifts_rad, shape, light, bands, _ALL_ADU * (reach > 0))
             bands = fitted_waves(self.bands.waves, self.rows())
         for _ in range(_MAX_STEPS):
             self._evaluate(seen_adu, shifts_rad, shape, light, bands, reach)
             if self._inverse is None:
                 self._inverse = self._inverted(shifts_rad, shape, light, self._out[1])
-                matrices, change = (
-                    matrices + 1,
-                    math.inf,
-                )  # its first step is not judged by an old one's last
+                matrices += 1
+                change = math.inf  # the first step is not compared with one of another matrix
             if self._inverse is None:
                 break
-            delta, last = self._inverse @ self._right(), change
+
+            # One Gauss-Newton step of all unknowns.
+            delta = self._inverse @ self._right()
+            last_change = change
             shape = Surface.from_parameters(shape.parameters + delta[:PARAMETERS], shape.radius_mm)
             light += delta[PARAMETERS:_UNKNOWNS].reshape(3, ZERNIKE_TERMS)
             bands = bands + delta[_UNKNOWNS:]
             change = float(np.max(np.abs(height_probe() @ delta[:PARAMETERS])))
             if not TOLERANCE_MM < change < _ASTRAY_MM:
                 break
-            if change > _SLOW * last and (
-                matrices < _MAX_MATRICES or (patient and change < _LINEAR_MM)
-            ):
+            is_slow = change > _SLOW * last_change
+            may_renew = matrices < _MAX_MATRICES or (patient and change < _LINEAR_MM)
+            if is_slow and may_renew:
                 self._inverse = None
         residual, weights = self._out[:2].copy()
         return FrameFit(shape, light, residual, weights, change <= _SETTLED_MM, bands)
@@ -154,12 +197,15 @@ class FrameFitter:
         bands: FloatArray,
         reach: Singles,
     ) -> None:
-        """Residual, weights and what the right side is made of, at a surface, maps of light and
-        bands.
-        """
-        known = self.scene.edge, self.bands.gain(bands)
+        """Compute residual, weights and the right side at a surface, maps of light and bands."""
         light_left(
-            *self._shown(shifts_rad, shape, light), *known, seen, reach, self._pull, self._out
+            *self._shown(shifts_rad, shape, light),
+            self.scene.edge,
+            self.bands.gain(bands),
+            seen,
+            reach,
+            self._pull,
+            self._out,
         )
 
     def rows(self) -> FloatArray:
@@ -167,15 +213,15 @@ class FrameFitter:
         return self.bands.sums(self._out[2:])
 
     def _shown(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> tuple[AnyArray, ...]:
-        """What the kernels take a frame's light from."""
-        moved = shape.parameters - self._traced.parameters
-        if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
-            self._traced, moved = shape, np.zeros(PARAMETERS)
+        """The arguments from which the kernels compute a frame's light."""
+        moved_mm = shape.parameters - self._traced.parameters
+        if np.max(np.abs(height_probe() @ moved_mm)) > _LINEAR_MM:
+            # Too far from the last exact trace for derivatives: trace again.
+            self._traced = shape
+            moved_mm = np.zeros(PARAMETERS)
             self._base = _reduce_phase(self.scene.phase_rad(shape))
-        changes, shifts = (
-            np.vstack([moved, light]).astype(np.float32),
-            np.array(shifts_rad, np.float32),
-        )
+        changes = np.vstack([moved_mm, light]).astype(np.float32)
+        shifts = np.array(shifts_rad, np.float32)
         return (
             self._base,
             self.light_adu,
@@ -188,13 +234,13 @@ class FrameFitter:
 
     def _right(self) -> FloatArray:
         """J^T W r (144 + 2 k,) of the last evaluation."""
-        bands = self.bands.waves @ self.rows()[0] if len(self.bands.waves) else np.zeros(0)
-        return np.concatenate([self._pull.ravel(), bands])
+        of_bands = np.zeros(0)
+        if len(self.bands.waves):
+            of_bands = self.bands.waves @ self.rows()[0]
+        return np.concatenate([self._pull.ravel(), of_bands])
 
     def _waves(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> Singles:
-        """Rows (6, n): dI by phi_x, by phi_y, by relative changes of A, B_x, B_y,
-        and of all light.
-        """
+        """Rows (6, n): dI by phi_x, phi_y, relative changes of A, B_x and B_y, and of all light."""
         waves = np.empty((6, self.scene.index.size), np.float32)
         light_waves(*self._shown(shifts_rad, shape, light), waves)
         return waves
@@ -204,21 +250,27 @@ class FrameFitter:
     ) -> FloatArray | None:
         """(J^T W J)^-1; None if the bins do not determine the unknowns."""
         *waves, shown = self._waves(shifts_rad, shape, light)
-        slow = [
-            planes[:, 0] for planes in (*self.jacobian, *[self._basis] * 3)
-        ]  # it need not be exact
-        bands, weights = shown * self.bands.waves[:, self.bands.row], weights * self.scene.edge
+        bands = shown * self.bands.waves[:, self.bands.row]
+        weights = weights * self.scene.edge
+        # What changes slowly counts with its mean over each cell: the matrix need not be exact.
+        slow = [planes[:, 0] for planes in (*self.jacobian, *[self._basis] * 3)]
         matrix = np.zeros((_UNKNOWNS + len(bands),) * 2)
+
+        # Unknowns of the waves by each other.
         for i, j in product(range(len(slow)), repeat=2):
-            rows, columns = (slice(start, start + PARAMETERS) for start in (_STARTS[i], _STARTS[j]))
+            rows = slice(_STARTS[i], _STARTS[i] + PARAMETERS)
+            columns = slice(_STARTS[j], _STARTS[j] + PARAMETERS)
             both = self._cells.sums(waves[i] * waves[j] * weights)
             matrix[rows, columns] += (slow[i] * both) @ slow[j].T
+
+        # Those of the bands by them, and by each other.
         for start, planes, wave in zip(_STARTS, slow, waves, strict=True):
-            matrix[start : start + PARAMETERS, _UNKNOWNS:] += (
-                planes @ self._cells.sums(bands * wave * weights).T
-            )
+            both = self._cells.sums(bands * wave * weights)
+            matrix[start : start + PARAMETERS, _UNKNOWNS:] += planes @ both.T
         matrix[_UNKNOWNS:, :_UNKNOWNS] = matrix[:_UNKNOWNS, _UNKNOWNS:].T
         matrix[_UNKNOWNS:, _UNKNOWNS:] = (bands * weights) @ bands.T
+
+        # Inverted with a unit diagonal.
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
         if not matrix_inverse.invert_in_place(matrix):
