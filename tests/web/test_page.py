@@ -109,6 +109,28 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
 
 @needs("chromium")
 @pytest.mark.real_time
+async def test_several_signals_share_a_chart_and_are_drawn_again(tmp_path: Path) -> None:
+    async with viewed(tmp_path) as (_, tab):
+        field = "document.querySelector('[aria-label=signals]').closest('.q-select')"
+        await tab.value(f"{field}.querySelector('.q-field__control').click()")
+        items = "[...document.querySelectorAll('.q-menu .q-item')]"
+        await tab.until(f"{items}.some(i => i.innerText.trim() === 'pump')")
+        await tab.value(f"{items}.find(i => i.innerText.trim() === 'pump').click()")
+        canvas = "document.querySelector('[aria-label=history] canvas')"
+        chart = f"getElement(+{canvas}.closest('[id^=c]').id.slice(1)).chart"
+        await tab.until(f"{chart}.getOption().grid.length === 2")
+        named = f"{chart}.getOption().series.filter(s => s.id && s.unit !== undefined)"
+        assert await tab.value(f"{named}.map(s => s.name)") == ["error", "pump"]
+        fetched = (
+            "performance.getEntriesByType('resource').filter(r => "
+            "r.name.includes('/chart?')).length"
+        )
+        before = await tab.value(fetched)
+        await tab.until(f"{fetched} > {before} + 1")
+
+
+@needs("chromium")
+@pytest.mark.real_time
 async def test_a_viewer_sees_all_locks_and_types_the_word_of_one(tmp_path: Path) -> None:
     press = (
         "[...document.querySelectorAll('button')].find(b => b.innerText.trim().toLowerCase() === "
