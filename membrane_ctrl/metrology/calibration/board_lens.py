@@ -25,6 +25,11 @@ LEAST_CORNERS = 12  # of a view
 _WORSE = 3.0  # times the median view's error
 # Bow of a board over its longest side: paper on a plate, a screen
 FLATNESS = 2e-4
+# Corners that the picture of a plane leaves by this many squares are not those of the board, and a
+# lens that leaves this share of a square on average fits none
+_OF_ANOTHER_BOARD, _LEFT_OF_CORNERS = 0.5, 0.1
+_SMALLEST_SQUARE_PX = 2.0
+_FOCAL_UNKNOWN = 0.2  # relative sigma of a focal length about which nothing was learned
 _SPLIT_VIEWS = 2 * LEAST_VIEWS  # fewer views are not tested for two cameras
 _FOCAL_SPREAD = np.linspace(-0.08, 0.08, 33)  # of the focal length, tried on each view
 _SPLIT_SIGMAS = 5.0
@@ -60,15 +65,20 @@ class Lens:
 def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
     """Fit the lens.
 
-    Raises ValueError with fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing
-    fits. `stated` is where the fit begins, and what the result is compared with.
+    Raises ValueError with fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, if nothing
+    fits, or if the views do not determine the lens. `stated` is where the fit begins, and what the
+    result is compared with.
     """
-    good = [view for view in views if len(view.place) >= LEAST_CORNERS]
+    seen = [view for view in views if len(view.place) >= LEAST_CORNERS]
+    bent = [view.name for view in seen if _plane_misfit(view) > _OF_ANOTHER_BOARD]
+    good = [view for view in seen if view.name not in bent]
     while True:
         if len(good) < LEAST_VIEWS:
+            named = ", ".join(bent)
+            also = f"; the corners in {named} do not lie on a plane board" if bent else ""
             raise ValueError(
                 f"the board is seen in {len(good)} photographs; at least {LEAST_VIEWS} are "
-                "needed, tilted both ways"
+                f"needed, tilted both ways{also}"
             )
         rms, matrix, lens, sigmas, errors = _fit_camera(good, stated)
         worst = int(np.argmax(errors))
@@ -83,6 +93,7 @@ def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
     scatter = _jackknife_sigmas(good, stated)
     flatness = _parameters(*_fit_camera(_bowed_views(good), stated)[1:3]) - found
     values = np.hypot(np.maximum(independent, scatter), flatness)
+    _require_determined(good, values, rms)
     _refuse_two_cameras(good, stated, matrix, lens, rms)
     return Lens(
         focal_px=focal_px,
@@ -94,6 +105,50 @@ def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
         used=tuple(view.name for view in good),
         left_out=tuple(view.name for view in views if view.name not in names),
     )
+
+
+def _plane_misfit(view: BoardView) -> float:
+    """What the picture of a plane leaves of the corners, RMS, in sides of a square.
+
+    Infinite without a plane, or with corners that are no numbers. A lens's distortion leaves a few
+    hundredths.
+    """
+    square_px = _square_px(view)
+    if not np.isfinite(view.seen_px).all() or square_px < _SMALLEST_SQUARE_PX:
+        return math.inf
+    plane, _ = cv2.findHomography(view.place[:, :2], view.seen_px)
+    if plane is None or not np.isfinite(plane).all():
+        return math.inf
+    expected = cv2.perspectiveTransform(view.place[:, None, :2].astype(float), plane)[:, 0]
+    off_px = np.sqrt(np.mean(np.sum((expected - view.seen_px) ** 2, axis=1)))
+    return float(off_px) / square_px
+
+
+def _square_px(view: BoardView) -> float:
+    """About the side of a square in the picture, of a board whose squares have the side 1."""
+    spans = [float(np.linalg.norm(np.std(part, axis=0))) for part in (view.seen_px, view.place)]
+    return spans[0] / max(spans[1], 1e-9)
+
+
+def _require_determined(views: Sequence[BoardView], sigmas: FloatArray, rms_px: float) -> None:
+    """Raise ValueError if the fit leaves too much, or does not determine the lens."""
+    square_px = float(np.median([_square_px(view) for view in views]))
+    if rms_px > _LEFT_OF_CORNERS * square_px:
+        raise ValueError(
+            f"the corners are {rms_px:.1f} px RMS off with the best lens, {rms_px / square_px:.0%} "
+            "of a square: cause unknown; it looks like corners mistaken for their neighbours, a "
+            "board that is not flat, or photographs of several boards"
+        )
+    unknown = [
+        name
+        for name, sigma in zip(_NAMES, sigmas, strict=True)
+        if not np.isfinite(sigma) or (name == "focal_relative" and sigma > _FOCAL_UNKNOWN)
+    ]
+    if unknown:
+        raise ValueError(
+            f"the photographs do not determine {', '.join(unknown)}: the board must be tilted by "
+            "about 30 degrees both ways, and fill the picture"
+        )
 
 
 def _parameters(matrix: FloatArray, lens: FloatArray) -> FloatArray:

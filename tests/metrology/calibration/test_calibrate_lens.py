@@ -149,3 +149,50 @@ def test_the_picture_is_exact_to_the_pixel() -> None:
 def test_impossible_boards_are_refused(text: str, square_px: int, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         on_screen(Board.parse(text), square_px, 640, 480)
+
+
+@pytest.mark.parametrize("kind", ["random", "nan", "one point", "two neighbours exchanged"])
+def test_corners_that_are_none_are_refused_with_the_cause(kind: str) -> None:
+    """Nothing but finite sigmas is a result."""
+    rng = np.random.default_rng(11)
+    views = []
+    for view in corner_views(8, 5):
+        seen_px = view.seen_px.copy()
+        if kind == "random":
+            seen_px = rng.uniform(0, 1000, seen_px.shape)
+        elif kind == "nan":
+            seen_px[3] = np.nan
+        elif kind == "one point":
+            seen_px[:] = seen_px[0]
+        else:
+            seen_px = rng.permutation(seen_px)
+        views.append(replace(view, seen_px=seen_px))
+    with pytest.raises(ValueError, match="do not lie on a plane board"):
+        calibrate_lens(views, WIDE)
+
+
+def test_photographs_that_do_not_tilt_the_board_do_not_determine_the_lens() -> None:
+    """The board always parallel to the sensor: any focal length fits with another distance."""
+    column, row = (part.ravel() for part in np.meshgrid(np.arange(1, 12.0), np.arange(1, 9.0)))
+    place = np.stack([column, row, np.zeros_like(column)], axis=1)
+    rng = np.random.default_rng(12)
+    views = [
+        BoardView(
+            f"{k}.png",
+            place,
+            70.0 * place[:, :2] + [200.0, 180.0] + rng.normal(0, 0.1, (place.shape[0], 2)),
+        )
+        for k in range(6)
+    ]
+    with pytest.raises(ValueError, match=r"do not determine focal_relative|no lens fits"):
+        calibrate_lens(views, WIDE)
+
+
+def test_corners_on_a_wavy_board_are_refused() -> None:
+    """A quarter of a square off, as no lens has it."""
+    views = []
+    for view in corner_views(8, 6):
+        wave = 20.0 * np.sin(2.2 * view.place[:, 0]) * np.cos(1.9 * view.place[:, 1])
+        views.append(replace(view, seen_px=view.seen_px + wave[:, None]))
+    with pytest.raises(ValueError, match="of a square: cause unknown"):
+        calibrate_lens(views, WIDE)
