@@ -375,7 +375,8 @@ class LiveReconstructor:
 
     def _binned(self, sums: AnyArray) -> Binned:
         """Sums of frames as means."""
-        means = (sums / self._bin_px**2).astype(np.float32)
+        # in single precision throughout, which holds every sum exactly: a third of the time
+        means = np.divide(sums, self._bin_px**2, dtype=np.float32, casting="unsafe")
         saturated = np.broadcast_to(self._binner.saturated > 0, means.shape)
         return Binned(self._bin_px, means, saturated, ClipLevels(self._binner.white_adu))
 
