@@ -19,6 +19,7 @@ from membrane_ctrl.model import events, run_events, telemetry
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
 
+_CLOSING_US = 120_000_000  # longer than `TimeoutStopSec=` of the unit
 _NOTIFY_S = 0.5  # far below any sensible WatchdogSec=, and cheap
 
 
@@ -159,7 +160,8 @@ class SystemdNotify:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._send_message("STOPPING=1")
+        # The recording is closed without ticks; `TimeoutStopSec=` limits how long that takes.
+        self._send_message(f"STOPPING=1\nWATCHDOG_USEC={_CLOSING_US}")
         self._socket.close()
 
     def note_report(self, event: events.Event) -> None:

@@ -47,7 +47,7 @@ def start(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
 
 def told_until_it_stops(systemd: socket.socket) -> list[list[str]]:
     messages: list[list[str]] = []
-    while messages[-1:] != [["STOPPING=1"]]:
+    while messages[-1:] != [["STOPPING=1", "WATCHDOG_USEC=120000000"]]:
         messages.append(systemd.recv(4096).decode().splitlines())
     return messages
 

@@ -63,7 +63,7 @@ def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(
     assert messages[5:] == [
         ["WATCHDOG=1", "STATUS=hold, error -0.42 µm"],
         ["WATCHDOG=1", "STATUS=fault, fault 20"],
-        ["STOPPING=1"],
+        ["STOPPING=1", "WATCHDOG_USEC=120000000"],
     ]
 
 
