@@ -76,7 +76,8 @@ def _start_in_session(words: list[str], log: Path) -> None:
     """Start one of our commands in a session of its own, no child of this program, and forget it.
     Raises OSError.
     """
-    handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW
+    handle = os.open(log, flags, 0o600)
     detached = ["nice", "-n", str(_NICE), "setsid", "--fork", sys.executable]
     with os.fdopen(handle, "wb") as output:
         subprocess.run(

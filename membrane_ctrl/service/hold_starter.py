@@ -21,7 +21,7 @@ from pathlib import Path
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.control_port import sockets
-from membrane_ctrl.model import errors, terminal
+from membrane_ctrl.model import errors, files, terminal
 
 TWIN = "twin"
 LOG_NAME = "hold.log"
@@ -99,8 +99,8 @@ class HoldStarter:
         """
         found = [] if self._units else [Configuration(TWIN, None)]
         with suppress(OSError):
-            files = sorted(self._configurations.glob("*.toml"))[:_CONFIGURATIONS_MOST]
-            found += [_read_configuration(file) for file in files if _is_configuration(file)]
+            paths = sorted(self._configurations.glob("*.toml"))[:_CONFIGURATIONS_MOST]
+            found += [_read_configuration(file) for file in paths if _is_configuration(file)]
         return [each for each in found if each.has_devices or each.problem or not self._units]
 
     def is_running(self) -> bool:
@@ -175,7 +175,7 @@ class HoldStarter:
         given = options_file(self._logs, chosen.name)
         try:
             # read by the unit at this start only: a restart by systemd has no options
-            given.write_text(f"HOLD_OPTIONS={' '.join(options.words)}\n", encoding="utf-8")
+            files.write_text_atomic(given, f"HOLD_OPTIONS={' '.join(options.words)}\n")
             done = subprocess.run(
                 words, capture_output=True, text=True, check=False, timeout=_SYSTEMCTL_S
             )
@@ -199,7 +199,7 @@ class HoldStarter:
         try:
             self._logs.mkdir(parents=True, exist_ok=True)
             # appended, so that `limit_log` may cut it while the hold writes
-            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW
             handle = os.open(self._logs / LOG_NAME, flags, 0o600)
             with os.fdopen(handle, "wb") as log:
                 process = subprocess.Popen(

@@ -183,6 +183,12 @@ _OWN = {
     "model/kernel_cache.py",
     # the machine's own folder of locks, whose owner and mode are checked
     "instruments/lock_store.py",
+    # logs, lock and key of the service in the user's own folders, opened without following a link
+    "control_port/service_link.py",
+    "hold/page_service.py",
+    "service/hold_starter.py",
+    # folders of the machine, made by its administrator
+    "service/units.py",
     # a new folder, a temporary one, or a file that the user has named
     "sim/optics/simulate.py",
     "cli/man_pages.py",
