@@ -141,6 +141,7 @@ _.faulty_sensor  # in the template of a sentence
     find_bound,
     _.distance_um,
 )  # the protection table, for docs/reference/faults.md, the safety case and the campaign
+_.vent_um_per_s  # of the simulated truth, packed as a whole
 _.sent  # of an event, written as a whole
 _.writable  # of a file that Arrow writes to
 Barometer, Thermometer  # contracts of drivers, which packages of others fill
