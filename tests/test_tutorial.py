@@ -35,6 +35,8 @@ NOT_RUN = ("make hold", "review last")  # the first makes an environment, the se
 # A rejected measurement and a fault that ends a hold are what the page describes
 SUCCESSES = frozenset({Exit.DONE, Exit.REJECTED, Exit.SAFETY_TRIP})
 _START_S = 300.0
+# The figures of a hold count from 5 s after the setpoint was reached.
+_SETTLED_S = 15.0
 _NUMBER = re.compile(r"[-+]?\d+(?:[.:]\d+)*")
 _DIFFERS = (
     (re.compile(r"\d{8}T\d{6}Z"), "<time>"),
@@ -170,6 +172,7 @@ def test_a_hold_is_commanded_from_a_second_terminal(tmp_path: Path) -> None:
     with start_program(command, tmp_path) as process:
         repeat_until_shown(status, tmp_path)
         run_step(replace(setpoint, shown=setpoint.shown[:end]), tmp_path)
+        time.sleep(_SETTLED_S)
         process.send_signal(signal.SIGINT)
         printed, _ = process.communicate(timeout=_START_S)
     shown = (*hold.shown, *setpoint.shown[end:])

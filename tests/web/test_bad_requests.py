@@ -34,8 +34,6 @@ TARGETS = (
     "/\x7f",
     "/\u00e4",
     "*",
-    "/docs",
-    "/openapi.json",
     "/chart",
     "/chart?hold=&signals=x%00&span=1+min&utc=1",
     "/chart?hold=&signals=error_um&span=1+min&utc=maybe",
@@ -119,6 +117,10 @@ async def test_a_malformed_request_gets_a_status_of_the_400s(tmp_path: Path) -> 
                 for cookie in (session, "Cookie: membrane_ctrl=none"):
                     status = await status_of(url, head(target, host, cookie, method=method))
                     assert 400 <= status < 500, (method, target[:60], cookie[:20], status)
+        # the description of the interface is for users only
+        for target in ("/docs", "/openapi.json"):
+            stranger = await status_of(url, head(target, host, "Cookie: membrane_ctrl=none"))
+            assert (stranger, await status_of(url, head(target, host, session))) == (401, 200)
         for name in HOSTS:
             for cookie in (session, "Cookie: membrane_ctrl=none"):
                 status = await status_of(url, head("/", name, cookie))

@@ -85,7 +85,8 @@ async def test_everything_works_under_the_public_address(name: str, tmp_path: Pa
         answer = await anna.client.post(ROUTES.login, data={"name": "anna", "password": PASSWORD})
         assert (answer.status_code, answer.headers["location"]) == (303, setup.location)
         path = setup.location.rstrip("/") or "/"
-        assert all(f"Path={path};" in each for each in answer.headers.get_list("set-cookie"))
+        cookies = answer.headers.get_list("set-cookie")
+        assert all(f"path={path};" in cookie.lower() for cookie in cookies)
         page = await anna.client.get("")
         assert page.status_code == 200
         origin = "/".join(url.split("/")[:3])
