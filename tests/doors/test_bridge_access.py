@@ -37,7 +37,7 @@ def warnings(**doors: object) -> list[str]:
         ),
         (
             {"mqtt": MqttConfig()},
-            "MQTT by the broker 127.0.0.1:1883: whoever the broker lets publish there",
+            "MQTT by the broker 127.0.0.1:1883: everyone whom the broker lets publish there",
         ),
     ],
 )

@@ -88,7 +88,7 @@ def test_a_terse_keyence(end: tuple[bytes, ...]) -> None:
         driver = KeyenceDlRs1a(KeyenceDlRs1aConfig(port="memory", baud=38_400, parity="E"), wire)
         opening = asyncio.ensure_future(driver.open())
         await asyncio.sleep(0)
-        emulator._sent(BANNER)
+        emulator._transmit_bytes(BANNER)
         await opening
         begin_s = asyncio.get_running_loop().time()
         for _ in range(10):

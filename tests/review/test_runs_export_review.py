@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import shutil
@@ -25,13 +26,15 @@ from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.telemetry import get_column
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES
+from membrane_ctrl.report_pages.blocks import PageSection, ReportPage
+from membrane_ctrl.report_pages.render import render_page
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.catalogue import Filter, list_entries, resolve_run
 from membrane_ctrl.review.export import export_run
 from membrane_ctrl.review.formatting import format_number, format_span, one_line
 from membrane_ctrl.review.prune import to_prune
-from membrane_ctrl.review.report import html
-from membrane_ctrl.review.report.pump_history import pump_change, pump_history
+from membrane_ctrl.review.report.pump_history import PumpSeen, pump_change, pump_history
+from membrane_ctrl.review.report.run_page import _list_history
 from membrane_ctrl.review.run_times import moment_s
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from tests.support.review_runs import same, set_summary, written
@@ -49,6 +52,12 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         set_summary(run, held={"std_um": std, "in_band": 1.0})
     (folder / "notes").mkdir()
     return folder
+
+
+def render_history(seen: list[PumpSeen], change_max: float) -> str:
+    """The report's section about the pump, as text with the entities of HTML resolved."""
+    section = PageSection("Pump", _list_history(seen, change_max))
+    return html.unescape(render_page(ReportPage("run", [section])))
 
 
 def week(
@@ -101,11 +110,11 @@ def test_a_pump_that_wears_over_the_weeks_is_told(tmp_path: Path) -> None:
     )
     assert pump_change(seen, 0.12) == said
     assert pump_change(seen, 0.25) == ""
-    page = html._render_history(seen, 0.12)
-    assert html._escape_text(said) in page
+    page = render_history(seen, 0.12)
+    assert said in page
     assert "0.800 ± 0.030" in page
     assert "<svg" in page
-    assert html._escape_text(said) not in html._render_history(seen, 0.25)
+    assert said not in render_history(seen, 0.25)
     assert pump_change([], 0.12) == ""
 
 

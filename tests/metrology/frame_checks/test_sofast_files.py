@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.measure import sofast_file
+from membrane_ctrl.model.errors import InputError
 from tests.support import sofast_facet
 
 
@@ -94,7 +95,7 @@ def test_oblong_pixels_become_square_ones_of_the_same_rays(tmp_path):
 
 def test_without_h5py_the_missing_extra_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(ImportError, match=r"membrane-ctrl\[sofast\]"):
+    with pytest.raises(InputError, match=r"membrane-ctrl\[sofast\]"):
         sofast_facet.read_camera(tmp_path / "c.h5")
 
 
