@@ -108,13 +108,6 @@ def own_locks() -> Iterator[None]:
     os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
 
 
-# The keys of a test's services are its own.
-_STATE_FOLDER = tempfile.mkdtemp(prefix="membrane-state-")
-os.environ["XDG_STATE_HOME"] = _STATE_FOLDER
-# No hold of a test starts a service, unless the test is about that.
-os.environ["MEMBRANE_CTRL_SERVICE"] = "false"
-
-
 @pytest.fixture(autouse=True)
 def leaves_nothing_behind(request: pytest.FixtureRequest) -> Iterator[None]:
     function = getattr(request, "function", None)
