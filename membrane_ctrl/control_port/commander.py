@@ -65,7 +65,7 @@ class Commander:
         who : str
             The client's name.
         take_over : bool
-            Take command from whoever has it.
+            Take command from the session that has it.
         now_s : float
             The run's clock.
         connection : str

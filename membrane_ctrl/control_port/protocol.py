@@ -92,7 +92,7 @@ class Request(Section):
     shape_time_constant_s: float | None = None  # `gains`: of the shape loop
     # `gains`: of the setpoint, on trial
     setpoint_step_um: Annotated[float, Field(ge=-30, le=30)] | None = None
-    take_over: bool = False  # take command from whoever has it
+    take_over: bool = False  # take command from the session that has it
     period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: interval
     on_behalf: OnBehalf | None = None  # None: the peer of the connection itself
     # time limit on the clock of the greeting's `now_s`; later the request is refused, unless it is

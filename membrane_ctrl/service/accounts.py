@@ -101,7 +101,7 @@ class Accounts:
     """The link's key, and the users who may log in."""
 
     users: dict[str, KnownUser]
-    link_role: Role = "tune"  # of whoever has the link; what the port grants limits it further
+    link_role: Role = "tune"  # of a person with the link; what the port grants limits it further
     # of the cookies (`PublicAddress.cookie_attributes`)
     attributes: str = "HttpOnly; SameSite=Strict; Path=/"
     secret: str = field(default_factory=lambda: secrets.token_urlsafe(24))

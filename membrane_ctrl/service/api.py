@@ -209,7 +209,7 @@ def make_api(feeds: Mapping[str, HoldFeed], starter: HoldStarter) -> FastAPI:
         body: Annotated[SafetyBody | None, Body()] = None,
     ) -> CommandAnswer:
         """Stop, vent, lower or lock (`latch`) the hold, on threads that serve nothing else; takes
-        command from whoever has it.
+        command from the session that has it.
         """
         request = (body or SafetyBody()).model_dump(exclude_defaults=True)
         request |= {"do": command, "take_over": True}

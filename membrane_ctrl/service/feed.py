@@ -332,7 +332,7 @@ SPANS_S = {
 }
 _LIVE_S = 3600.0  # the feed remembers this much; a longer span is read from the tables
 _POINTS_MAX = 1200  # as many as a wide screen shows
-_LISTED_S = 10.0  # the runs of a folder are listed anew so often
+_LISTED_S = 10.0  # the runs of a folder are listed again so often
 _GAP = 3.0  # windows without data interrupt the line
 
 

@@ -72,7 +72,7 @@ class Refusal:
 
 
 class LoginMiddleware:
-    """ASGI middleware: lets in whoever has a session or a token, and asks the others for the link
+    """ASGI middleware: admits requests with a session or a token, and asks the others for the link
     or a password. `with_login` puts the framework's sessions around it.
 
     `scope["membrane_user"]` holds the `WebUser` of a request that was let in.
@@ -213,7 +213,7 @@ class LoginMiddleware:
         await self._admit(scope, send, user, device)
 
     async def _open_link(self, scope: Scope, send: Send) -> None:
-        """Let in whoever has the link's secret; show the others how to get in."""
+        """Admit a person with the link's secret; show the others how to log in."""
         secret = parse_qs(scope["query_string"].decode("latin-1")).get("key", [""])[0]
         user = self._accounts.by_link(secret)
         if user is not None:

@@ -91,7 +91,7 @@ async def open_report(folder: Path, hold: str, user: WebUser) -> None:
 def runs_panel(
     logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]
 ) -> Callable[[], Awaitable[None]]:
-    """Fill the tab; returns what reads the runs anew."""
+    """Fill the tab; returns the function that lists the runs again."""
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
         for name, label in (

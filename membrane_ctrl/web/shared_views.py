@@ -1,4 +1,4 @@
-"""What all viewers of a hold see alike, made once: charts, maps, alarms, the tuning session.
+"""What is the same for all viewers of a hold, made once: charts, maps, alarms, the tuning session.
 
 Browsers fetch charts and maps when they are ready, so that none pile up for a slow one.
 """
