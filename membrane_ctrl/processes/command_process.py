@@ -31,7 +31,10 @@ class CommandProcess:
             self._process = subprocess.Popen(
                 program, stdin=stdin, stdout=log, stderr=log, process_group=0
             )
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, self._nice)
+            # a child never gets more of the processor than whoever started it
+            own_niceness = os.getpriority(os.PRIO_PROCESS, 0)
+            niceness = max(own_niceness, self._nice)
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, niceness)
 
     @property
     def alive(self) -> bool:
