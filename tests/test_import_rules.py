@@ -78,7 +78,7 @@ LAYERS = {
         "membrane_ctrl/review",
     },
     8: {"membrane_ctrl/cli", "membrane_ctrl/service", "tuning"},
-    9: {"membrane_ctrl/__main__", "membrane_ctrl/doors", "membrane_ctrl/web"},
+    9: {"membrane_ctrl/__main__", "membrane_ctrl/bridges", "membrane_ctrl/web"},
 }
 
 

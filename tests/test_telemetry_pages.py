@@ -45,4 +45,4 @@ def test_an_old_file_is_named_and_not_touched(
 
 def test_a_page_without_marks_is_not_written_over() -> None:
     with pytest.raises(ValueError, match=r"bridges\.md"):
-        telemetry_pages.doors_page("# Bridges\n")
+        telemetry_pages.bridges_page("# Bridges\n")

@@ -3,9 +3,10 @@ parts restart.
 
 python -m benchmarks.interfaces.bridges FOLDER [--minutes 30] [--apart-minutes 10] [--raised]
 
-Phases: without doors, with doors, without doors. With doors, a client of each kind (mosquitto with
-aiomqtt, asyncua, caproto for Channel Access, p4p for PV Access) reads all names twice a second.
-Broker and clients are killed and started again four times each, then the door three times. A bare
+Phases: without bridges, with bridges, without bridges. With bridges, a client of each kind
+(mosquitto with aiomqtt, asyncua, caproto for Channel Access, p4p for PV Access) reads all names
+twice a second.
+Broker and clients are killed and started again four times each, then the bridge three times. A bare
 loop of the hold's rate, in a separate process, shows what the machine does to any such loop.
 FOLDER gets the raw lines; `--tell` prints the figures from them again.
 """
@@ -36,11 +37,11 @@ WARM_S = 60.0  # memory is compared from here on
 RAISED = "-5"  # of the session, against everything else on the machine
 CONFIG = """[twin]
 port = 0
-[doors.mqtt]
+[bridges.mqtt]
 port = {mqtt}
-[doors.opcua]
+[bridges.opcua]
 port = {opcua}
-[doors.epics]
+[bridges.epics]
 ca_port = {ca}
 pva_port = {pva}
 """
@@ -51,7 +52,7 @@ pva_port = {pva}
 
 @dataclass(frozen=True)
 class Restart:
-    """Kills `who` at a time of the phase with doors, and starts it again `away_s` later."""
+    """Kills `who` at a time of the phase with bridges, and starts it again `away_s` later."""
 
     at_s: float
     who: str
@@ -59,13 +60,13 @@ class Restart:
 
 
 def restarts(span_s: float) -> list[Restart]:
-    """Broker and clients in turn, away for a few seconds or for 20; then the door."""
+    """Broker and clients in turn, away for a few seconds or for 20; then the bridge."""
     turns = [(number, who) for number in range(4) for who in ("broker", *CLIENTS[1:])]
     found = [
         Restart(span_s * (0.04 + 0.0375 * place), who, 20.0 if number % 2 else 3.0)
         for place, (number, who) in enumerate(turns)
     ]
-    return [*found, *(Restart(span_s * share, "door", 3.0) for share in (0.70, 0.80, 0.90))]
+    return [*found, *(Restart(span_s * share, "bridge", 3.0) for share in (0.70, 0.80, 0.90))]
 
 
 def _free_port() -> int:
@@ -106,7 +107,7 @@ class Bench:
                 "--json",
                 *more,
             ],
-            "door": [sys.executable, "-m", "membrane_ctrl", "doors", *config],
+            "bridge": [sys.executable, "-m", "membrane_ctrl", "bridges", *config],
             "broker": [broker, "-p", str(self._ports["mqtt"])],
         }.get(who, part)
         out = self._folder / f"{who}.log"
@@ -129,7 +130,7 @@ class Bench:
         if who == "hold":
             return (self._folder / "logs" / "control.sock").exists()
         said = out.read_bytes()[begin:].decode()
-        return who != "door" or all(f"{name}:" in said for name in ("opcua", "epics"))
+        return who != "bridge" or all(f"{name}:" in said for name in ("opcua", "epics"))
 
     def kill(self, who: str, number: int = signal.SIGKILL) -> None:
         """End a part at once, or with another signal, and its children with it."""
@@ -139,9 +140,9 @@ class Bench:
         process.wait()
 
     def sample(self) -> None:
-        """Note the memory of door and hold, and the machine's load."""
+        """Note the memory of bridge and hold, and the machine's load."""
         rss_mb = {}
-        for who in {"door", "hold"} & set(self._running):
+        for who in {"bridge", "hold"} & set(self._running):
             pages = (
                 Path(f"/proc/{self._running[who].pid}/statm").read_text(encoding="utf-8").split()[1]
             )
@@ -170,10 +171,10 @@ def measure(folder: Path, minutes: float, apart_minutes: float, raised: bool) ->
         bench.tell(phase="apart")
         bench.wait(time.monotonic() + 60.0 * apart_minutes)
         bench.start("broker")
-        bench.start("door")
+        bench.start("bridge")
         for name in CLIENTS:
             bench.start(name)
-        bench.tell(phase="doors")
+        bench.tell(phase="bridges")
         begin_s = time.monotonic()
         for restart in restarts(60.0 * minutes):
             bench.wait(max(begin_s + restart.at_s, time.monotonic() + BETWEEN_S))
@@ -181,7 +182,7 @@ def measure(folder: Path, minutes: float, apart_minutes: float, raised: bool) ->
             bench.wait(time.monotonic() + restart.away_s)
             bench.start(restart.who)
         bench.wait(begin_s + 60.0 * minutes)
-        for who in (*CLIENTS, "door", "broker"):
+        for who in (*CLIENTS, "bridge", "broker"):
             bench.kill(who)
         bench.tell(phase="apart again")
         bench.wait(time.monotonic() + 60.0 * apart_minutes)
@@ -235,7 +236,7 @@ def tick_figures(folder: Path, told: list[Line]) -> list[Figure]:
 
 
 def _affected(who: str) -> tuple[str, ...]:
-    return {"broker": ("mqtt",), "door": CLIENTS}.get(who, (who,))
+    return {"broker": ("mqtt",), "bridge": CLIENTS}.get(who, (who,))
 
 
 def _good(sweep: Line) -> bool:
@@ -246,7 +247,7 @@ def age_figures(folder: Path, told: list[Line]) -> list[Figure]:
     """How soon each client has all names again after a restart, and how old they become between
     restarts.
     """
-    ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "doors")
+    ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "bridges")
     found = []
     for name in CLIENTS:
         sweeps = [
@@ -282,18 +283,18 @@ def age_figures(folder: Path, told: list[Line]) -> list[Figure]:
 
 
 def memory_figures(told: list[Line]) -> list[Figure]:
-    """Memory of the door in its longest life, and of the hold."""
-    starts = [line["utc_s"] for line in told if line.get("started") == "door"]
-    ends = [line["utc_s"] for line in told if line.get("killed") == "door"]
+    """Memory of the bridge in its longest life, and of the hold."""
+    starts = [line["utc_s"] for line in told if line.get("started") == "bridge"]
+    ends = [line["utc_s"] for line in told if line.get("killed") == "bridge"]
     begin_s, end_s = max(zip(starts, ends, strict=True), key=lambda life: life[1] - life[0])
     found = []
-    for who in ("door", "hold"):
+    for who in ("bridge", "hold"):
         at = [
             (line["utc_s"], line["rss_mb"][who]) for line in told if who in line.get("rss_mb", {})
         ]
         part = [mb for utc_s, mb in at if begin_s + WARM_S <= utc_s < end_s]
         minutes = (end_s - begin_s - WARM_S) / 60
-        name = f"{who}: memory at the end of {minutes:.0f} min with doors"
+        name = f"{who}: memory at the end of {minutes:.0f} min with bridges"
         found.append(
             at_most(name, part[-1], "MB", round(1.05 * part[0], 1), "first minute", part[0])
         )
@@ -303,8 +304,8 @@ def memory_figures(told: list[Line]) -> list[Figure]:
 def figures(folder: Path) -> list[Figure]:
     """All figures of a measured folder."""
     told = lines(folder / "bench.jsonl")
-    ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "doors")
-    span = at_least("minutes with doors", (end_s - begin_s) / 60, "min", 0.0)
+    ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "bridges")
+    span = at_least("minutes with bridges", (end_s - begin_s) / 60, "min", 0.0)
     return [span, *tick_figures(folder, told), *age_figures(folder, told), *memory_figures(told)]
 
 
@@ -329,7 +330,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends what was started, too
     if not options.tell:
         measure(options.folder.resolve(), options.minutes, options.apart_minutes, options.raised)
-    show("doors", figures(options.folder))
+    show("bridges", figures(options.folder))
     return 0
 
 

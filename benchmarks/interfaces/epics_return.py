@@ -2,11 +2,11 @@
 
 python -m benchmarks.interfaces.epics_return [--restarts 8] [--repeater]
 
-The clients: p4p, which looks for the door by UDP or through a TCP name server; caproto; and EPICS'
-own Channel Access library, if aioca is there (`pip install aioca`). `--repeater` runs the repeater,
-which passes the beacons of the door on to Channel Access clients; on most EPICS machines one runs.
-Each client reads three names, again and again; its time runs from the door's word that it serves to
-the end of the first read of values younger than 2 s.
+The clients: p4p, which looks for the bridge by UDP or through a TCP name server; caproto; and
+EPICS' own Channel Access library, if aioca is there (`pip install aioca`). `--repeater` runs the
+repeater, which passes the beacons of the bridge on to Channel Access clients; on most EPICS
+machines one runs. Each client reads three names, again and again; its time runs from the bridge's
+line that it serves to the end of the first read of values younger than 2 s.
 """
 
 from __future__ import annotations
@@ -98,22 +98,22 @@ def started(*words: object) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def serving(folder: Path) -> Iterator[float]:
-    """Start the door, yield when it served, and kill it; for ever."""
-    door = (
+    """Start the bridge, yield when it served, and kill it; for ever."""
+    bridge = (
         sys.executable,
         "-m",
         "membrane_ctrl",
-        "doors",
+        "bridges",
         "--config",
         folder / "lab.toml",
         "--logs",
         folder,
     )
     while True:
-        with started(*door) as process:
+        with started(*bridge) as process:
             assert process.stderr is not None
             while not (line := process.stderr.readline()).startswith(b"epics:"):
-                assert line, "the door ended"
+                assert line, "the bridge ended"
             yield time.time()
         time.sleep(AWAY_S)
 
@@ -121,7 +121,7 @@ def serving(folder: Path) -> Iterator[float]:
 async def measure(restarts: int, repeater: bool, folder: Path) -> list[Figure]:
     """Figures of so many restarts."""
     ca, pva = str(free_port()), str(free_port())
-    (folder / "lab.toml").write_text(f"[doors.epics]\nca_port = {ca}\npva_port = {pva}\n")
+    (folder / "lab.toml").write_text(f"[bridges.epics]\nca_port = {ca}\npva_port = {pva}\n")
     known = [name for name in CLIENTS if "own" not in name or importlib.util.find_spec("aioca")]
     files = {name: folder / f"client{number}.jsonl" for number, name in enumerate(known)}
     served_s = []
@@ -143,11 +143,11 @@ async def measure(restarts: int, repeater: bool, folder: Path) -> list[Figure]:
                     file,
                 )
                 stack.enter_context(started(sys.executable, *words))
-            door = serving(folder)
+            bridge = serving(folder)
             for _ in range(1 + restarts):
-                served_s.append(await asyncio.to_thread(next, door))
+                served_s.append(await asyncio.to_thread(next, bridge))
                 await asyncio.sleep(WATCH_S)
-            await asyncio.to_thread(door.close)
+            await asyncio.to_thread(bridge.close)
             task.cancel()
     found = []
     for name, file in files.items():

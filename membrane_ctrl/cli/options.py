@@ -65,15 +65,15 @@ def load_configuration(path: Path | None) -> "Config":
     if optics.geometry_file is not None:
         optics = _resolve_beside(optics, folder, "geometry_file")
     alarms = _resolve_beside(alarms, folder, "urls_file", "escalation_urls_file")
-    doors = config.doors
-    if doors.mqtt is not None:
-        doors = doors.model_copy(
-            update={"mqtt": _resolve_beside(doors.mqtt, folder, "password_file", "ca_file")}
+    bridges = config.bridges
+    if bridges.mqtt is not None:
+        bridges = bridges.model_copy(
+            update={"mqtt": _resolve_beside(bridges.mqtt, folder, "password_file", "ca_file")}
         )
-    if doors.opcua is not None:
-        opcua = _resolve_beside(doors.opcua, folder, "users_file", "certificate_file", "key_file")
-        doors = doors.model_copy(update={"opcua": opcua})
-    update = {"optics": optics, "port": port, "alarms": alarms, "doors": doors}
+    if bridges.opcua is not None:
+        opcua = _resolve_beside(bridges.opcua, folder, "users_file", "certificate_file", "key_file")
+        bridges = bridges.model_copy(update={"opcua": opcua})
+    update = {"optics": optics, "port": port, "alarms": alarms, "bridges": bridges}
     return config.model_copy(update=update)
 
 

@@ -208,7 +208,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         "control port": _describe_port(config.port),
         "alarms": _describe_alarms(config.alarms),
         "page": _describe_page(config),
-        "bridges": describe_bridges(config.doors),
+        "bridges": describe_bridges(config.bridges),
     }
 
 

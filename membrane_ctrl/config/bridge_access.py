@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from membrane_ctrl.config.port import LOCAL_HOSTS, DoorsConfig
+from membrane_ctrl.config.port import LOCAL_HOSTS, BridgesConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,16 +17,16 @@ class BridgeAccess:
     unknown: bool  # whether clients act that neither this program nor a broker's log-in can name
 
 
-def bridge_accesses(doors: DoorsConfig) -> list[BridgeAccess]:
+def bridge_accesses(bridges: BridgesConfig) -> list[BridgeAccess]:
     """The configured bridges."""
     found = []
-    if doors.mqtt is not None:
-        mqtt = doors.mqtt
+    if bridges.mqtt is not None:
+        mqtt = bridges.mqtt
         who = "everyone whom the broker lets publish there (its access list)"
         where = f"MQTT by the broker {mqtt.host}:{mqtt.port}"
-        found.append(BridgeAccess("doors.mqtt", where, who, mqtt.username is None))
-    if doors.opcua is not None:
-        opcua = doors.opcua
+        found.append(BridgeAccess("bridges.mqtt", where, who, mqtt.username is None))
+    if bridges.opcua is not None:
+        opcua = bridges.opcua
         where = f"OPC UA on {opcua.host}:{opcua.port}" + (", encrypted" if opcua.encrypted else "")
         known = opcua.users_file is not None
         who = (
@@ -34,24 +34,24 @@ def bridge_accesses(doors: DoorsConfig) -> list[BridgeAccess]:
             if known
             else _is_open_to_anybody(opcua.host)
         )
-        found.append(BridgeAccess("doors.opcua", where, who, not known))
-    if doors.epics is not None:
-        where = f"EPICS on {doors.epics.host}"
+        found.append(BridgeAccess("bridges.opcua", where, who, not known))
+    if bridges.epics is not None:
+        where = f"EPICS on {bridges.epics.host}"
         found.append(
-            BridgeAccess("doors.epics", where, _is_open_to_anybody(doors.epics.host), True)
+            BridgeAccess("bridges.epics", where, _is_open_to_anybody(bridges.epics.host), True)
         )
     return found
 
 
-def describe_bridges(doors: DoorsConfig) -> str:
+def describe_bridges(bridges: BridgesConfig) -> str:
     """The configured bridges, and who may do what through them, in one line."""
-    accesses = bridge_accesses(doors)
+    accesses = bridge_accesses(bridges)
     if not accesses:
         return "none"
     may = (
         "read, and nobody acts"
-        if doors.role == "read"
-        else f"read and act (role {doors.role} at most)"
+        if bridges.role == "read"
+        else f"read and act (role {bridges.role} at most)"
     )
     return "; ".join(f"{each.where}: {each.who} may {may}" for each in accesses)
 

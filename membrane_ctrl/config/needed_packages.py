@@ -16,7 +16,7 @@ class NeededPackage:
     Attributes
     ----------
     table : str
-        Of the configuration, such as `doors.mqtt`.
+        Of the configuration, such as `bridges.mqtt`.
     package : str
         As it is imported.
     extra : str
@@ -40,8 +40,8 @@ def needed_packages(config: Config) -> Iterator[NeededPackage]:
     """
     bridges = {"mqtt": "aiomqtt", "opcua": "asyncua", "epics": "softioc"}
     for bridge, package in bridges.items():
-        if getattr(config.doors, bridge) is not None:
-            yield NeededPackage(f"doors.{bridge}", package, bridge)
+        if getattr(config.bridges, bridge) is not None:
+            yield NeededPackage(f"bridges.{bridge}", package, bridge)
 
 
 def missing_packages(config: Config) -> list[NeededPackage]:

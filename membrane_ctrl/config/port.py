@@ -1,4 +1,4 @@
-"""Configuration of the control port, of the doors for other systems, and of the alarms."""
+"""Configuration of the control port, of the bridges for other systems, and of the alarms."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -145,9 +145,9 @@ class EpicsConfig(Section):
     """Port of PV Access. Change it if another server has it."""
 
 
-class DoorsConfig(Section):
+class BridgesConfig(Section):
     """Bridges to the lab's other systems (docs/how-to/bridges.md), started by `membrane-ctrl
-    doors`."""
+    bridges`."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")] = "mirror"
     """First part of every published name. Change it where there are several mirrors."""
@@ -160,18 +160,18 @@ class DoorsConfig(Section):
     epics: EpicsConfig | None = None
 
     @model_validator(mode="after")
-    def _only_people_we_know_act(self) -> "DoorsConfig":
-        for name, door in (("opcua", self.opcua), ("epics", self.epics)):
-            known = isinstance(door, OpcuaConfig) and door.users_file is not None
+    def _only_people_we_know_act(self) -> "BridgesConfig":
+        for name, bridge in (("opcua", self.opcua), ("epics", self.epics)):
+            known = isinstance(bridge, OpcuaConfig) and bridge.users_file is not None
             if (
-                door is not None
-                and door.host not in LOCAL_HOSTS
+                bridge is not None
+                and bridge.host not in LOCAL_HOSTS
                 and self.role != "read"
                 and not known
             ):
                 remedy = "give users_file, or keep" if name == "opcua" else "keep"
                 raise ValueError(
-                    f"{name}.host = {door.host!r}: this door cannot tell who acts from "
+                    f"{name}.host = {bridge.host!r}: this bridge cannot tell who acts from "
                     "another machine; "
                     f"{remedy} role = 'read', or the host {LOCAL}"
                 )

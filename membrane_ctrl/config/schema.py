@@ -36,7 +36,7 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     PatternConfig,
 )
-from membrane_ctrl.config.port import AlarmsConfig, DoorsConfig, PortConfig
+from membrane_ctrl.config.port import AlarmsConfig, BridgesConfig, PortConfig
 
 __all__ = [
     "CameraConfig",
@@ -321,7 +321,7 @@ class Config(Section):
     recording: RecordingConfig = RecordingConfig()
     port: PortConfig = PortConfig()
     alarms: AlarmsConfig = AlarmsConfig()
-    doors: DoorsConfig = DoorsConfig()
+    bridges: BridgesConfig = BridgesConfig()
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":

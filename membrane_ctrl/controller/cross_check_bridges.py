@@ -5,16 +5,16 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.cross_check_plant import ConfigFindings
 
 _REMEDIES = {
-    "doors.mqtt": "give username and password_file, and let the broker's access list decide",
-    "doors.opcua": "give users_file, or set the role to read",
-    "doors.epics": "set the role to read, unless every user of this machine may act",
+    "bridges.mqtt": "give username and password_file, and let the broker's access list decide",
+    "bridges.opcua": "give users_file, or set the role to read",
+    "bridges.epics": "set the role to read, unless every user of this machine may act",
 }
 
 
 def judge_bridges(config: Config, say: ConfigFindings) -> None:
     """Warn of bridges through which clients may act whom nobody knows."""
-    for bridge in bridge_accesses(config.doors):
-        acts = bridge.unknown and config.doors.role != "read"
+    for bridge in bridge_accesses(config.bridges):
+        acts = bridge.unknown and config.bridges.role != "read"
         say.warn(
-            acts, "doors.role", f"{bridge.where}: {bridge.who} may act", _REMEDIES[bridge.field]
+            acts, "bridges.role", f"{bridge.where}: {bridge.who} may act", _REMEDIES[bridge.field]
         )

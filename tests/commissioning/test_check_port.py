@@ -12,7 +12,7 @@ import pytest
 from membrane_ctrl.commissioning.check import check_config
 from membrane_ctrl.config.port import (
     AlarmsConfig,
-    DoorsConfig,
+    BridgesConfig,
     MqttConfig,
     OpcuaConfig,
     PortConfig,
@@ -76,11 +76,11 @@ def test_a_bridge_without_its_library_is_named_and_the_hold_is_possible(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", missing("aiomqtt", "asyncua"))
-    config = Config(doors=DoorsConfig(mqtt=MqttConfig(host="broker"), opcua=OpcuaConfig()))
+    config = Config(bridges=BridgesConfig(mqtt=MqttConfig(host="broker"), opcua=OpcuaConfig()))
     assert check_config(config, "lab.toml", as_json=False) == Exit.DONE
     said = " ".join(capsys.readouterr().out.split())
-    assert "lab.toml: [doors.mqtt] needs aiomqtt: pip install 'membrane-ctrl[mqtt]'" in said
-    assert "lab.toml: [doors.opcua] needs asyncua: pip install 'membrane-ctrl[opcua]'" in said
+    assert "lab.toml: [bridges.mqtt] needs aiomqtt: pip install 'membrane-ctrl[mqtt]'" in said
+    assert "lab.toml: [bridges.opcua] needs asyncua: pip install 'membrane-ctrl[opcua]'" in said
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:

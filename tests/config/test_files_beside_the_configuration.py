@@ -11,7 +11,7 @@ from membrane_ctrl.cli.options import load_configuration
 TEXT = """
 [optics]
 geometry_file = "geometry.toml"
-[doors.opcua]
+[bridges.opcua]
 users_file = "keys/users"
 certificate_file = "/etc/bench.pem"
 key_file = "~/bench.key"
@@ -28,7 +28,7 @@ def test_each_file_is_a_path_from_the_configurations_folder(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     config = load_configuration(Path("lab/bench.toml"))
-    opcua = config.doors.opcua
+    opcua = config.bridges.opcua
     assert opcua is not None
     assert config.optics.geometry_file == tmp_path / "lab" / "geometry.toml"
     assert opcua.users_file == str(tmp_path / "lab" / "keys" / "users")

@@ -18,14 +18,14 @@ from typing import Any
 
 from rich.console import Console
 
-from membrane_ctrl.config.port import DoorsConfig
+from membrane_ctrl.bridges.mqtt import discovery
+from membrane_ctrl.bridges.names import Bridge, values
+from membrane_ctrl.config.port import BridgesConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import ConsoleModel
 from membrane_ctrl.console.view import ConsolePage
 from membrane_ctrl.control_port.ctl import Where, status_lines
 from membrane_ctrl.control_port.server import status_table
-from membrane_ctrl.doors.mqtt import discovery
-from membrane_ctrl.doors.names import Door, values
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.recorder.blueprint import run_blueprint
@@ -57,10 +57,10 @@ def bridge_values(status: RunStatus, column: str) -> dict[str, Any]:
     """The column among the published values, and its entity for Home Assistant."""
     table = status_table(status)
     seen = HoldSeen("a-run", status=table, seen_s=time.monotonic(), problem="")
-    door = Door(HoldFeed(Where()), Config(doors=DoorsConfig()))
+    bridge = Bridge(HoldFeed(Where()), Config(bridges=BridgesConfig()))
     return {
         "value": values(seen)[column],
-        "entity": discovery(door, "membrane/mirror")["components"][column],
+        "entity": discovery(bridge, "membrane/mirror")["components"][column],
     }
 
 

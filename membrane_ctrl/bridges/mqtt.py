@@ -1,4 +1,4 @@
-"""The door to MQTT: one JSON object of all values, a retained availability, commands, Home
+"""The bridge to MQTT: one JSON object of all values, a retained availability, commands, Home
 Assistant's discovery.
 
 Topics, below `membrane/<name>/`: `values`, `availability` (`online`, `offline`; retained, also the
@@ -25,14 +25,14 @@ from aiomqtt.exceptions import MqttConnectError
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from membrane_ctrl.bridges.command_lanes import MOVES_NOTHING, overtaken
+from membrane_ctrl.bridges.mqtt_barrier import OrderBarrier
+from membrane_ctrl.bridges.mqtt_client import CancellableClient
+from membrane_ctrl.bridges.mqtt_inbox import HandleMessage, Inbox, Reports
+from membrane_ctrl.bridges.mqtt_owner import NameOwnership, OwnerClaim
+from membrane_ctrl.bridges.names import TABLE, Bridge, Published
 from membrane_ctrl.config.port import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY, is_safety_command
-from membrane_ctrl.doors.command_lanes import MOVES_NOTHING, overtaken
-from membrane_ctrl.doors.mqtt_barrier import OrderBarrier
-from membrane_ctrl.doors.mqtt_client import CancellableClient
-from membrane_ctrl.doors.mqtt_inbox import HandleMessage, Inbox, Reports
-from membrane_ctrl.doors.mqtt_owner import NameOwnership, OwnerClaim
-from membrane_ctrl.doors.names import TABLE, Door, Published
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.columns import QUANTITY_OF_UNIT
 
@@ -49,20 +49,20 @@ _STATE_LETTERS = 255  # the longest state that Home Assistant takes
 _UNSUPPORTED_VERSION = (1, 132)  # reason codes of MQTT 3.1.1 and 5
 
 
-async def serve(config: MqttConfig, door: Door) -> None:
+async def serve(config: MqttConfig, bridge: Bridge) -> None:
     """Publish until cancelled; connect again whenever the broker returns.
 
     Raises InputError for a wrong file, DeviceError if another bridge has the name at this broker.
     """
-    broker = Broker(config, door.settings.name)
-    ownership = NameOwnership(broker.claim, f"{broker.where}: the name {door.settings.name!r}")
+    broker = Broker(config, bridge.settings.name)
+    ownership = NameOwnership(broker.claim, f"{broker.where}: the name {bridge.settings.name!r}")
     printed = False
-    async with door.opening:
+    async with bridge.opening:
         pass  # a connection would time out meanwhile
     while True:
         began_s = time.monotonic()
         connection = asyncio.create_task(
-            _serve_connection(broker, config, door, ownership), name="mqtt connection"
+            _serve_connection(broker, config, bridge, ownership), name="mqtt connection"
         )
         await _wait_for_end(connection)
         try:
@@ -158,18 +158,18 @@ def _read(file: str | None) -> str | None:
     try:
         return None if file is None else files.read_text(Path(file), follow=True).strip()
     except (OSError, ValueError) as error:
-        raise errors.InputError(f"doors.mqtt.password_file: {error}") from None
+        raise errors.InputError(f"bridges.mqtt.password_file: {error}") from None
 
 
 def _context(config: MqttConfig) -> ssl.SSLContext | None:
     try:
         return None if config.ca_file is None else ssl.create_default_context(cafile=config.ca_file)
     except OSError as error:
-        raise errors.InputError(f"doors.mqtt.ca_file: {config.ca_file}: {error}") from None
+        raise errors.InputError(f"bridges.mqtt.ca_file: {config.ca_file}: {error}") from None
 
 
 async def _serve_connection(
-    broker: Broker, config: MqttConfig, door: Door, ownership: NameOwnership
+    broker: Broker, config: MqttConfig, bridge: Bridge, ownership: NameOwnership
 ) -> None:
     """Connect, claim the name, publish and obey until a connection fails."""
     base = broker.base
@@ -187,7 +187,7 @@ async def _serve_connection(
             return
         if not message.retain:
             barrier.raise_for(_command_name(message))
-        _obey(message, door, safety_reports)
+        _obey(message, bridge, safety_reports)
 
     async def publish_marker(marker: str) -> None:
         await guard.publish(f"{base}/order", marker, qos=1)
@@ -205,9 +205,9 @@ async def _serve_connection(
             tasks.create_task(barrier.run(publish_marker)),
         )
         await guard.subscribe([(f"{base}/do/{name}", 1) for name in sorted(SAFETY)])
-        door.late_listeners.append(safety_reports.add)
+        bridge.late_listeners.append(safety_reports.add)
         try:
-            await _publish_and_obey(broker, config, door, barrier)
+            await _publish_and_obey(broker, config, bridge, barrier)
         except asyncio.CancelledError:
             # The program ends, unless it was another task that failed: the name is free for the
             # next bridge.
@@ -219,7 +219,7 @@ async def _serve_connection(
                         await publish_claim(b"", True)
             raise
         finally:
-            door.late_listeners.remove(safety_reports.add)
+            bridge.late_listeners.remove(safety_reports.add)
 
 
 async def _wait_for_disconnect(client: aiomqtt.Client) -> None:
@@ -229,7 +229,7 @@ async def _wait_for_disconnect(client: aiomqtt.Client) -> None:
 
 
 async def _publish_and_obey(
-    broker: Broker, config: MqttConfig, door: Door, barrier: OrderBarrier
+    broker: Broker, config: MqttConfig, bridge: Bridge, barrier: OrderBarrier
 ) -> None:
     """Publish the values, and obey the commands that are no safety commands, on a connection of
     their own.
@@ -250,7 +250,7 @@ async def _publish_and_obey(
         elif barrier.newest and name not in MOVES_NOTHING:
             reports.add_refusal(f"{name} refused: {overtaken(barrier.newest)}")
         else:
-            _obey(message, door, reports)
+            _obey(message, bridge, reports)
 
     availability = Availability()
     reports = Reports(publish_answer, _REPORT_PAUSE_S)
@@ -261,12 +261,12 @@ async def _publish_and_obey(
             [(f"{base}/{topic}", 1) for topic in ("do/+", "availability", "order")]
         )
         if config.discovery_prefix:
-            topic = f"{config.discovery_prefix}/device/membrane_{door.settings.name}/config"
-            await client.publish(topic, json.dumps(discovery(door, base)), qos=1, retain=True)
+            topic = f"{config.discovery_prefix}/device/membrane_{bridge.settings.name}/config"
+            await client.publish(topic, json.dumps(discovery(bridge, base)), qos=1, retain=True)
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(_wait_for_disconnect(client))
-                tasks.create_task(_publish(client, door, base, availability))
+                tasks.create_task(_publish(client, bridge, base, availability))
                 tasks.create_task(reports.run())
         except asyncio.CancelledError:  # a clean goodbye suppresses the last will
             with suppress(aiomqtt.MqttError, TimeoutError):
@@ -302,18 +302,18 @@ class Availability:
 
 
 async def _publish(
-    client: aiomqtt.Client, door: Door, base: str, availability: Availability
+    client: aiomqtt.Client, bridge: Bridge, base: str, availability: Availability
 ) -> None:
     """Publish the values every period, and the availability when it changes or is wrong."""
     next_s = time.monotonic()
     while True:
-        now = "online" if door.live else "offline"
+        now = "online" if bridge.live else "offline"
         due = availability.is_due(now)
         if due or time.monotonic() >= next_s:
-            next_s = time.monotonic() + door.settings.period_s
+            next_s = time.monotonic() + bridge.settings.period_s
             message = {
                 "time_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
-                **door.values(),
+                **bridge.values(),
             }
             await client.publish(f"{base}/values", json.dumps(message))
         if due:  # after the values: whoever sees `online` has them
@@ -322,13 +322,13 @@ async def _publish(
         await asyncio.sleep(min(_LOOK_S, max(0.0, next_s - time.monotonic())))
 
 
-def _obey(message: aiomqtt.Message, door: Door, reports: Reports) -> None:
+def _obey(message: aiomqtt.Message, bridge: Bridge, reports: Reports) -> None:
     """Hand a command on, or refuse it; the answer is reported in either case."""
     name = _command_name(message)
     if message.retain:  # an old command, delivered again at each connection
         reports.add_refusal(f"{name} refused: a retained message is no command")
         return
-    outcome = door.submit("mqtt", name, _payload(message))
+    outcome = bridge.submit("mqtt", name, _payload(message))
     if outcome.done():
         reports.add_refusal(outcome.result())
     else:
@@ -343,20 +343,20 @@ def _payload(message: aiomqtt.Message) -> bytes:
     return message.payload if isinstance(message.payload, bytes) else b""
 
 
-def discovery(door: Door, base: str) -> dict[str, Any]:
+def discovery(bridge: Bridge, base: str) -> dict[str, Any]:
     """The device with its entities, as Home Assistant takes it (device discovery, 2024.11 and
     later).
     """
-    name = door.settings.name
+    name = bridge.settings.name
     found = {each.name: _sensor(each, name) for each in TABLE}
-    for do, action in door.commands.items():
+    for do, action in bridge.commands.items():
         entity: dict[str, Any] = {
             "unique_id": f"membrane_{name}_do_{do}",
             "command_topic": f"{base}/do/{do}",
         }
         entity |= {"name": action.label, "icon": "mdi:gesture-tap-button"}
         if action.asks == "number":
-            low, high = door.bounds[do]
+            low, high = bridge.bounds[do]
             shown = "target_um" if do == "setpoint" else "flow_um_per_s"
             entity |= {"platform": "number", "min": low, "max": high, "step": 0.01, "mode": "box"}
             entity |= {

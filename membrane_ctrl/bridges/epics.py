@@ -1,4 +1,4 @@
-"""The door to EPICS: one IOC for Channel Access and PV Access; a record for each published value
+"""The bridge to EPICS: one IOC for Channel Access and PV Access; a record for each published value
 and each command.
 
 Numbers without contact to the hold keep their last value with the severity INVALID and the status
@@ -14,9 +14,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from membrane_ctrl.bridges.epics_search import require_unserved
+from membrane_ctrl.bridges.names import TABLE, Bridge, Published, Value
 from membrane_ctrl.config.port import EpicsConfig
-from membrane_ctrl.doors.epics_search import require_unserved
-from membrane_ctrl.doors.names import TABLE, Door, Published, Value
 from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.service.access import Action
@@ -29,18 +29,18 @@ _TEXT_BYTES = 512
 _DIGITS = 4
 
 
-async def serve(config: EpicsConfig, door: Door) -> None:
+async def serve(config: EpicsConfig, bridge: Bridge) -> None:
     """Serve until cancelled. Raises DeviceError if the address is taken, or another server has
     these records.
     """
-    with device_claim.claim_devices([f"EPICS records {door.settings.name}:*"]):
-        await _serve_records(config, door)
+    with device_claim.claim_devices([f"EPICS records {bridge.settings.name}:*"]):
+        await _serve_records(config, bridge)
 
 
-async def _serve_records(config: EpicsConfig, door: Door) -> None:
-    async with door.opening:
-        await asyncio.to_thread(require_unserved, f"{door.settings.name}:state", config.ca_port)
-        records = _opened(config, door)
+async def _serve_records(config: EpicsConfig, bridge: Bridge) -> None:
+    async with bridge.opening:
+        await asyncio.to_thread(require_unserved, f"{bridge.settings.name}:state", config.ca_port)
+        records = _opened(config, bridge)
     print(
         f"epics: {config.host}, CA {config.ca_port}, PVA {config.pva_port}",
         file=sys.stderr,
@@ -49,8 +49,8 @@ async def _serve_records(config: EpicsConfig, door: Door) -> None:
     from softioc import alarm
 
     while True:
-        live = door.live
-        for name, value in door.values().items():
+        live = bridge.live
+        for name, value in bridge.values().items():
             record = records[name]
             if value is not None:
                 record.set(_fitting(value))
@@ -58,10 +58,10 @@ async def _serve_records(config: EpicsConfig, door: Door) -> None:
                 record.set_alarm(
                     alarm.INVALID_ALARM, alarm.COMM_ALARM if not live else alarm.UDF_ALARM
                 )
-        await asyncio.sleep(door.settings.period_s)
+        await asyncio.sleep(bridge.settings.period_s)
 
 
-def _opened(config: EpicsConfig, door: Door) -> dict[str, Any]:
+def _opened(config: EpicsConfig, bridge: Bridge) -> dict[str, Any]:
     """Start the IOC, which takes seconds; returns the records of the published values."""
     _require_free(config)
     addresses = {"EPICS_CAS_INTF_ADDR_LIST": config.host, "EPICS_PVAS_INTF_ADDR_LIST": config.host}
@@ -79,10 +79,10 @@ def _opened(config: EpicsConfig, door: Door) -> dict[str, Any]:
     )
     from softioc import asyncio_dispatcher, builder, imports, softioc  # they read the environment
 
-    builder.SetDeviceName(door.settings.name)
+    builder.SetDeviceName(bridge.settings.name)
     records = {each.name: _record(builder, each) for each in TABLE}
-    for do, action in door.commands.items():
-        _command(builder, door, do, action, records["answer"])
+    for do, action in bridge.commands.items():
+        _command(builder, bridge, do, action, records["answer"])
     builder.LoadDatabase()
     with tempfile.TemporaryDirectory() as folder:
         rules = Path(folder) / "rules.acf"
@@ -118,17 +118,17 @@ def _record(builder: Any, published: Published) -> Any:
     return builder.aIn(published.name, EGU=published.unit, PREC=_DIGITS, DESC=description)
 
 
-def _command(builder: Any, door: Door, do: str, action: Action, answer: Any) -> None:
+def _command(builder: Any, bridge: Bridge, do: str, action: Action, answer: Any) -> None:
     """The record `do:COMMAND`: a number, a text, or any write at all; a put ends once the answer is
     there.
     """
 
     async def obey(value: object) -> None:
-        answer.set(_fitting(await door.ask("epics", do, value if action.asks else "")))
+        answer.set(_fitting(await bridge.ask("epics", do, value if action.asks else "")))
 
     common = {"on_update": obey, "always_update": True, "ASG": "COMMAND", "DESC": action.label}
     if action.asks == "number":
-        low, high = door.bounds[do]
+        low, high = bridge.bounds[do]
         builder.aOut(
             f"do:{do}", EGU=action.unit, PREC=_DIGITS, LOPR=low, HOPR=high, blocking=True, **common
         )

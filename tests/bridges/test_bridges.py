@@ -1,4 +1,4 @@
-"""One table for all doors: its names and units, what is shown without contact, and who may act."""
+"""One table for all bridges: names and units, what is shown without contact, and who may act."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import pytest
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from membrane_ctrl.config.port import DoorsConfig, EpicsConfig, MqttConfig, OpcuaConfig
+from membrane_ctrl.bridges import mqtt
+from membrane_ctrl.bridges.cli import app
+from membrane_ctrl.bridges.names import COMMANDS, TABLE, Bridge, values
+from membrane_ctrl.config.port import BridgesConfig, EpicsConfig, MqttConfig, OpcuaConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
-from membrane_ctrl.doors import mqtt
-from membrane_ctrl.doors.cli import app
-from membrane_ctrl.doors.names import COMMANDS, TABLE, Door, values
 from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
@@ -74,11 +74,13 @@ def figure(**changed: object) -> ShapeEstimate:
     return dataclasses.replace(made, **changed)  # type: ignore[arg-type]
 
 
-def door_with(role: str = "read", seen: HoldSeen | None = None, port: Path | None = None) -> Door:
+def bridge_with(
+    role: str = "read", seen: HoldSeen | None = None, port: Path | None = None
+) -> Bridge:
     where = Where(socket=port)
     feed = HoldFeed(where)
     feed.seen = seen or seen_hold()
-    return Door(feed, Config(doors=DoorsConfig(role=role)), where)  # type: ignore[arg-type]
+    return Bridge(feed, Config(bridges=BridgesConfig(role=role)), where)  # type: ignore[arg-type]
 
 
 def test_names_are_unique_and_short_enough() -> None:
@@ -153,26 +155,26 @@ def test_faults_and_notices_are_in_words() -> None:
         ("tune", "keep", False),
     ],
 )
-async def test_a_door_asks_by_its_role(
+async def test_a_bridge_asks_by_its_role(
     tmp_path: Path, role: str, command: str, refused: bool
 ) -> None:
     async with port_run(tmp_path) as run:
-        door = door_with(
+        bridge = bridge_with(
             role, dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock"
         )
-        said = await door.ask("mqtt", command)
+        said = await bridge.ask("mqtt", command)
         assert ("needs the role" in said) is refused
         assert [asked.kind for asked in run.asked] == ([] if refused else [command])
-        assert door.values()["answer"] == said
-        assert (command in door.commands) is not refused
+        assert bridge.values()["answer"] == said
+        assert (command in bridge.commands) is not refused
 
 
-async def test_a_door_locks_for_nobody_and_removes_no_lock(tmp_path: Path) -> None:
+async def test_a_bridge_locks_for_nobody_and_removes_no_lock(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
-        door = door_with(
+        bridge = bridge_with(
             "tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock"
         )
-        assert "done" in await door.ask("mqtt", "latch", "hands inside")
+        assert "done" in await bridge.ask("mqtt", "latch", "hands inside")
         (command,) = run.asked
         assert command.lock is not None
         assert (command.lock.text, command.lock.author, command.lock.account) == (
@@ -181,7 +183,7 @@ async def test_a_door_locks_for_nobody_and_removes_no_lock(tmp_path: Path) -> No
             "",
         )
         assert not command.from_person
-        assert "no such command" in await door.ask("mqtt", "unlock", command.lock.word)
+        assert "no such command" in await bridge.ask("mqtt", "unlock", command.lock.word)
         assert run.asked == [command]
 
 
@@ -196,15 +198,15 @@ def test_the_locks_are_published() -> None:
 
 
 async def test_a_hold_that_grants_less_is_not_asked(tmp_path: Path) -> None:
-    door = door_with("tune", dataclasses.replace(seen_hold(), role="read"))
-    assert "setpoint refused: needs the role operate" in await door.ask("epics", "setpoint", "1")
+    bridge = bridge_with("tune", dataclasses.replace(seen_hold(), role="read"))
+    assert "setpoint refused: needs the role operate" in await bridge.ask("epics", "setpoint", "1")
 
 
 async def test_a_safety_command_is_sent_before_the_first_contact(tmp_path: Path) -> None:
     """The role at the port is not known yet; the port itself judges."""
     async with port_run(tmp_path) as run:
-        door = door_with("operate", HoldSeen(""), tmp_path / "control.sock")
-        assert (await door.ask("epics", "stop")).endswith("stop: done")
+        bridge = bridge_with("operate", HoldSeen(""), tmp_path / "control.sock")
+        assert (await bridge.ask("epics", "stop")).endswith("stop: done")
         assert [asked.kind for asked in run.asked] == ["stop"]
 
 
@@ -234,19 +236,19 @@ async def test_nonsense_gets_an_answer(
     tmp_path: Path, command: str, given: object, says: str
 ) -> None:
     async with port_run(tmp_path) as run:
-        door = door_with(
+        bridge = bridge_with(
             "tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock"
         )
-        assert says in await door.ask("opcua", command, given)
+        assert says in await bridge.ask("opcua", command, given)
         assert run.asked == [] or given == "1e9", "the tick judges limits"
 
 
 def test_home_assistant_finds_every_name_and_only_the_allowed_commands() -> None:
-    reader = mqtt.discovery(door_with(), "membrane/mirror")["components"]
+    reader = mqtt.discovery(bridge_with(), "membrane/mirror")["components"]
     assert set(reader) == {each.name for each in TABLE}
     assert reader["error_um"]["unit_of_measurement"] == "µm"
     assert "[:255]" in reader["why"]["value_template"]
-    found = mqtt.discovery(door_with("operate"), "membrane/mirror")
+    found = mqtt.discovery(bridge_with("operate"), "membrane/mirror")
     json.dumps(found, allow_nan=False)
     commands = {name: each for name, each in found["components"].items() if name.startswith("do_")}
     assert "do_keep" not in commands
@@ -262,19 +264,19 @@ def test_home_assistant_finds_every_name_and_only_the_allowed_commands() -> None
 
 
 @pytest.mark.parametrize(
-    "door", [{"opcua": OpcuaConfig(host="0.0.0.0")}, {"epics": EpicsConfig(host="::")}], ids=str
+    "bridge", [{"opcua": OpcuaConfig(host="0.0.0.0")}, {"epics": EpicsConfig(host="::")}], ids=str
 )
-def test_nobody_unknown_acts_from_another_machine(door: dict[str, object]) -> None:
-    DoorsConfig(**door)  # type: ignore[arg-type]
+def test_nobody_unknown_acts_from_another_machine(bridge: dict[str, object]) -> None:
+    BridgesConfig(**bridge)  # type: ignore[arg-type]
     with pytest.raises(ValidationError, match="cannot tell who acts from another machine"):
-        DoorsConfig(role="operate", **door)  # type: ignore[arg-type]
-    DoorsConfig(role="operate", mqtt=MqttConfig(host="broker.lab"))  # the broker knows its users
+        BridgesConfig(role="operate", **bridge)  # type: ignore[arg-type]
+    BridgesConfig(role="operate", mqtt=MqttConfig(host="broker.lab"))  # the broker knows its users
 
 
-def test_no_door_is_said(tmp_path: Path) -> None:
+def test_no_bridge_is_said(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["--logs", str(tmp_path)])
     assert isinstance(done.exception, InputError)
-    assert "add [doors.mqtt], [doors.opcua] or [doors.epics]" in str(done.exception)
+    assert "add [bridges.mqtt], [bridges.opcua] or [bridges.epics]" in str(done.exception)
 
 
 @pytest.mark.parametrize("name", ["mqtt", "opcua", "epics"])
@@ -282,7 +284,7 @@ def test_a_missing_library_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda library: None)
-    (tmp_path / "lab.toml").write_text(f"[doors.{name}]\n")
+    (tmp_path / "lab.toml").write_text(f"[bridges.{name}]\n")
     done = CliRunner().invoke(
         app, ["--logs", str(tmp_path), "--config", str(tmp_path / "lab.toml")]
     )
@@ -293,7 +295,7 @@ def test_a_missing_library_is_named(
 def test_a_taken_port_is_named(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        (tmp_path / "lab.toml").write_text(f"[doors.epics]\nca_port = {port}\n")
+        (tmp_path / "lab.toml").write_text(f"[bridges.epics]\nca_port = {port}\n")
         done = CliRunner().invoke(
             app, ["--logs", str(tmp_path), "--config", str(tmp_path / "lab.toml")]
         )
@@ -302,5 +304,5 @@ def test_a_taken_port_is_named(tmp_path: Path) -> None:
 
 
 async def test_a_missing_password_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"doors.mqtt.password_file: .*none"):
-        await mqtt.serve(MqttConfig(password_file=str(tmp_path / "none")), door_with())
+    with pytest.raises(InputError, match=r"bridges.mqtt.password_file: .*none"):
+        await mqtt.serve(MqttConfig(password_file=str(tmp_path / "none")), bridge_with())

@@ -1,5 +1,5 @@
-"""The door to OPC UA: a server with one object; its variables are the published values, its methods
-the commands.
+"""The bridge to OPC UA: a server with one object; its variables are the published values, its
+methods the commands.
 
 Without contact to the hold a variable has the status `BadNoCommunication` and no value. Sessions
 are anonymous, or of the users of a file; without a certificate they are not encrypted.
@@ -15,9 +15,9 @@ from asyncua import Server, ua
 from asyncua.common.node import Node
 from cryptography.hazmat.primitives.asymmetric import rsa
 
+from membrane_ctrl.bridges.names import TABLE, Bridge, Value
+from membrane_ctrl.bridges.opcua_server import AnonymousClients, BridgeServer, NamedClients, caller
 from membrane_ctrl.config.port import OpcuaConfig
-from membrane_ctrl.doors.names import TABLE, Door, Value
-from membrane_ctrl.doors.opcua_server import AnonymousClients, BridgeServer, NamedClients, caller
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.service.access import Action
 from membrane_ctrl.service.accounts import KnownUser, known_users
@@ -31,7 +31,7 @@ _ENCRYPTED = [
 ]
 
 
-async def serve(config: OpcuaConfig, door: Door) -> None:
+async def serve(config: OpcuaConfig, bridge: Bridge) -> None:
     """Serve until cancelled.
 
     Raises InputError for a bad file of users, certificate or key, DeviceError if the address is
@@ -39,16 +39,16 @@ async def serve(config: OpcuaConfig, door: Door) -> None:
     """
     where = f"opc.tcp://{config.host}:{config.port}/membrane_ctrl"
     users = _read_users(config)
-    async with door.opening:
+    async with bridge.opening:
         server = BridgeServer(AnonymousClients() if users is None else NamedClients(users))
         await server.init()
         server.set_endpoint(where)
         server.set_server_name("membrane_ctrl")
-        await _secure(server, config, door.settings.name)
-        space = await server.register_namespace(f"urn:membrane-ctrl:{door.settings.name}")
-        nodes = await _nodes(server, space, door, users)
+        await _secure(server, config, bridge.settings.name)
+        space = await server.register_namespace(f"urn:membrane-ctrl:{bridge.settings.name}")
+        nodes = await _nodes(server, space, bridge, users)
         await _show(
-            server, nodes, door
+            server, nodes, bridge
         )  # nobody may see the zeros that the variables were made with
         try:
             await server.start()
@@ -59,8 +59,8 @@ async def serve(config: OpcuaConfig, door: Door) -> None:
     print(f"opcua: {where}", file=sys.stderr, flush=True)
     try:
         while True:
-            await _show(server, nodes, door)
-            await asyncio.sleep(door.settings.period_s)
+            await _show(server, nodes, bridge)
+            await asyncio.sleep(bridge.settings.period_s)
     finally:
         await server.stop()
 
@@ -72,11 +72,11 @@ def _read_users(config: OpcuaConfig) -> dict[str, KnownUser] | None:
     try:
         text = files.read_text(Path(config.users_file), follow=True)
     except (OSError, ValueError) as error:
-        raise errors.InputError(f"doors.opcua.users_file: {error}") from None
+        raise errors.InputError(f"bridges.opcua.users_file: {error}") from None
     users = known_users(text, config.users_file)
     if not users:
         raise errors.InputError(
-            f"doors.opcua.users_file: {config.users_file} has no users; add one with web add-user"
+            f"bridges.opcua.users_file: {config.users_file} has no users; add one with web add-user"
         )
     return users
 
@@ -99,25 +99,27 @@ async def _secure(server: BridgeServer, config: OpcuaConfig, name: str) -> None:
         try:
             await load(Path(file), format="pem")
         except (OSError, ValueError, TypeError) as error:
-            raise errors.InputError(f"doors.opcua.{key}: {file}: {error}") from None
+            raise errors.InputError(f"bridges.opcua.{key}: {file}: {error}") from None
     if not isinstance(server.iserver.certificate.public_key(), rsa.RSAPublicKey):
         raise errors.InputError(
-            f"doors.opcua.certificate_file: {config.certificate_file}: OPC UA needs an RSA key"
+            f"bridges.opcua.certificate_file: {config.certificate_file}: OPC UA needs an RSA key"
         )
     if not isinstance(server.iserver.private_key, rsa.RSAPrivateKey):
-        raise errors.InputError(f"doors.opcua.key_file: {config.key_file}: OPC UA needs an RSA key")
+        raise errors.InputError(
+            f"bridges.opcua.key_file: {config.key_file}: OPC UA needs an RSA key"
+        )
 
 
-async def _show(server: Server, nodes: dict[str, Node], door: Door) -> None:
-    for name, value in door.values().items():
-        await server.write_attribute_value(nodes[name].nodeid, _data(value, door.live))
+async def _show(server: Server, nodes: dict[str, Node], bridge: Bridge) -> None:
+    for name, value in bridge.values().items():
+        await server.write_attribute_value(nodes[name].nodeid, _data(value, bridge.live))
 
 
 async def _nodes(
-    server: Server, space: int, door: Door, users: dict[str, KnownUser] | None
+    server: Server, space: int, bridge: Bridge, users: dict[str, KnownUser] | None
 ) -> dict[str, Node]:
     """Make the object with its variables and methods; returns the variables by name."""
-    name = door.settings.name
+    name = bridge.settings.name
     mirror = await server.nodes.objects.add_object(
         ua.NodeId(name, space), ua.QualifiedName(name, space)
     )
@@ -140,11 +142,11 @@ async def _nodes(
                 ua.NodeId(f"{name}.{each.name}.unit", space), "0:EngineeringUnits", unit
             )
         found[each.name] = node
-    for do, action in door.commands.items():
+    for do, action in bridge.commands.items():
         given = [_argument(action)] if action.asks else []
         node_id, browse_name = ua.NodeId(f"{name}.do.{do}", space), ua.QualifiedName(do, space)
         answer = ua.Argument(Name="answer", DataType=ua.NodeId(ua.ObjectIds.String))
-        await mirror.add_method(node_id, browse_name, _method(door, do, users), given, [answer])
+        await mirror.add_method(node_id, browse_name, _method(bridge, do, users), given, [answer])
     return found
 
 
@@ -158,13 +160,13 @@ def _argument(action: Action) -> ua.Argument:
     )
 
 
-def _method(door: Door, do: str, users: dict[str, KnownUser] | None) -> Any:
+def _method(bridge: Bridge, do: str, users: dict[str, KnownUser] | None) -> Any:
     async def call(parent: ua.NodeId, *given: ua.Variant) -> list[ua.Variant] | ua.StatusCode:
         if len(given) > 1 or any(not isinstance(each.Value, float | int | str) for each in given):
             return ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
         who = caller.get()
         role = None if users is None else users[who].role
-        said = await door.ask("opcua", do, given[0].Value if given else "", role, who)
+        said = await bridge.ask("opcua", do, given[0].Value if given else "", role, who)
         return [ua.Variant(said, ua.VariantType.String)]
 
     return call

@@ -32,7 +32,7 @@ def require_unserved(record: str, ca_port: int) -> None:
     if server:
         raise errors.DeviceError(
             f"epics: another server ({server}) has the record {record}; stop that one, or "
-            "choose another doors.name"
+            "choose another bridges.name"
         )
 
 

@@ -19,12 +19,12 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID
 from pydantic import ValidationError
 
-from membrane_ctrl.config.port import DoorsConfig, OpcuaConfig
+from membrane_ctrl.bridges import opcua
+from membrane_ctrl.config.port import BridgesConfig, OpcuaConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY
-from membrane_ctrl.doors import opcua
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.service.accounts import known_user
-from tests.doors.test_doors import door_with, seen_hold
+from tests.bridges.test_bridges import bridge_with, seen_hold
 from tests.worlds.free_port import free_port
 from tests.worlds.port_run import PortRun, port_run
 
@@ -69,9 +69,9 @@ async def bridge(
     seen = dataclasses.replace(seen_hold(), name="the-run", seen_s=time.monotonic() + 1e6)
     asyncio.get_running_loop().set_debug(False)  # which makes a call ten times as slow
     async with port_run(folder) as run:
-        door = door_with(role, seen, folder / "control.sock")
+        bridge = bridge_with(role, seen, folder / "control.sock")
         config = OpcuaConfig(port=port, **settings)  # type: ignore[arg-type]
-        serving = asyncio.create_task(opcua.serve(config, door))
+        serving = asyncio.create_task(opcua.serve(config, bridge))
         try:
             async with asyncio.timeout(60.0):
                 while not serving.done():
@@ -86,7 +86,7 @@ async def bridge(
         finally:
             serving.cancel()
             await asyncio.gather(serving, return_exceptions=True)
-            await door.close()
+            await bridge.close()
 
 
 def client_of(url: str, name: str = "", password: str = "") -> Client:
@@ -191,7 +191,7 @@ async def test_only_known_users_have_a_session_and_each_has_its_role(
             mirror, space = await mirror_of(operator)
             assert (await mirror.call_method(f"{space}:shape_on")).endswith("shape on: done")
         assert [(command.kind, command.why) for command in run.asked] == [
-            ("shape_on", "door: opcua, anna")
+            ("shape_on", "bridge: opcua, anna")
         ]
 
 
@@ -242,23 +242,25 @@ async def test_encrypted_sessions_only_with_a_certificate(tmp_path: Path, users_
 
 
 async def test_a_bad_file_is_named(tmp_path: Path) -> None:
-    door = door_with("operate")
-    with pytest.raises(InputError, match=r"doors.opcua.users_file: .*none"):
-        await opcua.serve(OpcuaConfig(users_file=str(tmp_path / "none")), door)
+    bridge = bridge_with("operate")
+    with pytest.raises(InputError, match=r"bridges.opcua.users_file: .*none"):
+        await opcua.serve(OpcuaConfig(users_file=str(tmp_path / "none")), bridge)
     (tmp_path / "empty").write_text("# nobody\n")
     with pytest.raises(InputError, match="has no users; add one"):
-        await opcua.serve(OpcuaConfig(users_file=str(tmp_path / "empty")), door)
+        await opcua.serve(OpcuaConfig(users_file=str(tmp_path / "empty")), bridge)
     (tmp_path / "junk.pem").write_text("junk")
     junk = str(tmp_path / "junk.pem")
-    with pytest.raises(InputError, match=r"doors.opcua.certificate_file: .*junk"):
-        await opcua.serve(OpcuaConfig(certificate_file=junk, key_file=junk, port=free_port()), door)
+    with pytest.raises(InputError, match=r"bridges.opcua.certificate_file: .*junk"):
+        await opcua.serve(
+            OpcuaConfig(certificate_file=junk, key_file=junk, port=free_port()), bridge
+        )
 
 
 async def test_a_second_server_on_the_port_is_refused(tmp_path: Path) -> None:
     async with bridge(tmp_path) as (_, url):
         port = int(url.split(":")[2].split("/")[0])
         with pytest.raises(DeviceError, match=r"address already in use.*choose another port"):
-            await opcua.serve(OpcuaConfig(port=port), door_with("operate"))
+            await opcua.serve(OpcuaConfig(port=port), bridge_with("operate"))
 
 
 def test_what_may_be_configured() -> None:
@@ -268,6 +270,6 @@ def test_what_may_be_configured() -> None:
     with pytest.raises(ValidationError, match="give both files"):
         OpcuaConfig(certificate_file="a.pem")
     safe = OpcuaConfig(certificate_file="a.pem", key_file="a.key", **everywhere)  # type: ignore[arg-type]
-    DoorsConfig(role="operate", opcua=safe)
+    BridgesConfig(role="operate", opcua=safe)
     with pytest.raises(ValidationError, match="give users_file, or keep role = 'read'"):
-        DoorsConfig(role="operate", opcua=OpcuaConfig(host="0.0.0.0"))
+        BridgesConfig(role="operate", opcua=OpcuaConfig(host="0.0.0.0"))

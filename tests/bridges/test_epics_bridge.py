@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from membrane_ctrl.bridges import epics
+from membrane_ctrl.bridges.epics_search import find_server, require_unserved
 from membrane_ctrl.config.port import EpicsConfig
-from membrane_ctrl.doors import epics
-from membrane_ctrl.doors.epics_search import find_server, require_unserved
 from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model.errors import DeviceError
-from tests.doors.test_door_clients import SERVERS, doors, held, program
-from tests.doors.test_doors import door_with, seen_hold
+from tests.bridges.test_bridge_clients import SERVERS, bridges, held, program
+from tests.bridges.test_bridges import bridge_with, seen_hold
 from tests.worlds.free_port import free_port
 from tests.worlds.port_run import port_run
 
@@ -27,7 +27,7 @@ async def test_a_second_bridge_of_the_same_records_on_this_machine_is_refused() 
         device_claim.claim_devices(["EPICS records mirror:*"]),
         pytest.raises(DeviceError, match=r"EPICS records mirror:\*: in use by"),
     ):
-        await epics.serve(EpicsConfig(ca_port=free_port(), pva_port=free_port()), door_with())
+        await epics.serve(EpicsConfig(ca_port=free_port(), pva_port=free_port()), bridge_with())
 
 
 @pytest.mark.campaign
@@ -35,8 +35,8 @@ async def test_a_second_bridge_of_the_same_records_on_this_machine_is_refused() 
 async def test_two_bridges_of_one_prefix_with_different_ports(tmp_path: Path) -> None:
     ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
     others = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
-    only_epics = "[doors.epics]" + SERVERS.partition("[doors.epics]")[2]
-    async with held(tmp_path), doors(tmp_path, only_epics.format(**ports)) as first:
+    only_epics = "[bridges.epics]" + SERVERS.partition("[bridges.epics]")[2]
+    async with held(tmp_path), bridges(tmp_path, only_epics.format(**ports)) as first:
         assert (
             await asyncio.to_thread(find_server, "mirror:state", [("127.0.0.1", ports["ca"])])
             == "127.0.0.1"
@@ -50,7 +50,7 @@ async def test_two_bridges_of_one_prefix_with_different_ports(tmp_path: Path) ->
         words = (
             "-m",
             "membrane_ctrl",
-            "doors",
+            "bridges",
             "--config",
             str(second / "lab.toml"),
             "--logs",
@@ -108,9 +108,9 @@ async def test_a_put_flood_of_one_record_does_not_delay_a_latch(tmp_path: Path) 
     """Each record hands its value to the bridge on its own; what waits there is bounded."""
     async with port_run(tmp_path) as run:
         seen = dataclasses.replace(seen_hold(), name="the-run")
-        door = door_with("operate", seen, tmp_path / "control.sock")
-        flood = [asyncio.create_task(door.ask("epics", "shape_on", 1)) for _ in range(150)]
+        bridge = bridge_with("operate", seen, tmp_path / "control.sock")
+        flood = [asyncio.create_task(bridge.ask("epics", "shape_on", 1)) for _ in range(150)]
         async with asyncio.timeout(1.0):
-            assert (await door.ask("epics", "latch", "hands inside")).endswith("latch: done")
+            assert (await bridge.ask("epics", "latch", "hands inside")).endswith("latch: done")
         await asyncio.gather(*flood)
         assert "latch" in [command.kind for command in run.asked][:2]

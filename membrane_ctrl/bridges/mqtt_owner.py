@@ -185,5 +185,5 @@ class NameOwnership:
         raise errors.DeviceError(
             f"mqtt: {self._what} is in use by another bridge (process {rival.pid} on "
             f"{rival.host}); "
-            "stop that one, or choose another doors.name"
+            "stop that one, or choose another bridges.name"
         )

@@ -28,7 +28,7 @@ from asyncua.server.binary_server_asyncio import BinaryServer, OPCUAProtocol
 from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import nodeid_from_binary, struct_from_binary
 
-from membrane_ctrl.doors.connection_turns import Turns
+from membrane_ctrl.bridges.connection_turns import Turns
 from membrane_ctrl.service.accounts import KnownUser, known_user
 
 _CALL = ua.NodeId(ua.ObjectIds.CallRequest_Encoding_DefaultBinary)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from membrane_ctrl.doors.connection_turns import Turns
+from membrane_ctrl.bridges.connection_turns import Turns
 
 
 def test_turns_come_back_with_time_and_memory_is_bounded() -> None:

@@ -19,17 +19,17 @@ from pathlib import Path
 import aiomqtt
 import pytest
 
+from membrane_ctrl.bridges import mqtt, mqtt_owner
+from membrane_ctrl.bridges.mqtt_client import CancellableClient
+from membrane_ctrl.bridges.mqtt_inbox import Reports
+from membrane_ctrl.bridges.mqtt_owner import OwnerClaim
+from membrane_ctrl.bridges.names import Bridge
 from membrane_ctrl.config.port import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY
-from membrane_ctrl.doors import mqtt, mqtt_owner
-from membrane_ctrl.doors.mqtt_client import CancellableClient
-from membrane_ctrl.doors.mqtt_inbox import Reports
-from membrane_ctrl.doors.mqtt_owner import OwnerClaim
-from membrane_ctrl.doors.names import Door
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.telemetry import State
-from tests.doors.test_door_clients import broker, program
-from tests.doors.test_doors import STRANGE_NUMBERS, door_with, seen_hold
+from tests.bridges.test_bridge_clients import broker, program
+from tests.bridges.test_bridges import STRANGE_NUMBERS, bridge_with, seen_hold
 from tests.support.machine_needs import needs, program_path
 from tests.support.peak_memory import peak_mb, reset_peak
 from tests.worlds.free_port import free_port
@@ -50,24 +50,24 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt_owner, "BEAT_S", 1.0)
 
 
-def door_to(folder: Path, role: str = "operate") -> Door:
+def bridge_to(folder: Path, role: str = "operate") -> Bridge:
     seen = dataclasses.replace(
         seen_hold(error_um=0.25), name="the-run", seen_s=time.monotonic() + 1e6
     )
-    return door_with(role, seen, folder / "control.sock")
+    return bridge_with(role, seen, folder / "control.sock")
 
 
 @asynccontextmanager
-async def serving(port: int, door: Door) -> AsyncIterator[asyncio.Task[None]]:
+async def serving(port: int, bridge: Bridge) -> AsyncIterator[asyncio.Task[None]]:
     """A bridge in this process; ended cleanly."""
-    task = asyncio.create_task(mqtt.serve(MqttConfig(port=port, discovery_prefix=""), door))
+    task = asyncio.create_task(mqtt.serve(MqttConfig(port=port, discovery_prefix=""), bridge))
     try:
         yield task
     finally:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError, ExceptionGroup):
             await task
-        await door.close()
+        await bridge.close()
 
 
 class Listener:
@@ -124,7 +124,7 @@ async def bridge(folder: Path) -> AsyncIterator[tuple[PortRun, Listener, int]]:
         port_run(folder) as run,
         broker(port),
         listening(port) as listener,
-        serving(port, door_to(folder)),
+        serving(port, bridge_to(folder)),
     ):
         await listener.until(lambda: "online" in listener.of("availability"))
         yield run, listener, port
@@ -237,7 +237,7 @@ async def test_a_retained_command_is_never_obeyed(tmp_path: Path, command: str) 
         await send(port, f"do/{command}", "old", retain=True)
         for _ in range(2):  # at the first connection, and at the next one
             listener.seen.clear()
-            async with serving(port, door_to(tmp_path)):
+            async with serving(port, bridge_to(tmp_path)):
                 assert (
                     await listener.answer(command)
                     == f"{command} refused: a retained message is no command"
@@ -247,10 +247,10 @@ async def test_a_retained_command_is_never_obeyed(tmp_path: Path, command: str) 
 
 @pytest.mark.parametrize("text", STRANGE_NUMBERS)
 async def test_a_text_that_is_no_number_is_refused(tmp_path: Path, text: str) -> None:
-    door = door_to(tmp_path)
+    bridge = bridge_to(tmp_path)
     async with port_run(tmp_path) as run:
         for payload in (text, text.encode()):
-            assert "Setpoint: enter a number in µm" in await door.ask("mqtt", "setpoint", payload)
+            assert "Setpoint: enter a number in µm" in await bridge.ask("mqtt", "setpoint", payload)
         assert run.asked == []
 
 
@@ -289,10 +289,10 @@ async def test_garbage_on_every_topic_is_answered_and_the_bridge_goes_on(tmp_pat
 
 
 async def test_a_latch_with_a_bad_text_is_obeyed(tmp_path: Path) -> None:
-    door = door_to(tmp_path)
+    bridge = bridge_to(tmp_path)
     async with port_run(tmp_path) as run:
         for payload in (b"\xff\xfe", b"hands\ninside", b"x" * 100_000, "ü" * 400, ""):
-            assert (await door.ask("mqtt", "latch", payload)).endswith("latch: done")
+            assert (await bridge.ask("mqtt", "latch", payload)).endswith("latch: done")
         assert [command.text for command in run.asked][:2] == ["\ufffd\ufffd", "hands?inside"]
 
 
@@ -306,7 +306,7 @@ async def test_an_old_will_is_corrected_within_seconds(tmp_path: Path) -> None:
         broker(port),
         listening(port) as listener,
         relay(relay_port, port) as reset,
-        serving(relay_port, door_to(tmp_path)),
+        serving(relay_port, bridge_to(tmp_path)),
     ):
         await listener.until(lambda: "online" in listener.of("availability"))
         for _ in range(3):
@@ -377,7 +377,7 @@ async def test_a_wrong_availability_is_corrected_but_not_by_a_storm(tmp_path: Pa
 async def test_a_second_bridge_of_the_name_is_refused_and_the_first_goes_on(tmp_path: Path) -> None:
     async with bridge(tmp_path) as (_, listener, port):
         begin_s = time.monotonic()
-        async with serving(port, door_to(tmp_path)) as second:
+        async with serving(port, bridge_to(tmp_path)) as second:
             with pytest.raises(ExceptionGroup) as refused:
                 await second
             assert time.monotonic() - begin_s < 8.0
@@ -398,8 +398,8 @@ async def test_of_two_bridges_that_start_together_one_goes_on(tmp_path: Path) ->
         async with (
             broker(port),
             listening(port) as listener,
-            serving(port, door_to(tmp_path)) as one,
-            serving(port, door_to(tmp_path)) as two,
+            serving(port, bridge_to(tmp_path)) as one,
+            serving(port, bridge_to(tmp_path)) as two,
         ):
             done, pending = await asyncio.wait(
                 {one, two}, timeout=PATIENCE_S, return_when=asyncio.FIRST_COMPLETED
@@ -424,7 +424,7 @@ async def test_the_claim_of_a_crashed_bridge_expires(tmp_path: Path) -> None:
     async with broker(port), listening(port) as listener:
         await send(port, "owner", claim.encode(), retain=True)
         begin_s = time.monotonic()
-        async with serving(port, door_to(tmp_path)):
+        async with serving(port, bridge_to(tmp_path)):
             await listener.until(lambda: "online" in listener.of("availability"))
             assert mqtt_owner.SILENT_S < time.monotonic() - begin_s < mqtt_owner.SILENT_S + 5.0
 
@@ -435,7 +435,7 @@ async def test_a_bridge_that_ends_frees_the_name_at_once(tmp_path: Path) -> None
         for _ in range(2):
             listener.seen.clear()
             begin_s = time.monotonic()
-            async with serving(port, door_to(tmp_path)):
+            async with serving(port, bridge_to(tmp_path)):
                 await listener.until(lambda: "online" in listener.of("availability"))
                 assert time.monotonic() - begin_s < mqtt_owner.SILENT_S
             await listener.until(
@@ -447,7 +447,11 @@ async def test_a_bridge_that_ends_frees_the_name_at_once(tmp_path: Path) -> None
 
 async def test_an_owner_that_comes_back_ends_the_bridge_that_took_its_name(tmp_path: Path) -> None:
     port = free_port()
-    async with broker(port), serving(port, door_to(tmp_path)) as task, listening(port) as listener:
+    async with (
+        broker(port),
+        serving(port, bridge_to(tmp_path)) as task,
+        listening(port) as listener,
+    ):
         await listener.until(lambda: "online" in listener.of("availability"))
         older = OwnerClaim(NOT_OURS, "elsewhere", 1, 5.0)
         await send(port, "owner", older.encode())
@@ -475,8 +479,8 @@ async def test_a_bridge_ends_though_its_broker_hangs_or_dies_at_that_moment(
     monkeypatch.setattr(mqtt, "_ANSWER_S", 1.0)
     port = free_port()
     async with program(program_path("mosquitto"), "-p", str(port)) as process:
-        door = door_to(tmp_path)
-        task = asyncio.create_task(mqtt.serve(MqttConfig(port=port, discovery_prefix=""), door))
+        bridge = bridge_to(tmp_path)
+        task = asyncio.create_task(mqtt.serve(MqttConfig(port=port, discovery_prefix=""), bridge))
         async with contextlib.AsyncExitStack() as stack:
             await asyncio.sleep(1.0)
             listener = await stack.enter_async_context(listening(port))
@@ -507,12 +511,12 @@ async def test_a_broker_that_does_not_answer_costs_neither_memory_nor_commands(
     port = free_port()
     server = await asyncio.start_server(serve, "127.0.0.1", port)
     before_mb = reset_peak()
-    door = door_to(tmp_path)
-    async with port_run(tmp_path) as run, serving(port, door) as task:
+    bridge = bridge_to(tmp_path)
+    async with port_run(tmp_path) as run, serving(port, bridge) as task:
         begin_s = time.monotonic()
         while time.monotonic() - begin_s < 4.0:
             asked_s = time.monotonic()
-            assert (await door.ask("opcua", "stop")).endswith("stop: done")
+            assert (await bridge.ask("opcua", "stop")).endswith("stop: done")
             assert time.monotonic() - asked_s < ANSWER_S
             await asyncio.sleep(0.2)
         assert "stop" in kinds(run)

@@ -1,5 +1,5 @@
-"""Clients of other makers at the doors read, are refused or obeyed, and survive a restart of either
-side.
+"""Clients of other makers at the bridges read, are refused or obeyed, and survive a restart of
+either side.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from membrane_ctrl.doors.names import TABLE
+from membrane_ctrl.bridges.names import TABLE
 from tests.studies.bridge_clients import lines
 from tests.support.machine_needs import needs, program_path
 from tests.worlds.free_port import free_port
@@ -45,19 +45,19 @@ async def program(*words: str, **env: str) -> AsyncIterator[asyncio.subprocess.P
 
 
 @asynccontextmanager
-async def doors(folder: Path, text: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    """`membrane-ctrl doors` with the settings, once all doors are open."""
+async def bridges(folder: Path, text: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """`membrane-ctrl bridges` with the settings, once all bridges are open."""
     (folder / "lab.toml").write_text(text)
     words = ["--config", str(folder / "lab.toml"), "--logs", str(folder)]
     async with program(
-        sys.executable, "-c", "from membrane_ctrl.doors.cli import app; app()", *words
+        sys.executable, "-c", "from membrane_ctrl.bridges.cli import app; app()", *words
     ) as process:
-        wanted = {name for name in ("mqtt", "opcua", "epics") if f"[doors.{name}]" in text}
+        wanted = {name for name in ("mqtt", "opcua", "epics") if f"[bridges.{name}]" in text}
         assert process.stdout is not None
         async with asyncio.timeout(PATIENCE_S):
             while wanted:
                 line = (await process.stdout.readline()).decode()
-                assert line, "the doors ended"
+                assert line, "the bridges ended"
                 wanted.discard(line.partition(":")[0])
         yield process
 
@@ -142,12 +142,12 @@ async def said_by(script: str, ports: dict[str, int], wanted: object = None) -> 
     return dict(json.loads(out.splitlines()[-1]))
 
 
-SERVERS = """[doors]
+SERVERS = """[bridges]
 role = "operate"
 period_s = 0.5
-[doors.opcua]
+[bridges.opcua]
 port = {opcua}
-[doors.epics]
+[bridges.epics]
 ca_port = {ca}
 pva_port = {pva}
 """
@@ -258,11 +258,11 @@ async def main():
     print(json.dumps(found))
 asyncio.run(main())
 """
-MQTT = """[doors]
+MQTT = """[bridges]
 name = "bench"
 role = "operate"
 period_s = 0.5
-[doors.mqtt]
+[bridges.mqtt]
 port = {port}
 """
 
@@ -273,13 +273,13 @@ async def test_mqtt_tells_obeys_and_survives_restarts(tmp_path: Path) -> None:
     async with (
         AsyncExitStack() as first_broker,
         AsyncExitStack() as first_hold,
-        AsyncExitStack() as door_stack,
+        AsyncExitStack() as bridge_stack,
     ):
         run = await first_hold.enter_async_context(held(tmp_path))
         await first_broker.enter_async_context(broker(port))
         await told(port, f"{base}/do/vent", "PRESS", "-r")  # stays at the broker
         async with hearing(port, f"{base}/answer") as answer:
-            door = await door_stack.enter_async_context(doors(tmp_path, settings))
+            bridge = await bridge_stack.enter_async_context(bridges(tmp_path, settings))
             assert await answer() == "vent refused: a retained message is no command"
             values = json.loads(await heard(port, f"{base}/values", '"hold"'))
             assert (values["error_um"], values["run"]) == (0.25, "the-run")
@@ -304,7 +304,7 @@ async def test_mqtt_tells_obeys_and_survives_restarts(tmp_path: Path) -> None:
             assert json.loads(await heard(port, f"{base}/values"))["error_um"] is None
             async with held(tmp_path):
                 await heard(port, f"{base}/availability", "online")
-                door.kill()
+                bridge.kill()
                 await heard(port, f"{base}/availability", "offline")
 
 
@@ -312,7 +312,7 @@ async def test_mqtt_tells_obeys_and_survives_restarts(tmp_path: Path) -> None:
 async def test_opc_ua_and_epics_tell_refuse_and_obey(tmp_path: Path) -> None:
     ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
     settings = SERVERS.format(**ports)
-    async with held(tmp_path) as run, doors(tmp_path, settings):
+    async with held(tmp_path) as run, bridges(tmp_path, settings):
         found = await said_by(OPCUA_CLIENT, ports)
         assert found == {
             "error_um": 0.25,
@@ -348,7 +348,7 @@ async def test_opc_ua_and_epics_tell_refuse_and_obey(tmp_path: Path) -> None:
 async def test_opc_ua_and_epics_survive_the_hold(tmp_path: Path) -> None:
     ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
     good, bad = {"opcua": "Good", "epics": 0}, {"opcua": "BadNoCommunication", "epics": 3}
-    async with doors(tmp_path, SERVERS.format(**ports)):
+    async with bridges(tmp_path, SERVERS.format(**ports)):
         for _ in range(2):
             async with held(tmp_path):
                 assert await said_by(WATCHER, ports, good) == good
@@ -358,7 +358,7 @@ async def test_opc_ua_and_epics_survive_the_hold(tmp_path: Path) -> None:
 @pytest.mark.campaign
 async def test_hostile_clients_change_nothing(tmp_path: Path) -> None:
     ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
-    async with held(tmp_path) as run, doors(tmp_path, SERVERS.format(**ports)):
+    async with held(tmp_path) as run, bridges(tmp_path, SERVERS.format(**ports)):
         finite = "Setpoint: enter a finite number in µm"
         assert await said_by(HOSTILE_OPCUA, ports) == {
             "nan": finite,
@@ -401,7 +401,7 @@ async def fresh(file: Path, after_s: float) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", ["opcua", "ca", "pva"])
-async def test_a_client_and_its_door_may_be_killed(tmp_path: Path, kind: str) -> None:
+async def test_a_client_and_its_bridge_may_be_killed(tmp_path: Path, kind: str) -> None:
     ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
     part = (
         sys.executable,
@@ -415,15 +415,15 @@ async def test_a_client_and_its_door_may_be_killed(tmp_path: Path, kind: str) ->
     env = {
         "EPICS_PVA_NAME_SERVERS": f"127.0.0.1:{ports['pva']}",
         "EPICS_PVA_ADDR_LIST": "",
-    }  # this door, no other
+    }  # this bridge, no other
     async with held(tmp_path), AsyncExitStack() as stack:
-        async with doors(tmp_path, settings) as door:
+        async with bridges(tmp_path, settings) as bridge:
             async with program(*part, **env):  # killed at the end
                 await fresh(seen, time.time())
             client = await stack.enter_async_context(program(*part, **env))
             await fresh(seen, time.time())
-            door.kill()
-            await door.wait()
-        async with doors(tmp_path, settings):
+            bridge.kill()
+            await bridge.wait()
+        async with bridges(tmp_path, settings):
             await fresh(seen, time.time())
             assert client.returncode is None, "the same client"

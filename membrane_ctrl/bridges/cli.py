@@ -1,4 +1,4 @@
-"""`membrane-ctrl doors`: one process that follows a hold and serves
+"""`membrane-ctrl bridges`: one process that follows a hold and serves
 it to the lab's other systems.
 """
 
@@ -15,23 +15,23 @@ import typer
 from membrane_ctrl.model import errors
 
 if TYPE_CHECKING:
-    from membrane_ctrl.doors.names import Door
+    from membrane_ctrl.bridges.names import Bridge
 
 _BRIDGES = ("opcua", "epics", "mqtt")  # tables of the configuration, and modules
 
 app = typer.Typer(
     invoke_without_command=True,
     rich_markup_mode="markdown",
-    help="Open the doors of `[doors]`: the hold's values by MQTT, OPC UA and EPICS, and commands "
-    "by role.",
+    help="Open the bridges of `[bridges]`: the hold's values by MQTT, OPC UA and EPICS, and "
+    "commands by role.",
 )
 
 
 @app.callback()
-def doors(
+def bridges(
     context: typer.Context,
     config: Annotated[
-        Path | None, typer.Option("--config", help="Configuration with the table `[doors]`.")
+        Path | None, typer.Option("--config", help="Configuration with the table `[bridges]`.")
     ] = None,
     logs: Annotated[Path | None, typer.Option("--logs", help="Folder of the runs.")] = None,
     socket: Annotated[
@@ -43,49 +43,49 @@ def doors(
         return
     import asyncio
 
+    from membrane_ctrl.bridges.names import Bridge
     from membrane_ctrl.cli.options import load_configuration
     from membrane_ctrl.config.needed_packages import missing_packages
-    from membrane_ctrl.doors.names import Door
 
     settings = load_configuration(config)
     for needed in missing_packages(settings):
         raise errors.InputError(needed.missing_line)
-    if not any(getattr(settings.doors, name) for name in _BRIDGES):
+    if not any(getattr(settings.bridges, name) for name in _BRIDGES):
         raise errors.InputError(
-            "no bridge is configured: add [doors.mqtt], [doors.opcua] or [doors.epics] "
+            "no bridge is configured: add [bridges.mqtt], [bridges.opcua] or [bridges.epics] "
             "(docs/how-to/bridges.md)"
         )
-    asyncio.run(_serve(Door.to(settings, logs, socket)))
+    asyncio.run(_serve(Bridge.to(settings, logs, socket)))
 
 
 @app.command()
 def names() -> None:
     """Print the published names with their units, as a Markdown table."""
-    from membrane_ctrl.doors.names import TABLE, table_lines
+    from membrane_ctrl.bridges.names import TABLE, table_lines
 
     print("\n".join(table_lines(TABLE)))
 
 
-async def _serve(door: Door) -> None:
+async def _serve(bridge: Bridge) -> None:
     import asyncio
 
-    opened = _opened(door)
+    opened = _opened(bridge)
     main = asyncio.current_task()
     assert main is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)
     wrong: BaseExceptionGroup[errors.CommandError] | None = None
-    door.feed.open()
+    bridge.feed.open()
     try:
-        async with asyncio.TaskGroup() as all_doors:
+        async with asyncio.TaskGroup() as all_bridges:
             for each in opened:
-                all_doors.create_task(each)
+                all_bridges.create_task(each)
     except* errors.CommandError as group:
         wrong = group
     except* asyncio.CancelledError:
-        print("doors: closed", file=sys.stderr)
+        print("bridges: closed", file=sys.stderr)
     finally:
-        await door.close()
-        await asyncio.to_thread(door.feed.close)
+        await bridge.close()
+        await asyncio.to_thread(bridge.feed.close)
     if wrong is not None:
         raise _first_error(wrong)
 
@@ -96,12 +96,14 @@ def _first_error(group: BaseExceptionGroup[errors.CommandError]) -> errors.Comma
     return _first_error(first) if isinstance(first, BaseExceptionGroup) else first
 
 
-def _opened(door: Door) -> list[Any]:
-    """The doors of the settings, to be awaited."""
+def _opened(bridge: Bridge) -> list[Any]:
+    """The bridges of the settings, to be awaited."""
     opened = []
     for name in _BRIDGES:
-        settings = getattr(door.settings, name)
+        settings = getattr(bridge.settings, name)
         if settings is None:
             continue
-        opened.append(importlib.import_module(f"membrane_ctrl.doors.{name}").serve(settings, door))
+        opened.append(
+            importlib.import_module(f"membrane_ctrl.bridges.{name}").serve(settings, bridge)
+        )
     return opened

@@ -1,5 +1,5 @@
-"""What every door publishes: one table of names with units, their values, and who may act through a
-door.
+"""What every bridge publishes: one table of names with units, their values, and who may act
+through a bridge.
 """
 
 import asyncio
@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from membrane_ctrl.bridges.command_lanes import CommandLanes
+from membrane_ctrl.bridges.hold_link import SendLimits, send_command
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.outcome import Outcome
@@ -17,8 +19,6 @@ from membrane_ctrl.control_port.protocol import TEXT_BYTES
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.status import fault_line, lock_lines, notice_lines
 from membrane_ctrl.controller.commands import Role
-from membrane_ctrl.doors.command_lanes import CommandLanes
-from membrane_ctrl.doors.hold_link import SendLimits, send_command
 from membrane_ctrl.model.columns import PUBLISHED, unit_of
 from membrane_ctrl.model.notices import Topic
 from membrane_ctrl.model.numbers import parse_number
@@ -114,14 +114,14 @@ def values(seen: HoldSeen) -> dict[str, Value]:
     }
 
 
-class Door:
-    """What a door knows and may do: the values, and commands by role; shared by all doors of the
-    process.
+class Bridge:
+    """The values that bridges publish and the commands that they may send, by role; shared by all
+    bridges of the process.
     """
 
     def __init__(self, feed: HoldFeed, config: Config, where: Where | None = None) -> None:
         self.feed = feed
-        self.settings = config.doors
+        self.settings = config.bridges
         limits, flow_max = config.limits, config.loop.flow_most_um_per_s(config.pump)
         # what the hold would accept; it judges by itself
         self.bounds: dict[str, tuple[float, float]] = {
@@ -137,11 +137,11 @@ class Door:
         ] = []  # get the late outcomes of safety commands
         self.opening = (
             asyncio.Lock()
-        )  # one door after the other: a server blocks the event loop while it opens
+        )  # one bridge after the other: a server blocks the event loop while it opens
 
     @classmethod
-    def to(cls, config: Config, logs: Path | None, socket: Path | None) -> "Door":
-        """A door to the hold of a configuration, or to another one."""
+    def to(cls, config: Config, logs: Path | None, socket: Path | None) -> "Bridge":
+        """A bridge to the hold of a configuration, or to another one."""
         folder = logs or Path(config.recording.logs_dir)
         where = Where(socket or config.port.socket_in(folder), logs=folder)
         return cls(HoldFeed(where), config, where)
@@ -246,7 +246,7 @@ class Door:
         )
         if not allowed:
             raise ValueError(f"{name} refused: needs the role {action.role}")
-        why = f"door: {by}, {who}" if who else f"door: {by}"
+        why = f"bridge: {by}, {who}" if who else f"bridge: {by}"
         asked = request(action, why, self._text(action, name, given))
         asked["on_behalf"] = {"via": "bridge", "name": by, "role": role}
         return asked

@@ -8,24 +8,24 @@ import pytest
 
 from membrane_ctrl.commissioning.check import check_config
 from membrane_ctrl.config.bridge_access import describe_bridges
-from membrane_ctrl.config.port import DoorsConfig, EpicsConfig, MqttConfig, OpcuaConfig
+from membrane_ctrl.config.port import BridgesConfig, EpicsConfig, MqttConfig, OpcuaConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.cross_check import cross_check
 
 USERS = OpcuaConfig(users_file="users.txt")
 
 
-def warnings(**doors: object) -> list[str]:
-    config = Config(doors=DoorsConfig(**doors))  # type: ignore[arg-type]
+def warnings(**bridges: object) -> list[str]:
+    config = Config(bridges=BridgesConfig(**bridges))  # type: ignore[arg-type]
     return [
         f"{found.why}; {found.remedy}"
         for found in cross_check(config)
-        if found.field == "doors.role"
+        if found.field == "bridges.role"
     ]
 
 
 @pytest.mark.parametrize(
-    ("doors", "says"),
+    ("bridges", "says"),
     [
         (
             {"opcua": OpcuaConfig()},
@@ -43,14 +43,14 @@ def warnings(**doors: object) -> list[str]:
 )
 @pytest.mark.parametrize("role", ["operate", "tune"])
 def test_a_bridge_through_which_anybody_acts_gives_a_warning(
-    doors: dict[str, object], says: str, role: str
+    bridges: dict[str, object], says: str, role: str
 ) -> None:
-    (found,) = warnings(role=role, **doors)
+    (found,) = warnings(role=role, **bridges)
     assert found.startswith(says)
 
 
 @pytest.mark.parametrize(
-    "doors",
+    "bridges",
     [
         {"role": "read", "opcua": OpcuaConfig(), "epics": EpicsConfig(), "mqtt": MqttConfig()},
         {"role": "operate", "opcua": USERS},
@@ -59,35 +59,37 @@ def test_a_bridge_through_which_anybody_acts_gives_a_warning(
     ],
     ids=str,
 )
-def test_known_clients_and_readers_give_no_warning(doors: dict[str, object]) -> None:
-    assert warnings(**doors) == []
+def test_known_clients_and_readers_give_no_warning(bridges: dict[str, object]) -> None:
+    assert warnings(**bridges) == []
 
 
 def test_check_states_who_may_act(capsys: pytest.CaptureFixture[str]) -> None:
-    config = Config(doors=DoorsConfig(role="operate", opcua=OpcuaConfig()))
+    config = Config(bridges=BridgesConfig(role="operate", opcua=OpcuaConfig()))
     assert check_config(config, "lab.toml", as_json=True) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["would"]["bridges"] == (
         "OPC UA on 127.0.0.1:4840: every program on this machine may read and act (role "
         "operate at most)"
     )
-    assert [each["field"] for each in found["findings"]] == ["doors.role"]
+    assert [each["field"] for each in found["findings"]] == ["bridges.role"]
     assert check_config(config, "lab.toml", as_json=False) == 0
     shown = capsys.readouterr().out
     assert (
-        "lab.toml: warning: doors.role = operate: OPC UA on 127.0.0.1:4840: every program on "
+        "lab.toml: warning: bridges.role = operate: OPC UA on 127.0.0.1:4840: every program on "
         "this machine"
     ) in shown
 
 
 def test_the_words_for_users_and_for_readers() -> None:
-    assert describe_bridges(DoorsConfig()) == "none"
+    assert describe_bridges(BridgesConfig()) == "none"
     encrypted = OpcuaConfig(
         host="0.0.0.0", users_file="users.txt", certificate_file="a.pem", key_file="a.key"
     )
-    assert describe_bridges(DoorsConfig(role="operate", opcua=encrypted)) == (
+    assert describe_bridges(BridgesConfig(role="operate", opcua=encrypted)) == (
         "OPC UA on 0.0.0.0:4840, encrypted: the users in users.txt, each by its role may "
         "read and act "
         "(role operate at most)"
     )
-    assert describe_bridges(DoorsConfig(epics=EpicsConfig())).endswith("may read, and nobody acts")
+    assert describe_bridges(BridgesConfig(epics=EpicsConfig())).endswith(
+        "may read, and nobody acts"
+    )

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from membrane_ctrl.bridges import command_lanes
+from membrane_ctrl.bridges.hold_link import SendLimits, send_command
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.outcome import Outcome
-from membrane_ctrl.doors import command_lanes
-from membrane_ctrl.doors.hold_link import SendLimits, send_command
 from membrane_ctrl.model.telemetry import State
-from tests.doors.test_doors import door_with, seen_hold
+from tests.bridges.test_bridges import bridge_with, seen_hold
 from tests.worlds.port_run import port_run
 
 
@@ -33,12 +33,12 @@ async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) 
     with socket.socket(socket.AF_UNIX) as frozen:
         frozen.bind(str(path))
         frozen.listen(8)
-        door = door_with("operate", dataclasses.replace(seen_hold(), name="the-run"), path)
+        bridge = bridge_with("operate", dataclasses.replace(seen_hold(), name="the-run"), path)
         begin_s = time.monotonic()
-        assert "hold refused: not obeyed within 2 s" in await door.ask("mqtt", "hold")
+        assert "hold refused: not obeyed within 2 s" in await bridge.ask("mqtt", "hold")
         assert time.monotonic() - begin_s < 2.5
         begin_s = time.monotonic()
-        assert "latch: no answer from the hold within 0.9 s; still being sent" in await door.ask(
+        assert "latch: no answer from the hold within 0.9 s; still being sent" in await bridge.ask(
             "mqtt", "latch"
         )
         assert time.monotonic() - begin_s < 1.0
@@ -56,7 +56,7 @@ async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) 
         latching.settimeout(5.0)
         assert b'"do": "latch"' in await asyncio.to_thread(latching.recv, 1000)
         latching.close()
-        await door.close()
+        await bridge.close()
 
 
 async def test_a_command_that_arrives_after_its_time_is_refused_by_the_hold(tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ async def test_a_command_that_arrives_after_its_time_is_refused_by_the_hold(tmp_
             run.now_s = greeted_s + 60.0
             return ""
 
-        asked = {"do": "hold", "why": "door: mqtt"}
+        asked = {"do": "hold", "why": "bridge: mqtt"}
         late = SendLimits(time.monotonic() + 2.0, refusal)
         said = await asyncio.to_thread(send_command, where, "the-run", asked, late)
         assert "hold refused: hold came 58" in said.text
@@ -98,8 +98,8 @@ async def test_a_command_is_not_sent_after_its_deadline_or_another_decision(tmp_
 
 
 async def test_no_hold_is_answered_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    door = door_with("operate", None, tmp_path / "control.sock")
+    bridge = bridge_with("operate", None, tmp_path / "control.sock")
     for name in ("hold", "latch"):
         begin_s = time.monotonic()
-        assert "no hold is listening" in await door.ask("mqtt", name)
+        assert "no hold is listening" in await bridge.ask("mqtt", name)
         assert time.monotonic() - begin_s < command_lanes.SAFETY_ANSWER_S

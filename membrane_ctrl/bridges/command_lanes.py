@@ -22,10 +22,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from membrane_ctrl.bridges.hold_link import SendLimits
 from membrane_ctrl.control_port.fair_queue import FairQueue
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import is_safety_command
-from membrane_ctrl.doors.hold_link import SendLimits
 
 ORDINARY_MOST = 8  # commands that wait
 SAFETY_MOST_EACH = 4  # different safety commands of one kind that wait

@@ -1,0 +1,1 @@
+"""Bridges for the lab's other systems: the same names and values by MQTT, OPC UA and EPICS."""

@@ -1,1 +1,0 @@
-"""Doors for the lab's other systems: the same names and values by MQTT, OPC UA and EPICS."""
