@@ -53,13 +53,14 @@ TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]
 def load_configuration(path: Path | None) -> "Config":
     """Return the configuration of a file, or the defaults without one; raises `InputError`.
 
-    The file names in it are relative to its own folder, not to the current one.
+    The file names in it are relative to its own folder, not to the current one. What the file does
+    not state, a hold finds at its start (`schema.leave_to_start`).
     """
     from membrane_ctrl.config import schema, toml_file
 
     if path is None:
-        return schema.Config()
-    config = toml_file.load_toml(path, schema.Config)
+        return schema.leave_to_start(schema.Config())
+    config = schema.leave_to_start(toml_file.load_toml(path, schema.Config))
     optics, port, alarms = config.optics, config.port, config.alarms
     folder = path.resolve().parent
     if optics.geometry_file is not None:

@@ -345,6 +345,10 @@ class EstimatorConfig(Section):
     """Speed at which the loop removes an error of the estimate. Lower it for a pump whose delay is
     uncertain.
     """
+    pump_response: Literal["stated", "identified"] = "stated"
+    """Origin of the pump's dead time and lag: the two keys below, or the test of the actuators at
+    each start, with the two keys until then. A hold whose file has none of the three keys
+    identifies them. Set it to `stated` for a start that is two seconds shorter."""
     pump_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.08
     """Dead time from command to gas. Change it to what `tune` found."""
     pump_lag_s: Annotated[float, Field(ge=0, le=10)] = 0.15

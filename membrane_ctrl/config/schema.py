@@ -380,3 +380,17 @@ class Config(Section):
         except ValidationError:
             return self
         return self.model_copy(update={"loop": loop, "pump": pump})
+
+
+_PUMP_RESPONSE_KEYS = frozenset({"pump_response", "pump_delay_s", "pump_lag_s"})
+
+
+def leave_to_start(config: Config) -> Config:
+    """The configuration of a new hold: what its file does not state is found at the start.
+
+    Recorded runs state every key, so this changes no replay.
+    """
+    estimator = config.estimator
+    if not _PUMP_RESPONSE_KEYS & estimator.model_fields_set:
+        estimator = estimator.model_copy(update={"pump_response": "identified"})
+    return config.model_copy(update={"estimator": estimator})

@@ -104,17 +104,7 @@ class InnerLoop:
     ) -> None:
         self.memory = memory = memory or InnerLoopState()
         self._loop = loop
-        lag_s, tick_s = estimator.pump_lag_s, 1 / loop.rate_hz
-        own_s = max(
-            1 / estimator.gain_per_s, lag_s / 3
-        )  # a faster one drives a slow pump from limit to limit
-        # both poles of the loop, its own and the pump's or a faster one, by what a tick leaves
-        # (docs/explanation/estimator.md)
-        slow_per_s, fast_per_s = (
-            filters.lag_step_fraction(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s))
-        )
-        self._error_gain_per_s = lag_s * slow_per_s * fast_per_s if lag_s > 0 else slow_per_s
-        self._due_gain = (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
+        self.set_pump_lag(estimator)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         flow_max_um_per_s = loop.flow_most_um_per_s(pump)
         self._ramp = setpoint_ramp.SetpointRamp(
@@ -347,6 +337,19 @@ class InnerLoop:
         self._limiter.rate_um_per_s2 = loop.flow_rate_limit_um_per_s2
         self._feedforward.set_gains(loop)
         self._pid.set_gains(_make_pid_gains(loop))
+
+    def set_pump_lag(self, estimator: EstimatorConfig) -> None:
+        """Take the gains of the loop on the estimate from other settings."""
+        lag_s, tick_s = estimator.pump_lag_s, 1 / self._loop.rate_hz
+        # A faster loop drives a slow pump from limit to limit
+        own_s = max(1 / estimator.gain_per_s, lag_s / 3)
+        # Both poles of the loop, its own and the pump's or a faster one, by what a tick leaves
+        # (docs/explanation/estimator.md)
+        slow_per_s, fast_per_s = (
+            filters.lag_step_fraction(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s))
+        )
+        self._error_gain_per_s = lag_s * slow_per_s * fast_per_s if lag_s > 0 else slow_per_s
+        self._due_gain = (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
 
     def _filter_reading(self, displacement_um: float, dt_s: float) -> float:
         return self.memory.measured.update(displacement_um, dt_s, self._loop.measurement_filter_s)

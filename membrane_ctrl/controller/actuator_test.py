@@ -4,6 +4,9 @@ Three parts follow each other, each with one command: everything off (the film's
 little open, pump at most of its flow. A response is awaited: a part ends as soon as the film's
 speed has changed clearly, and the test fails if it has not after the part's longest time. A slow
 pump or a weak vent takes longer, and a dead or reversed one is found.
+
+If it is wanted, a fourth part identifies dead time and lag of the pump, which switches off and on
+until they are known well enough, or the test's time is over.
 """
 
 import math
@@ -14,6 +17,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control import pump_curve
+from membrane_ctrl.control.pump_response import PumpResponse, Switch, identify_pump_response
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
@@ -75,6 +79,16 @@ PARTS = (
 _VENT_WINDOW_MOST_S = 2.0
 _PUMP_WINDOW_MOST_S = 2.5
 
+# Identification: the pump is off, then on for a share of the time after which it had responded
+RESPONSE = Part("response", 0.8, 0.0, 0.0, 0.0, 0.0)
+_SWITCH_SHARE = 0.5
+_SWITCH_RANGE_S = (1.0, 2.0)
+# Readings count from here on: until then the vent may still be closing.
+_VENT_CLOSED_S = 1.0
+# Dead time and lag together are known well enough at this standard deviation, or share of them.
+_RESPONSE_SIGMA_S = 0.08
+_RESPONSE_SIGMA_SHARE = 0.2
+
 
 @dataclass(frozen=True, slots=True)
 class Speed:
@@ -117,6 +131,16 @@ class ActuatorTestState(StateNode):
         How often that part was repeated.
     reversed_s : float
         How long the pump has lowered the mirror clearly.
+    total_s : float
+        How long the whole test has run.
+    identify : bool
+        Whether it has the part `response`.
+    switches : list of Switch
+        When the pump was switched, by the time of the part `pump`, which continues in `response`.
+    switch_s : float
+        Time between switches.
+    response : PumpResponse or None
+        Dead time and lag, once they are identified.
     failure : str
         What does not respond; empty if nothing has failed.
     """
@@ -133,6 +157,11 @@ class ActuatorTestState(StateNode):
     off_sigma_um_per_s: float = math.nan
     off_repeats: Count = 0
     reversed_s: float = 0.0
+    total_s: float = 0.0
+    identify: bool = False
+    switches: list[Switch] = field(default_factory=list)
+    switch_s: float = 0.0
+    response: PumpResponse | None = None
     failure: str = ""
 
 
@@ -150,6 +179,8 @@ class ActuatorTest:
         Whether the bench has a vent and the mirror pressure to release.
     rate_hz : float
         Tick rate; fewer readings per second take longer to show a speed.
+    identify : bool
+        Whether dead time and lag of the pump are to be identified.
     memory : ActuatorTestState, optional
         Of a test in progress, with this pump and vent.
     """
@@ -159,6 +190,7 @@ class ActuatorTest:
         pump: PumpConfig,
         test_vent: bool,
         rate_hz: float,
+        identify: bool = False,
         memory: ActuatorTestState | None = None,
     ) -> None:
         # A speed's standard deviation goes with rate^(-1/2) T^(-3/2): this T keeps it.
@@ -166,13 +198,24 @@ class ActuatorTest:
         self._parts = [
             _lengthen(part, longer) for part in PARTS if test_vent or part.name != "vent"
         ]
-        self.memory = memory or ActuatorTestState(pump, test_vent)
+        self.memory = memory or ActuatorTestState(pump, test_vent, identify=identify)
+        if self.memory.identify:
+            self._parts.append(RESPONSE)
 
     @property
     def part(self) -> Part | None:
         """The running part; None when the test is over."""
         number = self.memory.part
-        return self._parts[number] if number < len(self._parts) else None
+        if number >= len(self._parts):
+            return None
+        part = self._parts[number]
+        switched_off = part.name == RESPONSE.name and not self.memory.switches[-1].on
+        return replace(part, pump_fraction=0.0) if switched_off else part
+
+    @property
+    def response(self) -> PumpResponse | None:
+        """Dead time and lag of the pump; None if they were not identified."""
+        return self.memory.response
 
     @property
     def longest_s(self) -> float:
@@ -204,6 +247,7 @@ class ActuatorTest:
             reading = [[memory.part_s, displacement_um]]
             memory.readings = np.concatenate((memory.readings, reading))
         memory.part_s += dt_s
+        memory.total_s += dt_s
         if memory.part_s < part.wait_s + part.measure_s - 1e-9:
             return
         match part.name:
@@ -213,6 +257,8 @@ class ActuatorTest:
                 self._judge_vent(part)
             case "pump":
                 self._judge_pump(part, dt_s)
+            case "response":
+                self._switch_pump(dt_s)
 
     def _judge_off(self, part: Part) -> None:
         """Measure the film's own speed, and the noise of a reading."""
@@ -281,7 +327,7 @@ class ActuatorTest:
                 self._fail(found)
                 return
             if share >= least_share:
-                self._begin_part(memory.part + 1)
+                self._begin_response()
                 return
         memory.reversed_s = memory.reversed_s + dt_s if is_clear and share < 0.0 else 0.0
         # Noise may look like a reversed pump for a moment.
@@ -289,6 +335,52 @@ class ActuatorTest:
             self._fail(found)
             return
         self._fail_late(part, found)
+
+    def _begin_response(self) -> None:
+        """End the part `pump`: switch the pump off to identify it, if there is time for it."""
+        memory = self.memory
+        least_s, most_s = _SWITCH_RANGE_S
+        memory.switch_s = min(max(_SWITCH_SHARE * memory.part_s, least_s), most_s)
+        if not memory.identify or not self._has_time_to_switch():
+            self._begin_part(len(self._parts))
+            return
+        memory.switches = [Switch(0.0, on=True), Switch(memory.part_s, on=False)]
+        memory.part += 1
+
+    def _has_time_to_switch(self) -> bool:
+        """Whether the pump can be switched off and on once more within the test's longest time."""
+        return self.memory.total_s + 2.0 * self.memory.switch_s <= self.longest_s
+
+    def _switch_pump(self, dt_s: float) -> None:
+        """Switch the pump when it is time to; identify it at the end of each time on."""
+        memory = self.memory
+        last = memory.switches[-1]
+        if memory.part_s < last.at_s + memory.switch_s - 1e-9:
+            return
+        if last.on:
+            # The first reading of a part is taken a tick after the part's command
+            readings = memory.readings.copy()
+            readings[:, 0] += dt_s
+            memory.response = identify_pump_response(
+                readings[readings[:, 0] >= _VENT_CLOSED_S],
+                memory.switches,
+                memory.noise_um,
+                memory.off_um_per_s,
+                memory.off_sigma_um_per_s,
+                self._expected_um_per_s,
+            )
+            if self._is_response_known() or not self._has_time_to_switch():
+                self._begin_part(len(self._parts))
+                return
+        memory.switches.append(Switch(memory.part_s, on=not last.on))
+
+    def _is_response_known(self) -> bool:
+        response = self.memory.response
+        if response is None:
+            return False
+        return response.sum_sigma_s <= max(
+            _RESPONSE_SIGMA_S, _RESPONSE_SIGMA_SHARE * response.sum_s
+        )
 
     def _measure(self, from_s: float) -> Speed | None:
         """Speed by the readings of the running part from a time on; None without three readings."""

@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
-from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig
 from membrane_ctrl.control import (
     camera_mount,
     inner_loop,
@@ -110,6 +110,10 @@ class CentreEstimation:
         self._loop = loop
         if self._filter is not None:
             self._filter.set_gains(loop)
+
+    def set_estimator(self, config: EstimatorConfig) -> None:
+        """Take the settings of the estimates that begin from now on."""
+        self._config = config
 
     def step(
         self,

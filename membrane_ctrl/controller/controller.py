@@ -17,6 +17,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments import trial
 from membrane_ctrl.control.experiments.experiment import ExperimentEnd, Finished
+from membrane_ctrl.control.pump_response import apply_response
 from membrane_ctrl.controller import (
     centre_estimation,
     commands,
@@ -73,11 +74,12 @@ class Controller:
         self._safety = safety.SafetyTable(config.limits, memory=memory.safety)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity, memory.shape)
         self._shape.set_memory(self._gains.present.shape_time_constant_s)
+        estimator = apply_response(config.estimator, memory.context.pump_response)
         self._context = TickContext(
             config=config,
             loop_config=in_force.loop,
             pump_config=in_force.pump,
-            loop=inner_loop.InnerLoop(in_force.loop, in_force.pump, config.estimator, memory.loop),
+            loop=inner_loop.InnerLoop(in_force.loop, in_force.pump, estimator, memory.loop),
             observer=Observer(config, memory.observer),
             levels=safe_levels.SafeLevels(config.states, memory.levels),
             standstill=standstill.Standstill(config.loop, config.states, memory.standstill),
@@ -89,7 +91,9 @@ class Controller:
             self._context.trial = trial.Trial(memory.context.trial_memory, config.loop.rate_hz)
         self._resume = resume_rule.ResumeRule(config.resume, config.limits, memory.resume)
         self._consistency = sensor_consistency.SensorConsistency(config, memory.consistency)
-        self._estimation = centre_estimation.CentreEstimation(config, memory.holders)
+        self._estimation = centre_estimation.CentreEstimation(
+            config.model_copy(update={"estimator": estimator}), memory.holders
+        )
         self._estimation.set_gains(in_force.loop)
         self._consistency.set_gains(in_force.loop, in_force.pump)
         self._answers: list[tuple[int, str]] = []
@@ -181,6 +185,7 @@ class Controller:
             self.memory.state_since_s = inputs.now_s
             context.state_age_s = 0.0
         self._run_state(events)
+        self._use_response(events)
         if context.loop.learned and self.state == State.HOLD:
             events += self._consistency.report_pump_curve(context.loop)
         command = BenchCommand(context.pump_fraction, context.vent_fraction)
@@ -249,6 +254,7 @@ class Controller:
         if math.isnan(self.memory.state_since_s):  # the state's first tick
             self.memory.state_since_s = inputs.now_s
         context.state_age_s = inputs.now_s - self.memory.state_since_s
+        context.found_response = None
         events += context.interlocks.observe_reading(inputs.reading, self.state)
         self._answers, self._clear_mask = [], 0
         obeyed: set[str] = set()
@@ -467,6 +473,27 @@ class Controller:
                 context.pump_fraction, context.vent_fraction = 0.0, 0.0
         if wanted != self.state:
             self._enter_state(wanted, context.why.text, events)
+
+    def _use_response(self, events: list[told.Event]) -> None:
+        """Let loop and estimate use a response that was identified in this tick."""
+        context = self._context
+        found = context.found_response
+        if found is None:
+            return
+        context.pump_response = found
+        estimator = apply_response(self._config.estimator, found)
+        context.loop.set_pump_lag(estimator)
+        self._estimation.set_estimator(estimator)
+        events.append(
+            told.PumpResponseFound(
+                delay_s=found.delay_s,
+                delay_sigma_s=found.delay_sigma_s,
+                lag_s=found.lag_s,
+                lag_sigma_s=found.lag_sigma_s,
+                sum_s=found.sum_s,
+                sum_sigma_s=found.sum_sigma_s,
+            )
+        )
 
     def _enter_state(self, state: State, why: str, events: list[told.Event]) -> None:
         context = self._context

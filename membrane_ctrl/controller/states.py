@@ -388,6 +388,7 @@ def _test_actuators(context: TickContext) -> State:
         responds = f"the film does not respond: {test.failure}"
         context.explain(WhyCode.FILM_NOT_RESPONDING, responds)
         return State.CHECK
+    context.found_response = test.response
     return _begin_loop(context, test.leak_um_per_s)
 
 
@@ -395,13 +396,14 @@ def _running_test(context: TickContext) -> actuator_test.ActuatorTest:
     """The actuator test, which begins with this tick if there is none."""
     memory, rate_hz = context.test_memory, context.config.loop.rate_hz
     if memory is not None:
-        return actuator_test.ActuatorTest(memory.pump, memory.test_vent, rate_hz, memory)
+        return actuator_test.ActuatorTest(memory.pump, memory.test_vent, rate_hz, memory=memory)
     reading = context.observer.reading
     vents = reading is not None and math.isfinite(reading.vent_fraction)
     tense = (
         reading is not None and reading.gauge_pressure_pa > context.config.states.vented_pressure_pa
     )
-    test = actuator_test.ActuatorTest(context.pump_config, vents and tense, rate_hz)
+    identify = context.config.estimator.pump_response == "identified"
+    test = actuator_test.ActuatorTest(context.pump_config, vents and tense, rate_hz, identify)
     context.test_memory = test.memory
     return test
 

@@ -11,6 +11,7 @@ from membrane_ctrl.control import inner_loop, line_slope
 from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.control.experiments.experiment import Finished
 from membrane_ctrl.control.experiments.trial import Trial, TrialState
+from membrane_ctrl.control.pump_response import PumpResponse
 from membrane_ctrl.controller import (
     actuator_test,
     commands,
@@ -60,6 +61,7 @@ class TickContextState(StateNode):
     )  # of the mirror with the pump off, in `check`
     test_memory: actuator_test.ActuatorTestState | None = None  # of the actuator test, in `check`
     ramp_from_fraction: float = 0.0
+    pump_response: PumpResponse | None = None  # identified at this run's last start
     # of the last tick
     last_pump_fraction: float = 0.0
     trim_um: float = 0.0
@@ -92,6 +94,7 @@ class TickContext(TickContextState):
     dt_s: float = 0.02
     state_age_s: float = 0.0  # 0 exactly in the first tick of a state
     estimate: CentreEstimate | None = None  # held instead of the laser's reading, if there is one
+    found_response: PumpResponse | None = None  # identified in this tick
     pump_fraction: float = 0.0
     vent_fraction: float = 0.0
 

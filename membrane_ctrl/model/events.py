@@ -309,6 +309,24 @@ class PumpLearned(
     correction: float
 
 
+class PumpResponseFound(
+    Event,
+    kind="pump_response",
+    sentence="The pump responds after a dead time of {delay_s:.2f} ± {delay_sigma_s:.2f} s with a "
+    "lag of {lag_s:.2f} ± {lag_sigma_s:.2f} s; together {sum_s:.2f} ± {sum_sigma_s:.2f} s",
+):
+    """Dead time and lag of the pump, as the test of the actuators found them, with their standard
+    deviations.
+    """
+
+    delay_s: float
+    delay_sigma_s: float
+    lag_s: float
+    lag_sigma_s: float
+    sum_s: float
+    sum_sigma_s: float
+
+
 class InterlockOpened(
     Event,
     kind="interlock_opened",

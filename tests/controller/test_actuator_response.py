@@ -12,11 +12,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.config.schema import (
+    Config,
+    LoopConfig,
+    PumpConfig,
+    ShapeConfig,
+    TwinConfig,
+    leave_to_start,
+)
 from membrane_ctrl.controller.actuator_test import ActuatorTest, ActuatorTestState
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
+from membrane_ctrl.model.events import PumpResponseFound
 from membrane_ctrl.model.state_tree import decode_state, encode_state
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
@@ -46,13 +54,19 @@ class Bench:
     vent_delay_s: float = 0.1
     vent_lag_s: float = 0.15
     noise_um: float = 1.0
+    identify: bool = False
     error_um: Error = no_error  # of the laser, by the time of the test
 
     def run(self, seed: int) -> tuple[str, float]:
         """The test's failure, and how long it took."""
+        test, time_s = self.run_test(seed)
+        return test.failure, time_s
+
+    def run_test(self, seed: int) -> tuple[ActuatorTest, float]:
+        """The test at its end, and how long it took."""
         rng = np.random.default_rng(seed)
         pump = PumpConfig()
-        test = ActuatorTest(pump, True, self.rate_hz)
+        test = ActuatorTest(pump, True, self.rate_hz, self.identify)
         dt_s = 1.0 / self.rate_hz / _SUBSTEPS
         pumped, vented = (
             deque([0.0] * max(1, round(delay_s / dt_s)))
@@ -70,7 +84,7 @@ class Bench:
             seen_um = height_um + self.error_um(time_s) + self.noise_um * rng.standard_normal()
             test.step(seen_um, 1.0 / self.rate_hz)
             time_s += 1.0 / self.rate_hz
-        return test.failure, time_s
+        return test, time_s
 
     def failures(self, count: int) -> list[str]:
         """Failures of tests with different noise; those that pass are left out."""
@@ -178,10 +192,55 @@ def test_a_test_goes_on_from_its_memory() -> None:
         reading_um = 0.01 * number + float(rng.standard_normal())
         whole.step(reading_um, 0.02)
         memory = decode_state(encode_state(memory), ActuatorTestState, 1_000_000)
-        part = ActuatorTest(memory.pump, memory.test_vent, 50.0, memory)
+        part = ActuatorTest(memory.pump, memory.test_vent, 50.0, memory=memory)
         part.step(reading_um, 0.02)
         assert (part.part, part.failure) == (whole.part, whole.failure)
     assert whole.failure
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "lag_s", "longest_s"),
+    [(0.1, 0.15, 10.0), (0.3, 0.5, 10.0), (0.4, 0.8, 11.0), (1.0, 1.0, 11.0), (0.0, 2.0, 11.0)],
+)
+@pytest.mark.parametrize("rate_hz", [10.0, 50.0])
+def test_the_pump_is_identified_at_a_start(
+    rate_hz: float, delay_s: float, lag_s: float, longest_s: float
+) -> None:
+    """Also behind a vent that closes slowly, and within the time that the test may take."""
+    bench = Bench(rate_hz, pump_delay_s=delay_s, pump_lag_s=lag_s, vent_lag_s=0.25, identify=True)
+    scores = []
+    for seed in range(12):
+        test, time_s = bench.run_test(seed)
+        assert test.failure == ""
+        assert time_s <= longest_s * (50.0 / rate_hz) ** (1 / 3) + 0.2
+        assert test.response is not None
+        # the bench holds a flow for half of its own step more than the pump does
+        error_s = test.response.sum_s - delay_s - lag_s - 0.5 / rate_hz / _SUBSTEPS
+        scores.append(error_s / test.response.sum_sigma_s)
+    assert np.mean(np.abs(scores) < 2.5) >= 0.8
+
+
+def test_identification_costs_two_seconds_on_a_quick_bench() -> None:
+    quick = Bench(identify=True)
+    assert np.median(quick.durations_s(20)) == pytest.approx(5.56, abs=0.03)
+    assert quick.failures(20) == []
+
+
+@pytest.mark.parametrize("dead", [{"pump_share": 0.0}, {"pump_share": -1.0}])
+def test_identification_delays_no_failure(dead: dict[str, float]) -> None:
+    plain = replace(Bench(), **dead)
+    assert [plain.run(seed) for seed in range(6)] == [
+        replace(plain, identify=True).run(seed) for seed in range(6)
+    ]
+
+
+def test_a_hand_in_the_beam_gives_no_response_and_is_no_failure() -> None:
+    bench = Bench(identify=True, error_um=lambda time_s: 30.0 * (4.2 < time_s < 4.6))
+    for seed in range(10):
+        test, _ = bench.run_test(seed)
+        assert test.failure == ""
+        if test.response is not None:
+            assert abs(test.response.sum_s - 0.25) < 4 * test.response.sum_sigma_s
 
 
 SLOW_PUMPS = {
@@ -194,7 +253,7 @@ SLOW_PUMPS = {
 @pytest.mark.parametrize("name", SLOW_PUMPS)
 def test_a_hold_starts_with_a_slow_pump_of_another_world(name: str) -> None:
     for seed in range(4):
-        config = foreign_config()
+        config = leave_to_start(foreign_config())
         assert config.states.actuator_test
         bench = foreign_bench(ForeignPlant(replace(SLOW_PUMPS[name], _tube=deque()), seed))
         run = VirtualRun(config, bench, zernike_projection())
@@ -204,6 +263,10 @@ def test_a_hold_starts_with_a_slow_pump_of_another_world(name: str) -> None:
         states = [tick.row.state for tick in ticks if tick is not None]
         assert State.INFLATE in states, seed
         assert State.FAULT not in states, seed
+        events = [event for tick in ticks if tick is not None for event in tick.events]
+        (found,) = (event for event in events if isinstance(event, PumpResponseFound))
+        pump = SLOW_PUMPS[name]
+        assert abs(found.sum_s - pump.delay_s - pump.lag_s) < 3.5 * found.sum_sigma_s
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,8 @@ def _save_estimator(path: Path, folder: SessionFolder, config: schema.Config, ye
         keys = {*GAIN_KEYS, "flow_max_um_per_s"}
         loop = config.loop.model_copy(update=folder.head.before.model_dump(include=keys))
         tables = {"pump": pump, "loop": loop}
-    known = config.estimator.model_dump() | estimator_levels.derive_estimator_levels(folder)
+    levels = estimator_levels.derive_estimator_levels(folder)
+    known = config.estimator.model_dump() | levels | {"pump_response": "stated"}
     estimator = toml_file.parse_tables(known, schema.EstimatorConfig, str(folder.path))
     tables["estimator"] = estimator
     require_sound(config.model_copy(update=tables), str(path))
