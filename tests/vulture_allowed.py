@@ -11,9 +11,17 @@ _.get_user, _._make_protocol  # asyncua calls these
     _.max_pending_messages_per_connection,
     _.max_message_size,
 )  # asyncua reads these
-_.put_nowait, maxsize, _.MaximumPacketSize  # aiomqtt and paho use these
+(
+    _.put_nowait,
+    maxsize,
+    _.MaximumPacketSize,
+    _.on_connect,
+    _.on_connect_fail,
+    _.on_disconnect,
+)  # aiomqtt and paho use these
 (
     acquisition_main,
+    alarm_process_main,
     alarms_main,
     console_main,
     recorder_main,

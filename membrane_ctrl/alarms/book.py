@@ -4,14 +4,20 @@ An alarm is raised when its condition has persisted, escalated to more people if
 it, repeated as a reminder, and cleared when the condition has stayed away. A condition that returns
 sooner is the same alarm; a latched fault is always a new one. Several conditions under one name are
 one alarm: a full disk affects all files.
+
+A book may begin where another process has stopped: `adopt_sent` takes over what that has sent.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 from membrane_ctrl.config.port import AlarmRule, AlarmsConfig
 from membrane_ctrl.model.notices import NoticeChanges, Severity
+
+# Keys of the configuration that name the lists of services
+LAB, ESCALATION = "urls_file", "escalation_urls_file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,11 +33,12 @@ class Sign:
     # False, "" means all
     about: str = ""
     # once all conditions have cleared, the next one is a new alarm, however soon
-    anew: bool = False
+    always_new: bool = False
+    condition_s: float = math.nan  # of the run: when it appeared; NaN if no event states it
 
 
-def signs_of(changes: NoticeChanges) -> list[Sign]:
-    """Signs in the notices that an event closes and opens."""
+def signs_of(changes: NoticeChanges, condition_s: float = math.nan) -> list[Sign]:
+    """Signs in the notices that an event closes and opens; `condition_s` is the event's time."""
     cleared = [Sign(key.alarm, False, about=key.subject) for key in changes.closed]
     appeared = [
         Sign(
@@ -42,6 +49,7 @@ def signs_of(changes: NoticeChanges) -> list[Sign]:
             notice.delay_s,
             notice.key.subject,
             notice.always_new,
+            condition_s,
         )
         for notice in changes.opened
     ]
@@ -81,6 +89,17 @@ class AlarmMessage:
     severity: Severity
     text: str
     escalated: bool = False  # also to the `escalation_urls_file`
+    occurrence: int = 1  # of the alarms of this name in the run
+    condition_s: float = math.nan  # as in `Sign`
+
+
+@dataclass(frozen=True, slots=True)
+class SentMessage:
+    """A message that a list of services has accepted."""
+
+    message: AlarmMessage
+    to: str  # key of the configuration that names the list
+    at_s: float  # of the run: when it was sent
 
 
 @dataclass(slots=True)
@@ -89,14 +108,15 @@ class _Alarm:
     since_s: float  # of the condition
     standing: dict[str, Sign] = field(default_factory=dict)  # by subject, oldest first
     gone_s: float = math.inf  # when the last condition cleared
-    told_s: float = math.inf
+    reported_s: float = math.inf
     reminded_s: float = math.inf
     escalated: bool = False
     acknowledged: bool = False
+    occurrence: int = 0
 
     @property
     def is_reported(self) -> bool:
-        return math.isfinite(self.told_s)
+        return math.isfinite(self.reported_s)
 
     def end_condition(self, about: str) -> None:
         """End one of its conditions, or all with ""; reminders name one that still stands."""
@@ -114,6 +134,8 @@ class AlarmBook:
     def __init__(self, config: AlarmsConfig) -> None:
         self._config = config
         self._alarms: dict[str, _Alarm] = {}
+        self._occurrences: dict[str, int] = {}
+        self._acknowledged_s = -math.inf
 
     def note_standing(self, name: str) -> bool:
         """The condition of this alarm stands."""
@@ -123,7 +145,7 @@ class AlarmBook:
     def take_sign(self, sign: Sign, now_s: float) -> None:
         """Take a sign."""
         alarm = self._alarms.get(sign.name)
-        if alarm is None or (sign.bad and sign.anew and math.isfinite(alarm.gone_s)):
+        if alarm is None or (sign.bad and sign.always_new and math.isfinite(alarm.gone_s)):
             if sign.bad:
                 self._alarms[sign.name] = _Alarm(sign, now_s, standing={sign.about: sign})
             return
@@ -141,10 +163,49 @@ class AlarmBook:
         if not alarm.is_reported or alarm.sign.about not in alarm.standing:
             alarm.sign = sign
 
-    def acknowledge_all(self) -> None:
+    def acknowledge_all(self, now_s: float) -> None:
         """Acknowledge all raised alarms: no more reminders, no escalation."""
+        self._acknowledged_s = now_s
         for alarm in self._alarms.values():
             alarm.acknowledged |= alarm.is_reported
+
+    def adopt_sent(self, sent: Sequence[SentMessage], now_s: float) -> None:
+        """Continue where another sender has stopped: what it has sent is not sent again.
+
+        Parameters
+        ----------
+        sent : sequence of SentMessage
+            All of the run, oldest first.
+        now_s : float
+        """
+        for name, alarm in list(self._alarms.items()):
+            alarm.reported_s = alarm.reminded_s = math.inf
+            alarm.escalated = alarm.acknowledged = False
+            if math.isfinite(alarm.gone_s):
+                del self._alarms[name]
+        for name in dict.fromkeys(each.message.name for each in sent):
+            self._adopt_alarm(name, [each for each in sent if each.message.name == name], now_s)
+
+    def _adopt_alarm(self, name: str, sent: Sequence[SentMessage], now_s: float) -> None:
+        newest = max(each.message.occurrence for each in sent)
+        self._occurrences[name] = newest
+        of_newest = [each for each in sent if each.message.occurrence == newest]
+        first = of_newest[0]
+        if any(each.message.kind == "cleared" for each in of_newest):
+            return  # what stands under this name began later
+        alarm = self._alarms.get(name)
+        if alarm is not None and _began_later(alarm.sign, first.message):
+            return
+        if alarm is None:  # cleared while nobody sent
+            sign = Sign(name, True, first.message.severity, first.message.text)
+            alarm = self._alarms[name] = _Alarm(sign, now_s, gone_s=now_s)
+        alarm.occurrence = newest
+        alarm.reported_s = first.at_s
+        alarm.reminded_s = of_newest[-1].at_s
+        # the first list may have the message and the second not: each gets what it has not got
+        last_list = ESCALATION if self._config.escalation_urls_file else first.to
+        alarm.escalated = any(each.message.escalated and each.to == last_list for each in of_newest)
+        alarm.acknowledged = self._acknowledged_s >= first.at_s
 
     def step(self, now_s: float) -> list[AlarmMessage]:
         """Return the due messages."""
@@ -156,12 +217,22 @@ class AlarmBook:
             if kind == "cleared":
                 del self._alarms[name]
             elif kind == "raised":
-                alarm.told_s = alarm.reminded_s = now_s
+                alarm.reported_s = alarm.reminded_s = now_s
+                alarm.occurrence = self._occurrences.get(name, 0) + 1
+                self._occurrences[name] = alarm.occurrence
             else:
                 alarm.reminded_s = now_s
                 alarm.escalated |= kind == "escalated"
             messages.append(
-                AlarmMessage(kind, name, alarm.sign.severity, alarm.sign.text, alarm.escalated)
+                AlarmMessage(
+                    kind,
+                    name,
+                    alarm.sign.severity,
+                    alarm.sign.text,
+                    alarm.escalated,
+                    alarm.occurrence,
+                    alarm.sign.condition_s,
+                )
             )
         return messages
 
@@ -173,6 +244,11 @@ class AlarmBook:
             return "raised" if now_s - alarm.since_s >= alarm.sign.for_s else None
         if alarm.acknowledged or math.isfinite(alarm.gone_s):
             return None
-        if not alarm.escalated and now_s - alarm.told_s >= config.escalate_after_s:
+        if not alarm.escalated and now_s - alarm.reported_s >= config.escalate_after_s:
             return "escalated"
         return "reminder" if now_s - alarm.reminded_s >= config.remind_every_s else None
+
+
+def _began_later(sign: Sign, sent: AlarmMessage) -> bool:
+    """Whether a condition is another one than that of a message, under the same name."""
+    return sign.always_new and sign.condition_s > sent.condition_s

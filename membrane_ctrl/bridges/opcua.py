@@ -76,7 +76,8 @@ def _read_users(config: OpcuaConfig) -> dict[str, KnownUser] | None:
     users = known_users(text, config.users_file)
     if not users:
         raise errors.InputError(
-            f"bridges.opcua.users_file: {config.users_file} has no users; add one with web add-user"
+            f"bridges.opcua.users_file: {config.users_file} has no users; add one with "
+            "`membrane-ctrl serve add-user`"
         )
     return users
 

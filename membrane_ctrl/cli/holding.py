@@ -279,7 +279,7 @@ def alarm_test(
     json: JsonOption = False,
 ) -> int:
     """Send a test message to every address of the alarms."""
-    from membrane_ctrl.alarms.process import send_test_alarm
+    from membrane_ctrl.alarms.addresses import send_test_alarm
 
     return send_test_alarm(
         load_configuration(config), str(config or "the defaults"), escalated, json

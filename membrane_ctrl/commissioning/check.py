@@ -18,7 +18,7 @@ from rich.table import Table
 from firmware_iface import conformance, role_bench, roles
 from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
 from membrane_ctrl.acquisition import driver_check, optical_bench, waiting_clock
-from membrane_ctrl.alarms.process import require_sendable
+from membrane_ctrl.alarms.addresses import require_sendable
 from membrane_ctrl.commissioning import interlock_check
 from membrane_ctrl.config.bridge_access import describe_bridges
 from membrane_ctrl.config.needed_packages import NeededPackage, missing_packages

@@ -78,8 +78,8 @@ class FleetConfig(Section):
         return self
 
 
-class MqttConfig(Section):
-    """The broker that gets the published values."""
+class BrokerConfig(Section):
+    """A broker of MQTT."""
 
     host: str = "127.0.0.1"
     """Host of the broker. Set it to your broker's."""
@@ -93,6 +93,11 @@ class MqttConfig(Section):
     """CA of the broker's certificate; with it the connection is TLS. Set it for a broker on another
     machine.
     """
+
+
+class MqttConfig(BrokerConfig):
+    """The broker that gets the published values."""
+
     discovery_prefix: str = "homeassistant"
     """Prefix of Home Assistant's discovery; empty: none. Leave it, unless Home Assistant's was
     changed.

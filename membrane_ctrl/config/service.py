@@ -8,13 +8,45 @@ from urllib.parse import urlsplit
 from pydantic import Field, field_validator, model_validator
 
 from firmware_iface.settings import Section
-from membrane_ctrl.config.port import LOCAL, LOCAL_HOSTS
+from membrane_ctrl.config.port import LOCAL, LOCAL_HOSTS, BrokerConfig
 
 DEFAULT_PORT = 7480
 _PUBLIC_URL = re.compile(
     # no segment that a browser resolves
     r"https?://(\[[0-9a-f:.]+\]|[a-z0-9.-]+)(:[0-9]{1,5})?(/[A-Za-z0-9_~-]+)*/?"
 )
+
+
+class HeartbeatMqttConfig(BrokerConfig):
+    """The broker that gets the heartbeat."""
+
+    topic: Annotated[
+        str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", max_length=200)
+    ] = "membrane/service"
+    """Topic whose retained value is `online` or `offline`; the time of the last heartbeat is below
+    it in `/time_utc`. Change it where there are several services.
+    """
+
+
+class HeartbeatConfig(Section):
+    """A regular message to another machine, which raises an alarm when the messages stop.
+
+    It is sent while the service and its alarm process work.
+    """
+
+    every_s: Annotated[float, Field(ge=5, le=86_400)] = 60.0
+    """Interval. Set it below the period that the other machine expects."""
+    url_file: str | None = None
+    """File with the address that gets a POST, such as a check of healthchecks.io; it is a secret.
+    Set it to be notified of a dead machine or network.
+    """
+    mqtt: HeartbeatMqttConfig | None = None
+    """The broker that gets the heartbeat. Set it where a broker on another machine is watched."""
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether any is configured."""
+        return self.url_file is not None or self.mqtt is not None
 
 
 class ServiceConfig(Section):
@@ -51,6 +83,8 @@ class ServiceConfig(Section):
     """TLS certificate of the service. Set it for other machines."""
     key_file: str | None = None
     """The key of that certificate. Set it to a file that only the hold's user can read."""
+    heartbeat: HeartbeatConfig = HeartbeatConfig()
+    """Messages by which another machine notices that this one is dead."""
 
     @property
     def secure(self) -> bool:

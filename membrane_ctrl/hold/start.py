@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from membrane_ctrl.acquisition import driver_check
-from membrane_ctrl.alarms.process import require_sendable
+from membrane_ctrl.alarms.addresses import require_sendable
 from membrane_ctrl.control_port import server, sockets
 from membrane_ctrl.controller import cross_check
 from membrane_ctrl.geometry.run_geometry import read_configured_geometry
@@ -82,7 +82,9 @@ def hold_mirror(options: HoldOptions) -> int:
         geometry.copy_to_run(run_dir)
         rings = child_processes.rings_for(config, twin.truth if twin else None, stack)
         published_rings.publish_rings(
-            run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes}
+            run_dir,
+            {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes},
+            stack,
         )
         children = child_processes.ChildProcesses(
             config, clock, rings, run_dir, options.name, options.duration_s, listeners.path

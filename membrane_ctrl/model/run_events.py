@@ -7,6 +7,8 @@ from membrane_ctrl.model.event_base import Event, LogLevel
 from membrane_ctrl.model.notices import GLITCH_S, Topic
 
 _ENDED_WELL = frozenset({"done", "interrupted"})
+# The recorder writes these when the control process has gone
+ENDS_WITHOUT_CONTROL = frozenset({"killed", "terminated"})
 
 
 class Started(

@@ -1,9 +1,14 @@
-"""Publishes a run's rings: their addresses stand in a file of the run's folder."""
+"""Publishes a run's rings: their addresses stand in a file of the run's folder.
 
+The control process keeps a lock on that file while it lives, so other processes notice its end
+even if it was killed.
+"""
+
+import fcntl
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from mmap import PROT_READ, mmap
@@ -20,14 +25,30 @@ _RINGS = frozenset({"telemetry", "events", "shapes"})
 _SHARED_MEMORY_FOLDER = Path("/dev/shm")
 
 
-def publish_rings(run_dir: Path, rings: Mapping[str, RingAddress | None]) -> None:
-    """Write the addresses of the existing rings. Raises OSError."""
+def publish_rings(run_dir: Path, rings: Mapping[str, RingAddress | None], stack: ExitStack) -> None:
+    """Write the addresses of the existing rings; the stack ends the lock. Raises OSError."""
     found = {name: asdict(address) for name, address in rings.items() if address is not None}
     write_text_atomic(run_dir / _FILE, json.dumps(found, indent=1) + "\n")
+    file = stack.enter_context(open_plain(run_dir / _FILE))
+    fcntl.flock(file, fcntl.LOCK_EX)
 
 
-def attach_rings(run_dir: Path) -> dict[str, RingReader]:
-    """Return readers of a run's rings, each at its newest message.
+def is_control_alive(run_dir: Path) -> bool:
+    """Whether the control process of a run lives. Raises OSError if the run has published nothing.
+
+    Between the publication and the lock it does not seem to: ask twice.
+    """
+    with open_plain(run_dir / _FILE) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def attach_rings(run_dir: Path, whole: Collection[str] = ()) -> dict[str, RingReader]:
+    """Return readers of a run's rings, each at its newest message; those of `whole` at their
+    oldest.
 
     Raises FileNotFoundError if the run has published none or is over; OSError or RingError for
     foreign rings.
@@ -37,7 +58,8 @@ def attach_rings(run_dir: Path) -> dict[str, RingReader]:
         for name, address in _read_addresses(run_dir / _FILE).items():
             readers[name] = RingReader(address, _map_memory(address))
             stack.callback(readers[name].close)
-            readers[name].latest()
+            if name not in whole:
+                readers[name].latest()
         stack.pop_all()
     return readers
 

@@ -24,8 +24,6 @@ _EVENTS_MOST = 200
 _LAST_TICKS_S = 1.0
 _STOP_BEFORE_END_S = 120.0  # a stop that is older ended nothing: the run went on
 _READ_BACK = ("pump_readback_fraction", "vent_readback_fraction", "state")
-# Words of the recorder for an end without the control process (`recorder/process.py`)
-_WITHOUT_CONTROL = frozenset({"killed", "terminated"})
 _LOOK_AT_BENCH = (
     "look whether the pump runs (a board's watchdog stops its pump); then read the end of the "
     "hold's log, and start again"
@@ -213,7 +211,7 @@ def _judge_end(
 ) -> EndKind:
     if exit_word is None:
         return EndKind.NO_RECORD
-    if exit_word in _WITHOUT_CONTROL:
+    if exit_word in run_events.ENDS_WITHOUT_CONTROL:
         return EndKind.CONTROL_GONE
     if fault is not None:
         return EndKind.FAULT

@@ -17,7 +17,18 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     help="Serve the page and the interface for programs, before, during and after holds.",
 )
-_FILES = ("logs", "configurations", "users_file", "certificate_file", "key_file")
+_FILES = frozenset(
+    {
+        "logs",
+        "configurations",
+        "users_file",
+        "certificate_file",
+        "key_file",
+        "url_file",
+        "password_file",
+        "ca_file",
+    }
+)
 
 
 @app.callback()
@@ -70,7 +81,7 @@ def serve(
     if context.invoked_subcommand is not None:
         return
     from membrane_ctrl.config.service import ServiceConfig
-    from membrane_ctrl.config.toml_file import parse_tables, read_toml
+    from membrane_ctrl.config.toml_file import parse_tables
     from membrane_ctrl.control_port import ctl
     from membrane_ctrl.processes.command_process import end_with_parent
 
@@ -89,7 +100,7 @@ def serve(
         "certificate_file": certificate,
         "key_file": key,
     }
-    tables = {} if config is None else _resolve_files(read_toml(config), config.resolve().parent)
+    tables = {} if config is None else _read_service_file(config)
     tables |= {
         option: str(value) if isinstance(value, Path) else value
         for option, value in given.items()
@@ -103,14 +114,41 @@ def serve(
     serve(holds, page, idle_s)
 
 
+def _read_service_file(file: Path) -> dict[str, Any]:
+    """Return the tables of a service file. Raises InputError."""
+    from membrane_ctrl.config.toml_file import read_toml
+
+    return _resolve_files(read_toml(file), file.resolve().parent)
+
+
 def _resolve_files(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return the tables of a service file with its files relative to its folder."""
-    return {
-        name: str(folder / Path(value).expanduser())
-        if name in _FILES and isinstance(value, str)
-        else value
-        for name, value in tables.items()
-    }
+    resolved: dict[str, Any] = {}
+    for name, value in tables.items():
+        if isinstance(value, dict):
+            resolved[name] = _resolve_files(value, folder)
+        elif name in _FILES and isinstance(value, str):
+            resolved[name] = str(folder / Path(value).expanduser())
+        else:
+            resolved[name] = value
+    return resolved
+
+
+@app.command("check")
+def check(
+    config: Annotated[Path, typer.Argument(metavar="FILE", help="Service file.")],
+    send: Annotated[
+        bool, typer.Option("--send", help="Also send one heartbeat to each configured place.")
+    ] = False,
+) -> None:
+    """Check a service file, its users, certificate and heartbeat, without serving."""
+    from membrane_ctrl.config.service import ServiceConfig
+    from membrane_ctrl.config.toml_file import parse_tables
+    from membrane_ctrl.service.service_check import check_service
+
+    page = parse_tables(_read_service_file(config), ServiceConfig, str(config))
+    for line in check_service(page, send):
+        print(line)
 
 
 @app.command("add-user")

@@ -19,19 +19,21 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.service_link import link_key, publish_address, read_or_make_secret
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import files
 from membrane_ctrl.service.access import WebUser
-from membrane_ctrl.service.accounts import Accounts, known_users
+from membrane_ctrl.service.accounts import Accounts
+from membrane_ctrl.service.alarm_child import AlarmChild
 from membrane_ctrl.service.api import make_api
 from membrane_ctrl.service.connections import ConnectionGuard, GuardedHttp, raise_file_limit
 from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.idle_end import IdleEnd
-from membrane_ctrl.service.listening import require_certificate, require_free_address
+from membrane_ctrl.service.listening import require_free_address
 from membrane_ctrl.service.login import with_login
 from membrane_ctrl.service.path_dispatch import PathDispatch
 from membrane_ctrl.service.public_address import public_address
+from membrane_ctrl.service.service_check import read_users, require_usable_files
 from membrane_ctrl.service.service_feed import make_feed
 from membrane_ctrl.service.tokens import TokenBook, tokens_file
 from membrane_ctrl.service.work_pools import REPORT_FILES, PoolFullError
@@ -45,32 +47,22 @@ _AWAY_S = 20.0
 _STUCK_S = 20.0  # for a message to leave
 _REPORT_BYTES_MAX = 64_000_000
 _LOOK_AFTER_S = 10.0
+_ALARMS_S = 2.0
 _MESSAGE_BYTES_MAX = 1_000_000  # of a browser over its web socket; the page has no uploads
 _FRESH = {"cache-control": "no-store"}
 
 
 def accounts_of(page: ServiceConfig) -> Accounts:
     """Who may log in. Raises InputError for a users file that is wrong."""
-    users = {}
-    if page.users_file is not None:
-        try:
-            users = known_users(files.read_text(Path(page.users_file)), page.users_file)
-        except (OSError, ValueError) as error:
-            raise errors.InputError(f"{page.users_file}: {error}") from None
-        if not users:
-            raise errors.InputError(
-                f"{page.users_file}: no users; add one with `membrane-ctrl serve add-user`"
-            )
     attributes = public_address(page).cookie_attributes
-    return Accounts(users, attributes=attributes, secret=link_key())
+    return Accounts(read_users(page), attributes=attributes, secret=link_key())
 
 
 def require_servable(page: ServiceConfig) -> None:
-    """Raise InputError for files that are no certificate and its key, DeviceError for an address
-    that is taken.
+    """Raise InputError for files of certificate or heartbeat that cannot be used, DeviceError for
+    an address that is taken.
     """
-    if page.certificate_file is not None and page.key_file is not None:
-        require_certificate(Path(page.certificate_file), Path(page.key_file))
+    require_usable_files(page)
     require_free_address(page.host, page.port)
 
 
@@ -129,6 +121,8 @@ def _run_server(
 
     app.build_middleware_stack = build_middleware_stack  # type: ignore[method-assign]
     idle_end = IdleEnd(idle_s, time.monotonic())
+    folders = {feed.logs for feed in feeds.values() if feed.logs is not None}
+    alarms = AlarmChild(sorted(folders), page.heartbeat)
 
     def look_after() -> None:
         """End a service that nobody uses; keep the log of a hold short."""
@@ -142,6 +136,8 @@ def _run_server(
             app.shutdown()
 
     app.timer(_LOOK_AFTER_S, look_after)
+    app.timer(_ALARMS_S, lambda: alarms.look_after(time.monotonic()))
+    app.on_shutdown(alarms.close)
     for feed in feeds.values():
         app.on_startup(feed.open)
         app.on_shutdown(feed.close)

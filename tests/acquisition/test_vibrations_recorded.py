@@ -17,7 +17,8 @@ import pytest
 
 from membrane_ctrl.acquisition.vibrations import make_vibration_handler
 from membrane_ctrl.alarms.book import AlarmMessage
-from membrane_ctrl.alarms.process import Outbox, Watcher
+from membrane_ctrl.alarms.outbox import Outbox
+from membrane_ctrl.alarms.watcher import Watcher
 from membrane_ctrl.cli import run as command_line
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.config.schema import Config

@@ -79,7 +79,7 @@ def test_nobody_acknowledges_more_people_are_told() -> None:
 
 def test_acknowledged_it_is_quiet_until_it_is_over() -> None:
     book = book_with_a_told_alarm()
-    book.acknowledge_all()
+    book.acknowledge_all(20.0)
     assert book.step(1e6) == []
     book.take_sign(GOOD, 1e6)
     assert kinds(book.step(1e6 + 30.0)) == ["cleared"]
@@ -88,7 +88,7 @@ def test_acknowledged_it_is_quiet_until_it_is_over() -> None:
 def test_an_acknowledgement_is_not_for_what_comes_later() -> None:
     book = AlarmBook(CONFIG)
     book.take_sign(BAD, 0.0)
-    book.acknowledge_all()  # no notice of it was sent yet
+    book.acknowledge_all(20.0)  # no notice of it was sent yet
     assert kinds(book.step(10.0)) == ["raised"]
     assert kinds(book.step(910.0)) == ["escalated"]
 

@@ -14,16 +14,11 @@ from types import ModuleType
 
 import pytest
 
+from membrane_ctrl.alarms.addresses import apprise_senders, read_urls, require_sendable
 from membrane_ctrl.alarms.book import AlarmMessage
-from membrane_ctrl.alarms.process import (
-    AlarmsSpec,
-    Outbox,
-    Watcher,
-    apprise_senders,
-    read_urls,
-    require_sendable,
-    watch_run,
-)
+from membrane_ctrl.alarms.outbox import Outbox
+from membrane_ctrl.alarms.process import AlarmsSpec, watch_run
+from membrane_ctrl.alarms.watcher import Watcher
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model.clock import RunClock
@@ -177,28 +172,28 @@ def test_a_network_that_is_down_is_tried_later_and_later_in_order() -> None:
     assert not outbox.failures
 
 
-def spec(telemetry: object, events: object) -> AlarmsSpec:
-    return AlarmsSpec(RunClock.start(), telemetry, events, CONFIG, "the-run")  # type: ignore[arg-type]
+def spec(telemetry: object, events: object, folder: Path) -> AlarmsSpec:
+    return AlarmsSpec(RunClock.start(), telemetry, events, CONFIG, folder)  # type: ignore[arg-type]
 
 
-def test_the_process_ends_with_the_run_and_says_why_it_ended() -> None:
+def test_the_process_ends_with_the_run_and_says_why_it_ended(tmp_path: Path) -> None:
     sender, reports = FakeSender(), list[Event]()
     with open_ring(16, ROW_BYTES) as telemetry, open_ring(16, 4096) as events:
         writer = RingWriter(events)
         writer.put(message(kind="end", exit="safety_trip"))
-        watch_run(spec(telemetry, events), [sender], reports.append, lambda: True)
+        watch_run(spec(telemetry, events, tmp_path), [sender], reports.append, lambda: True)
         writer.close()
     assert told(sender) == [("run_ended", "raised")]
     assert [(r.alarm, r.sent) for r in reports if isinstance(r, AlarmTold)] == [("run_ended", True)]
 
 
-def test_a_control_process_that_vanishes_is_told() -> None:
+def test_a_control_process_that_vanishes_is_reported(tmp_path: Path) -> None:
     sender = FakeSender()
 
     theirs, ours = Pipe()
     theirs.close()
     with open_ring(16, ROW_BYTES) as telemetry, open_ring(16, 4096) as events:
-        watch_run(spec(telemetry, events), [sender], event_sender(ours), lambda: False)
+        watch_run(spec(telemetry, events, tmp_path), [sender], event_sender(ours), lambda: False)
     assert told(sender) == [("control_gone", "raised")]
 
 

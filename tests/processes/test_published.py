@@ -8,13 +8,24 @@ import json
 import os
 import random
 from collections.abc import Iterator
+from contextlib import ExitStack
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.processes.published_rings import attach_rings, publish_rings
+from membrane_ctrl.processes.published_rings import (
+    attach_rings,
+    is_control_alive,
+    publish_rings,
+)
 from membrane_ctrl.processes.ring import RingAddress, RingError, RingWriter, open_ring
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as found:
+        yield found
 
 
 @pytest.fixture
@@ -23,10 +34,12 @@ def address() -> Iterator[RingAddress]:
         yield found
 
 
-def test_a_session_reads_on_from_the_newest_message(tmp_path: Path, address: RingAddress) -> None:
+def test_a_session_reads_on_from_the_newest_message(
+    tmp_path: Path, stack: ExitStack, address: RingAddress
+) -> None:
     writer = RingWriter(address)
     writer.put(b"before")
-    publish_rings(tmp_path, {"telemetry": address, "shapes": None})
+    publish_rings(tmp_path, {"telemetry": address, "shapes": None}, stack)
     readers = attach_rings(tmp_path)
     writer.put(b"after")
     assert {name: reader.drain() for name, reader in readers.items()} == {"telemetry": [b"after"]}
@@ -34,8 +47,32 @@ def test_a_session_reads_on_from_the_newest_message(tmp_path: Path, address: Rin
     writer.close()
 
 
-def test_a_reader_cannot_write(tmp_path: Path, address: RingAddress) -> None:
-    publish_rings(tmp_path, {"telemetry": address})
+def test_events_are_read_from_the_oldest_on_where_that_is_wanted(
+    tmp_path: Path, address: RingAddress, stack: ExitStack
+) -> None:
+    writer = RingWriter(address)
+    writer.put(b"before")
+    publish_rings(tmp_path, {"telemetry": address, "events": address}, stack)
+    readers = attach_rings(tmp_path, whole=("events",))
+    found = {name: reader.drain() for name, reader in readers.items()}
+    assert found == {"telemetry": [], "events": [b"before"]}
+    for reader in readers.values():
+        reader.close()
+    writer.close()
+
+
+def test_a_control_process_is_alive_until_it_lets_go(tmp_path: Path, address: RingAddress) -> None:
+    with pytest.raises(FileNotFoundError):
+        is_control_alive(tmp_path)
+    with ExitStack() as process:
+        publish_rings(tmp_path, {"telemetry": address}, process)
+        assert is_control_alive(tmp_path)
+        assert is_control_alive(tmp_path), "asking changes nothing"
+    assert not is_control_alive(tmp_path)
+
+
+def test_a_reader_cannot_write(tmp_path: Path, stack: ExitStack, address: RingAddress) -> None:
+    publish_rings(tmp_path, {"telemetry": address}, stack)
     reader = attach_rings(tmp_path)["telemetry"]
     with pytest.raises(TypeError, match="read-only"):
         reader._slots.words[0] = 1
@@ -91,8 +128,10 @@ def test_a_pipe_in_place_of_the_file_hangs_nobody(tmp_path: Path) -> None:
         attach_rings(tmp_path)
 
 
-def test_a_link_in_place_of_the_file_is_not_followed(tmp_path: Path, address: RingAddress) -> None:
-    publish_rings(tmp_path, {"telemetry": address})
+def test_a_link_in_place_of_the_file_is_not_followed(
+    tmp_path: Path, stack: ExitStack, address: RingAddress
+) -> None:
+    publish_rings(tmp_path, {"telemetry": address}, stack)
     (tmp_path / "rings.json").rename(tmp_path / "other.json")
     (tmp_path / "rings.json").symlink_to("other.json")
     with pytest.raises(OSError, match=r"rings\.json"):
@@ -100,9 +139,12 @@ def test_a_link_in_place_of_the_file_is_not_followed(tmp_path: Path, address: Ri
 
 
 def test_shared_memory_of_another_user_is_refused(
-    tmp_path: Path, address: RingAddress, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    stack: ExitStack,
+    address: RingAddress,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    publish_rings(tmp_path, {"telemetry": address})
+    publish_rings(tmp_path, {"telemetry": address}, stack)
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     with pytest.raises(RingError, match=f"belongs to user {os.getuid()}"):
         attach_rings(tmp_path)
@@ -127,8 +169,8 @@ def test_shared_memory_that_is_no_ring_is_refused(tmp_path: Path) -> None:
         memory.unlink()
 
 
-def test_a_run_that_is_over_has_none(tmp_path: Path) -> None:
+def test_a_run_that_is_over_has_none(tmp_path: Path, stack: ExitStack) -> None:
     with open_ring(4, 16) as address:
-        publish_rings(tmp_path, {"telemetry": address})
+        publish_rings(tmp_path, {"telemetry": address}, stack)
     with pytest.raises(FileNotFoundError):
         attach_rings(tmp_path)

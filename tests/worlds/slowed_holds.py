@@ -87,7 +87,7 @@ async def hold(logs: Path, number: int) -> None:
             name: stack.enter_context(contextlib.closing(ring.RingWriter(each)))
             for name, each in rings.items()
         }
-        published_rings.publish_rings(run, rings)
+        published_rings.publish_rings(run, rings, stack)
         clock = VirtualClock(0.0, utc, lambda: loop.time() - begin_s)
         shape, due_s = TruthShape(board.virtual, config, number), 0.0
 

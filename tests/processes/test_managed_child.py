@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from membrane_ctrl.hold.child_processes import ManagedChild
 from membrane_ctrl.model.child_events import Alive, ChildSilent
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.recorder_events import DiskLow
+from membrane_ctrl.processes.managed_child import ManagedChild
 
 
 class FakeChild:

@@ -1,0 +1,174 @@
+"""The alarms of one run, as the service sends them: also when its hold vanishes.
+
+Rows and events come from the run's rings. A service that starts during a run reads the events
+before from the run's file. The hold keeps a lock on a file of the run while it lives: a run whose
+lock is free without an event of its end has lost its control process.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+from membrane_ctrl.alarms.addresses import apprise_senders
+from membrane_ctrl.alarms.run_alarms import RunAlarms
+from membrane_ctrl.alarms.sent_log import LOG_NAME, SentLog
+from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.model import event_lines, telemetry
+from membrane_ctrl.model.events import EventLine
+from membrane_ctrl.model.run_events import ENDS_WITHOUT_CONTROL, Ended
+from membrane_ctrl.processes import published_rings, ring
+from membrane_ctrl.run_files.event_log import read_events
+from membrane_ctrl.run_files.run_config import read_config
+
+_LOOKS_WITHOUT_CONTROL = 2  # see `is_control_alive`
+_NEWS_AGE_MAX_S = 86_400.0  # an older end is no news
+_RINGS = "rings.json"
+
+
+class FollowedRun:
+    """Follows a run and sends its alarms.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    alarms : AlarmsConfig
+        Its own.
+
+    Raises
+    ------
+    InputError, DeviceError
+        Its alarms cannot be sent from here.
+    OSError
+        Its files belong to another user.
+    """
+
+    def __init__(self, folder: Path, alarms: AlarmsConfig) -> None:
+        self.folder = folder
+        self._seconds = _RunSeconds(folder)
+        senders = apprise_senders(alarms, folder.name)
+        self._sent_log = SentLog(folder, "service")
+        self._alarms = RunAlarms(alarms, self._sent_log, senders, 0.0, self._seconds.now)
+        self._looks_without_control = 0
+        self._is_gone = False
+        self._rings: dict[str, ring.RingReader] = {}
+        with suppress(OSError, ValueError):
+            self._rings = published_rings.attach_rings(folder, whole=("events",))
+        self._past = [_without_control(each.line) for each in read_events(folder, [])]
+        self._known = {_identity(line) for line in self._past}
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the run is over, and all of its alarms are sent."""
+        return (self._alarms.has_ended or self._is_gone) and self._alarms.is_done
+
+    def step(self) -> None:
+        """Take what is new, and send what is due."""
+        self._look_for_control()  # before the rings: it has written its last message first
+        events = [json.dumps(line).encode() for line in self._past]
+        self._past = []
+        events += [
+            message
+            for message in _drain(self._rings.get("events"))
+            if _identity(event_lines.parse_event(message)) not in self._known
+        ]
+        rows = _drain(self._rings.get("telemetry"))
+        if rows:
+            self._seconds.note_tick(telemetry.TelemetryRow.unpack(rows[-1]).mono_s)
+        is_over = self._alarms.has_ended or self._is_gone
+        if not is_over or events:
+            self._alarms.process_news(rows, events)
+        else:
+            self._alarms.send_due()
+        if self._looks_without_control < _LOOKS_WITHOUT_CONTROL or self._alarms.has_ended:
+            return
+        if not self._is_gone:
+            self._is_gone = True
+            self._alarms.report_orphan()
+
+    def close(self) -> None:
+        """Stop following; the hold's own process may send."""
+        for reader in self._rings.values():
+            reader.close()
+        self._sent_log.close()
+
+    def _look_for_control(self) -> None:
+        is_alive = False
+        with suppress(OSError):
+            is_alive = published_rings.is_control_alive(self.folder)
+        self._looks_without_control = 0 if is_alive else self._looks_without_control + 1
+
+
+class _RunSeconds:
+    """Seconds of a run that another process has started.
+
+    They follow from the start in the folder's name, to a second, until a tick states them.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        began_utc = datetime.strptime(folder.name[:16], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        age_s = (datetime.now(UTC) - began_utc).total_seconds()
+        self._origin_s = time.monotonic() - age_s
+        self._is_exact = False
+
+    def now(self) -> float:
+        """The present second."""
+        return time.monotonic() - self._origin_s
+
+    def note_tick(self, mono_s: float) -> None:
+        """Note the newest tick's second."""
+        if not self._is_exact:
+            self._origin_s = time.monotonic() - mono_s
+            self._is_exact = True
+
+
+def find_published_run(logs: Path) -> Path | None:
+    """Return the newest run of a folder that has published its rings; None without one."""
+    with suppress(OSError):
+        for folder in sorted(logs.iterdir(), reverse=True):
+            if folder.name[:1].isdigit() and (folder / _RINGS).exists():
+                return folder
+    return None
+
+
+def read_alarms_config(folder: Path) -> AlarmsConfig | None:
+    """Return the alarms of a run; None if none are to be sent: it names no addresses, or its end is
+    no news.
+    """
+    alarms = read_config(folder, []).alarms
+    if alarms.urls_file is None:
+        return None
+    with suppress(OSError):
+        if published_rings.is_control_alive(folder):
+            return alarms
+    return alarms if _is_news(folder) else None
+
+
+def _is_news(folder: Path) -> bool:
+    """Whether a run without a control process has recorded something in the last day."""
+    with suppress(OSError):
+        age_s = time.time() - (folder / "events.jsonl").stat().st_mtime
+        return age_s < _NEWS_AGE_MAX_S and (folder / LOG_NAME).exists()
+    return False
+
+
+def _without_control(line: EventLine) -> EventLine:
+    """Return an event of the file; nothing for an end that the recorder has written without the
+    control process, which is reported as such.
+    """
+    event = event_lines.from_dict(line)
+    is_end = isinstance(event, Ended) and event.exit in ENDS_WITHOUT_CONTROL
+    return {} if is_end else line
+
+
+def _identity(line: EventLine) -> tuple[object, ...]:
+    """Return what an event has in the file and in the ring."""
+    return tuple(sorted((key, repr(value)) for key, value in line.items()))
+
+
+def _drain(reader: ring.RingReader | None) -> list[bytes]:
+    return [] if reader is None else reader.drain()
