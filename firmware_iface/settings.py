@@ -321,6 +321,8 @@ SENSOR_DRIVERS: dict[str, Any] = {
     "air_temperature_c": ValueDriver,
 }
 ON_MODBUS = (BronkhorstModbusConfig, ModbusMapConfig)  # have a `link`, the others a `port`
+# Controllers of a flow: it is proportional to the command, from 0 on.
+FLOW_CONTROLLERS = (BronkhorstModbusConfig, BronkhorstProparConfig)
 AnyDriver = DisplacementDriver | PumpDriver | PressureDriver | BarometerDriver
 
 

@@ -91,7 +91,7 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
         sensors = {"feedforward_barometer": "barometer", "feedforward_temperature": "thermometer"}
         missing = {key: False for key, role in sensors.items() if role not in section}
         tables |= {"loop": missing} if missing else {}
-        if str(section["pump"]["driver"]).startswith("bronkhorst"):  # linear from 0
+        if _sections_by_driver("pump")[section["pump"]["driver"]] in settings.FLOW_CONTROLLERS:
             tables["pump"] = dict.fromkeys(
                 ("dead_fraction", "start_fraction", "stall_fraction"), 0.0
             )

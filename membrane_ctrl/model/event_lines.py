@@ -30,31 +30,31 @@ def parse_event(message: bytes) -> EventLine:
     return event if isinstance(event, dict) else UnreadableEvent(repr(message[:200])).to_dict()
 
 
-def from_dict(line: EventLine) -> Event:
+def from_dict(logged: EventLine) -> Event:
     """The event of a line, without its times; never raises.
 
     Keys that a line lacks are empty; anything unintelligible is an `UnknownEvent`.
     """
-    cls = KINDS.get(line["kind"]) if isinstance(line.get("kind"), str) else None
+    cls = KINDS.get(logged["kind"]) if isinstance(logged.get("kind"), str) else None
     if cls is None:
-        return UnknownEvent(line)
+        return UnknownEvent(logged)
     try:
-        values = {field.name: _read_value(line, key, field.type) for field, key in cls.keys}
+        values = {field.name: _read_value(logged, key, field.type) for field, key in cls.keys}
     except ValueError:
-        return UnknownEvent(line)
+        return UnknownEvent(logged)
     return cls(**values)
 
 
-def _read_value(line: EventLine, key: str, hint: Any) -> object:
+def _read_value(logged: EventLine, key: str, hint: Any) -> object:
     """The value of a key, of its declared type. Raises ValueError if it is of another type."""
     if isinstance(hint, type) and issubclass(hint, StrEnum):
-        return hint(line[key]) if key in line else next(iter(hint))
+        return hint(logged[key]) if key in logged else next(iter(hint))
     if get_origin(hint) is tuple:
-        texts = line.get(key, ())
+        texts = logged.get(key, ())
         if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
             raise ValueError(f"{key} is no list of texts")
         return tuple(texts)
-    value = line[key] if key in line else _EMPTY.get(hint)
+    value = logged[key] if key in logged else _EMPTY.get(hint)
     if hint is Any or isinstance(value, hint) or (isinstance(value, int) and isinstance(0.0, hint)):
         return value
     raise ValueError(f"{key} is of another type")

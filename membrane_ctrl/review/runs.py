@@ -120,10 +120,10 @@ def _make_table(found: list[catalogue.RunEntry]) -> Table:
     """The table; runs of several folders have names from where these part."""
     common = os.path.commonpath([entry.folder.parent for entry in found]) if found else ""
     table = Table(box=None, header_style="bold", pad_edge=False)
-    words = {"run", "started, UTC", "configuration", "end"}
+    text_columns = {"run", "started, UTC", "configuration", "end"}
     numbers = ("length", "held", "std µm", "in band", "faults", "Kp", "Ti")
     for title in ("run", "started, UTC", *numbers, "configuration", "MB", "end"):
-        table.add_column(title, justify="left" if title in words else "right")
+        table.add_column(title, justify="left" if title in text_columns else "right")
     for entry in found:
         table.add_row(
             one_line(str(entry.folder.relative_to(common))),

@@ -88,7 +88,7 @@ class FleetOptions:
 class RunReport:
     """A run's own report, and its line of the fleet's page."""
 
-    line: dict[str, Any]  # with a `problem` instead of figures, if it cannot be reported
+    entry: dict[str, Any]  # with a `problem` instead of figures, if it cannot be reported
     text: str = ""  # report.json
     page: str = ""  # report.html
     curve: str = ""  # the error as a small SVG line
@@ -108,7 +108,7 @@ def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
             render_sparkline(analysis.level["mean_error_um"]),
         )
         return RunReport(
-            _make_fleet_line(analysis, table), text, render_report(analysis, history=history), curve
+            _make_fleet_entry(analysis, table), text, render_report(analysis, history=history), curve
         )
     except errors.CommandError as error:
         return RunReport({"problem": "; ".join(error.lines).removeprefix(f"{folder}: ")})
@@ -116,7 +116,7 @@ def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
         return RunReport({"problem": f"cannot be reported: {type(error).__name__}: {error}"})
 
 
-def _make_fleet_line(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
+def _make_fleet_entry(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
     """The figures of the run's own report that the fleet's page shows, and the names in its event
     log.
     """
@@ -166,7 +166,7 @@ def fleet_command(options: FleetOptions) -> int:
     folders, out = folders_of(options.runs), options.out.resolve()
     common = Path(os.path.commonpath([folder.parent for folder in folders]))
     workers = options.workers or min(os.cpu_count() or 1, len(folders))
-    job, rows, lines = partial(run_report, options.start, options.end), [], []
+    job, rows, entries = partial(run_report, options.start, options.end), [], []
     with (
         errors.convert_write_errors(out, errors.DeviceError, "; choose another folder with --out"),
         run_jobs(job, folders, workers, options.scheduler) as results,
@@ -174,60 +174,60 @@ def fleet_command(options: FleetOptions) -> int:
         counted = terminal.track_progress(results, "runs", len(folders))
         for folder, report in zip(folders, counted, strict=True):
             name = folder.relative_to(common)
-            line = {"name": str(name), "mirror": folder.parent.name} | report.line
-            if "problem" not in line:
-                line["report"] = str(name / "report.html")
+            entry = {"name": str(name), "mirror": folder.parent.name} | report.entry
+            if "problem" not in entry:
+                entry["report"] = str(name / "report.html")
                 write_report(out / name, report.text, report.page)
-            lines.append(line)
-            rows.append(_make_row(line, report.curve))
-        if all("problem" in line for line in lines):
-            raise errors.FindingsError([f"{line['name']}: {line['problem']}" for line in lines])
-        text = plain_json.dumps({**program.file_origin(SCHEMA), "runs": lines}, indent=1)
+            entries.append(entry)
+            rows.append(_make_row(entry, report.curve))
+        if all("problem" in entry for entry in entries):
+            raise errors.FindingsError([f"{entry['name']}: {entry['problem']}" for entry in entries])
+        text = plain_json.dumps({**program.file_origin(SCHEMA), "runs": entries}, indent=1)
         files.make_folder(out)
         files.write_text_atomic(out / "fleet.json", text + "\n")
-        files.write_text_atomic(out / "fleet.html", _make_page(lines, rows))
+        files.write_text_atomic(out / "fleet.html", _make_page(entries, rows))
     if options.as_json:
         print(text)
     else:
-        for line in lines:
-            print(terminal.one_line(f"{line['name']}: {line.get('sentence') or line['problem']}"))
+        for entry in entries:
+            print(terminal.one_line(f"{entry['name']}: {entry.get('sentence') or entry['problem']}"))
         print(out / "fleet.html")
     return errors.Exit.DONE
 
 
-def _make_row(line: dict[str, Any], curve: str) -> list[str]:
+def _make_row(entry: dict[str, Any], curve: str) -> list[str]:
     """Return the cells of a run's line, in the order of `_HEAD`."""
-    if "problem" in line:
-        cells = [line["name"], "", "", _NOT_REPORTED, line["problem"]]
+    if "problem" in entry:
+        cells = [entry["name"], "", "", _NOT_REPORTED, entry["problem"]]
         return cells + [""] * (len(_HEAD) - len(cells))
-    in_band = line["in_band"]
+    in_band = entry["in_band"]
     known = in_band is not None and in_band == in_band
     rest = format_time_beside(
-        line["faults_s"], line["paused_s"], line["moving_s"], line["duration_s"]
+        entry["faults_s"], entry["paused_s"], entry["moving_s"], entry["duration_s"]
     )
-    held = f"{format_span(line['settled_s'])} of {format_span(line['duration_s'])}"
-    faults = ", ".join(dict.fromkeys(line["faults"]))
+    held = f"{format_span(entry['settled_s'])} of {format_span(entry['duration_s'])}"
+    faults = ", ".join(dict.fromkeys(entry["faults"]))
     return [
-        _LINK.format(address=quote(line["report"]), name=line["name"]),
-        f"{datetime.fromisoformat(line['started_utc']):%Y-%m-%d %H:%M}",
+        _LINK.format(address=quote(entry["report"]), name=entry["name"]),
+        f"{datetime.fromisoformat(entry['started_utc']):%Y-%m-%d %H:%M}",
         Markup(curve),
-        f"{line['state']}, {line['exit'] or 'open'}",
+        f"{entry['state']}, {entry['exit'] or 'open'}",
         f"{held} ({', '.join(rest)})" if rest else held,
-        format_number(line["std_um"]),
-        format_number(line["mean_um"]),
+        format_number(entry["std_um"]),
+        format_number(entry["mean_um"]),
         f"{100 * in_band:.4g} %" if known else "–",
-        f"{len(line['faults'])}: {faults}" if faults else "0",
-        ", ".join(line["alarms"]) or "none",
-        str(line["found"]),
-        str(line["ticks_missed"]),
-        ", ".join(dict.fromkeys(line["anomalies"])) or "nothing unusual",
+        f"{len(entry['faults'])}: {faults}" if faults else "0",
+        ", ".join(entry["alarms"]) or "none",
+        str(entry["found"]),
+        str(entry["ticks_missed"]),
+        ", ".join(dict.fromkeys(entry["anomalies"])) or "nothing unusual",
     ]
 
 
-def _make_page(lines: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
-    failed = sum("problem" in line for line in lines)
-    odd = sum(line.get("verdict") in ("look", "bad") for line in lines)
+def _make_page(entries: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
+    failed = sum("problem" in entry for entry in entries)
+    odd = sum(entry.get("verdict") in ("look", "bad") for entry in entries)
     word = "bad" if failed else "look" if odd else "good"
-    sentence = f"{len(lines)} runs: {odd} to look at, {failed} cannot be reported."
+    sentence = f"{len(entries)} runs: {odd} to look at, {failed} cannot be reported."
     section = PageSection("", [PageText(sentence, MARKS[word]), PageTable(_HEAD, rows)])
     return render_page(ReportPage("Fleet", [section], wide=True))
