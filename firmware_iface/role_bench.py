@@ -200,8 +200,8 @@ class RoleBench:
         """The displacement, and the values of the other sensors by
         their field of `BenchReading`.
         """
-        asked = asyncio.gather(*(self._newest_value(role) for role in roles.SENSORS.values()))
-        sample, values = await asyncio.gather(self._newest_sample(), asked)
+        requests = asyncio.gather(*(self._newest_value(role) for role in roles.SENSORS.values()))
+        sample, values = await asyncio.gather(self._newest_sample(), requests)
         return sample, dict(zip(roles.SENSORS, values, strict=True))
 
     async def _read_actuators(self) -> tuple[float, float]:
@@ -209,11 +209,11 @@ class RoleBench:
         vent = self._devices.vent
         if vent is None:
             return await self._time_answer("pump", self._devices.pump.pump_fraction()), math.nan
-        asked = (
+        requests = (
             self._time_answer("pump", self._devices.pump.pump_fraction()),
             self._time_answer("vent", vent.vent_fraction()),
         )
-        found = await asyncio.gather(*asked, return_exceptions=True)
+        found = await asyncio.gather(*requests, return_exceptions=True)
         _raise_first(found)
         pump_fraction, vent_fraction = (value for value in found if isinstance(value, float))
         return pump_fraction, vent_fraction
@@ -243,10 +243,10 @@ class RoleBench:
         self._silent.pop(role.name, None)
         return value
 
-    async def _time_answer(self, role: str, asked: Awaitable[T]) -> T:
+    async def _time_answer(self, role: str, request: Awaitable[T]) -> T:
         """`answer`, with its time noted."""
         try:
-            return await answer(role, asked)
+            return await answer(role, request)
         finally:
             self._answered_s[role] = self._clock()
 
@@ -323,13 +323,13 @@ def _describe_ending(task: asyncio.Task[None]) -> str:
     return "was cancelled" if error is None else f"ended with {type(error).__name__}: {error}"
 
 
-async def answer(role: str, asked: Awaitable[T]) -> T:
+async def answer(role: str, request: Awaitable[T]) -> T:
     """A device's answer; an unexpected exception is a fault of that device, not the end of the run.
 
     Raises LinkError.
     """
     try:
-        return await asked
+        return await request
     except roles.LinkError:
         raise
     except Exception as error:

@@ -145,7 +145,7 @@ _.faulty_sensor  # in the template of a sentence
     _.td_s,
 )
 (
-    find_keepers,
+    find_protections,
     find_bound,
     _.distance_um,
 )  # the protection table, for docs/reference/faults.md, the safety case and the campaign

@@ -109,7 +109,7 @@ def find_roll_back(logs: Path, gains_only: bool = False) -> GainsEntry:
 
     A time constant of the shape loop counts too, unless `gains_only`.
     """
-    for found in _in_force(logs):
+    for found in _list_used_gains(logs):
         if found.shape_s is None or not gains_only:
             return found
     raise errors.InputError(f"{logs / 'tuning' / _FILE}: no kept gains")
@@ -119,11 +119,11 @@ def find_kept_shape_s(logs: Path, session: str = "") -> float | None:
     """The shape loop's time constant kept last, by any or this session,
     and not rolled back since.
     """
-    of_it = (line.shape_s for line in _in_force(logs) if session in ("", line.session))
+    of_it = (line.shape_s for line in _list_used_gains(logs) if session in ("", line.session))
     return next((shape_s[1] for shape_s in of_it if shape_s is not None), None)
 
 
-def _in_force(logs: Path) -> Iterator[GainsEntry]:
+def _list_used_gains(logs: Path) -> Iterator[GainsEntry]:
     """What was kept and not rolled back since, newest first."""
     undone: set[tuple[str, bool]] = set()
     for found in reversed(read_entries(logs)):

@@ -74,20 +74,20 @@ def ascii_frame(message: ProparMessage) -> bytes:
     )
 
 
-def split_binary(heard: bytes) -> tuple[list[ProparMessage], bytes]:
+def split_binary(received: bytes) -> tuple[list[ProparMessage], bytes]:
     """The complete messages received, and the remaining bytes; drops broken ones."""
     messages: list[ProparMessage] = []
-    while (start := heard.find(b"\x10\x02")) >= 0:
+    while (start := received.find(b"\x10\x02")) >= 0:
         body, at = bytearray(), start + 2
-        while at + 1 < len(heard) and (heard[at] != _DLE or heard[at + 1] == _DLE):
-            body.append(heard[at])
-            at += 2 if heard[at] == _DLE else 1
-        if at + 1 >= len(heard):
-            return messages, heard[start:]
-        if heard[at + 1] == _ETX and len(body) > 3 and body[2] == len(body) - 3:
+        while at + 1 < len(received) and (received[at] != _DLE or received[at + 1] == _DLE):
+            body.append(received[at])
+            at += 2 if received[at] == _DLE else 1
+        if at + 1 >= len(received):
+            return messages, received[start:]
+        if received[at + 1] == _ETX and len(body) > 3 and body[2] == len(body) - 3:
             messages.append(ProparMessage(body[0], body[1], bytes(body[3:])))
-        heard = heard[at + 2 if heard[at + 1] == _ETX else at :]
-    return messages, heard[-1:] if heard.endswith(b"\x10") else b""
+        received = received[at + 2 if received[at + 1] == _ETX else at :]
+    return messages, received[-1:] if received.endswith(b"\x10") else b""
 
 
 def parse_ascii(line: bytes) -> ProparMessage | None:
@@ -267,10 +267,10 @@ class ProparParameters:
 def _make_frame_filter(sequence: int, node: int) -> Callable[[bytes], bytes | None]:
     """Finds the answer with this sequence number; discards others, which are late."""
 
-    def take(heard: bytes) -> bytes | None:
-        for message in split_binary(heard)[0]:
+    def extract_frame(received: bytes) -> bytes | None:
+        for message in split_binary(received)[0]:
             if (message.sequence, message.node) == (sequence, node):
                 return binary_frame(message)
         return None
 
-    return take
+    return extract_frame

@@ -83,7 +83,7 @@ class AravisCamera:
             self._camera = library.call("arv_camera_new", config.camera.encode() or None)
             if not self._camera:
                 raise roles.LinkDownError(f"{self._name}: not found; see `membrane-ctrl devices`")
-            self._look_whether_ours()
+            self._check_ownership()
             identity = self._read_identity()
             self._apply_settings()
             self._start_stream()
@@ -187,7 +187,7 @@ class AravisCamera:
         vendor, model, serial = words
         return roles.DeviceIdentity(f"{vendor} {model}", serial, "", self.describe()["settings"])
 
-    def _look_whether_ours(self) -> None:
+    def _check_ownership(self) -> None:
         """Check control: a GigE Vision camera lets anyone read, but ignores writes except its
         controller's.
         """

@@ -40,9 +40,9 @@ class Mks937b(exchange.LineDriver):
         super().__init__(
             port or serial_port.SerialPort(config.port, line), ";FF", config.timeout_s, fence
         )
-        self._begin_anew()
+        self._reset_step_gate()
 
-    def _begin_anew(self) -> None:
+    def _reset_step_gate(self) -> None:
         self._gate = exchange.StepGate(self._config.step_max_pa)
         self._jumped = False
 
@@ -54,7 +54,7 @@ class Mks937b(exchange.LineDriver):
         take).
         """
         await self._link.close()
-        self._begin_anew()
+        self._reset_step_gate()
         return await self._opened(self._begin, ";FF")  # ends what an earlier program left half sent
 
     async def _begin(self) -> roles.DeviceIdentity:

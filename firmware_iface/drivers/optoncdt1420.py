@@ -33,7 +33,7 @@ _PROMPT = b"->"
 _ERROR = re.compile(r"E(\d{3})([^\r\n]*)")
 _RATE = re.compile(r"(\d+(?:\.\d*)?)(?: ?kHz)?")
 _MIDDLE_MIN = 8  # the median for fewer values
-_HEARD_BYTES_MAX = 65_536  # of the answer to a command, and of a stream that stops before it
+_BUFFER_BYTES_MAX = 65_536  # of the answer to a command, and of a stream that stops before it
 _BATCHES_MAX = 1024  # without a caller; old ones are dropped first
 _SILENT_MAX = 3  # readings without a single value: the sensor restarted or lost its power
 _BYTES = 6  # a measurement
@@ -105,12 +105,12 @@ class Optoncdt1420:
         self._port = port or serial_port.SerialPort(
             config.port, serial_port.SerialSettings(config.baud)
         )
-        self._settle_anew()
+        self._reset_stream()
 
-    def _settle_anew(self) -> None:
+    def _reset_stream(self) -> None:
         self._range_mm = self._zero_mm = math.nan
-        self._heard: bytes | None = b""  # None while streaming
-        self._stir = asyncio.Event()
+        self._buffer: bytes | None = b""  # None while streaming
+        self._arrival = asyncio.Event()
         self._parser = StreamParser()
         self._batches: list[NDArray[np.int64]] = []
         self._gate = exchange.StepGate(self._config.step_max_um)
@@ -126,7 +126,7 @@ class Optoncdt1420:
         (another device, another range, or a setting that the sensor does not take).
         """
         await self.close()
-        self._settle_anew()
+        self._reset_stream()
         self._port.open(self)
         try:
             with contextlib.suppress(
@@ -138,7 +138,7 @@ class Optoncdt1420:
             for setting in self._list_settings():
                 await self._write_setting(setting)
             self._port.write(b"OUTPUT RS422\n")  # stream data mixed with this answer are skipped
-            self._heard = None
+            self._buffer = None
             await self._first_readings()
         except roles.LinkError:
             await self.close()
@@ -192,34 +192,34 @@ class Optoncdt1420:
 
     async def _send_command(self, command: str) -> str:
         """The answer without its prompt. Raises LinkError, DeviceRefusedError."""
-        self._heard = b""
+        self._buffer = b""
         self._port.write(command.encode("ascii") + b"\n")
         what = f"{self._port.name}: {command}"
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._config.timeout_s):
-                while not self._heard.rstrip().endswith(_PROMPT):
+                while not self._buffer.rstrip().endswith(_PROMPT):
                     await self._wait_for_bytes()
-        if not self._heard.rstrip().endswith(
+        if not self._buffer.rstrip().endswith(
             _PROMPT
         ):  # it may have arrived while this process was suspended
             hint = (
                 f"no answer within {self._config.timeout_s:g} s; is it on, wired and set to "
                 f"{self._port.settings}?"
             )
-            if self._heard.strip() == command.encode("ascii"):
+            if self._buffer.strip() == command.encode("ascii"):
                 hint = (
                     "only what was sent comes back: the sensor is silent and the adapter echoes, "
                     "or the line's two directions are joined"
                 )
-            elif self._heard:
+            elif self._buffer:
                 hint = (
-                    f"{len(self._heard)} bytes but no prompt within {self._config.timeout_s:g} "
+                    f"{len(self._buffer)} bytes but no prompt within {self._config.timeout_s:g} "
                     "s; wrong baud rate?"
                 )
             raise roles.LinkError(f"{what}: {hint}")
         # bytes of a stream that is just stopping contain no text that could be an error: see the
         # marks
-        text = self._heard.rstrip()[: -len(_PROMPT)].decode("ascii", "replace")
+        text = self._buffer.rstrip()[: -len(_PROMPT)].decode("ascii", "replace")
         if error := _ERROR.search(text):
             raise roles.DeviceRefusedError(f"{what}: E{error[1]}{error[2]}")
         return text
@@ -294,30 +294,30 @@ class Optoncdt1420:
 
     async def _wait_for_bytes(self) -> None:
         """Wait for bytes or the end of the link. Raises LinkDownError."""
-        self._stir.clear()
-        await self._stir.wait()
+        self._arrival.clear()
+        await self._arrival.wait()
         if not self._port.is_open:
             raise roles.LinkDownError(f"{self._port.name}: the port is gone")
 
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
-        if self._heard is not None:
-            self._heard = (self._heard + data)[-_HEARD_BYTES_MAX:]
+        if self._buffer is not None:
+            self._buffer = (self._buffer + data)[-_BUFFER_BYTES_MAX:]
         elif len(batch := self._parser.feed(data)):
             self._counted += len(batch)
             self._arrived_s = asyncio.get_running_loop().time()
             self._batches.append(batch)
             del self._batches[:-_BATCHES_MAX]
-        self._stir.set()
+        self._arrival.set()
 
     def lost(self, error: roles.LinkDownError) -> None:
         """The port is gone (called by the port)."""
-        self._stir.set()
+        self._arrival.set()
 
     async def close(self) -> None:
         """Close the port; the laser stays on and streams on. Never raises."""
         self._port.close()
-        self._stir.set()
+        self._arrival.set()
 
     def describe(self) -> dict[str, str]:
         """For people: port, settings, manual."""

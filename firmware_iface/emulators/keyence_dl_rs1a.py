@@ -35,7 +35,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
     def line(self, text: str) -> None:
         """One command."""
         if text:  # of CR LF, the LF is left over
-            self.say(self._answer(text).encode("ascii", "replace") + b"\r\n")
+            self.send_answer(self._answer(text).encode("ascii", "replace") + b"\r\n")
 
     def _answer(self, text: str) -> str:
         command, *parameters = text.split(",")

@@ -49,7 +49,7 @@ class Optoncdt1420Emulator(LineDevice):
         self._raw = NO_PEAK
         self._stream: asyncio.TimerHandle | None = None
         self._streamed_s = 0.0
-        self._owed = 0.0
+        self._samples_due = 0.0
 
     def restart(self) -> None:
         """Settings that were not stored are lost, so it does not stream."""
@@ -84,7 +84,7 @@ class Optoncdt1420Emulator(LineDevice):
             self._register[name] = value
             self._stop_stream()
             answer = "\r\n"
-        self.say(answer.encode("ascii") + b"->")
+        self.send_answer(answer.encode("ascii") + b"->")
         if self._register["OUTPUT"] == "RS422" and self._stream is None:
             self._start_stream()
 
@@ -110,9 +110,11 @@ class Optoncdt1420Emulator(LineDevice):
     def _send_portion(self) -> None:
         """Send the measurements since the last portion."""
         loop = asyncio.get_running_loop()
-        self._owed += (loop.time() - self._streamed_s) * 1000 * float(self._register["MEASRATE"])
+        self._samples_due += (
+            (loop.time() - self._streamed_s) * 1000 * float(self._register["MEASRATE"])
+        )
         self._streamed_s = loop.time()
-        count, self._owed = int(self._owed), self._owed % 1
+        count, self._samples_due = int(self._samples_due), self._samples_due % 1
         displacement_um = self._displacement_um() if count else math.nan
         if data := b"".join(self._encode_measurement(displacement_um) for _ in range(count)):
             self.stream(data)
@@ -120,7 +122,7 @@ class Optoncdt1420Emulator(LineDevice):
 
     def stream(self, data: bytes) -> None:
         """Send measurements."""
-        self.say(data)
+        self.send_answer(data)
 
     def digital(self, displacement_um: float) -> int:
         """Page 65, without mastering: x = (d / range + 0.01) 65520 / 1.02;

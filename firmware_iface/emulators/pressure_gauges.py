@@ -42,7 +42,7 @@ class Mks937bEmulator(LineDevice):
         """One command, if it has this controller's address."""
         head, command = text[:4], text[4:]
         if head == f"@{self._address:03d}":
-            self.say(f"{head}{self._answer(command)};FF".encode("ascii"))
+            self.send_answer(f"{head}{self._answer(command)};FF".encode("ascii"))
 
     def _answer(self, command: str) -> str:
         if command.startswith("U!"):
@@ -50,8 +50,8 @@ class Mks937bEmulator(LineDevice):
                 return f"NAK{_ARGUMENT}"
             self.unit = command[2:].upper()
             return f"ACK{self.unit}"
-        told = self._answer_setting(command[:-1]) if command.endswith("?") else None
-        return f"NAK{_SYNTAX}" if told is None else f"ACK{told}"
+        setting = self._answer_setting(command[:-1]) if command.endswith("?") else None
+        return f"NAK{_SYNTAX}" if setting is None else f"ACK{setting}"
 
     def _answer_setting(self, name: str) -> str | None:
         if len(name) == 3 and name[:2] == "ST" and name[2] in "ABC":
@@ -116,7 +116,7 @@ class VaisalaPtb330Emulator(LineDevice):
     def _run(self) -> None:
         self._stream = None
         if self._running:
-            self.say(self._format_message())
+            self.send_answer(self._format_message())
             self._stream = asyncio.get_running_loop().call_later(_PERIOD_S, self._run)
 
     def line(self, text: str) -> None:
@@ -125,7 +125,7 @@ class VaisalaPtb330Emulator(LineDevice):
         answer = self._answer(text)
         prompt = ">" if self._echo else ""
         if whole := echo.encode("ascii", "replace") + answer + prompt.encode("ascii"):
-            self.say(whole)
+            self.send_answer(whole)
 
     def _answer(self, text: str) -> bytes:
         command, _, rest = text.partition(" ")

@@ -40,7 +40,7 @@ _BY_PLACE = {(parameter.process, parameter.number): parameter for parameter in b
 _FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
 _TYPES = {"u8": 0x00, "u16": 0x20, "f32": 0x40, "text": 0x60}
 WRITABLE = (bronkhorst.SETPOINT, bronkhorst.FSETPOINT, bronkhorst.CONTROL_MODE)
-_HEARD_BYTES_MAX = 4096  # of messages that have not ended
+_BUFFER_BYTES_MAX = 4096  # of messages that have not ended
 
 
 class VentusEmulator(LineDevice):
@@ -91,7 +91,7 @@ class VentusEmulator(LineDevice):
         if number in self.registers:
             value = self.registers[number]
             text = f"{value:.3f}" if number in _FLOATS else f"{value:.0f}"
-            self.say(f"#R{number},{text}\n".encode("ascii"))
+            self.send_answer(f"#R{number},{text}\n".encode("ascii"))
 
     def _set_flow(self) -> None:
         fraction = min(max(self._power_mw() / self._power_max_mw, 0.0), 1.0)
@@ -99,7 +99,7 @@ class VentusEmulator(LineDevice):
             self._driven = fraction
             self._drive(fraction)
         if self.registers[2] and self._stream is None and self._transmit is not None:
-            self._stream = asyncio.get_running_loop().call_later(_STREAM_PERIOD_S, self._say_state)
+            self._stream = asyncio.get_running_loop().call_later(_STREAM_PERIOD_S, self._send_state)
 
     def _power_mw(self) -> float:
         # manual mode from SetVal is the only one with a known power; the analogue input is open, at
@@ -107,10 +107,10 @@ class VentusEmulator(LineDevice):
         manual = self.registers[0] and not self.registers[10] and not self.registers[11]
         return min(self.registers[23], self.registers[1]) if manual else 0.0
 
-    def _say_state(self) -> None:
+    def _send_state(self) -> None:
         self._stream = None
         if self.registers[2]:
-            self.say(
+            self.send_answer(
                 f"#S{self.registers[0]:.0f},0.000,0.000,21000,0.000,0.000,0.000,0.000\n".encode(
                     "ascii"
                 )
@@ -243,22 +243,22 @@ class ProparDevice(serial_device.SerialDevice):
         super().__init__(settings)
         self.instrument = instrument
         self._node = node
-        self._heard = b""
+        self._buffer = b""
 
     def restart(self) -> None:
         """Power-up."""
-        self._heard = b""
+        self._buffer = b""
         self.instrument.restart()
 
     def received(self, data: bytes) -> None:
         """Answer every whole message."""
-        self._heard = (self._heard + data)[-_HEARD_BYTES_MAX:]
-        if b"\x10\x02" in self._heard:
-            messages, self._heard = bronkhorst_propar.split_binary(self._heard)
+        self._buffer = (self._buffer + data)[-_BUFFER_BYTES_MAX:]
+        if b"\x10\x02" in self._buffer:
+            messages, self._buffer = bronkhorst_propar.split_binary(self._buffer)
             for message in messages:
                 self._handle_frame(message, bronkhorst_propar.binary_frame)
-        while b"\r\n" in self._heard:
-            line, self._heard = self._heard.split(b"\r\n", 1)
+        while b"\r\n" in self._buffer:
+            line, self._buffer = self._buffer.split(b"\r\n", 1)
             ascii_message = bronkhorst_propar.parse_ascii(line)
             if ascii_message is not None:
                 self._handle_frame(ascii_message, bronkhorst_propar.ascii_frame)
@@ -275,7 +275,9 @@ class ProparDevice(serial_device.SerialDevice):
         except (ValueError, IndexError):
             answer = bytes([bronkhorst_propar.STATUS, _COMMAND_ERROR, 0])
         if answer:
-            self.say(frame(bronkhorst_propar.ProparMessage(message.sequence, message.node, answer)))
+            self.send_answer(
+                frame(bronkhorst_propar.ProparMessage(message.sequence, message.node, answer))
+            )
 
     def _answer(self, data: bytes) -> bytes:
         if data[0] == bronkhorst_propar.REQUEST:
@@ -309,10 +311,10 @@ class ProparDevice(serial_device.SerialDevice):
             if not chained:
                 answer.append(data[at])
                 at += 1
-            index, process, asked = data[at], data[at + 1], data[at + 2]
-            chained, kind = bool(index & 0x80), asked & 0x60
+            index, process, requested = data[at], data[at + 1], data[at + 2]
+            chained, kind = bool(index & 0x80), requested & 0x60
             at += 3
-            parameter = _BY_PLACE.get((process, asked & 0x1F))
+            parameter = _BY_PLACE.get((process, requested & 0x1F))
             if parameter is None:
                 return bytes([bronkhorst_propar.STATUS, _PARAMETER_ERROR, at])
             if kind != _TYPES[parameter.kind]:

@@ -29,21 +29,21 @@ class RtuBusEmulator(SerialDevice):
         super().__init__(settings)
         self._slaves = slaves
         self._echo_test = echo_test
-        self._heard = b""
-        self._heard_s = 0.0
+        self._buffer = b""
+        self._received_s = 0.0
 
     def received(self, data: bytes) -> None:
         """Answer a frame as soon as its CRC is right; after a silence the next one begins."""
         now_s = asyncio.get_running_loop().time()
-        self._heard = data if now_s - self._heard_s > _SILENCE_S else self._heard + data
-        self._heard_s = now_s
-        frame = self._heard = self._heard[-_LONGEST:]
+        self._buffer = data if now_s - self._received_s > _SILENCE_S else self._buffer + data
+        self._received_s = now_s
+        frame = self._buffer = self._buffer[-_LONGEST:]
         if len(frame) < _SHORTEST or struct.unpack("<H", frame[-2:])[0] != bitwise_crc(frame[:-2]):
             return
-        self._heard = b""
+        self._buffer = b""
         unit, pdu = frame[0], frame[1:-2]
         if unit in self._slaves and (body := self.answer(unit, pdu)):
-            self.say(body + struct.pack("<H", bitwise_crc(body)))
+            self.send_answer(body + struct.pack("<H", bitwise_crc(body)))
 
     def answer(self, unit: int, pdu: bytes) -> bytes:
         """Unit id and answer PDU to a request; empty for none."""

@@ -55,21 +55,21 @@ class SerialDevice:
     def restart(self) -> None:
         """Settings as after power-up."""
 
-    def hear(self, data: bytes) -> None:
+    def receive(self, data: bytes) -> None:
         """Bytes begin to arrive; the device gets them when the last one is in."""
         self._call_later(
             asyncio.get_running_loop().time() + len(data) * self.settings.char_s, self.arrived, data
         )
 
     def received(self, data: bytes) -> None:
-        """Bytes arrived; the device answers with `say`."""
+        """Bytes arrived; the device answers with `send_answer`."""
         raise NotImplementedError
 
     def arrived(self, data: bytes) -> None:
         """All bytes are in."""
         self.received(data)
 
-    def say(self, answer: bytes, delay_s: float = 0.0) -> None:
+    def send_answer(self, answer: bytes, delay_s: float = 0.0) -> None:
         """Send an answer after the bytes being sent."""
         begin_s = max(asyncio.get_running_loop().time() + delay_s, self._free_s)
         self._free_s = begin_s + len(answer) * self.settings.char_s
@@ -95,18 +95,18 @@ class LineDevice(SerialDevice):
 
     def __init__(self, baud: int, data_bits: int = 8, parity: str = "N") -> None:
         super().__init__(SerialSettings(baud, data_bits, parity))
-        self._heard = b""
+        self._buffer = b""
 
     def received(self, data: bytes) -> None:
         """Answer every complete line."""
-        *lines, self._heard = (self._heard + data).split(self.end)
+        *lines, self._buffer = (self._buffer + data).split(self.end)
         for line in lines:
             self.line(line.strip().decode("ascii", "replace"))
-        self._heard = self._heard[-_LINE_BYTES_MAX:]
+        self._buffer = self._buffer[-_LINE_BYTES_MAX:]
 
     def restart(self) -> None:
         """Half a line is forgotten."""
-        self._heard = b""
+        self._buffer = b""
 
     def line(self, text: str) -> None:
         """One line arrived."""
@@ -157,7 +157,7 @@ class PtyWire:
         if self._ends is None:
             return
         data = os.read(self._ends[0], _READ_BYTES)
-        self._device.hear(self._distort_bytes(data))
+        self._device.receive(self._distort_bytes(data))
 
     def _transmit(self, data: bytes) -> None:
         if self._ends is not None:

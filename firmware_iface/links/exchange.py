@@ -50,7 +50,7 @@ class Question:
 
     data: bytes  # sent unchanged
     # from all bytes so far: the answer, None while incomplete. Raises LinkError for anything else
-    take: Callable[[bytes], bytes | None]
+    extract_answer: Callable[[bytes], bytes | None]
     answer_bytes: (
         int  # length of the longest answer: its time on the wire is added to the device's own
     )
@@ -66,8 +66,8 @@ class _Abandoned:
     """A question that was not answered in time, and the bytes since it was asked."""
 
     question: Question
-    asked_s: float
-    heard: bytes
+    request_s: float
+    received_bytes: bytes
 
 
 class SerialExchange:
@@ -93,7 +93,7 @@ class SerialExchange:
         self._failures = 0
         self._noisy = False
         self._last_byte_s = 0.0
-        self._heard = b""
+        self._buffer = b""
         self._question: Question | None = None  # the last one
         self._answer: asyncio.Future[bytes] | None = None
         # the last questions without a valid answer in time, oldest first
@@ -198,8 +198,8 @@ class SerialExchange:
             raise DeviceRefusedError(f"{question.what}: {_ECHO}")
         loop = asyncio.get_running_loop()
         self.port.write(question.data)
-        self._heard, self._question = b"", question
-        asked_s = loop.time()
+        self._buffer, self._question = b"", question
+        request_s = loop.time()
         self._late.note_question()
         answer: asyncio.Future[bytes] = loop.create_future()
         self._answer = answer
@@ -211,18 +211,18 @@ class SerialExchange:
         finally:
             self._answer = None
         if not answer.done():
-            if self._heard == question.data:
+            if self._buffer == question.data:
                 raise DeviceRefusedError(f"{question.what}: {_ONLY_ECHO}")
-            self._abandoned.append(_Abandoned(question, asked_s, self._heard))
+            self._abandoned.append(_Abandoned(question, request_s, self._buffer))
             raise LinkError(f"{question.what}: {self._explain_missing_answer(timeout_s)}")
         if answer.exception() is not None:  # its own answer may still come
-            self._abandoned.append(_Abandoned(question, asked_s, b""))
+            self._abandoned.append(_Abandoned(question, request_s, b""))
             return answer.result()
         self._late.note_in_time()
         self._abandoned.clear()
-        heard = answer.result()
-        self._repeated = question.data if self._heard == question.data else b""
-        return heard
+        received_bytes = answer.result()
+        self._repeated = question.data if self._buffer == question.data else b""
+        return received_bytes
 
     def _require_open(self, what: str) -> None:
         if not self.port.is_open:
@@ -231,14 +231,14 @@ class SerialExchange:
     def _explain_missing_answer(self, timeout_s: float) -> str:
         if slow := self._late.explain():
             return f"no answer within {timeout_s:g} s; {slow}"
-        if not self._heard:
+        if not self._buffer:
             return (
                 f"no answer within {timeout_s:g} s; is it on, wired and set to "
                 f"{self.port.settings}?"
             )
-        shown = self._heard[:_SHOWN_BYTES]
+        shown = self._buffer[:_SHOWN_BYTES]
         return (
-            f"incomplete answer within {timeout_s:g} s: {len(self._heard)} bytes ({shown!r}); "
+            f"incomplete answer within {timeout_s:g} s: {len(self._buffer)} bytes ({shown!r}); "
             "wrong baud rate?"
         )
 
@@ -251,23 +251,23 @@ class SerialExchange:
             self._echoes |= self._is_second_copy(data)
             return
         question = self._question
-        self._heard += data
-        if len(self._heard) > question.answer_bytes + _EXTRA_BYTES_MAX:
+        self._buffer += data
+        if len(self._buffer) > question.answer_bytes + _EXTRA_BYTES_MAX:
             self._answer.set_exception(
-                LinkError(f"{self.port.name}: {len(self._heard)} bytes without an answer")
+                LinkError(f"{self.port.name}: {len(self._buffer)} bytes without an answer")
             )
             return
-        is_echo = self._heard.startswith(question.data)
+        is_echo = self._buffer.startswith(question.data)
         if is_echo and not question.answer_repeats:
-            if len(self._heard) > len(question.data):
+            if len(self._buffer) > len(question.data):
                 self._answer.set_exception(DeviceRefusedError(f"{question.what}: {_ECHO}"))
             return
         try:
-            answer = question.take(self._heard)
+            answer = question.extract_answer(self._buffer)
         except LinkError as error:
-            if question.data.startswith(self._heard) and not is_echo:
+            if question.data.startswith(self._buffer) and not is_echo:
                 return  # it may be the beginning of an echo
-            if is_echo or self._is_second_copy(self._heard):
+            if is_echo or self._is_second_copy(self._buffer):
                 self._answer.set_exception(DeviceRefusedError(f"{question.what}: {_ECHO}"))
             elif is_late:
                 self._answer.set_exception(LinkError(f"{question.what}: {self._late.explain()}"))
@@ -277,21 +277,21 @@ class SerialExchange:
             if answer is not None:
                 self._answer.set_result(answer)
 
-    def _is_second_copy(self, heard: bytes) -> bool:
+    def _is_second_copy(self, received_bytes: bytes) -> bool:
         """Whether these bytes answer a question that its own bytes had answered before."""
-        return bool(self._repeated) and heard.startswith(self._repeated)
+        return bool(self._repeated) and received_bytes.startswith(self._repeated)
 
     def _completes_abandoned(self, data: bytes) -> bool:
         """Whether these bytes complete the answer to an abandoned question; notes its delay."""
         for abandoned in self._abandoned:
-            abandoned.heard = (abandoned.heard + data)[-_EXTRA_BYTES_MAX:]
+            abandoned.received_bytes = (abandoned.received_bytes + data)[-_EXTRA_BYTES_MAX:]
             try:
-                answer = abandoned.question.take(abandoned.heard)
+                answer = abandoned.question.extract_answer(abandoned.received_bytes)
             except LinkError:  # the answer to another one
-                abandoned.heard = b""
+                abandoned.received_bytes = b""
                 continue
             if answer is not None:
-                self._late.note_late(self._last_byte_s - abandoned.asked_s)
+                self._late.note_late(self._last_byte_s - abandoned.request_s)
                 self._abandoned.remove(abandoned)
                 return True
         return False
@@ -353,34 +353,36 @@ class LineLink:
         this form in time), LinkDownError (the line is gone).
         """
         fence = self._question(self._fence.command, self._fence.answer, self._fence.longest)
-        heard = await self._exchange.ask(
+        received_bytes = await self._exchange.ask(
             self._question(command, answer, longest), self._timeout_s, fence
         )
-        found = answer.fullmatch(heard.decode("ascii"))
-        assert found is not None  # `take` matched it
+        found = answer.fullmatch(received_bytes.decode("ascii"))
+        assert found is not None  # `extract_answer` matched it
         return found
 
     def _question(self, command: str, answer: re.Pattern[str], longest: int) -> Question:
         what = f"{self.name}: {command.splitlines()[-1]}"
 
-        def take(heard: bytes) -> bytes | None:
-            heard = heard.lstrip(_LINE_ENDS)
+        def extract_answer(received_bytes: bytes) -> bytes | None:
+            received_bytes = received_bytes.lstrip(_LINE_ENDS)
             try:
-                text = heard.decode("ascii")
+                text = received_bytes.decode("ascii")
             except UnicodeDecodeError:
                 raise LinkError(
-                    f"{what}: not text ({heard[:24].hex(' ')}); noise, or wrong baud rate"
+                    f"{what}: not text ({received_bytes[:24].hex(' ')}); noise, or wrong baud rate"
                 ) from None
             if answer.fullmatch(text):
-                return heard
+                return received_bytes
             if len(text) > longest:
                 raise LinkError(f"{what}: {text[:_SHOWN_CHARS]!r}... is not a valid answer")
             return None
 
-        asked = command + self._end
+        request = command + self._end
         # a device may confirm a command by repeating it: that is no echo of the adapter
-        repeats = answer.fullmatch(asked) is not None
-        return Question(asked.encode("ascii"), take, longest, what, answer_repeats=repeats)
+        repeats = answer.fullmatch(request) is not None
+        return Question(
+            request.encode("ascii"), extract_answer, longest, what, answer_repeats=repeats
+        )
 
 
 class LineDriver:

@@ -233,8 +233,8 @@ class GuardedModbusRtu:
         exactly: bytes = b"",
         repeats: bool = False,
     ) -> exchange.Question:
-        def take(heard: bytes) -> bytes | None:
-            reply = take_reply(heard, self._unit_id, pdu[0], answer_bytes, what)
+        def extract_answer(received_bytes: bytes) -> bytes | None:
+            reply = extract_reply(received_bytes, self._unit_id, pdu[0], answer_bytes, what)
             if (
                 exactly
                 and reply is not None
@@ -246,7 +246,7 @@ class GuardedModbusRtu:
 
         reads = pdu[0] in _READS_REGISTERS + _READS_BITS
         frame = rtu_frame(self._unit_id, pdu)
-        return exchange.Question(frame, take, answer_bytes, what, repeats, reads)
+        return exchange.Question(frame, extract_answer, answer_bytes, what, repeats, reads)
 
 
 class ModbusLinks:
@@ -291,8 +291,8 @@ def parse_tcp_url(url: str) -> tuple[str, int]:
     return host, DEFAULT_PORT if port is None else port
 
 
-def take_reply(
-    heard: bytes, unit_id: int, function_code: int, answer_bytes: int, what: str
+def extract_reply(
+    received_bytes: bytes, unit_id: int, function_code: int, answer_bytes: int, what: str
 ) -> bytes | None:
     """The PDU of a whole reply, None while bytes are missing.
 
@@ -300,28 +300,34 @@ def take_reply(
     wire, do not survive the buffers of adapters and kernels. Raises LinkError (another unit,
     function, length or CRC).
     """
-    if heard[0] != unit_id:
-        raise LinkError(f"{what}: answer from unit {heard[0]}, expected unit {unit_id}")
-    if len(heard) < 3:
+    if received_bytes[0] != unit_id:
+        raise LinkError(f"{what}: answer from unit {received_bytes[0]}, expected unit {unit_id}")
+    if len(received_bytes) < 3:
         return None
-    if heard[1] == function_code | modbus_link.EXCEPTION_FLAG:
+    if received_bytes[1] == function_code | modbus_link.EXCEPTION_FLAG:
         length = _EXCEPTION_BYTES
-    elif heard[1] == function_code:
+    elif received_bytes[1] == function_code:
         length = answer_bytes
     else:
-        raise LinkError(f"{what}: answer has function code {heard[1]}, expected {function_code}")
-    data_bytes = answer_bytes - 5
-    if length == answer_bytes and function_code in _READS_REGISTERS and heard[2] != data_bytes:
         raise LinkError(
-            f"{what}: {heard[2] / 2:g} registers instead of {data_bytes // 2}; "
+            f"{what}: answer has function code {received_bytes[1]}, expected {function_code}"
+        )
+    data_bytes = answer_bytes - 5
+    if (
+        length == answer_bytes
+        and function_code in _READS_REGISTERS
+        and received_bytes[2] != data_bytes
+    ):
+        raise LinkError(
+            f"{what}: {received_bytes[2] / 2:g} registers instead of {data_bytes // 2}; "
             f"{modbus_link.SHORT_REPLY}"
         )
-    if length == answer_bytes and function_code in _READS_BITS and heard[2] != data_bytes:
-        raise LinkError(f"{what}: {heard[2]} bytes of bits instead of {data_bytes}")
-    if len(heard) < length:
+    if length == answer_bytes and function_code in _READS_BITS and received_bytes[2] != data_bytes:
+        raise LinkError(f"{what}: {received_bytes[2]} bytes of bits instead of {data_bytes}")
+    if len(received_bytes) < length:
         return None
-    if len(heard) > length:
-        raise LinkError(f"{what}: {len(heard)} bytes instead of {length}")
-    if compute_crc16(heard):  # over a frame with its own CRC the sum is 0
+    if len(received_bytes) > length:
+        raise LinkError(f"{what}: {len(received_bytes)} bytes instead of {length}")
+    if compute_crc16(received_bytes):  # over a frame with its own CRC the sum is 0
         raise LinkError(f"{what}: wrong checksum; noise on the line, or wrong baud rate")
-    return heard[1:-2]
+    return received_bytes[1:-2]

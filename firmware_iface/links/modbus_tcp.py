@@ -72,7 +72,7 @@ class GuardedModbusTcp:
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
         self._back_off = serial_port.BackOff()
         self._received_bytes = 0  # since the last request was sent
-        self._asked_s: dict[int, float] = {}  # the newest requests, by transaction number
+        self._request_times_s: dict[int, float] = {}  # the newest requests, by transaction number
         self._late = LateAnswers()
 
     @property
@@ -98,7 +98,7 @@ class GuardedModbusTcp:
             raise LinkWaitsError(f"{self.name}: next attempt to connect in {wait_s:.1f} s")
         await self.close()
         self._back_off.attempted(self._clock())
-        self._asked_s.clear()
+        self._request_times_s.clear()
 
         def changed(connected: bool) -> None:
             if not connected:
@@ -142,19 +142,19 @@ class GuardedModbusTcp:
     def _note_request(self, transaction: int) -> None:
         """Remember when a request is sent, to recognise its reply if that comes late."""
         self._late.note_question()
-        self._asked_s[transaction] = self._clock()
-        while len(self._asked_s) > _REMEMBERED_REQUESTS:
-            del self._asked_s[next(iter(self._asked_s))]
+        self._request_times_s[transaction] = self._clock()
+        while len(self._request_times_s) > _REMEMBERED_REQUESTS:
+            del self._request_times_s[next(iter(self._request_times_s))]
 
     def _note_reply(self, transaction: int, newest: int) -> None:
         """Measure how late a reply comes that nobody waits for; `newest` is the present request."""
-        asked_s = self._asked_s.pop(transaction, None)
-        if asked_s is None:
+        request_s = self._request_times_s.pop(transaction, None)
+        if request_s is None:
             return
         if transaction == newest:
             self._late.note_in_time()
         else:
-            self._late.note_late(self._clock() - asked_s)
+            self._late.note_late(self._clock() - request_s)
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Read `count` holding registers (function code 3).

@@ -70,7 +70,7 @@ def _read_earlier(config: Config, run_dir: Path) -> FollowedModes | None:
 def _read_followed(path: Path) -> FollowedModes:
     """Read the modes that an acquisition followed. Raises OSError; ValueError if damaged."""
     table = plain_json.loads(files.read_text(path, _FILE_BYTES_MAX))
-    if not isinstance(table, dict) or not file_checksums.take_checksum(table):
+    if not isinstance(table, dict) or not file_checksums.pop_checksum(table):
         raise ValueError(f"{path}: damaged")
     remove_origin(table, _SCHEMA)
     return decode_state(json.dumps(table.get(_MODES_KEY)).encode(), FollowedModes, _FILE_BYTES_MAX)

@@ -72,7 +72,7 @@ class FleetConfig(Section):
     """The holds."""
 
     @model_validator(mode="after")
-    def _told_apart(self) -> "FleetConfig":
+    def _require_distinct_mirrors(self) -> "FleetConfig":
         if len({hold.name for hold in self.holds}) < len(self.holds):
             raise ValueError("holds: two have the same name")
         return self

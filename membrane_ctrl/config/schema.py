@@ -368,15 +368,15 @@ class Config(Section):
         """Whether the mirror is held without a laser."""
         return self.estimator.process_value == "optics"
 
-    def with_gains(self, told: Mapping[str, Any] | None) -> "Config":
+    def with_gains(self, changed: Mapping[str, Any] | None) -> "Config":
         """This configuration with the gains, and the pump's curve, of an event; as it is if they do
         not fit.
         """
-        told = told or {}
-        loop_told = {key: told[key] for key in LoopConfig.model_fields if key in told}
+        changed = changed or {}
+        loop_changed = {key: changed[key] for key in LoopConfig.model_fields if key in changed}
         try:
-            loop = LoopConfig.model_validate(self.loop.model_dump() | loop_told)
-            pump = PumpConfig.model_validate(told.get("pump", self.pump))
+            loop = LoopConfig.model_validate(self.loop.model_dump() | loop_changed)
+            pump = PumpConfig.model_validate(changed.get("pump", self.pump))
         except ValidationError:
             return self
         return self.model_copy(update={"loop": loop, "pump": pump})

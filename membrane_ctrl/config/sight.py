@@ -277,13 +277,13 @@ def _angle_hint(optics: OpticsConfig, alpha_deg: float, depths_mm: list[float]) 
         ("as radians", math.degrees(alpha_deg)),
         ("from the mirror's axis", 90.0 - alpha_deg),
     )
-    for reading, meant_deg in alternatives:
-        if not 0.0 < meant_deg < 180.0:
+    for reading, corrected_deg in alternatives:
+        if not 0.0 < corrected_deg < 180.0:
             continue
-        geometry = optics.geometry.model_copy(update={"alpha_deg": meant_deg})
-        meant = optics.model_copy(update={"geometry": geometry})
-        if max(trace_view(meant, depth_mm).measured for depth_mm in depths_mm) >= _GOOD:
-            return f"{reading} it is {meant_deg:.1f} deg"
+        geometry = optics.geometry.model_copy(update={"alpha_deg": corrected_deg})
+        corrected = optics.model_copy(update={"geometry": geometry})
+        if max(trace_view(corrected, depth_mm).measured for depth_mm in depths_mm) >= _GOOD:
+            return f"{reading} it is {corrected_deg:.1f} deg"
     return (
         "measure alpha_deg from the mirror's plane; check a_mm, b_mm, [pattern] and mirror.sag_mm"
     )

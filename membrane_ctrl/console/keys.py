@@ -25,7 +25,7 @@ class Desk:
         self._send = send
         self._prompt = ""  # "mark" or "stop" while it waits for an answer
         self._text = ""
-        self._said = ""
+        self._status_line = ""
         self._answer: Future[str] | None = None
         self.help = False
 
@@ -38,13 +38,13 @@ class Desk:
     def bottom_line(self) -> str:
         """The console's last line."""
         if self._answer is not None and self._answer.done():
-            self._said, self._answer = self._answer.result(), None
+            self._status_line, self._answer = self._answer.result(), None
         match self._prompt:
             case "mark":
                 return f"mark: {self._text}▏ (Enter sends, Esc cancels)"
             case "stop":
                 return "stop the run? y: yes, any other key: no"
-        return f"{self._said}   · {_FOOT}" if self._said else _FOOT
+        return f"{self._status_line}   · {_FOOT}" if self._status_line else _FOOT
 
     def process_keys(self, text: str, paused: bool) -> None:
         """Take what was typed. Of several characters at once only the first is a command: the rest
@@ -59,7 +59,7 @@ class Desk:
             if text[0] in "yY":
                 self._send_request({"do": "stop"})
             else:
-                self._said = "not stopped"
+                self._status_line = "not stopped"
         else:
             self._run_command(text[0].lower(), paused)
 
@@ -76,7 +76,7 @@ class Desk:
             case "?":
                 self.help = not self.help
             case "\x1a":
-                self._said = _SUSPENDED
+                self._status_line = _SUSPENDED
 
     def _write_text(self, text: str) -> None:
         for letter in text:
@@ -94,5 +94,5 @@ class Desk:
                 self._text = (self._text + letter)[:_MARK_MAX]
 
     def _send_request(self, request: Request) -> None:
-        self._said = f"{request['do']}: waiting for the answer"
+        self._status_line = f"{request['do']}: waiting for the answer"
         self._answer = self._send(request)

@@ -142,7 +142,7 @@ class ConsoleModel:
         """The "end" event has arrived."""
         return self._status.ended
 
-    def take_row(self, row: telemetry.TelemetryRow) -> None:
+    def add_row(self, row: telemetry.TelemetryRow) -> None:
         """Take one tick."""
         if self._status.row is None:
             self._started_s = row.mono_s
@@ -155,14 +155,14 @@ class ConsoleModel:
         if len(rows):
             self._held.add_rows(rows)
 
-    def take_event(self, line: events.EventLine) -> None:
+    def add_event(self, line: events.EventLine) -> None:
         """Take one event, a line of `events.jsonl`."""
         event = event_lines.from_dict(line)
         self._status = self._status.after_event(event, line.get("mono_s", math.nan))
         if not isinstance(event, _NOT_LISTED):
             self._events.append(line)
 
-    def take_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
+    def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Take one measurement cycle."""
         self._estimate, row = estimate, self._status.row
         self._cycles += 1
@@ -178,7 +178,7 @@ class ConsoleModel:
     def make_view(self, now_s: float) -> ConsoleView:
         """The content at a time of the run's clock."""
         status, row = self._status, self._status.row
-        in_force = self._config.with_gains(status.loop)
+        present = self._config.with_gains(status.loop)
         errors = self._error.finite_values()
         band_um = self._config.limits.band_um
         age_s = now_s - row.mono_s if row else 0.0
@@ -206,8 +206,8 @@ class ConsoleModel:
             last_fault=f"{fault_words(status.last_fault)} at {format_duration(status.last_fault_s)}"
             * bool(status.faults),
             too_tight=self._too_tight(now_s),
-            gains=run_status.gains_words(vars(in_force.loop), status.trial_left_s),
-            flow_most_um_per_s=in_force.loop.flow_most_um_per_s(in_force.pump),
+            gains=run_status.gains_words(vars(present.loop), status.trial_left_s),
+            flow_most_um_per_s=present.loop.flow_most_um_per_s(present.pump),
             notices=tuple(notice.short_text for notice in status.other_notices),
             events=tuple(self._events),
             shape=self._make_shape_view(now_s),
@@ -259,11 +259,11 @@ class ConsoleModel:
         )
 
 
-def _acquisition_words(said: acquisition_events.AcquisitionState | None) -> str:
+def _acquisition_words(reported: acquisition_events.AcquisitionState | None) -> str:
     return (
         ""
-        if said is None or said.state == "running"
-        else ": ".join(w for w in (said.state, said.message) if w)
+        if reported is None or reported.state == "running"
+        else ": ".join(w for w in (reported.state, reported.message) if w)
     )
 
 

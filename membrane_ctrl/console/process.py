@@ -129,7 +129,7 @@ def _draw_console(
         rounds(show)
 
 
-def give_back_terminal(keyboard: key_reader.Keyboard | None = None) -> None:
+def restore_terminal(keyboard: key_reader.Keyboard | None = None) -> None:
     """Restore the terminal's main page, cursor and modes after a killed console."""
     if keyboard is not None:
         keyboard.restore_modes()
@@ -160,13 +160,13 @@ class _Feed:
         """Take all new messages; returns the events."""
         messages = list(self._telemetry.drain())
         for message in messages:
-            self.model.take_row(telemetry.TelemetryRow.unpack(message))
+            self.model.add_row(telemetry.TelemetryRow.unpack(message))
         self.model.add_rows(telemetry.unpack_rows(messages))
         for message in self._shapes.drain() if self._shapes else ():
-            self.model.take_shape(shape_estimate.unpack_estimate(message))
+            self.model.add_shape(shape_estimate.unpack_estimate(message))
         lines: list[EventLine] = [json.loads(message) for message in self._events.drain()]
         for line in lines:
-            self.model.take_event(line)
+            self.model.add_event(line)
         return lines
 
     def close(self) -> None:

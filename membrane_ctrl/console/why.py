@@ -48,21 +48,30 @@ def list_used_sensors(row: TelemetryRow) -> str:
 
 
 def explain_state(
-    row: TelemetryRow, told: str, fault: str, config: Config, paused: bool = False
+    row: TelemetryRow, reported: str, fault: str, config: Config, paused: bool = False
 ) -> str:
-    """The line; `told` is the controller's last reason, `fault` describes the standing fault or is
-    empty.
+    """Return the line.
+
+    Parameters
+    ----------
+    row : TelemetryRow
+    reported : str
+        The controller's last reason.
+    fault : str
+        Describes the standing fault, or is empty.
+    config : Config
+    paused : bool
     """
     state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
     if safe_level != SafeLevel.NONE:
-        return f"{_level_words(safe_level, row, config)}: {fault or told or 'unknown fault'}"
+        return f"{_level_words(safe_level, row, config)}: {fault or reported or 'unknown fault'}"
     if state in _STATES:
-        return told or _STATES[state]
+        return reported or _STATES[state]
     sees = math.isfinite(row.displacement_um) or math.isfinite(row.estimate_sigma_um)
     if not (sees and math.isfinite(row.filtered_um)):
-        return f"{_LEVELS[SafeLevel.HOLD_FLOW]}: {told or fault or 'no valid laser reading'}"
+        return f"{_LEVELS[SafeLevel.HOLD_FLOW]}: {reported or fault or 'no valid laser reading'}"
     if paused:
-        return told
+        return reported
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
         return (

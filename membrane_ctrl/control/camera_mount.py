@@ -12,7 +12,7 @@ from membrane_ctrl.model.state_tree import StateNode
 class CameraMountState(StateNode):
     """Temperatures of the stand: the present one, and at the lock."""
 
-    stand_c: LowPass = field(default_factory=LowPass)
+    mount_c: LowPass = field(default_factory=LowPass)
     locked_c: float = math.nan
 
 
@@ -31,12 +31,12 @@ class CameraMountGrowth:
 
     def lock(self) -> None:
         """From now on the present temperature is that of the reference."""
-        self.memory.locked_c = self.memory.stand_c.value
+        self.memory.locked_c = self.memory.mount_c.value
 
     def step(self, air_c: float, dt_s: float) -> None:
         """Follow the air's temperature; NaN without a good reading."""
         if math.isfinite(air_c):
-            self.memory.stand_c.update(air_c, dt_s, self._follows_air_s)
+            self.memory.mount_c.update(air_c, dt_s, self._follows_air_s)
             if math.isnan(self.memory.locked_c):
                 self.lock()
 
@@ -44,7 +44,7 @@ class CameraMountGrowth:
     def warmed_k(self) -> float:
         """By how much the stand is warmer than at the lock; 0 if unknown."""
         locked_c = self.memory.locked_c
-        return 0.0 if math.isnan(locked_c) else self.memory.stand_c.value - locked_c
+        return 0.0 if math.isnan(locked_c) else self.memory.mount_c.value - locked_c
 
     @property
     def um(self) -> float:

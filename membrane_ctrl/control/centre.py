@@ -36,7 +36,7 @@ from membrane_ctrl.control.weather_limits import discard_impossible_weather
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
-_GAS, _LEAK, _AMBIENT, _AIR, _WARMTH, _MOUNT, _STAND = range(7)
+_GAS, _LEAK, _AMBIENT, _AIR, _WARMTH, _MOUNT, _OPTICS_ZERO = range(7)
 _PLANT = 7  # states before the clones
 CLONES = 64  # 1.3 s at 50 Hz
 _CLONE_S = 0.02  # least time between clones
@@ -211,14 +211,14 @@ class CentreFilter:
         self._transit.place(flow_um_per_s)
         if math.isfinite(sag_zero_um):
             memory.origin.sag_um = sag_zero_um
-            memory.p[_STAND, _STAND] = 0.0
+            memory.p[_OPTICS_ZERO, _OPTICS_ZERO] = 0.0
             memory.frames = LOCK_FRAMES
 
     def relock(self) -> None:
         """Take the optics' next readings as a new zero."""
         memory = self.memory
-        memory.p[_STAND] = memory.p[:, _STAND] = 0.0
-        memory.p[_STAND, _STAND], memory.x[_STAND] = _UNKNOWN_UM2, 0.0
+        memory.p[_OPTICS_ZERO] = memory.p[:, _OPTICS_ZERO] = 0.0
+        memory.p[_OPTICS_ZERO, _OPTICS_ZERO], memory.x[_OPTICS_ZERO] = _UNKNOWN_UM2, 0.0
         memory.origin.sag_um = math.nan
         memory.frames = 0
         memory.watches[Sensor.OPTICS] = SensorWatch()
@@ -274,7 +274,7 @@ class CentreFilter:
             variance = config.thermometer_noise_k**2
             self._use_reading(Sensor.THERMOMETER, _ONE[_AIR], change_k, variance, given.now_s)
         if math.isfinite(given.sag_um) and 0.0 <= given.sag_sigma_um < _IMPOSSIBLE:
-            self._take_frame(given)
+            self._use_frame(given)
         if math.isfinite(given.laser_um):
             row = self._centre + _ONE[_MOUNT]
             self._use_reading(
@@ -317,7 +317,7 @@ class CentreFilter:
         memory.p[slot, slot] = self._centre @ memory.p[slot]
         memory.x[slot] = self._centre @ memory.x
 
-    def _take_frame(self, given: CentreReadings) -> None:
+    def _use_frame(self, given: CentreReadings) -> None:
         """Use a figure's sag: a reading of the centre at the time at which the frame was taken."""
         memory = self.memory
         times, time_s = memory.times, given.sag_time_s
@@ -328,7 +328,7 @@ class CentreFilter:
         if not math.isfinite(before[early]) or time_s > given.now_s:
             return  # older than the memory, or from the future
         # Its expectation: the centre then, linear between the two, less the optics' zero
-        row = _ONE[_PLANT + early] - _ONE[_STAND]
+        row = _ONE[_PLANT + early] - _ONE[_OPTICS_ZERO]
         if math.isfinite(after[late]):
             share = float((time_s - times[early]) / (times[late] - times[early]))
             row += share * (_ONE[_PLANT + late] - _ONE[_PLANT + early])
@@ -353,10 +353,10 @@ class CentreFilter:
         displacement mount + e.
         """
         for matrix in (self.memory.p, self.memory.p.T):
-            matrix[_GAS] -= matrix[_STAND]
-            matrix[_MOUNT] += matrix[_STAND]
-            matrix[_PLANT:] -= matrix[_STAND]
-            matrix[_STAND] = 0.0
+            matrix[_GAS] -= matrix[_OPTICS_ZERO]
+            matrix[_MOUNT] += matrix[_OPTICS_ZERO]
+            matrix[_PLANT:] -= matrix[_OPTICS_ZERO]
+            matrix[_OPTICS_ZERO] = 0.0
 
     def _use_reading(
         self,
@@ -513,7 +513,7 @@ class CentreFilter:
             if sensor == Sensor.LASER and self._is_fresh(Sensor.OPTICS, now_s):
                 self.relock()  # the optics missed it: their zero is where the laser shows the film
             elif sensor == Sensor.OPTICS and self._laser_agrees(now_s):
-                self._widen_states(_OPTICS_JUMP_SHARE * innovation * _ONE[_STAND])
+                self._widen_states(_OPTICS_JUMP_SHARE * innovation * _ONE[_OPTICS_ZERO])
 
     def _laser_agrees(self, now_s: float) -> bool:
         return self._is_fresh(Sensor.LASER, now_s) and not self.memory.watches[Sensor.LASER].far

@@ -82,7 +82,7 @@ class CentreEstimate(StateNode):
 
     def telemetry(self) -> dict[str, float]:
         """What a telemetry row says of it."""
-        told = {
+        values = {
             f"{sensor.name.lower()}_innovation": view.innovation
             for sensor, view in zip(Sensor, self.sensors, strict=True)
             if view.fresh
@@ -90,5 +90,5 @@ class CentreEstimate(StateNode):
         return {
             "estimate_sigma_um": self.sigma_um,
             "optics_share": self.sensors[Sensor.OPTICS].share,
-            **told,
+            **values,
         }

@@ -98,7 +98,7 @@ class FilmHealth:
             (
                 "leak_growth",
                 leak / (LEAK_GREW * max(first.leak_um_per_s, TOO_TIGHT_UM_PER_S)),
-                self._says_leak(leak),
+                self._describe_leak(leak),
             ),
             (
                 "pump_reserve",
@@ -123,12 +123,12 @@ class FilmHealth:
         changed = set(bad) ^ set(warned)
         self.memory.warned = bad
         return [
-            MaintenanceNotice(name, says if name in bad else "no longer so", name in bad)
-            for name, _, says in found
+            MaintenanceNotice(name, describe if name in bad else "no longer so", name in bad)
+            for name, _, describe in found
             if name in changed
         ]
 
-    def _says_leak(self, leak_um_per_s: float) -> str:
+    def _describe_leak(self, leak_um_per_s: float) -> str:
         """The leak, and how long the pump can keep up at this growth."""
         hours = self.memory.hours
         days = (len(hours) - 1) / DAY_HOURS

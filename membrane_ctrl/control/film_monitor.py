@@ -62,7 +62,7 @@ def are_means_known(seen_s: float, readings: int) -> bool:
 
 
 @dataclass(slots=True)
-class SinceState(StateNode):
+class ComparisonState(StateNode):
     """A reference of laser, trim and gauge that follows slowly while laser and gauge agree."""
 
     laser_um: float = math.nan
@@ -72,16 +72,16 @@ class SinceState(StateNode):
 
 
 @dataclass(frozen=True, slots=True)
-class _Since:
+class _GaugeComparison:
     """Compares changes of sag against such a reference."""
 
     sensor: str  # of the displacement
     follow_s: float
     limit_um: float
 
-    def apart(
+    def find_contradiction(
         self,
-        memory: SinceState,
+        memory: ComparisonState,
         laser_um: float,
         trim_um: float,
         root: float,
@@ -98,8 +98,10 @@ class _Since:
         by_laser_um, trimmed_um = laser_um - memory.laser_um, trim_um - memory.trim_um
         by_gauge_um = (sag_um - by_laser_um) * (root / memory.root - 1)
         # A laser drift that the shape loop has compensated has not moved the film.
-        apart_um = min(abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um))
-        memory.share = apart_um / (
+        difference_um = min(
+            abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um)
+        )
+        memory.share = difference_um / (
             self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um))
         )
         if memory.share > 1.0:
@@ -122,9 +124,9 @@ class FilmMonitorState(StateNode):
     )  # of the cube root of the gauge pressure
     seen_s: float = 0.0
     readings: Count = 0
-    minutes: SinceState = field(default_factory=SinceState)
-    hour: SinceState = field(default_factory=SinceState)
-    day: SinceState = field(default_factory=SinceState)
+    minutes: ComparisonState = field(default_factory=ComparisonState)
+    hour: ComparisonState = field(default_factory=ComparisonState)
+    day: ComparisonState = field(default_factory=ComparisonState)
     # sensor and gauge have moved apart over hours, as by climate or a slow drift
     drifting: bool = False
 
@@ -152,9 +154,9 @@ class FilmMonitor:
         self.memory = memory or FilmMonitorState()
         self._limits = limits
         self._sag_um, self._pressure_pa = 1e3 * mirror.sag_mm, mirror.pressure_pa
-        self._minutes = _Since(sensor, SINCE_MINUTES_S, limits.laser_gauge_apart_max_um)
-        self._hour = _Since(sensor, SINCE_HOUR_S, limits.laser_gauge_drift_max_um)
-        self._day = _Since(sensor, SINCE_DAY_S, limits.laser_gauge_day_max_um)
+        self._minutes = _GaugeComparison(sensor, SINCE_MINUTES_S, limits.laser_gauge_apart_max_um)
+        self._hour = _GaugeComparison(sensor, SINCE_HOUR_S, limits.laser_gauge_drift_max_um)
+        self._day = _GaugeComparison(sensor, SINCE_DAY_S, limits.laser_gauge_day_max_um)
 
     def reset(self) -> None:
         """Forget everything."""
@@ -193,7 +195,8 @@ class FilmMonitor:
             (self._day, memory.day),
         )
         contradictions = [
-            since.apart(kept, laser_um, trim_um, root, sag_um, dt_s) for since, kept in spans
+            since.find_contradiction(kept, laser_um, trim_um, root, sag_um, dt_s)
+            for since, kept in spans
         ]
         memory.drifting = memory.day.share > (
             DRIFTING_OVER_SHARE if memory.drifting else DRIFTING_SHARE

@@ -161,7 +161,7 @@ class InnerLoop:
         The flow is the pump's present flow, or the mean it is known to need.
         """
         self.memory.measured.reset(displacement_um)
-        self._stand_at(displacement_um)
+        self._hold_setpoint_at(displacement_um)
         self._ramp.place(math.nan)  # placed by the first step, which knows the trim
         self._pid.place(self._limiter.place(flow_um_per_s))
         self._curve.note_stop()
@@ -277,7 +277,7 @@ class InnerLoop:
         if seen:
             self._filter_reading(given.displacement_um, dt_s)
         if not math.isnan(self.memory.measured.value):
-            self._stand_at(self.memory.measured.value)
+            self._hold_setpoint_at(self.memory.measured.value)
             self._ramp.place(self.memory.measured.value - given.trim_um)
         weather_um_per_s = self._feedforward.update(
             given.ambient_pressure_pa, given.air_temperature_c, dt_s
@@ -382,7 +382,7 @@ class InnerLoop:
         self._pid.place(self._limiter.place(self._curve.flow(mean_fraction)))
         self.memory.leak.skip_step()
 
-    def _stand_at(self, setpoint_um: float) -> None:
+    def _hold_setpoint_at(self, setpoint_um: float) -> None:
         """Put everything that follows the setpoint to rest there."""
         self.memory.setpoint_um = setpoint_um
         self.memory.shaped_um = setpoint_um
@@ -394,7 +394,7 @@ class InnerLoop:
     ) -> tuple[float, float]:
         """Advance the setpoint; return it as the loop sees it, and its speed in µm/s."""
         if math.isnan(self.memory.setpoint_um):
-            self._stand_at(filtered_um)
+            self._hold_setpoint_at(filtered_um)
         if math.isnan(self._ramp.value_um):
             self._ramp.place(self.memory.setpoint_um - given.trim_um)
         base_um = self._ramp.advance(given.target_um, self._pid.integral_um_per_s, dt_s)

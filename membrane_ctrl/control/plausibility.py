@@ -219,7 +219,7 @@ class PlausibilityCheck:
         `blind`: the last one is old. A camera that saw nothing of what moved is not accused of it.
         """
         memory = self.memory
-        self._take_laser(displacement_um, dt_s)
+        self._average_laser(displacement_um, dt_s)
         if math.isfinite(gauge_pa):
             memory.gauge.update(gauge_pa, dt_s, SMOOTH_S)
         if (
@@ -238,7 +238,7 @@ class PlausibilityCheck:
             self._judge_means(means, dt_s)
         return memory.faulty
 
-    def _take_laser(self, displacement_um: float, dt_s: float) -> None:
+    def _average_laser(self, displacement_um: float, dt_s: float) -> None:
         """Update the laser's mean; after a gap it begins with the first reading, for the film may
         have moved.
         """

@@ -224,13 +224,13 @@ class ShapeLoop:
             estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity
         )
         drift_um = estimate.displacement_um - reference.displacement_um - change.change_um
-        apart_um = drift_um - memory.drift.drift_at(estimate.time_s, self._time_constant_s)
-        if abs(apart_um) > self._config.disagreement_max_um:
-            apart = (
-                f"camera and laser disagree by {apart_um:+.1f} µm: check the laser's mount, or "
-                "lock again"
+        disagreement_um = drift_um - memory.drift.drift_at(estimate.time_s, self._time_constant_s)
+        if abs(disagreement_um) > self._config.disagreement_max_um:
+            disagreement = (
+                f"camera and laser disagree by {disagreement_um:+.1f} µm: check the laser's "
+                "mount, or lock again"
             )
-            self._refuse_estimate(make_reason(ShapeCode.DISAGREE, apart))
+            self._refuse_estimate(make_reason(ShapeCode.DISAGREE, disagreement))
             return
         memory.admitted_s = estimate.time_s
         memory.change = change

@@ -167,11 +167,11 @@ class CentreEstimation:
         self.memory.estimate = estimate = self._filter.step(readings, context.dt_s)
         self._note_blindness(inputs.now_s)
         context.trim_um = estimate.mount_um
-        news = [
+        events = [
             *self._report_sensors_in_use(inputs.now_s, estimate.jumped),
             *self._report_mount_growth(),
         ]
-        news += self._mount_drift.step(
+        events += self._mount_drift.step(
             estimate.mount_um,
             estimate.jumped_sensors,
             inputs.now_s,
@@ -181,7 +181,7 @@ class CentreEstimation:
         if self._follows_sensor(Sensor.OPTICS):
             sigma_um = math.hypot(estimate.sigma_um, self._camera_mount.sigma_um)
             self.memory.estimate = replace(estimate, sigma_um=sigma_um)
-        return news
+        return events
 
     def _stop_estimate(self) -> None:
         self._filter = None

@@ -70,16 +70,16 @@ class Controller:
         self._config = config
         self.memory = memory = memory or first_state(config)
         self._gains = gains_trial.GainsTrial(memory.gains)
-        in_force = self._in_force
+        present = self._present_config
         self._safety = safety.SafetyTable(config.limits, memory=memory.safety)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity, memory.shape)
         self._shape.set_memory(self._gains.present.shape_time_constant_s)
         estimator = apply_response(config.estimator, memory.context.pump_response)
         self._context = TickContext(
             config=config,
-            loop_config=in_force.loop,
-            pump_config=in_force.pump,
-            loop=inner_loop.InnerLoop(in_force.loop, in_force.pump, estimator, memory.loop),
+            loop_config=present.loop,
+            pump_config=present.pump,
+            loop=inner_loop.InnerLoop(present.loop, present.pump, estimator, memory.loop),
             observer=Observer(config, memory.observer),
             levels=safe_levels.SafeLevels(config.states, memory.levels),
             standstill=standstill.Standstill(config.loop, config.states, memory.standstill),
@@ -94,8 +94,8 @@ class Controller:
         self._estimation = centre_estimation.CentreEstimation(
             config.model_copy(update={"estimator": estimator}), memory.holders
         )
-        self._estimation.set_gains(in_force.loop)
-        self._consistency.set_gains(in_force.loop, in_force.pump)
+        self._estimation.set_gains(present.loop)
+        self._consistency.set_gains(present.loop, present.pump)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
 
@@ -124,7 +124,7 @@ class Controller:
         return self._context.pump_config
 
     @property
-    def _in_force(self) -> Config:
+    def _present_config(self) -> Config:
         gains = self._gains.present
         return self._config.model_copy(update={"loop": gains.loop, "pump": gains.pump})
 
@@ -272,8 +272,8 @@ class Controller:
         refused = (
             commands.explain_overruled(command, obeyed)
             or locks.refuse_while_locked(command, self._context.locks)
-            or commands.explain_refusal(command, self.state, self._in_force)
-            or self._prepare_experiment(command)
+            or commands.explain_refusal(command, self.state, self._present_config)
+            or self._refuse_hold_or_experiment(command)
         )
         self._answers.append((command.number, refused))
         events.append(commands.make_command_event(command, refused))
@@ -329,7 +329,7 @@ class Controller:
         )
         events.append(event)
 
-    def _prepare_experiment(self, command: commands.Command) -> str:
+    def _refuse_hold_or_experiment(self, command: commands.Command) -> str:
         """Prepare the experiment of a `tune`; returns why the command is refused,
         or an empty text.
         """
@@ -349,7 +349,7 @@ class Controller:
                 else context.setpoint_um
             )
             stepped = replace(command, kind="setpoint", value=now_um + command.setpoint_step_um)
-            return commands.explain_refusal(stepped, self.state, self._in_force)
+            return commands.explain_refusal(stepped, self.state, self._present_config)
         if command.kind != "tune" or spec is None:
             return ""
         centre_um = context.setpoint_um + context.trim_um

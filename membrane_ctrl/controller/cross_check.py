@@ -268,16 +268,19 @@ def _check_limits(config: Config, say: cross_check_plant.ConfigFindings) -> None
         setpoint_um - limits.displacement_min_um,
     )
     field = "shape.trim_max_um" if trim_um >= limits.band_um else "limits.band_um"
-    for room_um, side in ((above_um, "above"), (below_um, "below")):
+    for margin_um, side in ((above_um, "above"), (below_um, "below")):
         why = (
-            f"trim and band reach the limit, {room_um:g} µm {side} the setpoint ({setpoint_um:g} "
+            f"trim and band reach the limit, {margin_um:g} µm {side} the setpoint ({setpoint_um:g} "
             "µm)"
         )
         remedy = "lower it, or move the setpoint or the limits"
-        say.error(trim_um + limits.band_um >= room_um, field, why, remedy)
-    following_um, room_um = limits.following_error_max_um, min(above_um, below_um)
-    why, less = "can never trip: a displacement limit trips first", f"set less than {room_um:g} µm"
-    say.warn(following_um >= room_um, "limits.following_error_max_um", why, less)
+        say.error(trim_um + limits.band_um >= margin_um, field, why, remedy)
+    following_um, margin_um = limits.following_error_max_um, min(above_um, below_um)
+    why, less = (
+        "can never trip: a displacement limit trips first",
+        f"set less than {margin_um:g} µm",
+    )
+    say.warn(following_um >= margin_um, "limits.following_error_max_um", why, less)
     why = f"a mirror inside the band would be a following error ({following_um:g} µm)"
     say.error(
         limits.band_um >= following_um,

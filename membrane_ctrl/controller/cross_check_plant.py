@@ -301,13 +301,15 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
         1.0 / config.loop.rate_hz,
     )
     above_um = limits.displacement_max_um - config.loop.setpoint_um
-    room_pa = limits.gauge_pressure_max_pa - pressure_pa
+    margin_pa = limits.gauge_pressure_max_pa - pressure_pa
     why = f"the mirror has {pressure_pa:g} Pa at displacement 0 (optics.mirror.pressure_pa)"
     say.error(
-        room_pa <= 0.0, "limits.gauge_pressure_max_pa", why, "measure that, or raise the limit"
+        margin_pa <= 0.0, "limits.gauge_pressure_max_pa", why, "measure that, or raise the limit"
     )
     step, why = "limits.gauge_step_max_pa", "can never trip: the pressure limit trips first"
-    say.error(0.0 < room_pa <= limits.gauge_step_max_pa, step, why, f"set less than {room_pa:g} Pa")
+    say.error(
+        0.0 < margin_pa <= limits.gauge_step_max_pa, step, why, f"set less than {margin_pa:g} Pa"
+    )
     least = f"set at least {_STORM_PA:g} Pa"
     say.error(
         limits.gauge_step_max_pa < _STORM_PA, step, "a storm alone moves the gauge this far", least

@@ -110,10 +110,10 @@ class Guard(Enum):
     EXPERIMENT_TIME = "an experiment ends after its duration (`experiments/trial.py`)"
 
 
-Keeper = str | Guard  # the name of a rule of `safety.TABLE`, or a guard
-_Keepers = tuple[Keeper, ...]
+Protection = str | Guard  # the name of a rule of `safety.TABLE`, or a guard
+_Protections = tuple[Protection, ...]
 
-_MOTIONS: Mapping[Activity, _Keepers] = {
+_MOTIONS: Mapping[Activity, _Protections] = {
     Activity.INFLATE: (Guard.RAMP_WAITS,),
     Activity.SETTLE: ("overdue",),
     Activity.HOLD: ("following_error",),
@@ -121,7 +121,7 @@ _MOTIONS: Mapping[Activity, _Keepers] = {
     Activity.MANUAL: (Guard.MANUAL_RANGE,),
     Activity.TUNE: (Guard.EXPERIMENT,),
 }
-_TIMES: Mapping[Activity, _Keepers] = {
+_TIMES: Mapping[Activity, _Protections] = {
     Activity.INFLATE: ("overdue",),
     Activity.SETTLE: ("overdue",),
     Activity.HOLD: ("following_error",),
@@ -129,11 +129,11 @@ _TIMES: Mapping[Activity, _Keepers] = {
     Activity.MANUAL: (Guard.MANUAL_TIME,),
     Activity.TUNE: (Guard.EXPERIMENT_TIME,),
 }
-_DEPTHS: _Keepers = ("over_displacement", "under_displacement")
+_DEPTHS: _Protections = ("over_displacement", "under_displacement")
 _COMPARED = frozenset(Activity) - {Activity.INFLATE}
 
 
-def find_keepers(process_value: ProcessValue, activity: Activity, duty: Duty) -> _Keepers:
+def find_protections(process_value: ProcessValue, activity: Activity, duty: Duty) -> _Protections:
     """The rules and guards that fulfil a duty in a cell; each keeps it by itself.
 
     Parameters
@@ -150,8 +150,8 @@ def find_keepers(process_value: ProcessValue, activity: Activity, duty: Duty) ->
     """
     uses_laser = process_value is not ProcessValue.OPTICS
     uses_optics = process_value is not ProcessValue.LASER
-    by_figures: _Keepers = (Guard.FIGURE_GATE,) if uses_optics else ()
-    by_laser: _Keepers
+    by_figures: _Protections = (Guard.FIGURE_GATE,) if uses_optics else ()
+    by_laser: _Protections
     match duty:
         case Duty.PRESSURE:
             return ("over_pressure", "pressure_missing", "gauge_stuck", "gauge_jump")

@@ -187,7 +187,7 @@ class SensorConsistency:
         if moves:
             self.memory.growth.note_ramp()
             self.memory.gas_excess = ""
-        self._look_at_camera(held.figure)
+        self._note_figure(held.figure)
         events += self._judge_weather(inputs, dt_s)
         blind = not inputs.now_s - self.memory.camera_s <= self._fresh_s
         faulty = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
@@ -332,7 +332,7 @@ class SensorConsistency:
             )
         ]
 
-    def _look_at_camera(self, estimate: ShapeEstimate | None) -> None:
+    def _note_figure(self, estimate: ShapeEstimate | None) -> None:
         """Note when the camera last showed the film, and how often it repeated one shape bit by
         bit.
         """

@@ -149,8 +149,8 @@ class Standstill:
         if reading is None:
             memory.seen_off = False
             return
-        self._look_at_readback(now_s, reading.pump_fraction)
-        self._look_at_mirror(now_s, reading)
+        self._compare_readback(now_s, reading.pump_fraction)
+        self._watch_mirror(now_s, reading)
 
     def _forget_observations(self) -> None:
         """The pump is commanded on: nothing that was observed counts."""
@@ -163,7 +163,7 @@ class Standstill:
         memory.runs_on = ""
         memory.inflow = ""
 
-    def _look_at_readback(self, now_s: float, readback: float) -> None:
+    def _compare_readback(self, now_s: float, readback: float) -> None:
         memory = self.memory
         memory.seen_off = readback <= OFF_FRACTION  # false for NaN: an unseen pump may run
         if memory.seen_off:
@@ -176,7 +176,7 @@ class Standstill:
         if on_s > self._states.lower_timeout_s:
             memory.runs_on = f"read-back {100.0 * readback:.0f} %, commanded off for {on_s:.1f} s"
 
-    def _look_at_mirror(self, now_s: float, reading: BenchReading) -> None:
+    def _watch_mirror(self, now_s: float, reading: BenchReading) -> None:
         memory, block = self.memory, self.memory.open_block
         if math.isnan(block.ends_s):
             block.ends_s = now_s + _BLOCK_S

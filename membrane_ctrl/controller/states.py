@@ -326,7 +326,7 @@ def run_state(state: State, context: TickContext) -> State:
         return State.LOWER
     if (
         state in (State.INFLATE, State.SETTLE, State.HOLD)
-        and (elsewhere := _asked_elsewhere(context)) is not None
+        and (elsewhere := _find_requested_state(context)) is not None
     ):
         return elsewhere
     return HANDLERS[state](context)
@@ -354,7 +354,7 @@ def _manual_over(context: TickContext) -> str:
     return ""
 
 
-def _asked_elsewhere(context: TickContext) -> State | None:
+def _find_requested_state(context: TickContext) -> State | None:
     """The requested state, if it is not a hold."""
     if context.trial is not None:
         _drive_pump(

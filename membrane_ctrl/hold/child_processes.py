@@ -196,16 +196,16 @@ class ChildProcesses:
 
     def _end_console(self) -> None:
         """Give the terminal back, even if the console hangs."""
-        from membrane_ctrl.console.process import give_back_terminal
+        from membrane_ctrl.console.process import restore_terminal
 
         console = self._console.child
         if not console.join(_CHILD_STOPS_S):
             console.stop(0.0)
         if console.exit_code != 0:
-            give_back_terminal(self._keyboard)
+            restore_terminal(self._keyboard)
 
 
-def _make_child_factory(name: str, room: str, nice: int, spec: Callable[[int], object]) -> Make:
+def _make_child_factory(name: str, package: str, nice: int, spec: Callable[[int], object]) -> Make:
     """Return a maker of a room's children; `spec` maps the number of earlier children to the next
     one's argument.
     """
@@ -213,7 +213,7 @@ def _make_child_factory(name: str, room: str, nice: int, spec: Callable[[int], o
     def make(count: int) -> tuple[Child, Connection]:
         ours, theirs = make_pipe()
         return Child(
-            name, f"membrane_ctrl.{room}.process:{room}_main", (spec(count), theirs), nice
+            name, f"membrane_ctrl.{package}.process:{package}_main", (spec(count), theirs), nice
         ), ours
 
     return make

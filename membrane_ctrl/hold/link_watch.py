@@ -111,14 +111,14 @@ class FailureCounter:
             self._messages.clear()
         self._messages.add(message)
         self._standing, self._reported_s = True, now_s
-        self._tell(message, works=False)
+        self._count_and_report(message, works=False)
 
     def note_success(self, now_s: float) -> None:
         """Everything that was asked was answered."""
         if now_s - self._last_failure_s < _GOOD_S:
             return
         if self._standing:
-            self._tell("answers again", works=True)
+            self._count_and_report("answers again", works=True)
         self._standing, self._unreported = False, 0
         self._repeat_s = _FIRST_REPEAT_S
         self._messages.clear()
@@ -126,8 +126,8 @@ class FailureCounter:
     def note_connection(self) -> None:
         """A lost connection is back; whether it stays is not known yet."""
         self._standing = False
-        self._tell("connected again", works=True)
+        self._count_and_report("connected again", works=True)
 
-    def _tell(self, message: str, works: bool) -> None:
+    def _count_and_report(self, message: str, works: bool) -> None:
         count, self._unreported = self._unreported, 0
         self._report(message, works, count)

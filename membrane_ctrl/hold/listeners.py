@@ -37,7 +37,7 @@ class FaultLatch:
         Name of the run folder.
     utc : callable
         Converts the run's clock to UTC.
-    tell : callable
+    report : callable
         Records that writing the file failed, or works again.
     """
 
@@ -47,13 +47,19 @@ class FaultLatch:
         resumes: ResumeLog | None,
         run: str,
         utc: Callable[[float], datetime],
-        tell: Callable[[events.Event], None],
+        report: Callable[[events.Event], None],
     ) -> None:
-        self._file, self._resumes, self._run, self._utc, self._tell = file, resumes, run, utc, tell
+        self._file, self._resumes, self._run, self._utc, self._report = (
+            file,
+            resumes,
+            run,
+            utc,
+            report,
+        )
         # one thread, so that a fault and its acknowledgement stay in order; started by the first
         # fault
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
-        self._news: deque[events.Event] = deque()  # from the disk thread
+        self._pending: deque[events.Event] = deque()  # from the disk thread
         self._failing = False
         self._last: Callable[[], None] = lambda: None
         self._fault: events.Fault | None = None
@@ -128,16 +134,16 @@ class FaultLatch:
             act()
         except Exception as error:  # nothing else would see an exception of this thread
             if not self._failing:
-                self._news.append(run_events.LatchFailed(str(error)))
+                self._pending.append(run_events.LatchFailed(str(error)))
             self._failing = True
         else:
             if self._failing:
-                self._news.append(run_events.LatchWritten())
+                self._pending.append(run_events.LatchWritten())
                 self._failing = False
 
     def _report_failure(self) -> None:
-        while self._news:
-            self._tell(self._news.popleft())
+        while self._pending:
+            self._report(self._pending.popleft())
 
 
 class SystemdNotify:

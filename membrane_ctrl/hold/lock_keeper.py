@@ -23,7 +23,7 @@ from membrane_ctrl.model.errors import os_reason
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.lock_words import distinct_word
 
-_LOOK_S = 1.0  # for locks that other programs store
+_CHECK_S = 1.0  # for locks that other programs store
 _RETRY_S = 10.0  # of a write that failed
 _OUTCOMES_MOST = 256  # remembered for the port, which asks at once
 
@@ -47,19 +47,19 @@ class LockKeeper:
     ----------
     storage : LockStorage or None
         None: locks end with the run (the twin's default).
-    tell : callable
+    report : callable
         Records that storing failed, or works again.
-    ask : callable
+    send_command : callable
         Hands a command to the next tick.
     """
 
     def __init__(
         self,
         storage: LockStorage | None,
-        tell: Callable[[events.Event], None],
-        ask: Callable[[Command], None] = lambda command: None,
+        report: Callable[[events.Event], None],
+        send_command: Callable[[Command], None] = lambda command: None,
     ) -> None:
-        self._storage, self._tell, self._ask = storage, tell, ask
+        self._storage, self._report, self._send_command = storage, report, send_command
         # one thread, so that a lock and its removal stay in order
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="locks")
         self._files: dict[str, Path | None] = {}  # by word; of the disk thread after the start
@@ -68,12 +68,12 @@ class LockKeeper:
         self._failed: dict[
             str, Callable[[], None]
         ] = {}  # by word: what to try again; of the disk thread
-        self._news: deque[events.Event] = deque()  # from the disk thread, as the next one
+        self._pending: deque[events.Event] = deque()  # from the disk thread, as the next one
         self._asked: deque[Command] = deque()
         self._looking: Future[None] | None = None
         self._outcomes: dict[int, Future[str]] = {}  # by number of the request
         self._retry_at_s = time.monotonic() + _RETRY_S
-        self._look_at_s = time.monotonic() + _LOOK_S
+        self._check_at_s = time.monotonic() + _CHECK_S
 
     @property
     def at_start(self) -> tuple[Lock, ...]:
@@ -109,8 +109,8 @@ class LockKeeper:
         if time.monotonic() >= self._retry_at_s:
             self._retry_at_s = time.monotonic() + _RETRY_S
             self._disk.submit(self._retry_write)
-        if time.monotonic() >= self._look_at_s and (self._looking is None or self._looking.done()):
-            self._look_at_s = time.monotonic() + _LOOK_S
+        if time.monotonic() >= self._check_at_s and (self._looking is None or self._looking.done()):
+            self._check_at_s = time.monotonic() + _CHECK_S
             self._looking = self._disk.submit(self._find_new, self._storage)
 
     def find_outcome(self, number: int) -> Future[str] | None:
@@ -156,11 +156,11 @@ class LockKeeper:
                 else str(error)
             )
             if word not in self._failed:
-                self._news.append(run_events.LockNotStored(word, reason))
+                self._pending.append(run_events.LockNotStored(word, reason))
             self._failed[word] = act
             return reason
         if self._failed.pop(word, None) is not None:
-            self._news.append(run_events.LockStored(word))
+            self._pending.append(run_events.LockStored(word))
         return ""
 
     def _find_new(self, storage: LockStorage) -> None:
@@ -182,10 +182,10 @@ class LockKeeper:
             self._try_write(word, act)
 
     def _report_failure(self) -> None:
-        while self._news:
-            self._tell(self._news.popleft())
+        while self._pending:
+            self._report(self._pending.popleft())
         while self._asked:
-            self._ask(self._asked.popleft())
+            self._send_command(self._asked.popleft())
 
 
 def _lock_of(event: events.LockSet) -> Lock:

@@ -175,8 +175,8 @@ class Supervisor:
         self._record_tick(inputs, outputs)
         for event in outputs.events:
             self.record_event(event)
-        for name, hear in wiring.tick_listeners.items():
-            self._run_guarded(name, partial(hear, outputs))
+        for name, listener in wiring.tick_listeners.items():
+            self._run_guarded(name, partial(listener, outputs))
         self._record_snapshot(now_s)
         return inputs, outputs
 
@@ -290,8 +290,8 @@ class Supervisor:
         """Report what happened to the children; the hold continues without them."""
         for report in self._wiring.reports():
             self.record_event(report)
-            for name, told in self._wiring.report_listeners.items():
-                self._run_guarded(name, partial(told, report))
+            for name, listener in self._wiring.report_listeners.items():
+                self._run_guarded(name, partial(listener, report))
 
     def _run_guarded(self, name: str, act: Callable[[], None]) -> None:
         """Run a part of the program; if it raises, the next tick sees the fault `dead_task`."""

@@ -124,8 +124,8 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
 def _record_and_notify(event: events.Event, supervisor: Supervisor, wiring: Wiring) -> None:
     """Record an event, and pass it on as a child's report."""
     supervisor.record_event(event)
-    for told in wiring.report_listeners.values():
-        told(event)
+    for listener in wiring.report_listeners.values():
+        listener(event)
 
 
 def _make_wiring(parts: HoldResources, stack: contextlib.ExitStack) -> Wiring:
@@ -170,7 +170,7 @@ def _send_first_commands(
 
 def _forward_captures(
     children: child_processes.ChildProcesses,
-    tell: Callable[[events.Event], None],
+    report: Callable[[events.Event], None],
     outputs: tick.TickOutputs,
 ) -> None:
     """Pass accepted requests for a capture set to the acquisition."""
@@ -179,7 +179,7 @@ def _forward_captures(
             case events.CommandTaken(command="capture", refused=None) if (
                 failed := children.request_capture()
             ) is not None:
-                tell(failed)
+                report(failed)
 
 
 @contextlib.contextmanager

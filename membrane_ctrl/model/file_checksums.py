@@ -23,10 +23,10 @@ def dumps_checked(table: dict[str, Any], indent: int | None = None) -> str:
     return dumps({**plain, KEY: _table_crc(plain)}, indent)
 
 
-def take_checksum(table: dict[str, Any]) -> bool:
+def pop_checksum(table: dict[str, Any]) -> bool:
     """Remove an object's checksum after reading; True if correct or missing."""
-    said = table.pop(KEY, None)
-    return said is None or said == _table_crc(table)
+    stored = table.pop(KEY, None)
+    return stored is None or stored == _table_crc(table)
 
 
 def with_comment(text: str) -> str:

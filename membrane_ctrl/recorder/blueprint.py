@@ -217,9 +217,10 @@ def _make_shape_tab(config: Config) -> rrb.Vertical:
     if config.shape.mode == "track":
         terms = f"Z{zernike_terms.FIRST_FIGURE_INDEX} (top) to Z{zernike_terms.ZERNIKE_TERMS}"
         fall = f"{terms}, change since hold began; a column a second, now on the right"
-        heard = _figure_plot(figure_columns.VIBRATIONS)
+        vibrations = _figure_plot(figure_columns.VIBRATIONS)
         rows.insert(
-            2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH), heard)
+            2,
+            rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH), vibrations),
         )
     if config.recording.thumbnails:
         names = frame_names(config)

@@ -73,13 +73,13 @@ class EventsFile:
             os.fsync(self._descriptor)
             self._sync = False
 
-    def begin_anew(self, recent: Sequence[EventLine]) -> None:
+    def restart(self, recent: Sequence[EventLine]) -> None:
         """Start a new file after the old one's removal, with the events written to it meanwhile.
         Raises OSError.
         """
-        gone = self._descriptor is not None  # not opened yet: nothing was lost
+        was_open = self._descriptor is not None  # not opened yet: nothing was lost
         self.close()
-        self.append_events(recent if gone else [])
+        self.append_events(recent if was_open else [])
 
     def close(self) -> None:
         """Close the file."""

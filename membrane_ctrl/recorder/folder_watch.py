@@ -30,7 +30,7 @@ class FolderWatch:
             return True
         return not os.path.samestat(found, os.fstat(self._descriptor))
 
-    def begin_anew(self, config: Config) -> None:
+    def restart(self, config: Config) -> None:
         """Make the folder again, with its configuration. Raises OSError; the folder is then still
         `is_gone`.
         """

@@ -80,15 +80,15 @@ class Housekeeping:
         now_utc = self._clock.utc(self._clock.now())
         retention.delete_remains(self._run_dir.parent)
         runs = retention.deletable_runs(self._run_dir.parent, self._run_dir, now_utc)
-        gone = retention.find_expired(
+        expired = retention.find_expired(
             runs, retention.size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc
         )
         # a folder that a person has moved away is no longer an error
-        self._errors.clear_errors(_RUN, but={_RUN + run.folder.name for run, _ in gone})
+        self._errors.clear_errors(_RUN, but={_RUN + run.folder.name for run, _ in expired})
         for (
             run,
             why,
-        ) in gone:  # one by one: a folder that cannot be deleted must not block the others
+        ) in expired:  # one by one: a folder that cannot be deleted must not block the others
             self._errors.run_guarded(_RUN + run.folder.name, partial(self._delete_run, run, why))
 
     def _delete_run(self, run: retention.OldRun, why: str) -> None:

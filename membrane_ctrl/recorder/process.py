@@ -61,12 +61,14 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
         Gets the recorder's events, and a sign of life each second; drops those that cannot be sent
         at once.
     """
-    asked = Flag()
+    is_stop_requested = Flag()
     # Ctrl-C reaches the whole terminal group, but the supervisor ends the run, with the "end" event
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(STOP, lambda *_: asked.set())
+    signal.signal(STOP, lambda *_: is_stop_requested.set())
     prepare_rerun()
-    if not _record_run(spec, event_sender(status), asked.is_set, lambda: not parent_lives()):
+    if not _record_run(
+        spec, event_sender(status), is_stop_requested.is_set, lambda: not parent_lives()
+    ):
         os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
 
 
@@ -81,7 +83,7 @@ def prepare_rerun() -> None:
 def _record_run(
     spec: RecorderSpec,
     report: Callable[[Event], None],
-    asked: Callable[[], bool],
+    is_stop_requested: Callable[[], bool],
     orphan: Callable[[], bool],
 ) -> bool:
     """Record until the end; returns whether the process may exit normally."""
@@ -107,17 +109,17 @@ def _record_run(
     next_write_s = 0.0
     while not recorder.ended:
         # asked before draining, so that this round still sees a dying parent's last messages
-        exit_word = "killed" if orphan() else "terminated" if asked() else ""
+        exit_word = "killed" if orphan() else "terminated" if is_stop_requested() else ""
         recorder.drain_rings()
         if exit_word and not recorder.ended:
-            recorder.take_events([_end_event(spec.clock, exit_word)])
+            recorder.add_events([_end_event(spec.clock, exit_word)])
         elif recorder.urgent or time.monotonic() >= next_write_s:
             next_write_s = time.monotonic() + spec.flush_s
             recorder.write_second()
             report(Alive(_ROUND_S))
         if not recorder.ended:
             time.sleep(POLL_S)
-    recorder.finish(in_haste=asked())
+    recorder.finish(in_haste=is_stop_requested())
     if thumbnails is not None:
         thumbnails.close()
     for ring in rings.values():

@@ -97,15 +97,15 @@ class Recorder:
         self._events_lost = before.events_lost
         self._summary = before.summary
         self._status = RunStatus()
-        for told in event_log.read_events(run_dir, []) if resumes else ():
-            self._status = self._status.after_event(told.event, told.mono_s)
+        for logged in event_log.read_events(run_dir, []) if resumes else ():
+            self._status = self._status.after_event(logged.event, logged.mono_s)
         self._tables = RunTables(run_dir, clock.origin_utc, before.windows if resumes else None)
         self._input_ticks_lost = before.input_ticks_lost
         self._assembler = TickAssembler()
         self._frames = thumbnails
         self._thumbnails: list[Thumbnail] = []  # of this second
         self._resumes = resumes
-        self._began_anew = resumes > 0 and handed_on is None
+        self._restarted_without_handover = resumes > 0 and handed_on is None
         self._messages: list[bytes] = []
         self._shapes: list[shape_estimate.ShapeEstimate] = []
         self._events: list[EventLine] = []
@@ -121,12 +121,12 @@ class Recorder:
             self._assembler.add_snapshots(self._feeds["snapshots"].drain_messages())
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain_messages():
-                self._errors.run_guarded("shape estimate", partial(self._take_shape, message))
-        self.take_events(
+                self._errors.run_guarded("shape estimate", partial(self._add_shape, message))
+        self.add_events(
             [event_lines.parse_event(message) for message in self._feeds["events"].drain_messages()]
         )
 
-    def take_events(self, new: list[EventLine]) -> None:
+    def add_events(self, new: list[EventLine]) -> None:
         """Take events; an "end" among them ends the run."""
         for line in new:
             event = event_lines.from_dict(line)
@@ -146,7 +146,7 @@ class Recorder:
     def _follow_event(self, event: Event, mono_s: float) -> None:
         self._status = self._status.after_event(event, mono_s)
 
-    def _take_shape(self, message: bytes) -> None:
+    def _add_shape(self, message: bytes) -> None:
         estimate = shape_estimate.unpack_estimate(message)
         self._summary.add_shape(estimate)
         self._shapes.append(estimate)
@@ -163,7 +163,7 @@ class Recorder:
         guarded = self._errors.run_guarded
         guarded("summary", lambda: self._summary.add_rows(rows))
         guarded("table of ticks", lambda: self._tables.add_ticks(batch))
-        guarded("table of thumbnails", lambda: self._take_thumbnails(now_s))
+        guarded("table of thumbnails", lambda: self._add_thumbnails(now_s))
         guarded("tables", self._tables.sync_tables)
         guarded("parts of tables", self._tables.seal_full_journal)
         closed, self._rerun.closed = self._rerun.closed, []
@@ -174,7 +174,7 @@ class Recorder:
             self._rows_lost += len(rows)
         guarded("state file", self._hand_on)
 
-    def _take_thumbnails(self, now_s: float) -> None:
+    def _add_thumbnails(self, now_s: float) -> None:
         self._thumbnails = []
         if self._frames is None or self._housekeeping.detail != DetailLevel.ALL:
             return
@@ -193,14 +193,14 @@ class Recorder:
         """
         if not self._folder.is_gone():
             return
-        self._folder.begin_anew(self._config)
+        self._folder.restart(self._config)
         self._folder_anew_s = now_s
         # never cleared: the lost part stays lost
         what = f"{self._run_dir} was removed or moved; a new one starts at {now_s:.1f} s"
         self._errors.report_error("run folder", f"{what}, without the earlier data")
         self._tables.leave_folder()
         self._rerun.leave_folder()
-        self._events_file.begin_anew(self._events)
+        self._events_file.restart(self._events)
 
     def _hand_on(self) -> None:
         """Save the state that a successor would need."""
@@ -243,7 +243,7 @@ class Recorder:
             "folder_anew_s": self._folder_anew_s,  # None: it is still the original
             # without its predecessor's state, the statistics start with the oldest message in the
             # ring
-            "partial": self._began_anew and self._feeds["inputs"].dropped > 0,
+            "partial": self._restarted_without_handover and self._feeds["inputs"].dropped > 0,
         }
         text = (
             file_checksums.dumps_checked(

@@ -41,7 +41,7 @@ def send_events(recording: rerun_recording.Recording, events: Sequence[EventLine
         )
     for at_s, event in timed:
         if isinstance(event, Vibrations):
-            heard = [math.nan if value is None else value for value in event.frequency_hz]
-            padded = [*heard, *VIBRATIONS_MOST * [math.nan]]
+            frequencies_hz = [math.nan if value is None else value for value in event.frequency_hz]
+            padded = [*frequencies_hz, *VIBRATIONS_MOST * [math.nan]]
             values = np.array([padded[:VIBRATIONS_MOST]])
             recording.send_scalars(streams.VIBRATIONS.path, np.array([at_s]), values)

@@ -64,7 +64,7 @@ class RecordedRun:
     config: Config
     inputs: inputs_file.InputsReader
     decisions: list[replays.Decision]
-    told_until_s: float  # end of the event log, if a crash truncated it
+    log_end_s: float  # end of the event log, if a crash truncated it
     config_damage: str = ""  # why this is not the run's configuration
 
     @property
@@ -113,11 +113,11 @@ def open_recorded(folder: Path) -> RecordedRun:
     log = event_log.read_events(folder, [])
     cut = not any(isinstance(each.event, run_events.Ended) for each in log)
     decisions = replays.decisions_of((each.mono_s, each.event) for each in log)
-    told_until_s = max((each.mono_s for each in log), default=0.0) if cut else math.inf
+    log_end_s = max((each.mono_s for each in log), default=0.0) if cut else math.inf
     config = run_config.exact_config(folder)
     right = file_checksums.comment_is_right(files.read_text(folder / "config.toml"))
     damage = "" if right else "config.toml: checksum mismatch (damaged or edited)"
-    return RecordedRun(folder, config, inputs, decisions, told_until_s, damage)
+    return RecordedRun(folder, config, inputs, decisions, log_end_s, damage)
 
 
 def replay_command(
@@ -212,7 +212,7 @@ def _make_report(
     run: RecordedRun, found: replays.Replay, begin: int, to_s: float
 ) -> dict[str, Any]:
     # make no claim about the time after the log or the inputs end
-    end_s = min(to_s, run.told_until_s, found.last_s)
+    end_s = min(to_s, run.log_end_s, found.last_s)
     today = [decision for decision in found.decisions if decision.time_s <= end_s]
     recorded = [d for d in run.decisions if found.begin_s <= d.time_s <= end_s + DECISION_SLACK_S]
     in_time = sum(decision.time_s <= end_s for decision in recorded)

@@ -66,9 +66,9 @@ def repair_run(run_dir: Path, in_place: bool = False) -> list[FileFinding]:
     _refuse_running(run_dir)
     findings = _repair_events(run_dir, in_place)
     findings += _seal_journals(run_dir, in_place)
-    findings += _look_at_tables(run_dir)
-    findings += _look_at_inputs(run_dir)
-    findings += _look_at_config(run_dir)
+    findings += _check_tables(run_dir)
+    findings += _check_inputs(run_dir)
+    findings += _check_config(run_dir)
     return [*findings, _repair_summary(run_dir, in_place)]
 
 
@@ -136,7 +136,7 @@ def _is_whole_object(data: bytes) -> bool:
         table = plain_json.loads(data.decode())
     except ValueError:
         return False
-    return isinstance(table, dict) and file_checksums.take_checksum(table)
+    return isinstance(table, dict) and file_checksums.pop_checksum(table)
 
 
 def _seal_journals(run_dir: Path, in_place: bool) -> list[FileFinding]:
@@ -158,7 +158,7 @@ def _seal_journals(run_dir: Path, in_place: bool) -> list[FileFinding]:
     return findings
 
 
-def _look_at_tables(run_dir: Path) -> list[FileFinding]:
+def _check_tables(run_dir: Path) -> list[FileFinding]:
     """Report only: a reader skips what is damaged."""
     findings = []
     for spec in table_specs.ALL:
@@ -172,7 +172,7 @@ def _look_at_tables(run_dir: Path) -> list[FileFinding]:
     return findings
 
 
-def _look_at_inputs(run_dir: Path) -> list[FileFinding]:
+def _check_inputs(run_dir: Path) -> list[FileFinding]:
     """Report only: a replay reads whatever is intact."""
     reader = inputs_file.InputsReader(run_dir)
     ticks = sum(len(frame.records) for frame in reader)
@@ -181,7 +181,7 @@ def _look_at_inputs(run_dir: Path) -> list[FileFinding]:
     return [FileFinding("inputs", "whole", f"{ticks} ticks")] if reader.exists else []
 
 
-def _look_at_config(run_dir: Path) -> list[FileFinding]:
+def _check_config(run_dir: Path) -> list[FileFinding]:
     """Report only: a rebuilt summary uses defaults for settings that cannot be read."""
     notes: list[str] = []
     run_config.read_config(run_dir, notes)

@@ -208,10 +208,10 @@ def _compare_tick(
         found.different_rows.append(outputs.row)
 
 
-def decisions_of(told: Iterable[tuple[float, Event]]) -> list[Decision]:
+def decisions_of(logged: Iterable[tuple[float, Event]]) -> list[Decision]:
     """The decisions among events with their times."""
     found: list[Decision] = []
-    for time_s, event in told:
+    for time_s, event in logged:
         match event:
             case (
                 StateEntered(state=name)
@@ -288,7 +288,7 @@ def without_repeats(decisions: list[Decision]) -> list[Decision]:
 
 def find_unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -> list[str]:
     """Differences between two lists of decisions, as sentences; times may differ by `slack_s`."""
-    said: list[str] = []
+    lines: list[str] = []
     recorded, today = without_repeats(recorded), without_repeats(today)
     for place in range(max(len(recorded), len(today))):
         then = recorded[place] if place < len(recorded) else None
@@ -299,10 +299,10 @@ def find_unmatched(recorded: list[Decision], today: list[Decision], slack_s: flo
             or then.description != now.description
             or abs(then.time_s - now.time_s) > slack_s
         ):
-            said.append(f"recorded: {_describe_decision(then)}; today: {_describe_decision(now)}")
+            lines.append(f"recorded: {_describe_decision(then)}; today: {_describe_decision(now)}")
             if then is None or now is None or then.description != now.description:
                 break  # all later ones are shifted against each other
-    return said
+    return lines
 
 
 def _describe_decision(decision: Decision | None) -> str:

@@ -122,8 +122,8 @@ def read_entry(folder: Path) -> RunEntry:
     log = event_log.read_events(folder, notes)
     summary: dict[str, Any] = summary_file.read_summary(folder, notes) or {}
     config = run_config.read_config(folder, notes)
-    told, duration_s = summary.get("held"), _read_number(summary.get("duration_s"))
-    held = told if isinstance(told, dict) else {}
+    stored, duration_s = summary.get("held"), _read_number(summary.get("duration_s"))
+    held = stored if isinstance(stored, dict) else {}
     pump = next(
         (each.event for each in reversed(log) if isinstance(each.event, events.PumpLearned)), None
     )

@@ -97,7 +97,7 @@ def _list_files(
             named_table(block, run.origin_utc) for block in run.tick_blocks(fields, start_s, end_s)
         )
         written += _write_tables(blocks, out / f"ticks.{to}", to, _make_origin(run))
-        _say_if_missing(run, bool(written))
+        _warn_if_missing(run, bool(written))
     if SHAPES in extras and (shapes := run.cycles(start_s, end_s)).num_rows:
         written += _write_tables(iter([shapes]), out / f"shapes.{to}", to, _make_origin(run))
     if EVENTS in extras and (lines := _event_lines(run, start_s, end_s)):
@@ -113,7 +113,7 @@ def _event_lines(run: Run, start_s: float, end_s: float) -> list[str]:
     return [json.dumps(each.line, ensure_ascii=False) for each in run.log_between(start_s, end_s)]
 
 
-def _say_if_missing(run: Run, telemetry: bool) -> None:
+def _warn_if_missing(run: Run, telemetry: bool) -> None:
     if not telemetry:
         run.notes.append("no telemetry in this part of the run: no ticks are exported")
 
@@ -203,7 +203,7 @@ def _write_hdf5(
                 data.resize(data.shape[0] + values.size, axis=0)
                 data[-values.size :] = values
         if fields:
-            _say_if_missing(run, "ticks" in file)
+            _warn_if_missing(run, "ticks" in file)
         shapes = run.shapes()
         shapes = shapes.select_cycles((shapes.time_s >= start_s) & (shapes.time_s < end_s))
         if SHAPES in extras and len(shapes):

@@ -50,8 +50,8 @@ def format_time_beside(
         ("paused", paused_s, 0.0),
         ("moving or settling", moving_s, _MOVING_LEAST_S),
     )
-    told = [(name, time_s) for name, time_s, least_s in parts if time_s > least_s]
+    shown = [(name, time_s) for name, time_s, least_s in parts if time_s > least_s]
     return [
         f"{name} {format_span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)"
-        for name, time_s in told
+        for name, time_s in shown
     ]

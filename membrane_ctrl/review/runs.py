@@ -38,7 +38,7 @@ def list_command(
 def show_command(run: Path, logs: Path, json: bool) -> int:
     """Print one run: its line of the catalogue, its states and faults, its missing parts."""
     opened = open_run(catalogue.resolve_run(run, logs))
-    opened.look_through()
+    opened.read_all_parts()
     entry = catalogue.read_entry(opened.folder)
     if json:
         table = catalogue.as_dict(entry) | {
@@ -76,24 +76,25 @@ def prune_command(
     logs: Path, keep_days: float | None, keep_gb: float | None, delete: bool, json: bool
 ) -> int:
     """List the runs that the retention rule would delete; delete them only with `delete`."""
-    gone = prune.to_prune(logs, datetime.now(UTC), keep_days, keep_gb)
-    stay = prune.prune_runs([run for run, _ in gone]) if delete else {}
-    gone = [(run, why) for run, why in gone if run.folder not in stay]
+    expired = prune.to_prune(logs, datetime.now(UTC), keep_days, keep_gb)
+    stay = prune.prune_runs([run for run, _ in expired]) if delete else {}
+    expired = [(run, why) for run, why in expired if run.folder not in stay]
     if json:
         table = [
-            {"name": run.folder.name, "size_bytes": run.size_bytes, "why": why} for run, why in gone
+            {"name": run.folder.name, "size_bytes": run.size_bytes, "why": why}
+            for run, why in expired
         ]
         print(plain_json.dumps({"deleted": delete, "runs": table}, indent=1))
     else:
-        for run, why in gone:
+        for run, why in expired:
             print(
                 f"{'deleted' if delete else 'would delete'} {run.folder.name}, "
                 f"{run.size_bytes / 1e6:.0f} MB: {why}"
             )
-        freed_mb = sum(run.size_bytes for run, _ in gone) / 1e6
+        freed_mb = sum(run.size_bytes for run, _ in expired) / 1e6
         print(
-            f"{len(gone)} runs, {freed_mb:.0f} MB"
-            + ("" if delete or not gone else "; --delete deletes them")
+            f"{len(expired)} runs, {freed_mb:.0f} MB"
+            + ("" if delete or not expired else "; --delete deletes them")
         )
     for folder, why in stay.items():
         print(f"{folder}: cannot be deleted ({why}); check its permissions", file=sys.stderr)

@@ -40,11 +40,11 @@ def parse_logged_line(line: events.EventLine) -> LoggedEvent:
 
 def read_events(folder: Path, notes: list[str]) -> tuple[LoggedEvent, ...]:
     """Events and annotations in order of time; `notes` counts lines that are not JSON objects."""
-    told = _json_lines(folder / "events.jsonl", notes)
+    logged = _json_lines(folder / "events.jsonl", notes)
     if not (folder / "events.jsonl").exists():
         notes.append("events.jsonl: missing; states are taken from the telemetry")
     later = _json_lines(folder / ANNOTATIONS_FILE, notes)
-    return tuple(sorted(map(parse_logged_line, told + later), key=lambda each: each.mono_s))
+    return tuple(sorted(map(parse_logged_line, logged + later), key=lambda each: each.mono_s))
 
 
 def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:
@@ -73,7 +73,7 @@ def event_of(line: str) -> events.EventLine | None:
         event = plain_json.loads(line)
     except ValueError:
         return None
-    if not isinstance(event, dict) or not file_checksums.take_checksum(event):
+    if not isinstance(event, dict) or not file_checksums.pop_checksum(event):
         return None
     moment_s = event.get("mono_s")
     right = isinstance(event.get("kind", ""), str) and (moment_s is None or is_moment(moment_s))

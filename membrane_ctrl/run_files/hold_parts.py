@@ -82,17 +82,17 @@ class HoldParts(StateNode):
         for first in np.flatnonzero(
             ~let_go & np.concatenate(([not math.isnan(self.let_go_s)], let_go[:-1]))
         ):
-            gone_s, away_s = (
+            end_s, away_s = (
                 (time_s[first - 1], time_s[first - 1]) if first else (self.let_go_s, self.away_s)
             )
-            rows = first + np.flatnonzero((outside & (time_s <= gone_s + _BACK_WITHIN_S))[first:])
+            rows = first + np.flatnonzero((outside & (time_s <= end_s + _BACK_WITHIN_S))[first:])
             away = np.append(away_s, time_s[rows])
             stayed = np.flatnonzero(np.diff(away, append=time_s[-1]) >= telemetry.SETTLED_AFTER_S)
             count = int(stayed[0]) if stayed.size else rows.size
             straying[rows[:count]] = True
-            over = stayed.size or time_s[-1] > gone_s + _BACK_WITHIN_S
+            over = stayed.size or time_s[-1] > end_s + _BACK_WITHIN_S
             self.let_go_s, self.away_s = (
-                (math.nan, math.nan) if over else (float(gone_s), float(away[count]))
+                (math.nan, math.nan) if over else (float(end_s), float(away[count]))
             )
         if let_go.size and let_go[-1]:
             self.let_go_s = self.away_s = float(time_s[-1])

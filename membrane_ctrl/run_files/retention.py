@@ -85,7 +85,7 @@ def find_expired(
     The bytes of the present run count, but it stays. None means no limit.
     """
     total = present_bytes + sum(run.size_bytes for run in runs)
-    gone: list[tuple[OldRun, str]] = []
+    expired: list[tuple[OldRun, str]] = []
     for place, run in enumerate(runs):
         old_enough = place < len(runs) - _NEVER_TOO_OLD
         if (
@@ -93,13 +93,13 @@ def find_expired(
             and old_enough
             and now_utc - run.started_utc > timedelta(days=keep_days)
         ):
-            gone.append((run, f"older than recording.keep_days = {keep_days:g}"))
+            expired.append((run, f"older than recording.keep_days = {keep_days:g}"))
         elif keep_gb is not None and total > keep_gb * 1e9:
-            gone.append((run, f"all runs exceed recording.keep_gb = {keep_gb:g}"))
+            expired.append((run, f"all runs exceed recording.keep_gb = {keep_gb:g}"))
         else:
             continue
         total -= run.size_bytes
-    return gone
+    return expired
 
 
 def delete_run(run: OldRun) -> None:

@@ -359,7 +359,7 @@ class Run:
                 chosen = table.filter(pa.compute.is_in(table["number"], wanted)).drop_null()
                 yield from chosen.select(names[1:]).to_pylist()
 
-    def look_through(self) -> None:
+    def read_all_parts(self) -> None:
         """Check every file of every table, so that `notes` names all damage."""
         for spec in table_specs.ALL:
             table = self._open_table(spec)

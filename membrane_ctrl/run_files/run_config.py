@@ -32,13 +32,13 @@ def keep_understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
             return Config.model_validate(tables), left_out
         except ValidationError as error:
             # all at once: removing ten thousand keys one by one would validate as many times
-            names = [_take_out(tables, found["loc"]) for found in error.errors(include_url=False)]
+            names = [_remove_key(tables, found["loc"]) for found in error.errors(include_url=False)]
         if not any(names):  # incompatible tables
             return Config(), [*left_out, "tables that do not go together"]
         left_out += filter(None, names)
 
 
-def _take_out(tables: dict[str, Any], location: Sequence[int | str]) -> str:
+def _remove_key(tables: dict[str, Any], location: Sequence[int | str]) -> str:
     """Delete the deepest existing key of an error's location; returns its name, or ""."""
     inside: Any = tables
     path: list[str] = []

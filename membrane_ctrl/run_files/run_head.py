@@ -43,7 +43,7 @@ def read_run_head(folder: Path, notes: list[str]) -> RunHead:
         notes.append(f"{HEAD_FILE}: cannot be read ({error})")
         return RunHead()
     found = _SCHEMA.fullmatch(str(table.get("schema"))) if isinstance(table, dict) else None
-    if found is None or not file_checksums.take_checksum(table):
+    if found is None or not file_checksums.pop_checksum(table):
         notes.append(f"{HEAD_FILE}: damaged or edited; it is not used")
         return RunHead()
     head = RunHead(int(found[1]), stated_program(table))

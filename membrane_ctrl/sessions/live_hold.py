@@ -118,7 +118,7 @@ class LiveHold:
             raise errors.InputError(
                 f"{run_dir}: its rings cannot be read ({error}); is it on this machine?"
             ) from None
-        self._heard_s = time.monotonic()
+        self._last_answer_s = time.monotonic()
 
     def _claim_command(self, session: str) -> None:
         answer = self._client.ask(
@@ -164,8 +164,8 @@ class LiveHold:
             raise HoldError(f"the rings of {self.name} are not those of a hold ({error})") from None
         now_s = time.monotonic()
         if found.rows:
-            self._heard_s = now_s
-        elif now_s - self._heard_s > _SILENT_S:
+            self._last_answer_s = now_s
+        elif now_s - self._last_answer_s > _SILENT_S:
             raise HoldError(f"no tick for {_SILENT_S:g} s: has the hold {self.name} ended?")
         return found
 
@@ -314,13 +314,13 @@ class Progress:
         It is empty at the end of the input, and for none of them. Ctrl-C interrupts at once.
         """
         if self.log is not None:
-            self.log.take_answer("", ())  # one that came too late for the last question
+            self.log.pop_answer("", ())  # one that came too late for the last question
         print(f"{question} ", end="", file=sys.stderr, flush=True)
         self.log_entry("asks", question, among=among)
         self._asking = True
         try:
             while among and self.log is not None and not _has_typed_line(_POLL_S):
-                if (given := self.log.take_answer(question, among)) is not None:
+                if (given := self.log.pop_answer(question, among)) is not None:
                     self.print_line(f"{given.by} answers on the page: {given.said or 'none'}")
                     return given.said
             return sys.stdin.readline().strip()

@@ -30,11 +30,13 @@ _LINES_MAX, _LINE_MAX, _ANSWERS_MAX = 200, 500, 20  # what a page can show
 class LiveLog:
     """Appends to a session's log. A disk that is full ends the log, not the session.
 
-    `told` receives the reason if it can no longer be written.
+    `report_failure` receives the reason if it can no longer be written.
     """
 
-    def __init__(self, session: Path, rate_hz: float, told: Callable[[str], None]) -> None:
-        self._path, self._told = files.resolve_user_path(session / NAME), told
+    def __init__(
+        self, session: Path, rate_hz: float, report_failure: Callable[[str], None]
+    ) -> None:
+        self._path, self._report_failure = files.resolve_user_path(session / NAME), report_failure
         self._ticks_a_point = max(1, round(EVERY_S * rate_hz))
         self._every_s = self._ticks_a_point / rate_hz
         self._rows: list[telemetry.TelemetryRow] = []
@@ -67,7 +69,7 @@ class LiveLog:
         self.write_means()
         self._append_entry({what: line, "utc": folder.now_utc(), **more})
 
-    def take_answer(self, question: str, among: Sequence[str]) -> "PageAnswer | None":
+    def pop_answer(self, question: str, among: Sequence[str]) -> "PageAnswer | None":
         """Take the answer to a question from the page; None if there is none, or it is to another,
         or not `among`.
         """
@@ -97,7 +99,7 @@ class LiveLog:
             self._end = ""
         except OSError as error:
             self._good = False
-            self._told(
+            self._report_failure(
                 f"{self._path}: {errors.os_reason(error)}; the page does not show the rest "
                 "of this session"
             )
@@ -111,7 +113,7 @@ class PageAnswer:
     by: str
 
 
-def give_answer(session: Path, question: str, given: PageAnswer) -> None:
+def write_answer(session: Path, question: str, given: PageAnswer) -> None:
     """Leave the answer to a question where the session finds it. Raises OSError."""
     text = json.dumps({"to": question, "said": given.said, "by": given.by})
     files.write_text_atomic(files.resolve_user_path(session / ANSWER), text + "\n")
@@ -166,15 +168,15 @@ class LiveReader:
         whole = data.rfind(b"\n") + 1
         for line in data[self._offset : whole].splitlines():
             try:
-                self._take_entry(plain_json.loads(line.decode("utf-8")), points)
+                self._apply_entry(plain_json.loads(line.decode("utf-8")), points)
             except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
                 continue
         self._offset = max(self._offset, whole)
         return points
 
-    def _take_entry(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
+    def _apply_entry(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
         if "every_s" in entry:
-            self._take_points(entry, points)
+            self._add_points(entry, points)
             return
         now = self.progress
         if "step" in entry:
@@ -193,7 +195,7 @@ class LiveReader:
         else:
             self.progress = replace(now, ended=_parse_line(entry["ended"]), asks="", among=())
 
-    def _take_points(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
+    def _add_points(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
         every_s = float(entry["every_s"])
         columns = {
             name: [math.nan if v is None else float(v) for v in entry[name]] for name in _COLUMNS

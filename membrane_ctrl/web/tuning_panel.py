@@ -14,7 +14,7 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.work_pools import ANSWERS
 from membrane_ctrl.sessions import folder as folders
-from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, give_answer
+from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, write_answer
 from membrane_ctrl.web.log_lines import find_new_lines
 from membrane_ctrl.web.messages import show_message
 
@@ -78,7 +78,7 @@ def answered(session: Path, question: str, given: PageAnswer) -> Outcome:
     """Give a session an answer; returns what became of it."""
     what = given.said or "none of them"
     try:
-        give_answer(session, question, given)
+        write_answer(session, question, given)
     except OSError as error:
         return Outcome.failed(what, f"not given: {errors.os_reason(error)}")
     for _ in range(_TAKES):

@@ -18,7 +18,7 @@ import pytest
 from console_feed import FAULT, event, packed, rows, shape
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.process import ConsoleSpec, console_main, give_back_terminal
+from membrane_ctrl.console.process import ConsoleSpec, console_main, restore_terminal
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
@@ -198,5 +198,5 @@ def test_the_terminal_of_a_killed_console_is_given_back(
     ours, theirs = terminal
     with open(theirs, "w", closefd=False) as stderr:
         monkeypatch.setattr(sys, "stderr", stderr)
-        give_back_terminal()
+        restore_terminal()
     assert read_until(ours, b"\x1b[?25h").startswith(b"\x1b[?1049l")

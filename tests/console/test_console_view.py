@@ -24,9 +24,9 @@ CONFIG = Config()
 def held(duration_s: float | None = 120.0) -> ConsoleModel:
     model = ConsoleModel(CONFIG, duration_s)
     for row in rows(75.0):
-        model.take_row(row)
-    model.take_shape(shape(6.0))
-    model.take_shape(shape(73.8, sag_um=37100.03, cycle=2))
+        model.add_row(row)
+    model.add_shape(shape(6.0))
+    model.add_shape(shape(73.8, sag_um=37100.03, cycle=2))
     return model
 
 
@@ -65,7 +65,7 @@ def test_everything_a_person_wants_is_there() -> None:
 
 def test_real_bench_shows_no_truth_and_an_open_run_no_end() -> None:
     model = held(duration_s=None)
-    model.take_row(replace(HOLDING, mono_s=75.0, truth_displacement_um=math.nan))
+    model.add_row(replace(HOLDING, mono_s=75.0, truth_displacement_um=math.nan))
     page = "\n".join(drawn(model))
     assert "truth" not in page
     assert "until stopped" in page
@@ -73,8 +73,8 @@ def test_real_bench_shows_no_truth_and_an_open_run_no_end() -> None:
 
 def everything_wrong() -> ConsoleModel:
     model = held()
-    model.take_event(event(75.0, "fault", **FAULT))
-    model.take_event(
+    model.add_event(event(75.0, "fault", **FAULT))
+    model.add_event(
         event(
             75.0,
             "shape",
@@ -82,10 +82,10 @@ def everything_wrong() -> ConsoleModel:
             reason="no fresh estimate for 15 s: the last trim is held",
         )
     )
-    model.take_shape(
+    model.add_shape(
         shape(70.0, verdict="rejected", reason="tracking lost: the film moved by 5 mrad")
     )
-    model.take_event(
+    model.add_event(
         event(75.0, "recorder_error", what="recording", message="events.jsonl: No space left " * 20)
     )
     row = replace(
@@ -95,7 +95,7 @@ def everything_wrong() -> ConsoleModel:
         safe_level=SafeLevel.VENT,
         fault=30.0,
     )
-    model.take_row(
+    model.add_row(
         replace(row, mono_s=75.0, tick=3e6, missed_ticks=12.0, vent_fraction=1.0, leak_um_per_s=0.1)
     )
     return model
@@ -137,7 +137,7 @@ def test_every_terminal_is_used_and_none_overflows(
 def test_a_wide_terminal_shows_a_longer_trend() -> None:
     model = ConsoleModel(CONFIG)
     for row in rows(150.0):
-        model.take_row(row)
+        model.add_row(row)
     page = drawn(model, now_s=150.0, width=160)
     upper, lower = (
         next(row for row in page if f"{sign}1 µm" in row or f"{sign}2 µm" in row) for sign in "+-"
@@ -149,13 +149,11 @@ def test_a_wide_terminal_shows_a_longer_trend() -> None:
 def test_a_large_terminal_lists_the_last_events_with_those_who_caused_them() -> None:
     model = held()
     for k in range(70):
-        model.take_event(
-            event(70.0, "command", command="setpoint", who="unix:ann", why=f"step {k}")
-        )
-    model.take_event(
+        model.add_event(event(70.0, "command", command="setpoint", who="unix:ann", why=f"step {k}"))
+    model.add_event(
         event(70.0, "command", command="hold", who="unix:tom", why="", refused="not now")
     )
-    model.take_event(event(70.0, "why", why="only the headline says this"))
+    model.add_event(event(70.0, "why", why="only the headline says this"))
     page = "\n".join(drawn(model, width=100, height=40))
     assert "03:12:00  Command setpoint by unix:ann: step 69" in page
     assert "Command hold by unix:tom. Refused: not now" in page
@@ -165,20 +163,20 @@ def test_a_large_terminal_lists_the_last_events_with_those_who_caused_them() -> 
 
 def test_who_waits_for_a_person_says_how_to_go_on() -> None:
     model = ConsoleModel(CONFIG, ctl="membrane-ctrl ctl --socket x/control.sock", keys=True)
-    model.take_row(replace(HOLDING, state=State.STANDBY))
+    model.add_row(replace(HOLDING, state=State.STANDBY))
     assert any(
         "go on: `membrane-ctrl ctl --socket x/control.sock hold` or key h" in row
         for row in drawn(model, 0.0)
     )
-    model.take_event(
+    model.add_event(
         event(0.0, "command", command="latched", who="command line", why="", text="over_pressure")
     )
     view = model.make_view(0.0)
     assert view.go_on == "go on: `membrane-ctrl ctl --socket x/control.sock ack`"
     assert format_line(view).endswith(view.go_on)
-    model.take_row(HOLDING)
+    model.add_row(HOLDING)
     assert model.make_view(0.0).go_on == ""
-    model.take_event(
+    model.add_event(
         event(0.0, "why", why="held up by ann: the pump keeps its mean flow", code="paused")
     )
     assert model.make_view(0.0).paused
@@ -187,7 +185,7 @@ def test_who_waits_for_a_person_says_how_to_go_on() -> None:
 
 def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_removed() -> None:
     model = ConsoleModel(CONFIG, ctl="ctl", keys=True)
-    model.take_row(replace(HOLDING, state=State.STANDBY))
+    model.add_row(replace(HOLDING, state=State.STANDBY))
     for word, author in (("bofak", "unix:ann"), ("gumil", "page:bob")):
         fields = {
             "word": word,
@@ -197,7 +195,7 @@ def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_rem
             "set_utc": "2026-01-02",
             "number": 1,
         }
-        model.take_event(event(0.0, "lock", text="hands inside", **fields))
+        model.add_event(event(0.0, "lock", text="hands inside", **fields))
     page = " ".join(" ".join(drawn(model, 0.0)).replace("│", " ").split())
     for author, word in (("unix:ann", "bofak"), ("page:bob", "gumil")):
         assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in page
@@ -206,9 +204,9 @@ def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_rem
         )
     assert model.make_view(0.0).go_on == "go on: ask unix:ann, then `ctl unlock bofak`"
     removed = {"text": "", "author": "", "set_utc": "", "remover": "", "how": "word", "number": 2}
-    model.take_event(event(0.0, "unlock", word="bofak", **removed))
+    model.add_event(event(0.0, "unlock", word="bofak", **removed))
     assert model.make_view(0.0).go_on == "go on: ask page:bob, then `ctl unlock gumil`"
-    model.take_event(event(0.0, "unlock", word="gumil", **removed))
+    model.add_event(event(0.0, "unlock", word="gumil", **removed))
     assert model.make_view(0.0).locks == ()
     assert "hold" in model.make_view(0.0).go_on
 
@@ -225,13 +223,13 @@ def test_fault_and_its_remedy_are_seen() -> None:
 
 def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
     model = held()
-    model.take_event(
+    model.add_event(
         event(75.0, "disk_low", what="disk", message="less than 500 MB free; delete old runs")
     )
     low = "Disk almost full: less than 500 MB free; delete old runs"
     assert any(f"notice {low}" in " ".join(row.split()) for row in drawn(model))
     assert format_line(model.make_view(75.0)).count(low) == 1
-    model.take_event(event(76.0, "recorder_recovered", what="disk", message="disk works again"))
+    model.add_event(event(76.0, "recorder_recovered", what="disk", message="disk works again"))
     assert not any("notice" in row for row in drawn(model))
     assert "500 MB" not in format_line(model.make_view(75.0))
 
@@ -239,7 +237,7 @@ def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
 def test_of_many_notices_the_first_are_shown() -> None:
     model = held()
     for nth in range(5):
-        model.take_event(
+        model.add_event(
             event(75.0, "recorder_error", what=f"file {nth}", message=f"file {nth} failed")
         )
     shown = [" ".join(row.split()) for row in drawn(model) if "notice" in row]
@@ -255,7 +253,7 @@ def test_silence_is_the_headline() -> None:
 def test_before_the_first_tick_and_with_nothing_known() -> None:
     assert any("waiting for the first tick" in row for row in drawn(ConsoleModel(CONFIG)))
     model = ConsoleModel(CONFIG)
-    model.take_row(
+    model.add_row(
         replace(
             NOTHING,
             mono_s=0.0,

@@ -17,7 +17,7 @@ from membrane_ctrl.controller.protection import (
     Guard,
     ProcessValue,
     find_bound,
-    find_keepers,
+    find_protections,
 )
 from membrane_ctrl.controller.safety import MOVING, TABLE
 
@@ -36,16 +36,19 @@ def test_every_state_in_which_the_pump_may_run_has_a_row() -> None:
 def test_every_protection_goal_has_a_rule_that_applies_in_its_state(
     value: ProcessValue, activity: Activity, duty: Duty
 ) -> None:
-    keepers = find_keepers(value, activity, duty)
-    assert keepers or duty in NOT_EVERYWHERE
-    for keeper in keepers:
-        if not isinstance(keeper, Guard):
-            assert activity.state in RULES[keeper].states, keeper
+    protections = find_protections(value, activity, duty)
+    assert protections or duty in NOT_EVERYWHERE
+    for protection in protections:
+        if not isinstance(protection, Guard):
+            assert activity.state in RULES[protection].states, protection
 
 
 def test_every_guard_appears_in_the_table() -> None:
     named = {
-        keeper for cell in CELLS for keeper in find_keepers(*cell) if isinstance(keeper, Guard)
+        protection
+        for cell in CELLS
+        for protection in find_protections(*cell)
+        if isinstance(protection, Guard)
     }
     assert named == set(Guard)
 

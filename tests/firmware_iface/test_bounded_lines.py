@@ -53,7 +53,7 @@ async def test_an_answer_without_end_ends_the_question(junk: bytes) -> None:
     def flood() -> None:
         for _ in range(100):
             exchange.received(junk)
-            received.append(len(exchange._heard))
+            received.append(len(exchange._buffer))
 
     port.on_write = lambda: asyncio.get_running_loop().call_soon(flood)  # type: ignore[assignment,return-value]
     with pytest.raises(LinkError, match="bytes without an answer"):
@@ -75,5 +75,5 @@ async def test_emulated_devices_keep_no_endless_line() -> None:
     for _ in range(100):
         device.received(b"x" * 4096)
         bus.received(b"x" * 4096)
-    assert len(device._heard) <= 1024
-    assert len(bus._heard) <= 4096
+    assert len(device._buffer) <= 1024
+    assert len(bus._buffer) <= 4096

@@ -85,7 +85,7 @@ def test_the_frames_of_the_manual() -> None:
     instrument = Instrument("DMFC", "M1", 200.0, "mln/min", lambda: 123.456)
     device = ProparDevice(instrument, LINE)
     said: list[bytes] = []
-    device.say = said.append  # type: ignore[method-assign]
+    device.send_answer = said.append  # type: ignore[method-assign]
     device.received(b":06030421402140\r\n")
     assert said == [b":080302214042F6E979\r\n"]
     answer = parse_ascii(said[0])

@@ -63,7 +63,7 @@ def test_frames(command: bytes, answer: bytes) -> None:
         said: list[bytes] = []
         emulator = KeyenceDlRs1aEmulator(lambda: -123.0)
         emulator.attach(said.append)
-        emulator.hear(command)
+        emulator.receive(command)
         await asyncio.sleep(0.1)
         assert b"".join(said) == answer
 

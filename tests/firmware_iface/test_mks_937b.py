@@ -64,7 +64,7 @@ class Manual(SerialDevice):
 
     def received(self, data: bytes) -> None:
         if data != b";FF":
-            self.say(PAGES[data])
+            self.send_answer(PAGES[data])
 
 
 def test_the_bytes_of_the_manual() -> None:

@@ -10,7 +10,7 @@ import pytest_asyncio
 from firmware_iface.drivers.modbus_input import ModbusInputs
 from firmware_iface.emulators.input_module import InputModule
 from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer
-from firmware_iface.links.modbus_rtu import RtuBus, rtu_frame, take_reply
+from firmware_iface.links.modbus_rtu import RtuBus, extract_reply, rtu_frame
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
@@ -154,5 +154,5 @@ def test_bits_over_rtu_are_in_the_standards_order() -> None:
 
 def test_a_serial_answer_with_another_number_of_bytes_is_an_error() -> None:
     with pytest.raises(LinkError, match="2 bytes of bits instead of 1"):
-        take_reply(rtu_frame(1, bytes([2, 2, 1, 1])), 1, 2, 6, "reading")
-    assert take_reply(rtu_frame(1, bytes([2, 1, 1])), 1, 2, 6, "reading") == bytes([2, 1, 1])
+        extract_reply(rtu_frame(1, bytes([2, 2, 1, 1])), 1, 2, 6, "reading")
+    assert extract_reply(rtu_frame(1, bytes([2, 1, 1])), 1, 2, 6, "reading") == bytes([2, 1, 1])

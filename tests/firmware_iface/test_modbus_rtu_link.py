@@ -17,9 +17,9 @@ from firmware_iface.emulators.rtu_bus import bitwise_crc
 from firmware_iface.links.modbus_rtu import (
     RtuBus,
     compute_crc16,
+    extract_reply,
     parse_rtu_url,
     rtu_frame,
-    take_reply,
 )
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
@@ -57,13 +57,13 @@ class Bus:
         self.bus = RtuBus(self.wire, quiet_s=TIMEOUT_S)
         self.first, self.second = (self.bus.device(unit, TIMEOUT_S) for unit in (1, 2))
         self.sent: list[bytes] = []
-        hear = self.emulator.hear
+        receive_original = self.emulator.receive
 
         def listen(data: bytes) -> None:
             self.sent.append(data)
-            hear(data)
+            receive_original(data)
 
-        self.emulator.hear = listen  # type: ignore[method-assign]
+        self.emulator.receive = listen  # type: ignore[method-assign]
 
 
 def on_bus(test: Callable[[Bus], Coroutine[Any, Any, None]], echo_test: bool = True) -> None:
@@ -151,12 +151,12 @@ GOOD = rtu_frame(1, bytes([3, 4, 0, 1, 0, 2]))
 )
 def test_what_is_no_answer(heard: bytes, message: str) -> None:
     with pytest.raises(LinkError, match=message):
-        take_reply(heard, 1, 3, 9, "reading")
+        extract_reply(heard, 1, 3, 9, "reading")
 
 
 def test_an_answer_is_taken_when_its_last_byte_is_there() -> None:
-    assert [take_reply(GOOD[:n], 1, 3, 9, "reading") for n in range(1, 9)] == [None] * 8
-    assert take_reply(GOOD, 1, 3, 9, "reading") == GOOD[1:-2]
+    assert [extract_reply(GOOD[:n], 1, 3, 9, "reading") for n in range(1, 9)] == [None] * 8
+    assert extract_reply(GOOD, 1, 3, 9, "reading") == GOOD[1:-2]
 
 
 @pytest.mark.parametrize("bits", [1, 2, 3])
@@ -167,7 +167,7 @@ def test_no_answer_with_up_to_three_turned_bits_passes(bits: int) -> None:
         for bit in [(first + 11 * k) % (8 * len(GOOD)) for k in range(bits)]:
             spoilt[bit // 8] ^= 1 << bit % 8
         try:
-            taken = take_reply(bytes(spoilt), 1, 3, 9, "reading")
+            taken = extract_reply(bytes(spoilt), 1, 3, 9, "reading")
         except LinkError:
             continue
         assert taken is None  # a corrupted length byte leaves it waiting for more
@@ -374,7 +374,7 @@ def test_someone_else_talking_is_not_waited_for() -> None:
     async def test(bus: Bus) -> None:
         async def babble() -> None:
             while True:
-                bus.emulator.say(b"\x55" * 20)
+                bus.emulator.send_answer(b"\x55" * 20)
                 await asyncio.sleep(0.01)
 
         babbling = asyncio.create_task(babble())

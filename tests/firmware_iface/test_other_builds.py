@@ -38,11 +38,11 @@ class WordyOptoncdt(Optoncdt1420Emulator):
         self._echo = text
         super().line(text)
 
-    def say(self, answer: bytes) -> None:
+    def send_answer(self, answer: bytes) -> None:
         if answer.endswith(b"->"):
             answer = answer.replace(b"MEASRATE 4\r", b"MEASRATE " + self.rate.encode() + b"\r")
             answer = self._echo.encode() + b"\r\n" + answer + b"\r\n"
-        super().say(answer)
+        super().send_answer(answer)
 
 
 @pytest.mark.parametrize("rate", ["4.00", "4 kHz", "4.kHz"])
@@ -72,10 +72,10 @@ class TerseKeyence(KeyenceDlRs1aEmulator):
         if text:
             super().line("SR,00,999" if text == "SR,00,033" else text)
 
-    def say(self, answer: bytes) -> None:
-        super().say(answer.rstrip(b"\r\n") + self._end[0])
+    def send_answer(self, answer: bytes) -> None:
+        super().send_answer(answer.rstrip(b"\r\n") + self._end[0])
         for more in self._end[1:]:
-            super().say(more)
+            super().send_answer(more)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ class OtherVentus(VentusEmulator):
 
     def _read(self, number: int) -> None:
         if number in self.registers:
-            self.say(f"#R{number},{self.registers[number]:.6f}\r\n".encode())
+            self.send_answer(f"#R{number},{self.registers[number]:.6f}\r\n".encode())
 
 
 def test_another_ventus() -> None:

@@ -26,7 +26,7 @@ class Echo(SerialDevice):
     """Echoes its input."""
 
     def received(self, data: bytes) -> None:
-        self.say(data)
+        self.send_answer(data)
 
 
 class Ear:

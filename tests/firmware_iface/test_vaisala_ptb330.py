@@ -49,7 +49,7 @@ def test_frames() -> None:
         said: list[bytes] = []
         emulator = VaisalaPtb330Emulator(lambda: 101_325.0)
         emulator.attach(said.append)
-        emulator.hear(b"ECHO OFF\r\nFORM 4.3 P #r #n\r\nSEND\r\nFORM ?\r\nERRS\r\nVERS\r\n")
+        emulator.receive(b"ECHO OFF\r\nFORM 4.3 P #r #n\r\nSEND\r\nFORM ?\r\nERRS\r\nVERS\r\n")
         await asyncio.sleep(2.0)
         assert b"".join(said) == (
             b"ECHO OFF\r\nEcho           : OFF\r\n"
@@ -65,7 +65,7 @@ def test_a_message_carries_its_checksum() -> None:
         said: list[bytes] = []
         emulator = VaisalaPtb330Emulator(lambda: 99_800.0)
         emulator.attach(said.append)
-        emulator.hear(b'ECHO OFF\r\nFORM 4.3 P " " U3 " " CS4 #r #n\r\nSEND\r\n')
+        emulator.receive(b'ECHO OFF\r\nFORM 4.3 P " " U3 " " CS4 #r #n\r\nSEND\r\n')
         await asyncio.sleep(1.0)
         message = said[-1]
         assert message[:13] == b" 998.000 hPa "

@@ -43,7 +43,7 @@ def test_frames() -> None:
         said: list[bytes] = []
         emulator = VentusEmulator(lambda fraction: None)
         emulator.attach(said.append)
-        emulator.hear(b"#W23,123.456\n#R23\n#R37\n#X\n#R99\n#W31,5\n#R31\n")
+        emulator.receive(b"#W23,123.456\n#R23\n#R37\n#X\n#R99\n#W31,5\n#R31\n")
         await asyncio.sleep(0.1)
         assert b"".join(said) == b"#R23,123.456\n#R37,3\n#R31,0\n"
 

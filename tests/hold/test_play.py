@@ -54,7 +54,7 @@ def test_a_played_scenario_is_a_run_for_every_reader(
     (folder,) = (path for path in Path("logs").iterdir() if path.is_dir())
     assert folder.name.endswith("-dropout")
     run = open_run(folder)
-    run.look_through()
+    run.read_all_parts()
     assert run.notes == []
     assert (
         run.config.recording == RecordingConfig()

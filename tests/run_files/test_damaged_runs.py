@@ -93,7 +93,7 @@ def _content(folder: Path) -> dict[str, bytes]:
 
 def test_a_sound_run_has_nothing_to_say(sound: Path) -> None:
     run = open_run(sound)
-    run.look_through()
+    run.read_all_parts()
     assert run.notes == []
 
 

@@ -17,7 +17,7 @@ from membrane_ctrl.controller.protection import (
     Guard,
     ProcessValue,
     find_bound,
-    find_keepers,
+    find_protections,
 )
 from membrane_ctrl.controller.safety import (
     ALWAYS,
@@ -178,8 +178,8 @@ def _protections() -> list[str]:
 
 
 def _keepers(value: ProcessValue, activity: Activity, duty: Duty) -> str:
-    keepers = find_keepers(value, activity, duty)
-    names = [_LETTERS[k] if isinstance(k, Guard) else str(_CODES[k]) for k in keepers]
+    protections = find_protections(value, activity, duty)
+    names = [_LETTERS[k] if isinstance(k, Guard) else str(_CODES[k]) for k in protections]
     return ", ".join(names) or "-"
 
 

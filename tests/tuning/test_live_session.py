@@ -25,7 +25,7 @@ from membrane_ctrl.sessions.live_log import (
     LiveReader,
     PageAnswer,
     Progressed,
-    give_answer,
+    write_answer,
 )
 from tuning import same_bench
 from tuning.explore.live_page import LivePage, status
@@ -260,7 +260,9 @@ def answer(said: str, to: str = "which?", by: str = "anna") -> str:
 def test_a_question_is_answered_on_the_page(
     tmp_path: Path, keyboard: int, capsys: pytest.CaptureFixture[str], said: str
 ) -> None:
-    give_answer(tmp_path, "which?", PageAnswer("lively", "bob"))  # to an earlier question: too late
+    write_answer(
+        tmp_path, "which?", PageAnswer("lively", "bob")
+    )  # to an earlier question: too late
     log = AskedPage(tmp_path, answer(said, by="anna\x1b[2J"))
     assert progress_of(log).ask_question("which?", ("lively", "calm")) == said
     assert f"answers on the page: {said or 'none'}" in capsys.readouterr().err
@@ -289,7 +291,7 @@ def test_the_terminal_answers_as_ever_and_an_unfit_answer_of_the_page_does_not(
 ) -> None:
     log = AskedPage(tmp_path, unfit, keyboard=keyboard, typed="lively\n")
     assert progress_of(log).ask_question("which?", ("lively", "calm")) == "lively"
-    assert log.take_answer("which?", ("lively", "calm")) is None
+    assert log.pop_answer("which?", ("lively", "calm")) is None
     assert not (tmp_path / ANSWER).exists()
 
 

@@ -154,7 +154,7 @@ def test_an_answer_that_no_session_takes_is_withdrawn(
     log = LiveLog(tmp_path, 50.0, print)
     taken: list[PageAnswer | None] = []
     monkeypatch.setattr(
-        tuning_panel.time, "sleep", lambda _: taken.append(log.take_answer("which?", ("calm",)))
+        tuning_panel.time, "sleep", lambda _: taken.append(log.pop_answer("which?", ("calm",)))
     )
     assert tuning_panel.answered(tmp_path, "which?", given).done
     assert taken == [given]

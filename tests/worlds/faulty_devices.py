@@ -58,24 +58,24 @@ class SerialDevice(serial_device.SerialDevice):
     def frozen(self) -> bool:  # type: ignore[override]
         return self.faults.frozen
 
-    def hear(self, data: bytes) -> None:
+    def receive(self, data: bytes) -> None:
         if self.faults.echo:
             self._call_later(
                 asyncio.get_running_loop().time() + len(data) * self.settings.char_s,
                 self._transmit_bytes,
                 data,
             )
-        super().hear(data)
+        super().receive(data)
 
     def arrived(self, data: bytes) -> None:
         faults = self._drawn()
         if not faults.deaf:
             super().arrived(self._hit(data, faults.question_bit_errors))
 
-    def say(self, answer: bytes, delay_s: float = 0.0) -> None:
+    def send_answer(self, answer: bytes, delay_s: float = 0.0) -> None:
         faults = self._drawn()
         if not faults.silent:
-            super().say(self._spoilt(answer, faults), faults.delay_s)
+            super().send_answer(self._spoilt(answer, faults), faults.delay_s)
 
     def _spoilt(self, answer: bytes, faults: SerialFaults) -> bytes:
         if faults.garbage_bytes:
@@ -186,7 +186,7 @@ class MemoryWire(SerialPort):
         """Hand over bytes. Raises LinkDownError."""
         if self._receiver is None:
             raise LinkDownError(f"{self.name}: not open")
-        self._device.hear(data)
+        self._device.receive(data)
 
     def unplug(self) -> None:
         """Pull the plug."""

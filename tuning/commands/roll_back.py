@@ -23,7 +23,7 @@ def roll_back(options: TuneOptions) -> int:
             )
         except HoldError as error:
             raise DeviceError(str(error)) from None
-    told_of = (
+    entry_values = (
         kept.session,
         options.author,
         options.reason,
@@ -32,8 +32,8 @@ def roll_back(options: TuneOptions) -> int:
         None,
         kept.shape_s,
     )
-    told = journal.make_entry("rolled_back", *told_of)
-    journal.append_entry(options.logs, told)
+    entry = journal.make_entry("rolled_back", *entry_values)
+    journal.append_entry(options.logs, entry)
     progress.print_line(
         (
             f"back to the gains before {kept.session}: K {kept.before.kp_per_s:g} 1/s, Ti "

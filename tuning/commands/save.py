@@ -60,10 +60,10 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
         return errors.Exit.DONE
     if not confirm_and_replace(path, before, after, folder, yes):
         return errors.Exit.DONE
-    told = journal.make_entry(
+    entry = journal.make_entry(
         "saved", folder.path.name, author, str(path.resolve()), folder.head.before, gains
     )
-    journal.append_entry(folder.path.resolve().parents[1], told)
+    journal.append_entry(folder.path.resolve().parents[1], entry)
     return errors.Exit.DONE
 
 

@@ -57,7 +57,7 @@ def tune_shape_loop(options: TuneOptions) -> int:
         times_s = (before_s, found.time_constant_s)
         done = shape_loop_trial.try_time_constant(rig, times_s, earlier, assumed, options.verify_s)
         what: journal.What = "taken_back" if done.reason else "kept"
-        told_of = (
+        entry_values = (
             folder.path.name,
             options.author,
             done.reason or options.reason,
@@ -66,7 +66,7 @@ def tune_shape_loop(options: TuneOptions) -> int:
             None,
             times_s,
         )
-        journal.append_entry(options.logs, journal.make_entry(what, *told_of))
+        journal.append_entry(options.logs, journal.make_entry(what, *entry_values))
         plain.write_session_file(folder.file_path("outer_verified.json"), done)
         progress.print_line(
             f"taken back: {done.reason}"
@@ -99,10 +99,10 @@ def _to_be_tried(
     if abs(after_s / before_s - 1) < 0.1:
         progress.print_line(f"the present time constant, {before_s:.0f} s, fits")
         return False
-    asked = not options.yes and sys.stdin.isatty()
+    is_interactive = not options.yes and sys.stdin.isatty()
     answer = (
         progress.ask_question(f"try it instead of {before_s:.0f} s? [y/N]", ("yes",))
-        if asked
+        if is_interactive
         else ""
     )
     return options.yes or answer.lower() in ("y", "yes")

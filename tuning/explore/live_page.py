@@ -34,8 +34,8 @@ class LivePage:
             name="now", sizing_mode="stretch_width", styles={"font-size": "18px"}
         )
         self._steps = widgets.Div(name="steps", width=330)
-        self._said = widgets.Div(name="found", sizing_mode="stretch_width")
-        self._look()
+        self._results = widgets.Div(name="found", sizing_mode="stretch_width")
+        self._update_page()
 
     def attach(self, page: document.Document) -> None:
         """Put the page into a viewer's document."""
@@ -43,11 +43,11 @@ class LivePage:
         head = self._session.head
         of = f"{self._session.path.name}: {head.author} on {head.source}, begun {head.created_utc}"
         title = widgets.Div(text=f"<b>{html.escape(of)}</b>", sizing_mode="stretch_width")
-        found = layouts.row(self._steps, self._said, sizing_mode="stretch_width")
+        found = layouts.row(self._steps, self._results, sizing_mode="stretch_width")
         page.add_root(
             layouts.column(title, self._now, found, *self._plots(), sizing_mode="stretch_width")
         )
-        page.add_periodic_callback(self._look, _POLL_MS)
+        page.add_periodic_callback(self._update_page, _POLL_MS)
 
     def _plots(self) -> list[plotting.figure]:
         centre = plotting.figure(
@@ -87,7 +87,7 @@ class LivePage:
         )
         return [centre, flow]
 
-    def _look(self) -> None:
+    def _update_page(self) -> None:
         """Take what is new into the page."""
         points = self._log.read_new()
         if points["time_s"]:
@@ -106,7 +106,7 @@ class LivePage:
         silent_s = time.time() - _changed_s(self._session.path / live_log.NAME)
         self._now.text = html.escape(status(progress, done, silent_s, self._session.path))
         self._steps.text = _STYLE + _step_list(progress, done)
-        self._said.text = f"<pre class=said>{html.escape(chr(10).join(progress.said))}</pre>"
+        self._results.text = f"<pre class=said>{html.escape(chr(10).join(progress.said))}</pre>"
 
 
 def status(progress: live_log.Progressed, done: set[str], silent_s: float, session: Path) -> str:

@@ -92,7 +92,7 @@ class Page:
         self._over_time = {name: models.ColumnDataSource() for name in _COLOURS}
         self._over_frequency = {name: models.ColumnDataSource() for name in _COLOURS}
         self._table = widgets.Div(name="table", sizing_mode="stretch_width")
-        self._said = widgets.Div(name="said", text="")
+        self._message = widgets.Div(name="said", text="")
         for name, found in self._curves.items():
             self._fill(name, found)
         self._show(self._gains)
@@ -120,7 +120,7 @@ class Page:
         source = widgets.Div(
             text=f"<b>{html.escape(self._of.source)}</b>", sizing_mode="stretch_width"
         )
-        buttons = layouts.row(copy, save, self._said)
+        buttons = layouts.row(copy, save, self._message)
         controls = layouts.column(
             self._start, self._speed, self._damping, self._filter, buttons, self._command
         )
@@ -203,7 +203,7 @@ class Page:
         self._fill("yours", found)
         rows = [*self._curves.values(), found]
         self._table.text = _STYLE + _table([_row(each) for each in rows])
-        self._said.text = ""
+        self._message.text = ""
         keys = {"kp_per_s": gains.kp_per_s, "ti_s": gains.ti_s, "td_s": gains.td_s}
         keys["measurement_filter_s"] = gains.filter_s
         words = json.dumps({key: float(f"{value:.4g}") for key, value in keys.items()})
@@ -231,7 +231,7 @@ class Page:
 
     def _saved(self) -> None:
         assert self._save is not None
-        self._said.text = html.escape(self._save(self._gains))
+        self._message.text = html.escape(self._save(self._gains))
 
     def _plots(self) -> list[models.Row]:
         times, over, demands = self._over_time, self._over_frequency, gain_search.Demands()

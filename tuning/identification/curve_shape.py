@@ -82,8 +82,8 @@ def smooth_flows(
     share = np.exp(-0.5 * (costs - costs.min()))
     share /= share.sum()
     mean = share @ means
-    apart = means - mean
-    spread = np.tensordot(share, covariances, 1) + (share[:, None] * apart).T @ apart
+    deviations = means - mean
+    spread = np.tensordot(share, covariances, 1) + (share[:, None] * deviations).T @ deviations
     return full * mean, full**2 * spread
 
 

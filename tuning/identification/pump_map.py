@@ -187,7 +187,7 @@ class Surveyed:
         part = slice(low, top + 1)
         return Branch(fractions[part], flows[part], sigmas[part]), low == 0
 
-    def _refuse_steep(self, leaks: float, said: str) -> None:
+    def _refuse_steep(self, leaks: float, reading_text: str) -> None:
         """Raises ValueError if the flow rises at once from less than the leak to more than so many
         times as much.
         """
@@ -201,7 +201,7 @@ class Surveyed:
             and fractions[above] - fractions[below] <= _STEP_MOST
         ):
             raise ValueError(
-                f"{said}: the flow rises from {flows[below]:.1f} µm/s at a command of "
+                f"{reading_text}: the flow rises from {flows[below]:.1f} µm/s at a command of "
                 f"{fractions[below]:.2f} to {flows[above]:.1f} µm/s at {fractions[above]:.2f}, "
                 f"and the mirror loses {leak:.1f} µm/s: throttle the pump, or "
                 f"{describe_bleed_remedy(leak, flows[above])}, then run `tune pump` again"

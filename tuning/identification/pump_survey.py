@@ -182,10 +182,10 @@ class PumpSurvey:
         """
         from scipy.optimize import isotonic_regression
 
-        asked = [
+        visits = [
             level in self._wanted or not self._wanted for level in self.fit.levels
         ]  # not just passed through
-        own = [i for i, level in enumerate(self.fit.levels) if level.rising == rising and asked[i]]
+        own = [i for i, level in enumerate(self.fit.levels) if level.rising == rising and visits[i]]
         levels = list(self.fit.levels.items())
         at = [(levels[i][0].fraction, levels[i][1].flow_um_per_s) for i in own]
         fractions, flows = np.array([(0.0, 0.0), *at]).T
@@ -298,11 +298,11 @@ class PumpSurvey:
         worst = sorted(
             (level for level in wanted if level not in fresh), key=self.sigma, reverse=True
         )
-        asked = [3 * (self.sigma(level) / wide) ** 2 for level in worst]
+        visits = [3 * (self.sigma(level) / wide) ** 2 for level in worst]
         again = [
             level
             for turn in range(_MOST_VISITS)
-            for level, n in zip(worst, asked, strict=True)
+            for level, n in zip(worst, visits, strict=True)
             if n > max(turn, 3)
         ]
         return fresh + again

@@ -87,9 +87,9 @@ def describe_change(row: Candidate, present: Candidate | None) -> str:
             factor = f" x {then / now:.2f}" if 0 < now < math.inf and then < math.inf else ""
             (better if then < now else worse).append(word + factor)
     return "; ".join(
-        f"{word}: {', '.join(said)}"
-        for word, said in (("better", better), ("worse", worse))
-        if said
+        f"{word}: {', '.join(quantities)}"
+        for word, quantities in (("better", better), ("worse", worse))
+        if quantities
     )
 
 

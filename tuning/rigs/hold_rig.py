@@ -95,8 +95,8 @@ class HoldRig:
             begun = begun or rows[-1].state == telemetry.State.TUNE
             if not begun and len(rows) > _ANSWER_TICKS:
                 raise HoldError("the hold accepted the experiment but did not begin it")
-        told = self._experiment_ended()
-        return rows, experiment.Finished(experiment.ExperimentEnd(told.end), told.reason)
+        end = self._experiment_ended()
+        return rows, experiment.Finished(experiment.ExperimentEnd(end.end), end.reason)
 
     def set_gains(
         self,
@@ -112,10 +112,10 @@ class HoldRig:
         `shape_s`: time constant of the shape loop, `pump`: the pump's curve; NaN and None leave
         them. With `setpoint_step_um` the trial moves the setpoint too, with the shape loop off.
         """
-        told = Command(
+        end = Command(
             "gains", self._who, why, trial_s, loop=loop, shape_time_constant_s=shape_s, pump=pump
         )
-        self._link.send_command(replace(told, setpoint_step_um=setpoint_step_um))
+        self._link.send_command(replace(end, setpoint_step_um=setpoint_step_um))
         self.loop, self.pump = loop, pump or self.pump
 
     def keep(self) -> None:
@@ -132,19 +132,19 @@ class HoldRig:
         """End the experiment that runs, perhaps that of a session that was killed, and discard its
         ticks.
         """
-        self._take_news()
+        self._read_news()
         if self._state != telemetry.State.TUNE:
             return
         self._link.send_command(Command("hold", self._who, "tuning session interrupted"))
         while not self._rows or self._rows[-1].state == telemetry.State.TUNE:
             self._rows.clear()
-            self._take_news()
+            self._read_news()
         while self._rows[0].state == telemetry.State.TUNE:
             self._rows.popleft()
 
     def catch_up(self) -> None:
         """Discard the ticks so far: while a person thinks, nothing is recorded."""
-        self._take_news()
+        self._read_news()
         self._rows.clear()
 
     def record(self, rows: Sequence[telemetry.TelemetryRow]) -> Record:
@@ -194,7 +194,7 @@ class HoldRig:
 
     def _next_held(self) -> telemetry.TelemetryRow:
         while not self._rows:
-            self._take_news()
+            self._read_news()
         row = self._rows[0]
         if row.state not in _HELD:
             raise HoldError(
@@ -206,7 +206,7 @@ class HoldRig:
         self.seen(row)
         return self._rows.popleft()
 
-    def _take_news(self) -> None:
+    def _read_news(self) -> None:
         news = self._link.read_news()
         self._state = news.rows[-1].state if news.rows else self._state
         self._rows.extend(
@@ -221,9 +221,9 @@ class HoldRig:
             found = [event for event in self._events if isinstance(event, events.ExperimentEnded)]
             if found:
                 return found[-1]
-            self._take_news()
+            self._read_news()
         raise HoldError("the hold did not report the end of the experiment")
 
     def _explain_state(self) -> str:
-        said = [event.why for event in self._events if isinstance(event, events.StateEntered)]
-        return said[-1] if said else "no reason was given"
+        reasons = [event.why for event in self._events if isinstance(event, events.StateEntered)]
+        return reasons[-1] if reasons else "no reason was given"

@@ -24,7 +24,7 @@ class TicksByFigures:
 
     def __init__(self, config: Config) -> None:
         self._zero_um = 1e3 * config.optics.mirror.sag_mm
-        self._asked_s = 1 / config.shape.track_rate_hz
+        self._figure_interval_s = 1 / config.shape.track_rate_hz
         self._waiting: deque[telemetry.TelemetryRow] = deque()
         self._shown: deque[tuple[float, float]] = deque(
             [(-math.inf, math.nan)]
@@ -34,7 +34,10 @@ class TicksByFigures:
     @property
     def interval_s(self) -> float:
         """Time between figures: as asked for, or the median so far if that is longer."""
-        return max(self._asked_s, float(np.median(self._intervals_s)) if self._intervals_s else 0.0)
+        return max(
+            self._figure_interval_s,
+            float(np.median(self._intervals_s)) if self._intervals_s else 0.0,
+        )
 
     def add_rows(
         self, rows: Sequence[telemetry.TelemetryRow], shapes: Sequence[shape_estimate.ShapeEstimate]

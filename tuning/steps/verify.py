@@ -46,7 +46,7 @@ class Verified:
 def run_verify(
     session: folder.SessionFolder,
     rig: HoldRig,
-    told: Callable[[verification.Stage], None] = lambda stage: None,
+    report_stage: Callable[[verification.Stage], None] = lambda stage: None,
     stages: tuple[tuple[float, float], ...] = verification.STAGES,
 ) -> Verified:
     """Hold with the new gains and judge them in stages; keep them,
@@ -72,7 +72,7 @@ def run_verify(
             record = more if record is None else record.followed_by(more)
             setpoint_um = np.concatenate((setpoint_um, about_um))
             looks.append(verification.judge_stage(record, setpoint_um, trial, growth_max))
-            told(looks[-1])
+            report_stage(looks[-1])
             reason = looks[-1].reason
             if until_s == stages[-1][0] and looks[-1].close:
                 continue  # as likely the weather as the gains: as long again decides

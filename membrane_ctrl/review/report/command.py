@@ -59,8 +59,8 @@ def report_command(
         print(text)
         return 0
     _print_result(analysis, other, folder, time.monotonic() - began_s)
-    if said := pump_change(history, opened.config.pump.change_max):
-        print(f"note: {said}", file=sys.stderr)
+    if warning := pump_change(history, opened.config.pump.change_max):
+        print(f"note: {warning}", file=sys.stderr)
     return 0
 
 

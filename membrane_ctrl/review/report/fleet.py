@@ -108,7 +108,10 @@ def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
             render_sparkline(analysis.level["mean_error_um"]),
         )
         return RunReport(
-            _make_fleet_entry(analysis, table), text, render_report(analysis, history=history), curve
+            _make_fleet_entry(analysis, table),
+            text,
+            render_report(analysis, history=history),
+            curve,
         )
     except errors.CommandError as error:
         return RunReport({"problem": "; ".join(error.lines).removeprefix(f"{folder}: ")})
@@ -181,7 +184,9 @@ def fleet_command(options: FleetOptions) -> int:
             entries.append(entry)
             rows.append(_make_row(entry, report.curve))
         if all("problem" in entry for entry in entries):
-            raise errors.FindingsError([f"{entry['name']}: {entry['problem']}" for entry in entries])
+            raise errors.FindingsError(
+                [f"{entry['name']}: {entry['problem']}" for entry in entries]
+            )
         text = plain_json.dumps({**program.file_origin(SCHEMA), "runs": entries}, indent=1)
         files.make_folder(out)
         files.write_text_atomic(out / "fleet.json", text + "\n")
@@ -190,7 +195,9 @@ def fleet_command(options: FleetOptions) -> int:
         print(text)
     else:
         for entry in entries:
-            print(terminal.one_line(f"{entry['name']}: {entry.get('sentence') or entry['problem']}"))
+            print(
+                terminal.one_line(f"{entry['name']}: {entry.get('sentence') or entry['problem']}")
+            )
         print(out / "fleet.html")
     return errors.Exit.DONE
 
@@ -226,8 +233,8 @@ def _make_row(entry: dict[str, Any], curve: str) -> list[str]:
 
 def _make_page(entries: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
     failed = sum("problem" in entry for entry in entries)
-    odd = sum(entry.get("verdict") in ("look", "bad") for entry in entries)
-    word = "bad" if failed else "look" if odd else "good"
-    sentence = f"{len(entries)} runs: {odd} to look at, {failed} cannot be reported."
+    unusual = sum(entry.get("verdict") in ("look", "bad") for entry in entries)
+    word = "bad" if failed else "look" if unusual else "good"
+    sentence = f"{len(entries)} runs: {unusual} to look at, {failed} cannot be reported."
     section = PageSection("", [PageText(sentence, MARKS[word]), PageTable(_HEAD, rows)])
     return render_page(ReportPage("Fleet", [section], wide=True))

@@ -115,8 +115,8 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
 
 def make_timeline(analysis: Analysis) -> list[LoggedEvent]:
     """Notable events, in order; without events, states from the telemetry."""
-    told = [each for each in analysis.run.log if each.event.notable]
-    if not any(isinstance(each.event, events.StateEntered) for each in told):
+    notable = [each for each in analysis.run.log if each.event.notable]
+    if not any(isinstance(each.event, events.StateEntered) for each in notable):
         time_s, codes = analysis.level["time_s"], analysis.level["state"]
         lines = (
             {
@@ -127,8 +127,8 @@ def make_timeline(analysis: Analysis) -> list[LoggedEvent]:
             for row in range(codes.size)
             if math.isfinite(codes[row]) and (row == 0 or codes[row] != codes[row - 1])
         )
-        told = sorted([*told, *map(parse_logged_line, lines)], key=lambda each: each.mono_s)
-    return [each for each in told if analysis.part_s[0] <= each.mono_s < analysis.part_s[1]]
+        notable = sorted([*notable, *map(parse_logged_line, lines)], key=lambda each: each.mono_s)
+    return [each for each in notable if analysis.part_s[0] <= each.mono_s < analysis.part_s[1]]
 
 
 def _make_series(series: ErrorSeries | None) -> dict[str, Any] | None:

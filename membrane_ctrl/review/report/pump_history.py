@@ -67,10 +67,10 @@ def pump_history(newest: Path) -> list[PumpSeen]:
             if folder.name.startswith(".") or not run_folder.is_run(folder):
                 continue
             log, config = event_log.read_events(folder, []), run_config.read_config(folder, [])
-            told = _last_learned(log)
-            if told is None or config.devices != devices:
+            last = _last_learned(log)
+            if last is None or config.devices != devices:
                 continue
-            learned, pump = told[0], config.with_gains(told[1]).pump
+            learned, pump = last[0], config.with_gains(last[1]).pump
             latest = latest or pump
             fraction = pump_curve.PumpCurve(latest).fraction(0.5 * latest.flow_full_um_per_s)
             share = pump_curve.PumpCurve(pump).flow(fraction) / (0.5 * latest.flow_full_um_per_s)
@@ -85,12 +85,12 @@ def pump_history(newest: Path) -> list[PumpSeen]:
 
 def _last_learned(log: Sequence[LoggedEvent]) -> tuple[events.PumpLearned, dict[str, Any]] | None:
     """What a run told last of its pump, and the gains and curve then set."""
-    status, told = RunStatus(), None
+    status, last = RunStatus(), None
     for each in log:
         status = status.after_event(each.event, each.mono_s)
         if isinstance(each.event, events.PumpLearned):
-            told = each.event, dict(status.loop or {})
-    return told
+            last = each.event, dict(status.loop or {})
+    return last
 
 
 def _to_finite(value: object) -> float:

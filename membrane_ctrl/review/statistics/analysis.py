@@ -115,7 +115,7 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
     true = describe_error(run, ticks, TRUE)
     benefit = _compute_benefit(run, ticks, true is not None)
     leak = _compute_leak(level)
-    odd = find_anomalies(
+    anomalies = find_anomalies(
         run, (start_s, end_s), ticks, reading, true, leak[0], _tracking_share(level), found, shape
     )
     return Analysis(
@@ -131,7 +131,7 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
         found=found,
         unjudged=unjudged,
         shape=shape,
-        anomalies=odd,
+        anomalies=anomalies,
     )
 
 

@@ -49,29 +49,31 @@ def find_anomalies(
     shape: shape_review.ShapeReview | None,
 ) -> tuple[Anomaly, ...]:
     """All anomalies of a part of a run, the gravest first."""
-    odd = [Anomaly("incomplete recording", note) for note in run.notes]
+    anomalies = [Anomaly("incomplete recording", note) for note in run.notes]
     names = Counter(
         each.event.name for each in run.log_between(*part_s) if isinstance(each.event, events.Fault)
     )
-    odd += [
+    anomalies += [
         Anomaly("fault", f"{name}, {count} time{'s' * (count > 1)}")
         for name, count in names.most_common()
     ]
     if reading is None:
-        odd.append(Anomaly("never settled", "no tick counts as held: there are no hold statistics"))
+        anomalies.append(
+            Anomaly("never settled", "no tick counts as held: there are no hold statistics")
+        )
     series = true or reading
     if series is not None:
         seconds = series.windows[0]
         if seconds.count and not seconds.in_band >= _IN_BAND_LEAST:
-            odd.append(
+            anomalies.append(
                 Anomaly("band left", f"{100 * seconds.in_band:.3g} % of 1 s means within the band")
             )
         if seconds.count and abs(seconds.mean_um) > _BIAS_MOST_UM:
-            odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} µm on average"))
+            anomalies.append(Anomaly("bias", f"{seconds.mean_um:+.3f} µm on average"))
         if series.drift.is_significant:
-            odd.append(Anomaly("drift", _describe_slope(series.drift, "µm/h")))
+            anomalies.append(Anomaly("drift", _describe_slope(series.drift, "µm/h")))
     if ticks.paused_s:
-        odd.append(
+        anomalies.append(
             Anomaly(
                 "paused",
                 f"{format_span(ticks.paused_s)}: the pump gave its mean flow, "
@@ -79,19 +81,21 @@ def find_anomalies(
             )
         )
     if ticks.missed_ticks:
-        odd.append(
+        anomalies.append(
             Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}")
         )
     if ticks.lateness_ms.find_quantile(0.99) > _LATE_P99_MOST_MS:
-        odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.find_quantile(0.99):.1f} ms"))
+        anomalies.append(
+            Anomaly("late ticks", f"p99 is {ticks.lateness_ms.find_quantile(0.99):.1f} ms")
+        )
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
-        odd.append(
+        anomalies.append(
             Anomaly(
                 "too tight", f"a leak of {leak_um_per_s:.2f} µm/s leaves the pump no way to lower"
             )
         )
     if ticks.pump.saturated_share > _SATURATED_MOST:
-        odd.append(
+        anomalies.append(
             Anomaly(
                 "saturation",
                 f"{100 * ticks.pump.saturated_share:.1f} % of ticks at a limit of the flow",
@@ -107,17 +111,17 @@ def find_anomalies(
             f"tracked {100 * tracking_share:.0f} % of the time held; else the centre follows the "
             "laser's mount"
         )
-        odd.append(Anomaly("shape loop", seen))
+        anomalies.append(Anomaly("shape loop", seen))
     if shape is not None:
         if shape.rejected > _REJECTED_MOST * shape.cycles:
-            odd.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
+            anomalies.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
         if shape.disagreement.is_significant:
-            odd.append(
+            anomalies.append(
                 Anomaly("camera and laser diverge", _describe_slope(shape.disagreement, "µm/h"))
             )
     counts = Counter(event.kind for event in found)
-    odd += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
-    return tuple(odd)
+    anomalies += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
+    return tuple(anomalies)
 
 
 def _describe_slope(drift: FittedSlope, unit: str) -> str:

@@ -117,7 +117,7 @@ def _of_mean(offset_um: float, tracks: bool) -> str:
 
 
 def _compare_loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
-    mine, other = ours.ticks, theirs.ticks
+    ours_ticks, theirs_ticks = ours.ticks, theirs.ticks
     leak, pump, late = (
         [_select_held(analysis, name) for analysis in (ours, theirs)]
         for name in ("mean_leak_um_per_s", "mean_pump_fraction", "max_lateness_ms")
@@ -143,24 +143,24 @@ def _compare_loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
         _make_tested_row(
             "pump, mean",
             "of full",
-            mine.pump.mean_fraction,
-            other.pump.mean_fraction,
+            ours_ticks.pump.mean_fraction,
+            theirs_ticks.pump.mean_fraction,
             mean_p(pump[0], pump[1], window_s),
             _STRETCHES,
         ),
         Difference(
             "pump strokes",
             "1/h",
-            mine.pump.travel_per_hour,
-            other.pump.travel_per_hour,
+            ours_ticks.pump.travel_per_hour,
+            theirs_ticks.pump.travel_per_hour,
             math.nan,
             "no test: one sum over the run",
         ),
         Difference(
             "lateness p99",
             "ms",
-            mine.lateness_ms.find_quantile(0.99),
-            other.lateness_ms.find_quantile(0.99),
+            ours_ticks.lateness_ms.find_quantile(0.99),
+            theirs_ticks.lateness_ms.find_quantile(0.99),
             late_p,
             late_note,
         ),

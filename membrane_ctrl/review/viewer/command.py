@@ -286,11 +286,11 @@ def _find_event_time(run: Run, what: str) -> float:
     for item in found:
         if wanted in item.kind:
             return item.time_s
-    told = {
+    logged_kinds = {
         str(e.get("name") or e.get("state") or e.get("command") or e.get("kind"))
         for e in run.events
     }
-    named = sorted(told - {"why"} | {item.kind for item in found})
+    named = sorted(logged_kinds - {"why"} | {item.kind for item in found})
     raise errors.InputError(
         f"--around {what}: no such event in {run.name}; known: {', '.join(named)}"
     )

@@ -189,15 +189,17 @@ class Layer:
     def _send_events(
         self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]
     ) -> None:
-        told = [
+        logged = [
             e
             for e in run.log
             if not isinstance(e.event, events.Why) and part_s[0] <= e.mono_s <= part_s[1]
         ]
-        if told:
-            levels = [each.event.level.value for each in told]
-            texts = [each.event.sentence for each in told]
-            self._send_log(run, "/events", np.array([each.mono_s for each in told]), texts, levels)
+        if logged:
+            levels = [each.event.level.value for each in logged]
+            texts = [each.event.sentence for each in logged]
+            self._send_log(
+                run, "/events", np.array([each.mono_s for each in logged]), texts, levels
+            )
         for stream, time_s, values in plot_marks.mark_lines(
             [(each.mono_s, each.event) for each in run.log]
         ):
@@ -205,8 +207,8 @@ class Layer:
             self._send_columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
         pump = [(e.mono_s, e.event) for e in run.log if isinstance(e.event, events.PumpLearned)]
         if pump:
-            values = np.array([(told.scale, told.correction) for _, told in pump])
-            variances = np.array([(told.sigma**2, 0.0) for _, told in pump])
+            values = np.array([(logged.scale, logged.correction) for _, logged in pump])
+            variances = np.array([(logged.sigma**2, 0.0) for _, logged in pump])
             lines = _names_and_colours(streams.PUMP)
             self._send_measured(
                 streams.PUMP.path, lines, np.array([at_s for at_s, _ in pump]), values, variances
@@ -221,16 +223,16 @@ class Layer:
                 run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen)
             )
         for kind in dict.fromkeys(f.kind for f in found):
-            alike = sorted((f for f in found if f.kind == kind), key=lambda f: f.size)
+            of_kind = sorted((f for f in found if f.kind == kind), key=lambda f: f.size)
             ends = " to ".join(
-                dict.fromkeys(_format_size(f.size, f.unit) for f in (alike[0], alike[-1]))
+                dict.fromkeys(_format_size(f.size, f.unit) for f in (of_kind[0], of_kind[-1]))
             )
-            name = f"{kind}, {ends}" if len(alike) == 1 else f"{len(alike)} of {kind}, {ends}"
+            name = f"{kind}, {ends}" if len(of_kind) == 1 else f"{len(of_kind)} of {kind}, {ends}"
             path = f"/found/lines/{kind.replace(' ', '_')}"
             self._send_style(
                 path, [(name, _FOUND_COLOURS.get(kind, _OTHER_FOUND))], 1.0, vertical=True
             )
-            time_s, values = plot_marks.vertical_lines(np.array([f.time_s for f in alike]))
+            time_s, values = plot_marks.vertical_lines(np.array([f.time_s for f in of_kind]))
             self._send_columns(path, time_s, rr.Scalars.columns(scalars=values))
 
     def _send_log(

@@ -108,7 +108,7 @@ def serve_source(
     _require_listening(bind, port)
     data_port = free_port()
     url = source if isinstance(source, str) else proxy_url(_find_host(bind), data_port)
-    _say_where(bind, port, url)
+    _print_address(bind, port, url)
     options = [
         "--serve-web",
         "--bind",
@@ -135,7 +135,7 @@ def show_live_run(run: Run, web: bool, port: int = 0) -> int:
     proxy = proxy_url("127.0.0.1", data_port)
     if web:
         _require_listening("127.0.0.1", port)
-        _say_where("127.0.0.1", port, proxy)
+        _print_address("127.0.0.1", port, proxy)
     else:
         _require_screen()
     try:
@@ -188,7 +188,7 @@ def proxy_url(host: str, port: int) -> str:
     return f"rerun+http://{host}:{port}/proxy"
 
 
-def _say_where(bind: str, port: int, url: str) -> None:
+def _print_address(bind: str, port: int, url: str) -> None:
     """Print the address of the page that shows a server's data, and how to reach it from another
     machine.
     """

@@ -127,7 +127,7 @@ def read_manifest(folder: Path, notes: list[str]) -> dict[int, PartEntry]:
 def _entry_of(line: str) -> PartEntry | None:
     try:
         value = plain_json.loads(line)
-        if not isinstance(value, dict) or not file_checksums.take_checksum(value):
+        if not isinstance(value, dict) or not file_checksums.pop_checksum(value):
             return None
         entry = PartEntry.model_validate(value)
     except (ValueError, ValidationError):

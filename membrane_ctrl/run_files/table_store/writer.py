@@ -90,7 +90,7 @@ class TableWriter:
             self._journal.append_batch(self._next_row, batch)
         except OSError:
             self._close_journal()  # another one follows what this one could not take
-            self._give_up_oldest()
+            self._drop_oldest()
             raise
         self._next_row += batch.num_rows
         self._waiting.clear()
@@ -115,7 +115,7 @@ class TableWriter:
             with contextlib.suppress(OSError):  # every frame is synced
                 current.close()
 
-    def _give_up_oldest(self) -> None:
+    def _drop_oldest(self) -> None:
         """Drop the oldest rows if more than `WAIT_S` of them wait; their numbers stay unused."""
         while self.until_s - self._time_s(self._waiting[0], 0) > WAIT_S:
             dropped = self._waiting.popleft().num_rows

@@ -47,7 +47,7 @@ def console_page(row: TelemetryRow) -> str:
     """The console of that row, as text."""
     config = Config()
     model = ConsoleModel(config)
-    model.take_row(row)
+    model.add_row(row)
     console = Console(width=WIDTH, height=HEIGHT, record=True, file=io.StringIO())
     console.print(ConsolePage(model.make_view(row.mono_s), config, "logs/a-run"))
     return console.export_text()
