@@ -94,7 +94,7 @@ def _report_attempts(sent_log: SentLog, report: Callable[[Event], None]) -> None
     """Report the messages that any process has sent, for the run's events."""
     for line in sent_log.take_attempts():
         report(
-            port_events.AlarmTold(
+            port_events.AlarmSent(
                 alarm=str(line.get("name")),
                 what=str(line.get("kind")),
                 severity=str(line.get("severity")),

@@ -381,14 +381,14 @@ class EstimatorConfig(Section):
     leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.015
     """Random walk of the leak between its sudden changes, which the filter detects. Raise it for a
     leak that changes slowly: it then follows sooner and passes more noise."""
-    stand_um_per_k: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    camera_mount_um_per_k: Annotated[float, Field(ge=-100, le=100)] = 0.0
     """Apparent change of sag for each kelvin by which the camera mount is warmer; it is subtracted.
     Set it to the measured one: a steel mount has about 0.34 at 2.7 m, invar near 0.03."""
-    stand_sigma_um_per_k: Annotated[float, Field(ge=0, le=100)] = 0.4
+    camera_mount_sigma_um_per_k: Annotated[float, Field(ge=0, le=100)] = 0.4
     """How far that may be wrong, 1 sigma; it is part of the estimate's. Lower it for a mount that
     was measured.
     """
-    stand_follows_air_s: Annotated[float, Field(ge=0, le=1e5)] = 1800.0
+    camera_mount_follows_air_s: Annotated[float, Field(ge=0, le=1e5)] = 1800.0
     """Time constant with which the camera mount follows the air. Change it for a lighter or heavier
     mount.
     """

@@ -353,7 +353,7 @@ class DisturbancesConfig(Section):
     """Time from the first to the last row of a picture; 0: a global shutter. Set it to your
     camera's.
     """
-    stand_k: Annotated[float, Field(ge=0, le=20)] = 0.0
+    camera_mount_k: Annotated[float, Field(ge=0, le=20)] = 0.0
     """Swing of the temperature of the camera's mount, which grows by 60 µm/K. Raise it to see the
     sag follow it.
     """

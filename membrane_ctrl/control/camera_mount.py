@@ -25,8 +25,11 @@ class CameraMountGrowth:
     """
 
     def __init__(self, config: EstimatorConfig, memory: CameraMountState | None = None) -> None:
-        self._um_per_k, self._sigma_um_per_k = config.stand_um_per_k, config.stand_sigma_um_per_k
-        self._follows_air_s = config.stand_follows_air_s
+        self._um_per_k, self._sigma_um_per_k = (
+            config.camera_mount_um_per_k,
+            config.camera_mount_sigma_um_per_k,
+        )
+        self._follows_air_s = config.camera_mount_follows_air_s
         self.memory = memory or CameraMountState()
 
     def lock(self) -> None:

@@ -53,7 +53,9 @@ class CentreEstimationState(StateNode):
     agreed_mount: LowPass = field(default_factory=LowPass)
     slowly_agreed_mount: LowPass = field(default_factory=LowPass)
     mount_drift: MountDriftState = field(default_factory=MountDriftState)
-    stand: camera_mount.CameraMountState = field(default_factory=camera_mount.CameraMountState)
+    mount_growth: camera_mount.CameraMountState = field(
+        default_factory=camera_mount.CameraMountState
+    )
     mount_growth_reported: bool = False
     reported_sensors: tuple[int, ...] | None = None  # the sensors, as reported
     sensors_changed_s: float = math.nan
@@ -78,7 +80,7 @@ class CentreEstimation:
         )
         self._tracks = config.shape.mode == "track"
         self._mount_drift = MountDrift(config.shape, self.memory.mount_drift)
-        self._camera_mount = CameraMountGrowth(config.estimator, self.memory.stand)
+        self._camera_mount = CameraMountGrowth(config.estimator, self.memory.mount_growth)
         self._mount_growth_max_um = _MOUNT_SHARE * config.limits.band_um
 
     @property

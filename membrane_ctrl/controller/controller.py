@@ -38,7 +38,19 @@ from membrane_ctrl.controller.telemetry_row import make_telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_context import TickContext, apply_command, collect_state_fields
 from membrane_ctrl.model import arrays, errors
-from membrane_ctrl.model import events as told
+from membrane_ctrl.model.events import (
+    Cleared,
+    Event,
+    ExperimentEnded,
+    GainsReverted,
+    LockRemoved,
+    LockSet,
+    PumpResponseFound,
+    Resumed,
+    ShapeLoopState,
+    StateEntered,
+    Why,
+)
 from membrane_ctrl.model.lock import describe_locks
 from membrane_ctrl.model.reason import NO_REASON, make_reason
 from membrane_ctrl.model.telemetry import SafeLevel, State
@@ -133,7 +145,7 @@ class Controller:
         becomes a fault in the next tick.
         """
         context = self._context
-        events: list[told.Event] = []
+        events: list[Event] = []
         self._begin_tick(inputs, events)
         last = context.output or inner_loop.NO_OUTPUT
         judged = (
@@ -243,7 +255,7 @@ class Controller:
             return "the figures do not fit the estimate"
         return self._context.observer.figures.explain_unseen().text
 
-    def _begin_tick(self, inputs: TickInputs, events: list[told.Event]) -> None:
+    def _begin_tick(self, inputs: TickInputs, events: list[Event]) -> None:
         context = self._context
         self.memory.ticks += 1
         nominal_s = 1.0 / self._config.loop.rate_hz
@@ -259,21 +271,22 @@ class Controller:
         self._answers, self._clear_mask = [], 0
         obeyed: set[str] = set()
         for command in commands.sort_commands(inputs.commands):
-            if self._take_command(command, obeyed, events):
+            if self._handle_command(command, obeyed, events):
                 obeyed.add(command.kind)
         if self._gains.is_overdue(context.now_s):
             self._revert_gains("nobody kept them in time", events)
         context.loop.may_probe = not self._gains.on_trial
 
-    def _take_command(
-        self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]
+    def _handle_command(
+        self, command: commands.Command, obeyed: Collection[str], events: list[Event]
     ) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""
         refused = (
             commands.explain_overruled(command, obeyed)
             or locks.refuse_while_locked(command, self._context.locks)
             or commands.explain_refusal(command, self.state, self._present_config)
-            or self._refuse_hold_or_experiment(command)
+            or self._refuse_by_condition(command)
+            or self._begin_experiment(command)
         )
         self._answers.append((command.number, refused))
         events.append(commands.make_command_event(command, refused))
@@ -281,7 +294,7 @@ class Controller:
             self._execute_command(command, events)
         return not refused
 
-    def _execute_command(self, command: commands.Command, events: list[told.Event]) -> None:
+    def _execute_command(self, command: commands.Command, events: list[Event]) -> None:
         context = self._context
         match command.kind:
             case "setpoint" if math.isfinite(self.memory.setpoint_back_um):  # it stays
@@ -306,19 +319,19 @@ class Controller:
                 self._remove_lock(command, events)
         apply_command(context, command, self.state)
 
-    def _set_lock(self, command: commands.Command, events: list[told.Event]) -> None:
+    def _set_lock(self, command: commands.Command, events: list[Event]) -> None:
         lock = locks.make_lock(command, self._context.locks)
         if lock is not None:
             self._context.locks = (*self._context.locks, lock)
-            events.append(told.LockSet(**asdict(lock), number=command.number))
+            events.append(LockSet(**asdict(lock), number=command.number))
 
-    def _remove_lock(self, command: commands.Command, events: list[told.Event]) -> None:
+    def _remove_lock(self, command: commands.Command, events: list[Event]) -> None:
         context = self._context
         unlocking = locks.decide_unlock(command, context.locks)
         lock = unlocking.lock
         assert lock is not None  # checked by `refuse_while_locked`
         context.locks = tuple(each for each in context.locks if each != lock)
-        event = told.LockRemoved(
+        event = LockRemoved(
             word=lock.word,
             text=lock.text,
             author=lock.author,
@@ -329,11 +342,11 @@ class Controller:
         )
         events.append(event)
 
-    def _refuse_hold_or_experiment(self, command: commands.Command) -> str:
-        """Prepare the experiment of a `tune`; returns why the command is refused,
-        or an empty text.
+    def _refuse_by_condition(self, command: commands.Command) -> str:
+        """Why a fault, an interlock, a safe level or a limit forbids a command that its state
+        allows; empty if none does.
         """
-        context, spec = self._context, command.experiment
+        context = self._context
         if command.kind == "hold" and context.latched:
             return f"a fault is latched: {context.latched}; acknowledge it first"
         if command.kind == "hold" and self.state == State.STANDBY and context.interlocks.last_mask:
@@ -343,6 +356,7 @@ class Controller:
         if command.kind in ("manual", "tune") and context.levels.safe_level != SafeLevel.NONE:
             return "the safety table holds the mean flow"
         if math.isfinite(command.setpoint_step_um):
+            # The step of a trial begins at the setpoint of people, not at a step of an earlier one
             now_um = (
                 self.memory.setpoint_back_um
                 if math.isfinite(self.memory.setpoint_back_um)
@@ -350,6 +364,11 @@ class Controller:
             )
             stepped = replace(command, kind="setpoint", value=now_um + command.setpoint_step_um)
             return commands.explain_refusal(stepped, self.state, self._present_config)
+        return ""
+
+    def _begin_experiment(self, command: commands.Command) -> str:
+        """Begin the experiment of a `tune`; returns why it cannot begin, or an empty text."""
+        context, spec = self._context, command.experiment
         if command.kind != "tune" or spec is None:
             return ""
         centre_um = context.setpoint_um + context.trim_um
@@ -389,10 +408,10 @@ class Controller:
             self.memory.setpoint_back_um = math.nan
             self._shape.switch(self.memory.shape_back, context.now_s)
 
-    def _revert_gains(self, why: str, events: list[told.Event]) -> None:
+    def _revert_gains(self, why: str, events: list[Event]) -> None:
         self._gains.revert()
         self._set_gains(self._gains.present.loop)
-        events.append(told.GainsReverted(why))
+        events.append(GainsReverted(why))
 
     def _consider_resuming(self, observation: safety.Observation) -> None:
         """Decide whether a latched fault may clear automatically (`resume`)."""
@@ -405,14 +424,14 @@ class Controller:
         context.resume_possible = resume.possible
         self._clear_mask |= resume.clear_mask
 
-    def _apply_verdict(self, verdict: safety.Verdict, events: list[told.Event]) -> None:
+    def _apply_verdict(self, verdict: safety.Verdict, events: list[Event]) -> None:
         """Enter the safe level of the verdict; every level below HOLD_FLOW latches the fault."""
         context, levels = self._context, self._context.levels
         rule = verdict.rule
         if rule is None:
             if levels.safe_level == SafeLevel.HOLD_FLOW:
                 levels.clear(context.now_s)
-                events.append(told.Cleared(self.fault.name if self.fault else ""))
+                events.append(Cleared(self.fault.name if self.fault else ""))
                 self.fault = None
             return
         if self.fault is None or (verdict.safe_level > SafeLevel.HOLD_FLOW >= levels.safe_level):
@@ -422,7 +441,7 @@ class Controller:
         if levels.step(context.now_s) > SafeLevel.HOLD_FLOW and self.state != State.FAULT:
             self._enter_state(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
 
-    def _step_shape(self, inputs: TickInputs, events: list[told.Event]) -> shape_loop.ShapeOutput:
+    def _step_shape(self, inputs: TickInputs, events: list[Event]) -> shape_loop.ShapeOutput:
         context = self._context
         settled = self.state == State.HOLD and context.levels.safe_level == SafeLevel.NONE
         if self._consistency.laser_moved and self._shape.on:
@@ -447,11 +466,11 @@ class Controller:
         if reported != self.memory.reported_shape:
             self.memory.reported_shape = reported
             events.append(
-                told.ShapeLoopState(shape.state.name.lower(), shape.reason.text, shape.reason.code)
+                ShapeLoopState(shape.state.name.lower(), shape.reason.text, shape.reason.code)
             )
         return shape
 
-    def _run_state(self, events: list[told.Event]) -> None:
+    def _run_state(self, events: list[Event]) -> None:
         """Run the state's handler; everything is off unless it sets it."""
         context = self._context
         context.output, context.pump_fraction, context.vent_fraction = None, 0.0, 0.0
@@ -474,7 +493,7 @@ class Controller:
         if wanted != self.state:
             self._enter_state(wanted, context.why.text, events)
 
-    def _use_response(self, events: list[told.Event]) -> None:
+    def _use_response(self, events: list[Event]) -> None:
         """Let loop and estimate use a response that was identified in this tick."""
         context = self._context
         found = context.found_response
@@ -485,7 +504,7 @@ class Controller:
         context.loop.set_pump_lag(estimator)
         self._estimation.set_estimator(estimator)
         events.append(
-            told.PumpResponseFound(
+            PumpResponseFound(
                 delay_s=found.delay_s,
                 delay_sigma_s=found.delay_sigma_s,
                 lag_s=found.lag_s,
@@ -495,9 +514,9 @@ class Controller:
             )
         )
 
-    def _enter_state(self, state: State, why: str, events: list[told.Event]) -> None:
+    def _enter_state(self, state: State, why: str, events: list[Event]) -> None:
         context = self._context
-        events.append(told.StateEntered(state.name.lower(), self.state.name.lower(), why))
+        events.append(StateEntered(state.name.lower(), self.state.name.lower(), why))
         if self.state == State.TUNE:
             self._report_experiment(why, events)
         if state != State.TUNE:
@@ -507,7 +526,7 @@ class Controller:
         if self.state == State.FAULT:  # acknowledged, or may resume
             if not context.acknowledged and self.fault is not None:
                 self._resume.resumed(context.now_s)
-                events.append(told.Resumed(self.fault.name))
+                events.append(Resumed(self.fault.name))
             self.fault = None
             self.memory.tick_error = ""
             context.levels.leave()
@@ -523,18 +542,16 @@ class Controller:
         context.overdue = context.unfit = ""
         context.test_memory = None
 
-    def _report_experiment(self, why: str, events: list[told.Event]) -> None:
+    def _report_experiment(self, why: str, events: list[Event]) -> None:
         """Report how the experiment ended: by itself, or because the state changed."""
         experiment = self._context.trial
         assert experiment is not None
         ended = self._context.trial_ended or Finished(ExperimentEnd.INTERRUPTED, why)
         events.append(
-            told.ExperimentEnded(
-                experiment.spec.kind, ended.completed, ended.reason, ended.end.value
-            )
+            ExperimentEnded(experiment.spec.kind, ended.completed, ended.reason, ended.end.value)
         )
 
-    def _report_reason(self, events: list[told.Event]) -> None:
+    def _report_reason(self, events: list[Event]) -> None:
         """Report the operator's line once its reason (not its numbers) has changed durably."""
         context, memory = self._context, self.memory
         code = context.why.code
@@ -543,4 +560,4 @@ class Controller:
             memory.why_since_s = context.now_s
         if code != memory.reported_why_code and context.now_s - memory.why_since_s >= _WHY_STANDS_S:
             memory.reported_why_code = code
-            events.append(told.Why(context.why.text, code))
+            events.append(Why(context.why.text, code))

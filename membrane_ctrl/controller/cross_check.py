@@ -45,19 +45,19 @@ def cross_check(
     config: Config, board: BenchIdentity | None = None
 ) -> tuple[cross_check_plant.ConfigFinding, ...]:
     """Findings on a configuration and, if given, on its board's limits; errors first."""
-    say = cross_check_plant.ConfigFindings(config)
-    _check_finite(config, say)
-    if not say.found:  # the others compute with the values
+    findings = cross_check_plant.ConfigFindings(config)
+    _check_finite(config, findings)
+    if not findings.found:  # the others compute with the values
         for judge in _RULES:
-            judge(config, say)
+            judge(config, findings)
         for judge_board in (
             cross_check_plant.judge_ranges,
             cross_check_interlocks.judge_interlock_board,
             _check_board,
             _board_guards,
         ):
-            judge_board(config, board or _UNKNOWN, say)
-    return tuple(sorted(say.found, key=lambda finding: finding.severity))
+            judge_board(config, board or _UNKNOWN, findings)
+    return tuple(sorted(findings.found, key=lambda finding: finding.severity))
 
 
 def require_sound(
@@ -70,10 +70,10 @@ def require_sound(
     return findings
 
 
-def _check_finite(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_finite(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
     """Refuse NaN, which the file's reader refuses too, but which a program may have set."""
     for field, value in _list_numbers(config, ""):
-        say.error(not math.isfinite(value), field, "is not a number", "set a finite value")
+        findings.error(not math.isfinite(value), field, "is not a number", "set a finite value")
 
 
 def _list_numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
@@ -91,7 +91,7 @@ def _list_numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
         yield from _list_numbers(part, f"{field}.{name}".lstrip("."))
 
 
-def _check_resume(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_resume(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
     resume = config.resume
     known = [rule.name for rule in safety.TABLE]
     may = sorted(rule.name for rule in safety.TABLE if rule.may_resume)
@@ -99,14 +99,14 @@ def _check_resume(config: Config, say: cross_check_plant.ConfigFindings) -> None
         field = f"resume.faults.{index}"
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else f"may resume: {', '.join(may)}"
-        say.error(name not in known, field, "no fault has this name", hint)
+        findings.error(name not in known, field, "no fault has this name", hint)
         why, remedy = (
             "only a person may clear this fault",
             f"remove it; may resume: {', '.join(may)}",
         )
-        say.error(name in known and name not in may, field, why, remedy)
+        findings.error(name in known and name not in may, field, why, remedy)
     why = "a fault that recurs this often has a lasting cause"
-    say.error(
+    findings.error(
         resume.most_per_day > _RESUMES_MOST,
         "resume.most_per_day",
         why,
@@ -114,9 +114,9 @@ def _check_resume(config: Config, say: cross_check_plant.ConfigFindings) -> None
     )
     if resume.faults:
         never, remedy = "nothing would ever resume", "set at least 1, or empty resume.faults"
-        say.warn(resume.most_per_day == 0, "resume.most_per_day", never, remedy)
+        findings.warn(resume.most_per_day == 0, "resume.most_per_day", never, remedy)
         waits = resume.wait_s >= config.states.pump_off_max_s
-        say.warn(
+        findings.warn(
             waits,
             "resume.wait_s",
             f"the mirror is vented earlier: {never}",
@@ -124,7 +124,7 @@ def _check_resume(config: Config, say: cross_check_plant.ConfigFindings) -> None
         )
 
 
-def _check_watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_watchdog(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
     devices, limits = config.devices or _TWIN_BOARD, config.limits
     tick_s, watchdog_s = 1.0 / config.loop.rate_hz, devices.watchdog_s
     if config.devices is not None:
@@ -132,16 +132,16 @@ def _check_watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> No
             "the pump would run this long without a control process",
             f"set at most {_UNATTENDED_S:g} s",
         )
-        say.error(watchdog_s > _UNATTENDED_S, "devices.watchdog_s", why, most)
+        findings.error(watchdog_s > _UNATTENDED_S, "devices.watchdog_s", why, most)
         for field, timeout_s in _slowest_answers(devices):
             lost_s = timeout_s + tick_s
             waits = f"one lost answer ({timeout_s:g} s on its line) and a tick of {tick_s:g} s"
             why = f"{waits} take longer than the watchdog ({watchdog_s:g} s)"
-            say.error(
+            findings.error(
                 lost_s >= watchdog_s, field, why, "shorten it, or lengthen devices.watchdog_s"
             )
             ends = lost_s >= limits.stale_s and len(devices.roles()) == 0
-            say.warn(
+            findings.warn(
                 ends,
                 "limits.stale_s",
                 "one lost answer ends the run",
@@ -152,30 +152,32 @@ def _check_watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> No
         "first late one"
     )
     remedy = f"set at least {2.0 / watchdog_s:g} Hz, or lengthen devices.watchdog_s"
-    say.error(2.0 * tick_s > watchdog_s, "loop.rate_hz", why, remedy)
+    findings.error(2.0 * tick_s > watchdog_s, "loop.rate_hz", why, remedy)
     late, why = (
         "limits.lateness_max_ms",
         f"can never trip: the watchdog ({watchdog_s:g} s) trips first",
     )
-    say.error(
+    findings.error(
         1e-3 * limits.lateness_max_ms >= watchdog_s, late, why, "keep it below devices.watchdog_s"
     )
-    say.warn(limits.lateness_max_ms < 5.0, late, "a healthy machine can be that late", "set 100 ms")
+    findings.warn(
+        limits.lateness_max_ms < 5.0, late, "a healthy machine can be that late", "set 100 ms"
+    )
 
 
-def _check_stale(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_stale(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
     limits, tick_s = config.limits, 1.0 / config.loop.rate_hz
     why, least = (
         f"shorter than 1.5 ticks of {tick_s:g} s: every late tick would be a fault",
         f"set at least {1.5 * tick_s:g} s",
     )
-    say.error(limits.stale_s * config.loop.rate_hz < 1.5 - 1e-9, "limits.stale_s", why, least)
+    findings.error(limits.stale_s * config.loop.rate_hz < 1.5 - 1e-9, "limits.stale_s", why, least)
     why, most = "the pump would run this long without a reading", f"set at most {_UNATTENDED_S:g} s"
-    say.error(limits.stale_s > _UNATTENDED_S, "limits.stale_s", why, most)
+    findings.error(limits.stale_s > _UNATTENDED_S, "limits.stale_s", why, most)
     why, least = "two readings equal by chance would be a fault", f"set at least {3.0 * tick_s:g} s"
-    say.error(limits.stuck_s < 3.0 * tick_s, "limits.stuck_s", why, least)
+    findings.error(limits.stuck_s < 3.0 * tick_s, "limits.stuck_s", why, least)
     why, most = "the loop would follow a stopped laser this long", f"set at most {_BLIND_S:g} s"
-    say.error(limits.stuck_s > _BLIND_S, "limits.stuck_s", why, most)
+    findings.error(limits.stuck_s > _BLIND_S, "limits.stuck_s", why, most)
 
 
 def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
@@ -205,7 +207,7 @@ def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
     yield slowest[0][0], sum(timeout_s for _, timeout_s in slowest)
 
 
-def _check_states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_states(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
     states, limits = config.states, config.limits
     for name, most_s in (
         ("hold_flow_max_s", _BLIND_S),
@@ -213,7 +215,7 @@ def _check_states(config: Config, say: cross_check_plant.ConfigFindings) -> None
         ("pause_max_s", _PAUSE_S),
     ):
         too_long = getattr(states, name) > most_s
-        say.error(
+        findings.error(
             too_long,
             f"states.{name}",
             "the flow would be uncontrolled this long",
@@ -226,9 +228,9 @@ def _check_states(config: Config, say: cross_check_plant.ConfigFindings) -> None
         f"too short: the check may take {needed_s:.1f} s",
         f"set at least {1.3 * needed_s:.0f} s",
     )
-    say.error(states.check_timeout_s <= needed_s, "states.check_timeout_s", why, least)
+    findings.error(states.check_timeout_s <= needed_s, "states.check_timeout_s", why, least)
     why = f"too short: states.settle_s is {states.settle_s:g} s"
-    say.error(
+    findings.error(
         states.settle_timeout_s <= states.settle_s,
         "states.settle_timeout_s",
         why,
@@ -239,28 +241,30 @@ def _check_states(config: Config, say: cross_check_plant.ConfigFindings) -> None
         f"too short: a pump stops {_PUMP_STANDS_S:g} s after its command, and its read-back "
         "shows it a tick later"
     )
-    say.error(states.lower_timeout_s < seen_s, "states.lower_timeout_s", why, "set 3 s")
+    findings.error(states.lower_timeout_s < seen_s, "states.lower_timeout_s", why, "set 3 s")
     speed_um_per_s = min(
         config.loop.setpoint_ramp_um_per_s, cross_check_plant.flow_um_per_s(config)
     )
     way_s = (config.loop.setpoint_um - limits.displacement_min_um) / speed_um_per_s
     why = f"too short: inflating from limits.displacement_min_um takes at least {way_s:.0f} s"
-    say.warn(states.inflate_timeout_s < way_s, "states.inflate_timeout_s", why, "lengthen it")
+    findings.warn(states.inflate_timeout_s < way_s, "states.inflate_timeout_s", why, "lengthen it")
     rise_s = 2.0 * limits.band_um / speed_um_per_s
     why, least = (
         f"too short: a sound mirror takes {rise_s:.0f} s to rise by two bands",
         f"set at least {rise_s:.0f} s",
     )
-    say.error(states.inflate_stall_s < rise_s, "states.inflate_stall_s", why, least)
+    findings.error(states.inflate_stall_s < rise_s, "states.inflate_stall_s", why, least)
     vented, pressure_pa = "states.vented_pressure_pa", states.vented_pressure_pa
     less = "set less than half of limits.gauge_pressure_max_pa"
     too_high = pressure_pa > 0.5 * limits.gauge_pressure_max_pa
-    say.error(too_high, vented, "a mirror at this pressure is not vented", less)
+    findings.error(too_high, vented, "a mirror at this pressure is not vented", less)
     why = "within a gauge's noise at zero: venting would never end"
-    say.error(pressure_pa < _GAUGE_NOISE_PA, vented, why, f"set at least {_GAUGE_NOISE_PA:g} Pa")
+    findings.error(
+        pressure_pa < _GAUGE_NOISE_PA, vented, why, f"set at least {_GAUGE_NOISE_PA:g} Pa"
+    )
 
 
-def _check_limits(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_limits(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
     limits, setpoint_um = config.limits, config.loop.setpoint_um
     trim_um = config.shape.trim_max_um if config.shape.enabled else 0.0
     above_um, below_um = (
@@ -274,15 +278,15 @@ def _check_limits(config: Config, say: cross_check_plant.ConfigFindings) -> None
             "µm)"
         )
         remedy = "lower it, or move the setpoint or the limits"
-        say.error(trim_um + limits.band_um >= margin_um, field, why, remedy)
+        findings.error(trim_um + limits.band_um >= margin_um, field, why, remedy)
     following_um, margin_um = limits.following_error_max_um, min(above_um, below_um)
     why, less = (
         "can never trip: a displacement limit trips first",
         f"set less than {margin_um:g} µm",
     )
-    say.warn(following_um >= margin_um, "limits.following_error_max_um", why, less)
+    findings.warn(following_um >= margin_um, "limits.following_error_max_um", why, less)
     why = f"a mirror inside the band would be a following error ({following_um:g} µm)"
-    say.error(
+    findings.error(
         limits.band_um >= following_um,
         "limits.band_um",
         why,
@@ -290,23 +294,23 @@ def _check_limits(config: Config, say: cross_check_plant.ConfigFindings) -> None
     )
     step_um = cross_check_plant.flow_um_per_s(config) / config.loop.rate_hz
     why = f"a moving film ({step_um:.2f} µm a tick) and the laser's noise (1 µm) reach it"
-    say.error(
+    findings.error(
         limits.step_max_um < 4.0 + step_um,
         "limits.step_max_um",
         why,
         f"set at least {4.0 + step_um:.0f} µm",
     )
     why = f"can never trip: the limit is {above_um:g} µm above the setpoint"
-    say.error(limits.step_max_um >= above_um, "limits.step_max_um", why, "lower it")
+    findings.error(limits.step_max_um >= above_um, "limits.step_max_um", why, "lower it")
 
 
 def _check_board(
-    config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings
+    config: Config, board: BenchIdentity, findings: cross_check_plant.ConfigFindings
 ) -> None:
     """Check the limits that the board enforces itself."""
     own_pa = board.gauge_pressure_limit_pa
     above = config.limits.gauge_pressure_max_pa > own_pa
-    say.error(
+    findings.error(
         above,
         "limits.gauge_pressure_max_pa",
         f"the board itself vents at {own_pa:g} Pa",
@@ -316,7 +320,7 @@ def _check_board(
     needed = pump_curve.PumpCurve(config.pump).fraction(cross_check_plant.flow_um_per_s(config))
     most = f"and the board limits the pump to {limit:g}"
     remedy = "lower it, or raise the board's limit"
-    say.error(
+    findings.error(
         needed > limit + 1e-9,
         "loop.flow_max_um_per_s",
         f"takes a command of {needed:.2f}, {most}",
@@ -325,23 +329,23 @@ def _check_board(
     test = max(part.pump_fraction for part in actuator_test.PARTS)
     refused = config.states.actuator_test and test > limit + 1e-9
     remedy = "raise the board's limit, or omit the test"
-    say.error(refused, "states.actuator_test", f"commands {test:g}, {most}", remedy)
+    findings.error(refused, "states.actuator_test", f"commands {test:g}, {most}", remedy)
 
 
 def _board_guards(
-    config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings
+    config: Config, board: BenchIdentity, findings: cross_check_plant.ConfigFindings
 ) -> None:
     """Check whether the board itself protects the mirror when its gauge fails."""
     if config.devices is None or config.devices.board is None or board.map_version == 0:
         return
     guarded = board.map_version >= _GUARDED_SINCE
     why = "this board's firmware does not stop the pump when its gauge fails"
-    say.warn(not guarded, "devices.board", why, f"update to map version {_GUARDED_SINCE}")
+    findings.warn(not guarded, "devices.board", why, f"update to map version {_GUARDED_SINCE}")
     why = (
         "no gauge is fitted according to the board's settings, so it has no over-pressure "
         "protection of its own"
     )
-    say.warn(
+    findings.warn(
         guarded and not board.gauge_fitted,
         "devices.board",
         why,
@@ -354,7 +358,9 @@ def _board_guards(
         f"the board itself stops the pump and latches {board.gauge_timeout_s:g} s after its "
         "gauge fails"
     )
-    say.warn(cut, "states.ramp_down_s", why, "shorten it, or lengthen gauge_timeout_s in the board")
+    findings.warn(
+        cut, "states.ramp_down_s", why, "shorten it, or lengthen gauge_timeout_s in the board"
+    )
 
 
 _RULES = (

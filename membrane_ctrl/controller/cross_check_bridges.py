@@ -11,10 +11,10 @@ _REMEDIES = {
 }
 
 
-def judge_bridges(config: Config, say: ConfigFindings) -> None:
+def judge_bridges(config: Config, findings: ConfigFindings) -> None:
     """Warn of bridges through which clients may act whom nobody knows."""
     for bridge in bridge_accesses(config.bridges):
         acts = bridge.unknown and config.bridges.role != "read"
-        say.warn(
+        findings.warn(
             acts, "bridges.role", f"{bridge.where}: {bridge.who} may act", _REMEDIES[bridge.field]
         )

@@ -14,22 +14,22 @@ _BLIND_S = 2.0  # how long the pump may run without the signal, as without a con
 _MOMENT_S = 0.2  # a person's push of a button lasts at least this long
 
 
-def judge_interlocks(config: Config, say: ConfigFindings) -> None:
+def judge_interlocks(config: Config, findings: ConfigFindings) -> None:
     """Judge the sources and what they are for."""
     for index, interlock in enumerate(config.interlocks):
         field = f"devices.interlocks.{index}"
         if isinstance(interlock, PolledInterlockConfig):
-            _check_polled(field, interlock, say)
+            _check_polled(field, interlock, findings)
         if isinstance(interlock, ModbusInputConfig):
-            _check_modbus(field, interlock, config, say)
+            _check_modbus(field, interlock, config, findings)
         why = (
             "no vent is fitted: an open circuit only stops the pump, and the leak lowers the mirror"
         )
         without_vent = interlock.safe_level == "vent" and not config.vent_fitted
-        say.warn(without_vent, f"{field}.safe_level", why, "fit a vent (devices.vent)")
+        findings.warn(without_vent, f"{field}.safe_level", why, "fit a vent (devices.vent)")
 
 
-def _check_polled(field: str, interlock: PolledInterlockConfig, say: ConfigFindings) -> None:
+def _check_polled(field: str, interlock: PolledInterlockConfig, findings: ConfigFindings) -> None:
     period_s, age_max_s = interlock.period_s, interlock.age_max_s
     slowest_s = period_s + (
         interlock.timeout_s if isinstance(interlock, ModbusInputConfig) else 0.0
@@ -38,14 +38,16 @@ def _check_polled(field: str, interlock: PolledInterlockConfig, say: ConfigFindi
         f"a source asked every {period_s:g} s may take {slowest_s:g} s to answer: each late "
         "answer would be a fault"
     )
-    say.error(slowest_s >= age_max_s, f"{field}.age_max_s", why, f"set more than {slowest_s:g} s")
+    findings.error(
+        slowest_s >= age_max_s, f"{field}.age_max_s", why, f"set more than {slowest_s:g} s"
+    )
     why = "the pump would run this long after the signal is lost"
-    say.error(age_max_s > _BLIND_S, f"{field}.age_max_s", why, f"set at most {_BLIND_S:g} s")
+    findings.error(age_max_s > _BLIND_S, f"{field}.age_max_s", why, f"set at most {_BLIND_S:g} s")
     why = (
         f"nothing detects a circuit that opens and closes again within {period_s:g} s, as a "
         "pushed button does"
     )
-    say.warn(
+    findings.warn(
         period_s > _MOMENT_S,
         f"{field}.period_s",
         why,
@@ -54,21 +56,21 @@ def _check_polled(field: str, interlock: PolledInterlockConfig, say: ConfigFindi
 
 
 def _check_modbus(
-    field: str, interlock: ModbusInputConfig, config: Config, say: ConfigFindings
+    field: str, interlock: ModbusInputConfig, config: Config, findings: ConfigFindings
 ) -> None:
     coil = interlock.function == "coil"
     why = "a coil keeps what was written last: nothing detects that its writer has stopped"
-    say.warn(coil, f"{field}.function", why, "wire the circuit to a discrete input")
+    findings.warn(coil, f"{field}.function", why, "wire the circuit to a discrete input")
     if config.devices is None or not interlock.link.startswith("rtu:"):
         return
     pump = getattr(config.devices.pump, "link", None) or config.devices.board
     why = "on the pump's line: a module that does not answer also delays the pump's commands"
-    say.warn(
+    findings.warn(
         interlock.link == pump, f"{field}.link", why, "give the interlocks a line of their own"
     )
 
 
-def judge_interlock_board(config: Config, board: BenchIdentity, say: ConfigFindings) -> None:
+def judge_interlock_board(config: Config, board: BenchIdentity, findings: ConfigFindings) -> None:
     """Refuse inputs that the board which answers does not have."""
     if math.isnan(board.watchdog_s) and not board.kind:
         return  # no board has answered yet
@@ -78,10 +80,10 @@ def judge_interlock_board(config: Config, board: BenchIdentity, say: ConfigFindi
         field = f"devices.interlocks.{index}.input"
         why = f"this board has register map {board.map_version}, which has no interlock inputs"
         old = board.map_version < _INPUTS_SINCE
-        say.error(old, field, why, "update the board's firmware, or use another source")
+        findings.error(old, field, why, "update the board's firmware, or use another source")
         stops = board.interlocks_fitted >> interlock.input & 1
         why = "the board reports this circuit, but does not stop the pump by itself when it opens"
-        say.warn(
+        findings.warn(
             not old and not stops,
             field,
             why,

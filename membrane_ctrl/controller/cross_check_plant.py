@@ -74,22 +74,22 @@ def flow_um_per_s(config: Config) -> float:
     return config.loop.flow_most_um_per_s(config.pump)
 
 
-def judge_pump(config: Config, say: ConfigFindings) -> None:
+def judge_pump(config: Config, findings: ConfigFindings) -> None:
     pump, loop = config.pump, config.loop
     least = 0.0 if pump.curve_fraction else pump.dead_fraction  # of the straight line only
     why = f"must lie between dead_fraction ({least:g}) and start_fraction ({pump.start_fraction:g})"
     ordered = least <= pump.stall_fraction <= pump.start_fraction
-    say.error(not ordered, "pump.stall_fraction", why, "measure all three")
+    findings.error(not ordered, "pump.stall_fraction", why, "measure all three")
     test_fraction = max(part.pump_fraction for part in actuator_test.PARTS)
     if pump.start_fraction >= test_fraction:
         why = f"the actuator test commands {test_fraction:g}, which would not start the pump"
-        say.error(
+        findings.error(
             config.states.actuator_test,
             "pump.start_fraction",
             why,
             "measure it; no pump starts that late",
         )
-        say.warn(
+        findings.warn(
             not config.states.actuator_test,
             "pump.start_fraction",
             "no pump starts that late",
@@ -102,12 +102,12 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
             "and off"
         )
         remedy = "set several times as much, or measure pump.stall_fraction"
-        say.error(
+        findings.error(
             loop.flow_max_um_per_s <= 2.0 * least_um_per_s, "loop.flow_max_um_per_s", why, remedy
         )
     more = loop.flow_max_um_per_s > pump.flow_full_um_per_s + 1e-9
     why = f"the pump gives {pump.flow_full_um_per_s:g} µm/s (pump.flow_full_um_per_s)"
-    say.warn(more, "loop.flow_max_um_per_s", why, "measure the pump, or lower it")
+    findings.warn(more, "loop.flow_max_um_per_s", why, "measure the pump, or lower it")
     if config.devices is None:
         return
     for role in ("pump", "vent"):
@@ -120,19 +120,19 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
                 if role == "pump"
                 else "does not contain 0"
             )
-            say.error(low > 0.0, f"devices.{role}.{name}", never, "begin at 0")
-            say.error(
+            findings.error(low > 0.0, f"devices.{role}.{name}", never, "begin at 0")
+            findings.error(
                 high < 1.0, f"devices.{role}.{name}", "a command of 1 would be refused", "end at 1"
             )
 
 
-def judge_vent(config: Config, say: ConfigFindings) -> None:
+def judge_vent(config: Config, findings: ConfigFindings) -> None:
     """Report what a bench without a vent cannot do, and how long its mirror takes to go down."""
     if config.vent_fitted:
         return
     why = "no vent is fitted: the safe level vent, and `ctl vent`, only stop the pump"
     remedy = "fit a vent; for a better estimate set twin.leak_time_constant_s to your mirror's"
-    say.warn(
+    findings.warn(
         True,
         "devices.vent",
         f"{why}, and the leak alone lowers the mirror{_leak_estimate(config)}",
@@ -182,12 +182,12 @@ def weak_gains(loop: LoopConfig) -> tuple[Severity, str] | None:
     )
 
 
-def judge_loop(config: Config, say: ConfigFindings) -> None:
+def judge_loop(config: Config, findings: ConfigFindings) -> None:
     loop, full_um_per_s = config.loop, flow_um_per_s(config)
     severity, why = weak_gains(loop) or ("", "")
     measure = "run `tune`, or use the default gains"
-    say.error(severity == "error", "loop.kp_per_s", why, measure)
-    say.warn(severity == "warning", "loop.kp_per_s", why, measure)
+    findings.error(severity == "error", "loop.kp_per_s", why, measure)
+    findings.warn(severity == "warning", "loop.kp_per_s", why, measure)
     for on, name, nominal in (
         (loop.feedforward_barometer, "barometer_gain_um_per_pa", _BAROMETER_UM_PER_PA),
         (loop.feedforward_temperature, "temperature_gain_um_per_k", _TEMPERATURE_UM_PER_K),
@@ -196,82 +196,84 @@ def judge_loop(config: Config, say: ConfigFindings) -> None:
             getattr(loop, name) / nominal,
             f"physics gives {nominal:g}, see docs/explanation/physics.md",
         )
-        say.error(
+        findings.error(
             on and share < 0.0,
             f"loop.{name}",
             "wrong sign: it would double the weather's effect",
             remedy,
         )
         why = "more than twice the physical value: worse than no feed-forward"
-        say.error(on and share > _FEEDFORWARD_MOST, f"loop.{name}", why, remedy)
+        findings.error(on and share > _FEEDFORWARD_MOST, f"loop.{name}", why, remedy)
     why = f"faster than the pump's {full_um_per_s:g} µm/s"
-    say.warn(
+    findings.warn(
         loop.setpoint_ramp_um_per_s > full_um_per_s, "loop.setpoint_ramp_um_per_s", why, "lower it"
     )
     bleed_um_per_s = loop.bleed_fraction * pump_curve.VENT_FULL_UM_PER_S
     why = f"the vent would take about {bleed_um_per_s:.0f} µm/s, half of the pump's flow or more"
     remedy = f"set less than {0.5 * full_um_per_s / pump_curve.VENT_FULL_UM_PER_S:.3f}"
-    say.error(bleed_um_per_s > 0.5 * full_um_per_s, "loop.bleed_fraction", why, remedy)
+    findings.error(bleed_um_per_s > 0.5 * full_um_per_s, "loop.bleed_fraction", why, remedy)
     swing_s = full_um_per_s / loop.flow_rate_limit_um_per_s2
     why = f"the pump needs {swing_s:.0f} s from none to full: the loop would swing"
     remedy = f"set at least {0.5 * full_um_per_s:.1f} µm/s2"
-    say.error(swing_s > 2.0, "loop.flow_rate_limit_um_per_s2", why, remedy)
+    findings.error(swing_s > 2.0, "loop.flow_rate_limit_um_per_s2", why, remedy)
 
 
-def judge_shape(config: Config, say: ConfigFindings) -> None:
+def judge_shape(config: Config, findings: ConfigFindings) -> None:
     shape = config.shape
     if not shape.enabled:
         return
     why = f"a shape comes every {shape.period_s:g} s: the last one is never fresh"
-    say.error(shape.fresh_s < shape.period_s, "shape.fresh_s", why, "set several periods")
+    findings.error(shape.fresh_s < shape.period_s, "shape.fresh_s", why, "set several periods")
     why = f"shorter than two periods of {shape.period_s:g} s: the trim would follow the noise"
-    say.error(
+    findings.error(
         shape.time_constant_s < 2.0 * shape.period_s, "shape.time_constant_s", why, "set 20 periods"
     )
     outruns = shape.trim_rate_max_um_per_s > 0.5 * config.loop.setpoint_ramp_um_per_s
     why = "the trim may outrun the setpoint's ramp (loop.setpoint_ramp_um_per_s)"
-    say.error(outruns, "shape.trim_rate_max_um_per_s", why, "set 0.1 µm/s")
+    findings.error(outruns, "shape.trim_rate_max_um_per_s", why, "set 0.1 µm/s")
     never = shape.disagreement_max_um >= config.limits.displacement_max_um - config.loop.setpoint_um
     why = "can never trip: limits.displacement_max_um trips first"
-    say.error(never, "shape.disagreement_max_um", why, "set 10 µm")
+    findings.error(never, "shape.disagreement_max_um", why, "set 10 µm")
     why = f"a cycle of 8 frames does not fit into shape.period_s ({shape.period_s:g} s)"
-    say.warn(
+    findings.warn(
         8.0 * shape.frame_interval_s > shape.period_s, "shape.frame_interval_s", why, "shorten it"
     )
 
 
-def judge_optics(config: Config, say: ConfigFindings) -> None:
+def judge_optics(config: Config, findings: ConfigFindings) -> None:
     if config.by_optics:
         shape, why = config.shape, "a bench held without a laser needs a figure from every frame"
-        say.error(not shape.enabled, "shape.enabled", why, "set it to true")
-        say.error(shape.mode != "track", "shape.mode", why, 'set it to "track"')
+        findings.error(not shape.enabled, "shape.enabled", why, "set it to true")
+        findings.error(shape.mode != "track", "shape.mode", why, 'set it to "track"')
         slow, least = shape.track_rate_hz < _TRACK_LEAST_HZ, f"set at least {_TRACK_LEAST_HZ:g} Hz"
-        say.error(slow, "shape.track_rate_hz", "too few figures to hold the mirror by", least)
+        findings.error(slow, "shape.track_rate_hz", "too few figures to hold the mirror by", least)
     camera = config.devices is not None and config.devices.camera is not None
-    _check_geometry("optics.geometry", config.optics, config.shape.enabled or camera, say)
+    _check_geometry("optics.geometry", config.optics, config.shape.enabled or camera, findings)
     if config.twin.geometry is not None:
         true = config.optics.model_copy(update={"geometry": config.twin.geometry})
-        _check_geometry("twin.geometry", true, config.shape.enabled, say)
+        _check_geometry("twin.geometry", true, config.shape.enabled, findings)
 
 
-def _check_geometry(field: str, optics: OpticsConfig, used: bool, say: ConfigFindings) -> None:
+def _check_geometry(field: str, optics: OpticsConfig, used: bool, findings: ConfigFindings) -> None:
     geometry = optics.geometry
     for name in ("a", "b"):
         length_mm, sigma_mm = getattr(geometry, f"{name}_mm"), getattr(geometry, f"{name}_sigma_mm")
         wide = length_mm is not None and sigma_mm is not None and sigma_mm > 0.1 * length_mm
-        say.warn(wide, f"{field}.{name}_sigma_mm", "a tenth of the length or more", "measure again")
+        findings.warn(
+            wide, f"{field}.{name}_sigma_mm", "a tenth of the length or more", "measure again"
+        )
     if geometry.camera is not None and geometry.camera.position_mm[2] <= 0.0:
         why = "the camera is behind the mirror"
-        say.error(True, f"{field}.camera.position_mm", why, "z points out of the mirror")
+        findings.error(True, f"{field}.camera.position_mm", why, "z points out of the mirror")
     elif used and (found := sight.find_doubt(optics)):
         key = f"{field.removesuffix('geometry')}{found.table}.{found.key}"
-        say.error(found.hopeless, key, found.why, found.remedy)
-        say.warn(not found.hopeless, key, found.why, found.remedy)
+        findings.error(found.hopeless, key, found.why, found.remedy)
+        findings.warn(not found.hopeless, key, found.why, found.remedy)
 
 
-def judge_alarms(config: Config, say: ConfigFindings) -> None:
+def judge_alarms(config: Config, findings: ConfigFindings) -> None:
     alarms, tick_s = config.alarms, 1.0 / config.loop.rate_hz
-    say.error(
+    findings.error(
         alarms.silent_s < 2.0 * tick_s,
         "alarms.silent_s",
         "a tick takes that long",
@@ -288,12 +290,12 @@ def judge_alarms(config: Config, say: ConfigFindings) -> None:
     for index, rule in enumerate(alarms.rules):
         if rule.raise_at > rule.clear_at and rule.field in most:
             why = f"{rule.name} can never be raised: {rule.field} is at most {most[rule.field]:g}"
-            say.error(
+            findings.error(
                 rule.raise_at >= most[rule.field], f"alarms.rules.{index}.raise_at", why, "lower it"
             )
 
 
-def judge_gauge(config: Config, say: ConfigFindings) -> None:
+def judge_gauge(config: Config, findings: ConfigFindings) -> None:
     """Judge the gauge as a guard and as a check of the laser."""
     limits, pressure_pa, tick_s = (
         config.limits,
@@ -303,26 +305,26 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
     above_um = limits.displacement_max_um - config.loop.setpoint_um
     margin_pa = limits.gauge_pressure_max_pa - pressure_pa
     why = f"the mirror has {pressure_pa:g} Pa at displacement 0 (optics.mirror.pressure_pa)"
-    say.error(
+    findings.error(
         margin_pa <= 0.0, "limits.gauge_pressure_max_pa", why, "measure that, or raise the limit"
     )
     step, why = "limits.gauge_step_max_pa", "can never trip: the pressure limit trips first"
-    say.error(
+    findings.error(
         0.0 < margin_pa <= limits.gauge_step_max_pa, step, why, f"set less than {margin_pa:g} Pa"
     )
     least = f"set at least {_STORM_PA:g} Pa"
-    say.error(
+    findings.error(
         limits.gauge_step_max_pa < _STORM_PA, step, "a storm alone moves the gauge this far", least
     )
     stuck, most = "limits.gauge_stuck_s", f"set at most {_GAUGE_BLIND_S:g} s"
-    say.error(
+    findings.error(
         limits.gauge_stuck_s > _GAUGE_BLIND_S,
         stuck,
         "a stopped gauge would guard nothing this long",
         most,
     )
     least = f"set at least {3.0 * tick_s:g} s"
-    say.error(
+    findings.error(
         limits.gauge_stuck_s < 3.0 * tick_s,
         stuck,
         "two readings equal by chance would be a fault",
@@ -333,21 +335,21 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
         ("laser_gauge_drift_max_um", _CREEP_UM, "the creep of a fresh film"),
     ):
         why = f"can never trip: limits.displacement_max_um is {above_um:g} µm above the setpoint"
-        say.error(getattr(limits, name) >= above_um, f"limits.{name}", why, "lower it")
+        findings.error(getattr(limits, name) >= above_um, f"limits.{name}", why, "lower it")
         why = f"{by} alone reach it"
-        say.error(
+        findings.error(
             getattr(limits, name) < least_um, f"limits.{name}", why, f"set at least {least_um:g} µm"
         )
     why, least = (
         "a day's temperature and humidity alone reach it",
         f"set at least {_CLIMATE_UM:g} µm",
     )
-    say.error(
+    findings.error(
         limits.laser_gauge_day_max_um < _CLIMATE_UM, "limits.laser_gauge_day_max_um", why, least
     )
 
 
-def judge_film(config: Config, say: ConfigFindings) -> None:
+def judge_film(config: Config, findings: ConfigFindings) -> None:
     """Judge the film's data, which serve to judge gas, laser and gauge."""
     limits, mirror = config.limits, config.optics.mirror
     most = 1.0 + flow_um_per_s(config) / leak_growth.LEAK_LEAST_UM_PER_S
@@ -355,23 +357,23 @@ def judge_film(config: Config, say: ConfigFindings) -> None:
         "limits.leak_growth_max",
         f"can never trip: the pump gives {flow_um_per_s(config):g} µm/s",
     )
-    say.error(limits.leak_growth_max >= most, growth, why, f"set less than {most:.1f}")
+    findings.error(limits.leak_growth_max >= most, growth, why, f"set less than {most:.1f}")
     least = f"set at least {leak_growth.CONTRADICTED_MOST:g}"
-    say.error(
+    findings.error(
         limits.leak_growth_max < leak_growth.CONTRADICTED_MOST,
         growth,
         "the weather's effect on a leak trips it",
         least,
     )
     why = f"no film of {mirror.radius_mm:g} mm radius is this deep"
-    say.error(
+    findings.error(
         mirror.sag_mm >= 0.5 * mirror.radius_mm,
         "optics.mirror.sag_mm",
         why,
         "set the bowl's depth in mm",
     )
     why = f"can never trip: the bowl is only {mirror.sag_mm:g} mm deep (optics.mirror.sag_mm)"
-    say.error(
+    findings.error(
         limits.displacement_min_um <= -1e3 * mirror.sag_mm,
         "limits.displacement_min_um",
         why,
@@ -381,17 +383,19 @@ def judge_film(config: Config, say: ConfigFindings) -> None:
         "optics.mirror.pressure_pa",
         f"laser and gauge are not compared below {film_monitor.TAUT_PA:g} Pa",
     )
-    say.warn(
+    findings.warn(
         0.0 < mirror.pressure_pa <= film_monitor.TAUT_PA,
         pressure,
         why,
         "measure it with the film taut",
     )
     why = "unknown: a gauge in the wrong unit would go unnoticed"
-    say.warn(mirror.pressure_pa == 0.0, pressure, why, "set the gauge's reading at displacement 0")
+    findings.warn(
+        mirror.pressure_pa == 0.0, pressure, why, "set the gauge's reading at displacement 0"
+    )
 
 
-def judge_ranges(config: Config, board: BenchIdentity, say: ConfigFindings) -> None:
+def judge_ranges(config: Config, board: BenchIdentity, findings: ConfigFindings) -> None:
     """Judge limits against sensor ranges: a limit outside its sensor's range never trips."""
     limits, devices = config.limits, config.devices
     laser = devices.displacement if devices is not None else None
@@ -414,12 +418,12 @@ def judge_ranges(config: Config, board: BenchIdentity, say: ConfigFindings) -> N
         f"can never trip: the laser's range is {low_um:g} .. {high_um:g} µm",
         "change it, or move the laser",
     )
-    say.error(limits.displacement_max_um > high_um, "limits.displacement_max_um", why, remedy)
-    say.error(limits.displacement_min_um < low_um, "limits.displacement_min_um", why, remedy)
+    findings.error(limits.displacement_max_um > high_um, "limits.displacement_max_um", why, remedy)
+    findings.error(limits.displacement_min_um < low_um, "limits.displacement_min_um", why, remedy)
     pressure, why = (
         "limits.gauge_pressure_max_pa",
         f"can never trip: the gauge shows at most {full_pa:g} Pa",
     )
-    say.error(
+    findings.error(
         limits.gauge_pressure_max_pa >= full_pa, pressure, why, "lower it, or use another gauge"
     )

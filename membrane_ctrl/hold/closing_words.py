@@ -94,7 +94,7 @@ def print_closing_report(
         summary = json.loads(summary_path.read_text(encoding="utf-8"))
         for line in _list_headlines(summary):
             print(line, file=sys.stderr)
-        replaced_s = summary["recorder"].get("folder_anew_s")
+        replaced_s = summary["recorder"].get("folder_replaced_s")
         if replaced_s is not None:
             print(
                 f"the run folder was removed or moved; the new one starts at {replaced_s:.1f} s",

@@ -80,7 +80,7 @@ class AlarmsAcknowledged(
     why: str
 
 
-class AlarmTold(Event, kind="alarm", sentence="Alarm {alarm}[ to {to}]: {text}"):
+class AlarmSent(Event, kind="alarm", sentence="Alarm {alarm}[ to {to}]: {text}"):
     """An alarm's notice was sent, or failed."""
 
     alarm: str

@@ -62,5 +62,5 @@ class RecorderDone(Event, kind="recorder_done", sentence="Recorder done"):
     events_lost: Any
     input_ticks_lost: Any
     restarts: Any
-    folder_anew_s: Any
+    folder_replaced_s: Any
     partial: Any

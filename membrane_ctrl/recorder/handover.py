@@ -61,7 +61,7 @@ class RecorderState(StateNode):
     rows_lost: Count = 0
     events_lost: Count = 0
     input_ticks_lost: Count = 0
-    folder_anew_s: float | None = None  # when the folder was found removed
+    folder_replaced_s: float | None = None  # when the folder was found removed
 
 
 def save_state(run_dir: Path, state: RecorderState) -> None:

@@ -81,7 +81,7 @@ class Recorder:
         self._run_dir = run_dir
         self._config = config
         self._folder = folder_watch.FolderWatch(run_dir)
-        self._folder_anew_s = before.folder_anew_s
+        self._folder_replaced_s = before.folder_replaced_s
         self._clock = clock
         self._feeds = {
             name: Feed(ring, before.positions.get(name, 0), before.dropped.get(name, 0))
@@ -194,7 +194,7 @@ class Recorder:
         if not self._folder.is_gone():
             return
         self._folder.restart(self._config)
-        self._folder_anew_s = now_s
+        self._folder_replaced_s = now_s
         # never cleared: the lost part stays lost
         what = f"{self._run_dir} was removed or moved; a new one starts at {now_s:.1f} s"
         self._errors.report_error("run folder", f"{what}, without the earlier data")
@@ -215,7 +215,7 @@ class Recorder:
             self._rows_lost,
             self._events_lost + self._events_file.lost,
             self._input_ticks_lost + self._tables.lost_ticks,
-            self._folder_anew_s,
+            self._folder_replaced_s,
         )
         save_state(self._run_dir, state)
 
@@ -240,7 +240,7 @@ class Recorder:
             "events_lost": self._events_lost + self._events_file.lost,
             "input_ticks_lost": self._input_ticks_lost + self._tables.lost_ticks,
             "restarts": self._resumes,
-            "folder_anew_s": self._folder_anew_s,  # None: it is still the original
+            "folder_replaced_s": self._folder_replaced_s,  # None: it is still the original
             # without its predecessor's state, the statistics start with the oldest message in the
             # ring
             "partial": self._restarted_without_handover and self._feeds["inputs"].dropped > 0,

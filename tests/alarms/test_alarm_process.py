@@ -24,7 +24,7 @@ from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.events import Event, EventLine
-from membrane_ctrl.model.port_events import AlarmTold
+from membrane_ctrl.model.port_events import AlarmSent
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.event_pipe import event_sender
 from membrane_ctrl.processes.ring import RingWriter, open_ring
@@ -184,7 +184,7 @@ def test_the_process_ends_with_the_run_and_says_why_it_ended(tmp_path: Path) -> 
         watch_run(spec(telemetry, events, tmp_path), [sender], reports.append, lambda: True)
         writer.close()
     assert told(sender) == [("run_ended", "raised")]
-    assert [(r.alarm, r.sent) for r in reports if isinstance(r, AlarmTold)] == [("run_ended", True)]
+    assert [(r.alarm, r.sent) for r in reports if isinstance(r, AlarmSent)] == [("run_ended", True)]
 
 
 def test_a_control_process_that_vanishes_is_reported(tmp_path: Path) -> None:

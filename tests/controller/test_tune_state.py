@@ -390,7 +390,7 @@ def test_a_setpoint_step_is_part_of_the_snapshot() -> None:
 
 def test_a_step_without_a_trial_or_beyond_the_limits_is_refused() -> None:
     assert "for a trial" in explain_refusal(stepped(5.0, math.nan), State.HOLD, CONFIG)
-    assert "outside the limits" in Stepped().controller._refuse_hold_or_experiment(stepped(1e6))
+    assert "outside the limits" in Stepped().controller._refuse_by_condition(stepped(1e6))
 
 
 # Twice the true flow at every command: on it the mirror seems to lose twice its leak.

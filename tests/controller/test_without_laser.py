@@ -613,7 +613,7 @@ def _warmed(
 ) -> tuple[list[VirtualTick], Growing]:
     """Hours of hold at 10 Hz in air that becomes 1 K warmer in each."""
     growing = Growing(um_per_k, 1800.0, lambda now_s: max(0.0, now_s - 60.0) / 3600)
-    estimator = EstimatorConfig(process_value="estimate", stand_um_per_k=told_um_per_k)
+    estimator = EstimatorConfig(process_value="estimate", camera_mount_um_per_k=told_um_per_k)
     config = BY_ALL.model_copy(update={"estimator": estimator, "loop": LoopConfig(rate_hz=10.0)})
     warming = AirTemperatureChange(60.0, hours, 3600.0 * hours)
     return held(60.0 + 3600.0 * hours, growing, config, warming, shape_s=1.0), growing
@@ -647,9 +647,9 @@ def test_known_thermal_growth_of_the_camera_mount_does_not_move_the_mirror() -> 
     growing = Growing(20.0, 4.0, lambda now_s: 0.1 if now_s > 18.0 else 0.0)
     estimator = EstimatorConfig(
         process_value="estimate",
-        stand_um_per_k=20.0,
-        stand_sigma_um_per_k=10.0,
-        stand_follows_air_s=4.0,
+        camera_mount_um_per_k=20.0,
+        camera_mount_sigma_um_per_k=10.0,
+        camera_mount_follows_air_s=4.0,
     )
     config = BY_ALL.model_copy(update={"estimator": estimator})
     anew = {50 * 30: Command("shape_off", "a test"), 50 * 30 + 5: Command("shape_on", "a test")}

@@ -34,9 +34,9 @@ def test_a_folder_that_is_gone_is_not_offered(
 def test_a_recreated_folder_states_when_it_begins(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_anew_s": 13.44}}))
+    (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_replaced_s": 13.44}}))
     assert "starts at 13.4 s" in words(tmp_path, capsys)
-    (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_anew_s": None}}))
+    (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_replaced_s": None}}))
     assert "starts at" not in words(tmp_path, capsys)
 
 

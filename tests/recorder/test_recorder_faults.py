@@ -234,7 +234,7 @@ def test_a_run_folder_taken_away_is_begun_anew_and_said(tmp_path: Path, how: str
     assert config_file.load_toml(run_dir / "config.toml", Config) == config
     assert json.loads((run_dir / "events.jsonl").read_text())["kind"] == "mark"
     found = json.loads((run_dir / "summary.json").read_text())
-    assert (found["ticks"], found["recorder"]["folder_anew_s"]) == (150, 1.0)
+    assert (found["ticks"], found["recorder"]["folder_replaced_s"]) == (150, 1.0)
     rows = pq.read_metadata(run_dir / "ticks" / "ticks-0001.parquet").num_rows
     assert rows == 100  # those of the first second were in the old folder
 

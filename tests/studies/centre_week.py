@@ -107,7 +107,9 @@ def config_of(seed: int) -> Config:
     """All sensors, at 10 Hz."""
     return Config(
         loop=LoopConfig(rate_hz=RATE_HZ),
-        estimator=EstimatorConfig(process_value="estimate", stand_um_per_k=STAND_TOLD_UM_PER_K),
+        estimator=EstimatorConfig(
+            process_value="estimate", camera_mount_um_per_k=STAND_TOLD_UM_PER_K
+        ),
         twin=TwinConfig(seed=seed, start_error_um=-1.0),
     )
 

@@ -3,7 +3,7 @@
 import json
 
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
-from membrane_ctrl.sessions import folder as plain
+from membrane_ctrl.sessions import folder as session_folder
 from membrane_ctrl.sessions.live_hold import HoldError, Progress
 from tuning import connection, gains_file
 from tuning.options import TuneOptions
@@ -28,7 +28,7 @@ def watch_hold(options: TuneOptions) -> int:
         except ValueError as error:
             raise InputError(f"watch: {error}") from None
     if options.json:
-        print(json.dumps(plain.to_plain(found)))
+        print(json.dumps(session_folder.to_plain(found)))
     progress.print_line(
         f"std {found.std_um:.3f} µm, {found.ratio:.2f} of the lower bound "
         f"({found.ratio_designed:.2f} expected); "

@@ -130,7 +130,7 @@ def _make_fleet_entry(analysis: Analysis, table: dict[str, Any]) -> dict[str, An
     alarms = {
         event.alarm
         for event in log
-        if isinstance(event, port_events.AlarmTold) and event.what == "raised"
+        if isinstance(event, port_events.AlarmSent) and event.what == "raised"
     }
     return {
         **{name: table[name] for name in _SAME},

@@ -97,7 +97,7 @@ class Disturber:
         """
         wanted = self._wanted
         nodes = self._nodes
-        warm_k = wanted.stand_k * math.sin(2 * math.pi * time_s / _WARMS_S)
+        warm_k = wanted.camera_mount_k * math.sin(2 * math.pi * time_s / _WARMS_S)
         moved = _GROWTH_MM_PER_K * warm_k * nodes.grown
         if wanted.seeing_um:
             for k, air in enumerate(self._air):

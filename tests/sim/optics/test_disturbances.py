@@ -150,7 +150,9 @@ def test_dust_lies_still_and_then_elsewhere(film: FilmShape) -> None:
 
 def test_a_stand_that_grows_takes_the_camera_along(film: FilmShape) -> None:
     """A quarter of the swing's period after the start it is warmest: 2 K of 60 µm each."""
-    seen = bench(film, stand_k=2.0).render_picture(crossed(), 0.0, time_s=300.0).astype(float)
+    seen = (
+        bench(film, camera_mount_k=2.0).render_picture(crossed(), 0.0, time_s=300.0).astype(float)
+    )
     geometry = OPTICS.geometry.model_copy(update={"a_mm": OPTICS.geometry.a_mm + 0.12})
     there = (
         bench(film, OPTICS.model_copy(update={"geometry": geometry}))
