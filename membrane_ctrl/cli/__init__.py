@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from membrane_ctrl.cli import calibrating, ctl, holding, optics, reviewing
+from membrane_ctrl.cli import calibrating, configuring, ctl, holding, optics, reviewing
 from membrane_ctrl.cli.completion import complete_example
 from membrane_ctrl.model import errors, program, terminal
 
@@ -158,5 +158,5 @@ def man(
     print(f"{folder}: {count} pages; `man membrane-ctrl` shows the first", file=sys.stderr)
 
 
-for _family in (holding, optics, calibrating, reviewing):
+for _family in (holding, configuring, optics, calibrating, reviewing):
     _family.add_commands(app)

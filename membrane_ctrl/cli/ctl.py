@@ -33,21 +33,6 @@ TokenOption = Annotated[
 AuthorityOption = Annotated[
     Path | None, typer.Option(help="With --host: the CA of the service's certificate.")
 ]
-
-
-def _parse_number(text: str) -> float:
-    try:
-        return parse_number(text)
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
-
-
-SetpointArgument = Annotated[
-    float, typer.Argument(metavar="UM", help="Setpoint, µm.", parser=_parse_number)
-]
-FlowArgument = Annotated[
-    float, typer.Argument(metavar="FLOW", help="Flow, µm/s of the centre.", parser=_parse_number)
-]
 OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
 TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="The remark.")]
 ReasonArgument = Annotated[str, typer.Argument(metavar="TEXT", help="Why the mirror is locked.")]
@@ -70,6 +55,21 @@ TrialOption = Annotated[
     ),
 ]
 EveryOption = Annotated[str, typer.Option(help="Interval between lines, e.g. 0.5s.")]
+
+
+def _parse_number(text: str) -> float:
+    try:
+        return parse_number(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+SetpointArgument = Annotated[
+    float, typer.Argument(metavar="UM", help="Setpoint, µm.", parser=_parse_number)
+]
+FlowArgument = Annotated[
+    float, typer.Argument(metavar="FLOW", help="Flow, µm/s of the centre.", parser=_parse_number)
+]
 
 
 def _has_value_next(word: str) -> bool:

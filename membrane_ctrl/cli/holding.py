@@ -1,6 +1,4 @@
-"""The commands that write a configuration, look at its devices, hold a mirror with them, or talk to
-a hold.
-"""
+"""The commands that look at devices, hold a mirror with them, or talk to a hold."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,9 +12,6 @@ from membrane_ctrl.model import durations, errors, terminal
 
 if TYPE_CHECKING:
     from membrane_ctrl.config.schema import Config
-import textwrap
-from dataclasses import asdict
-from json import dumps
 
 twin_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
 devices_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
@@ -31,13 +26,10 @@ FlatOption = Annotated[
         "--from-flat", help="Start with a flat simulated mirror; filling it takes two hours."
     ),
 ]
-_WIDTH = 100
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`, `locks`,
-    `config`.
-    """
+    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`, `locks`."""
     for command in (hold, safe, check, conformance):
         app.command()(command)
     app.add_typer(devices_app, name="devices")
@@ -45,7 +37,6 @@ def add_commands(app: typer.Typer) -> None:
     app.add_typer(ctl_app, name="ctl")
     app.add_typer(alarm_app, name="alarm")
     app.add_typer(locks_app, name="locks")
-    app.add_typer(config_app, name="config")
 
 
 def hold(
@@ -308,76 +299,3 @@ def _started(config: "Config", from_flat: bool) -> "Config":
     if not from_flat:
         return config
     return config.model_copy(update={"twin": config.twin.model_copy(update={"from_flat": True})})
-
-
-config_app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    help="Explain the keys of a configuration; write a first one.",
-)
-
-
-@config_app.command()
-def explain(
-    key: Annotated[
-        str,
-        typer.Argument(
-            metavar="KEY",
-            help="Key, table or driver: loop.kp_per_s, kp_per_s, devices.pump, ventus.",
-        ),
-    ],
-    json: JsonOption = False,
-) -> int:
-    """Explain a key, or all keys of a table or driver: meaning, unit, range, default, when to
-    change it.
-    """
-    from membrane_ctrl.config.reference import find_explained
-
-    found = find_explained(key)
-    if json:
-        print(
-            dumps(
-                {"schema": "membrane-config-keys/1", "tables": [asdict(table) for table in found]}
-            )
-        )
-        return 0
-    for table in found:
-        print(textwrap.fill(f"{table.title}: {table.meaning}", _WIDTH))
-        for each in table.keys:
-            default = each.default if each.default == "required" else f"default {each.default}"
-            print(f"  {each.name}: {each.range} {each.unit}".rstrip() + f"; {default}")
-            print(textwrap.indent(textwrap.fill(f"{each.meaning} {each.advice}", _WIDTH), "    "))
-    return 0
-
-
-@config_app.command()
-def reference() -> int:
-    """Print every key of the configuration as one page of Markdown."""
-    from membrane_ctrl.config.reference import make_reference_page
-
-    print(make_reference_page(), end="")
-    return 0
-
-
-@config_app.command()
-def schema() -> int:
-    """Print the JSON schema of a configuration, for editors that complete and check TOML."""
-    from membrane_ctrl.config.reference import json_schema
-
-    print(dumps(json_schema(), indent=1))
-    return 0
-
-
-@config_app.command()
-def init(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="File to write; an existing one is kept.")
-    ] = Path("membrane-ctrl.toml"),
-    twin: Annotated[
-        bool, typer.Option("--twin", help="Ask nothing: a configuration for `membrane-ctrl twin`.")
-    ] = False,
-) -> int:
-    """Write a first configuration, with what is connected; on a terminal, ask for the devices."""
-    from membrane_ctrl.commissioning.first_config import write_first_config
-
-    return write_first_config(file, twin, ask=typer.get_text_stream("stdin").isatty() and not twin)

@@ -38,6 +38,17 @@ def _in_tables(name: str, description: str) -> TelemetryColumn:
     return TelemetryColumn(name, description, description, RECORD, "")
 
 
+def _low_order(index: int, name: str, colour: Colour) -> TelemetryColumn:
+    return TelemetryColumn(
+        f"z{index}_um",
+        f"{name} Z{index}",
+        f"change of Zernike term {index}",
+        LOW_ORDERS,
+        "/shape/change",
+        colour,
+    )
+
+
 _RECORDED = (
     _in_tables("time_s", "middle of the exposures"),
     _in_tables(
@@ -80,19 +91,6 @@ _RECORDED = (
     _in_tables("latency_s", "from the last frame to the result"),
     _in_tables("geometry_sag_sigma_um", "standard deviation of the sag that all cycles share"),
 )
-
-
-def _low_order(index: int, name: str, colour: Colour) -> TelemetryColumn:
-    return TelemetryColumn(
-        f"z{index}_um",
-        f"{name} Z{index}",
-        f"change of Zernike term {index}",
-        LOW_ORDERS,
-        "/shape/change",
-        colour,
-    )
-
-
 # By Noll index: low orders that a film shows, each worth a line.
 LOW_ORDER_COLUMNS: dict[int, TelemetryColumn] = {
     4: _low_order(4, "defocus", BLUE),
@@ -104,7 +102,6 @@ LOW_ORDER_COLUMNS: dict[int, TelemetryColumn] = {
     10: _low_order(10, "trefoil", WHITE),
     11: _low_order(11, "spherical", RED),
 }
-
 _DRAWN = (
     *(
         TelemetryColumn(
@@ -166,10 +163,8 @@ _DRAWN = (
         ORANGE,
     ),
 )
-
 # By name: the columns of the run's tables of figures that are numbers.
 RECORDED_COLUMNS: dict[str, TelemetryColumn] = {each.name: each for each in _RECORDED}
-
 DRAWN_COLUMNS: tuple[TelemetryColumn, ...] = (
     *(each for each in _RECORDED if each.entity),
     *_DRAWN,

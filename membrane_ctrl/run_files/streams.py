@@ -72,28 +72,24 @@ def _telemetry_streams() -> tuple[Stream, ...]:
     return tuple(Stream(path, tuple(lines)) for path, lines in by_entity.items())
 
 
-# Every column except `mono_s`, the time axis, is in exactly one stream.
-STREAMS: tuple[Stream, ...] = _telemetry_streams()
-
-
-def entities_of(plot: Plot) -> tuple[str, ...]:
-    """Return the Rerun entities that a plot shows."""
-    return tuple(dict.fromkeys(each.entity for each in columns_of(plot)))
-
-
 def mean_path(entity: str) -> str:
     """Return the entity of the means of each second of an entity."""
     return f"/overview{entity}"
-
-
-# Computed here from the rows, so that plots need no arithmetic.
-TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (_make_line(TRUE_ERROR_COLUMN),))
 
 
 def _line_of_second(what: str, colour: Colour, width: float) -> Line:
     return Line("", f"{_ERROR.label}, {what} of a second {_ERROR.unit}", colour, width)
 
 
+def _figure_stream(plot: Plot) -> Stream:
+    shown = figure_columns.figure_columns_of(plot)
+    return Stream(shown[0].entity, tuple(map(_make_line, shown)))
+
+
+# Every column except `mono_s`, the time axis, is in exactly one stream.
+STREAMS: tuple[Stream, ...] = _telemetry_streams()
+# Computed here from the rows, so that plots need no arithmetic.
+TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (_make_line(TRUE_ERROR_COLUMN),))
 OVERVIEW = Stream(
     mean_path("/loop/error"),
     (
@@ -107,18 +103,6 @@ MEANS = tuple(
 )
 TRUE_MEAN = replace(TRUE_ERROR, path=mean_path(TRUE_ERROR.path))
 DERIVED: tuple[Stream, ...] = (TRUE_ERROR, OVERVIEW, *MEANS, TRUE_MEAN)
-
-
-def make_band(band_um: float) -> Stream:
-    """The area in which the error is to stay, drawn as the deviation of a line without width."""
-    return Stream("/loop/band", (Line("", f"band ±{band_um:g} {_ERROR.unit}", GREEN, 0.0),))
-
-
-def _figure_stream(plot: Plot) -> Stream:
-    shown = figure_columns.figure_columns_of(plot)
-    return Stream(shown[0].entity, tuple(map(_make_line, shown)))
-
-
 ZERNIKE = _figure_stream(figure_columns.TERMS)
 CHANGE = _figure_stream(figure_columns.LOW_ORDERS)
 PUMP = _figure_stream(figure_columns.PUMP_CURVE)
@@ -129,6 +113,16 @@ QUALITY = _figure_stream(figure_columns.FRINGE_QUALITY)
 MODULATION = _figure_stream(figure_columns.MODULATION)
 LATENCY = _figure_stream(figure_columns.LATENCY)
 SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, RESIDUAL, QUALITY, MODULATION, LATENCY)
+
+
+def entities_of(plot: Plot) -> tuple[str, ...]:
+    """Return the Rerun entities that a plot shows."""
+    return tuple(dict.fromkeys(each.entity for each in columns_of(plot)))
+
+
+def make_band(band_um: float) -> Stream:
+    """The area in which the error is to stay, drawn as the deviation of a line without width."""
+    return Stream("/loop/band", (Line("", f"band ±{band_um:g} {_ERROR.unit}", GREEN, 0.0),))
 
 
 def overview_um(rows: Rows) -> FloatArray:

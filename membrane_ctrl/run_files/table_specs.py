@@ -69,17 +69,6 @@ def _make_spec(
     return TableSpec(name, schema, time_name, group_rows, layout, part_s)
 
 
-def with_origin(spec: TableSpec) -> TableSpec:
-    """A table whose files state the running program and its commit."""
-    about = {
-        **file_origin(FORMAT),
-        "table": spec.name,
-        "arithmetic": describe_arithmetic(),
-        **dict(spec.layout),
-    }
-    return replace(spec, schema=spec.schema.with_metadata(about))
-
-
 def _tick_field(column: TelemetryColumn) -> pa.Field:
     if column.kind is not Kind.QUANTITY:
         return _make_field(column.name, pa.int64(), column.description)
@@ -102,30 +91,6 @@ def _input_field(name: str) -> pa.Field:
     return _make_field(
         name, kind, _INPUT_TEXTS.get(name, f"{name.replace('_', ' ')} of the tick's reading")
     )
-
-
-TICKS = _make_spec("ticks", [_tick_field(column) for column in COLUMNS.values()], "mono_s")
-INPUTS = _make_spec(
-    "inputs",
-    [_make_field("tick", pa.int64(), "number of the tick"), *map(_input_field, INPUT_FIELDS)],
-)
-RARE = _make_spec(
-    "rare",
-    [
-        _make_field("time_s", pa.float64(), "start of the tick"),
-        _make_field("tick", pa.int64(), "number of the tick"),
-        _make_field("json", pa.string(), "commands and ended tasks of the tick"),
-    ],
-)
-SNAPSHOTS = _make_spec(
-    "snapshots",
-    [
-        _make_field("time_s", pa.float64(), "start of the tick"),
-        _make_field("tick", pa.int64(), "number of the tick"),
-        _make_field("json", pa.string(), "what the controller remembers before the tick"),
-    ],
-    group_rows=_SNAPSHOT_GROUP_ROWS,
-)
 
 
 def _shape_fields() -> list[pa.Field]:
@@ -160,24 +125,6 @@ def _shape_fields() -> list[pa.Field]:
     ]
 
 
-SHAPES = _make_spec("shapes", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
-TRACKED = _make_spec("tracked", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
-COVARIANCES = _make_spec(
-    "covariances",
-    [
-        _make_field("time_s", pa.float64(), "time of the cycle"),
-        _make_field(
-            "covariance_um2",
-            pa.list_(pa.float32(), ZERNIKE_TERMS**2),
-            "covariance of the coefficients, row by row; of a cycle in "
-            f"{COVARIANCE_INTERVAL_S:.0f} s",
-            "µm²",
-        ),
-    ],
-    layout=_SHAPE_LAYOUT,
-)
-
-
 def _level_field(name: str) -> pa.Field:
     if name == "time_s":
         return _make_field(name, pa.float64(), "start of the window")
@@ -201,6 +148,44 @@ def level_table(window_s: float) -> str:
     return f"ticks_{window_s:.0f}s"
 
 
+TICKS = _make_spec("ticks", [_tick_field(column) for column in COLUMNS.values()], "mono_s")
+INPUTS = _make_spec(
+    "inputs",
+    [_make_field("tick", pa.int64(), "number of the tick"), *map(_input_field, INPUT_FIELDS)],
+)
+RARE = _make_spec(
+    "rare",
+    [
+        _make_field("time_s", pa.float64(), "start of the tick"),
+        _make_field("tick", pa.int64(), "number of the tick"),
+        _make_field("json", pa.string(), "commands and ended tasks of the tick"),
+    ],
+)
+SNAPSHOTS = _make_spec(
+    "snapshots",
+    [
+        _make_field("time_s", pa.float64(), "start of the tick"),
+        _make_field("tick", pa.int64(), "number of the tick"),
+        _make_field("json", pa.string(), "what the controller remembers before the tick"),
+    ],
+    group_rows=_SNAPSHOT_GROUP_ROWS,
+)
+SHAPES = _make_spec("shapes", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
+TRACKED = _make_spec("tracked", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
+COVARIANCES = _make_spec(
+    "covariances",
+    [
+        _make_field("time_s", pa.float64(), "time of the cycle"),
+        _make_field(
+            "covariance_um2",
+            pa.list_(pa.float32(), ZERNIKE_TERMS**2),
+            "covariance of the coefficients, row by row; of a cycle in "
+            f"{COVARIANCE_INTERVAL_S:.0f} s",
+            "µm²",
+        ),
+    ],
+    layout=_SHAPE_LAYOUT,
+)
 LEVELS: dict[float, TableSpec] = {
     window_s: _make_spec(
         level_table(window_s),
@@ -209,7 +194,6 @@ LEVELS: dict[float, TableSpec] = {
     )
     for window_s in levels.WINDOWS_S
 }
-
 FIGURE_MINUTES = _make_spec(
     f"figures_{figure_minutes.WINDOW_S:.0f}s",
     [
@@ -229,7 +213,6 @@ FIGURE_MINUTES = _make_spec(
     layout=_SHAPE_LAYOUT,
     part_s=LONG_PART_S,
 )
-
 _EVENT_FIELDS = [
     _make_field("number", pa.int64(), "of the event in the run, from 1"),
     _make_field("time_s", pa.float64(), "when it was reported"),
@@ -252,7 +235,6 @@ THUMBNAILS = _make_spec(
     "number",
     _THUMBNAIL_GROUP_ROWS,
 )
-
 ALL: tuple[TableSpec, ...] = (
     TICKS,
     INPUTS,
@@ -267,3 +249,14 @@ ALL: tuple[TableSpec, ...] = (
     MARKS,
     THUMBNAILS,
 )
+
+
+def with_origin(spec: TableSpec) -> TableSpec:
+    """A table whose files state the running program and its commit."""
+    about = {
+        **file_origin(FORMAT),
+        "table": spec.name,
+        "arithmetic": describe_arithmetic(),
+        **dict(spec.layout),
+    }
+    return replace(spec, schema=spec.schema.with_metadata(about))
