@@ -12,7 +12,7 @@ from firmware_iface.settings import Section
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions.folder import SessionFolder
-from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions.progress import Progress
 
 
 def confirm_and_replace(

@@ -11,8 +11,9 @@ from membrane_ctrl.sessions.folder import (
     newest_session,
     open_session,
 )
-from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, Progress, live_hold
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, live_hold
 from membrane_ctrl.sessions.live_log import LiveLog
+from membrane_ctrl.sessions.progress import Progress
 from tuning import same_bench, twin_hold
 from tuning.options import TuneOptions
 from tuning.rigs.hold_rig import HoldRig

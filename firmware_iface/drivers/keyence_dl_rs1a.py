@@ -17,7 +17,8 @@ import math
 import re
 
 from firmware_iface import roles, settings
-from firmware_iface.links import exchange, serial_port
+from firmware_iface.drivers import step_gate
+from firmware_iface.links import line_link, serial_port
 
 _VALUE = r"[+-](?:\d\d\.\d{3}|\d{3}\.\d\d|\d{4}\.\d|E{2}\.E{3}|E{3}\.E{2}|E{4}\.E)"
 _ALL = re.compile(rf"(?:M0((?:,{_VALUE})+)|ER,M0,(\d\d))\r\n?")
@@ -36,7 +37,7 @@ _NOT_READABLE = "22"
 _STEPS_UM = {3: 1.0, 2: 10.0, 1: 100.0}  # decimals of the millimetre
 
 
-class KeyenceDlRs1a(exchange.LineDriver):
+class KeyenceDlRs1a(line_link.LineDriver):
     """A `DisplacementSensor`; `port` stands in for the configured one. Displacement = direction *
     (value - zero).
     """
@@ -54,12 +55,12 @@ class KeyenceDlRs1a(exchange.LineDriver):
         self._errors_answer = re.compile(rf"(?:SR,{number},033,(\d{{5}})|ER,SR,(\d\d))\r\n?")
         # the fence must differ from a reading even when refused, as when the amplifier is pulled
         # off: `M0`
-        fence = exchange.LineFence("M0", _ALL, _ALL_CHARS)
+        fence = line_link.LineFence("M0", _ALL, _ALL_CHARS)
         settings = serial_port.SerialSettings(config.baud, parity=config.parity)
         super().__init__(
             port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence
         )
-        self._gate = exchange.StepGate(config.step_max_um)
+        self._gate = step_gate.StepGate(config.step_max_um)
         self._decimals = 3
         self._readings = 0
 
@@ -71,7 +72,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
         such amplifier, one in error, or one with steps coarser than `step_max_um`).
         """
         await self._link.close()
-        self._gate = exchange.StepGate(self._config.step_max_um)
+        self._gate = step_gate.StepGate(self._config.step_max_um)
         return await self._opened(self._identify)
 
     async def _identify(self) -> roles.DeviceIdentity:

@@ -13,7 +13,8 @@ import math
 import re
 
 from firmware_iface import roles, settings
-from firmware_iface.links import exchange, serial_port
+from firmware_iface.drivers import step_gate
+from firmware_iface.links import line_link, serial_port
 
 _NUMBER = re.compile(r" ?([+-]?\d\.\d{1,4}) ?E([+-]?\d{1,2})")
 _MODELS = ("937B", "946")
@@ -21,7 +22,7 @@ _SENSORS = re.compile(r"([A-Z]{2})[, ]?([A-Z]{2})")  # two channels of a module,
 _MANOMETER = "CM"
 
 
-class Mks937b(exchange.LineDriver):
+class Mks937b(line_link.LineDriver):
     """A `PressureSensor`; `port` stands in for the configured one."""
 
     manual = "937B operation manual, page 86; 946 instruction manual, page 103"
@@ -34,7 +35,7 @@ class Mks937b(exchange.LineDriver):
         self._to = f"@{config.address:03d}"
         self._answer = re.compile(rf"{self._to}(?:ACK([^;@]{{0,20}})|NAK(\d{{1,3}}));FF")
         # a model has a digit, as no word in place of a reading has, and no decimal point
-        fence = exchange.LineFence(
+        fence = line_link.LineFence(
             f"{self._to}MD?", re.compile(rf"{self._to}ACK(?=[A-Z]*\d)[A-Z\d]{{3,6}};FF")
         )
         super().__init__(
@@ -43,7 +44,7 @@ class Mks937b(exchange.LineDriver):
         self._reset_step_gate()
 
     def _reset_step_gate(self) -> None:
-        self._gate = exchange.StepGate(self._config.step_max_pa)
+        self._gate = step_gate.StepGate(self._config.step_max_pa)
         self._jumped = False
 
     async def open(self) -> roles.DeviceIdentity:

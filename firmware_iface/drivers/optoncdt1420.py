@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface import roles, settings
-from firmware_iface.links import exchange, serial_port
+from firmware_iface.drivers import step_gate
+from firmware_iface.links import serial_port
 
 _IN_RANGE = (643, 64_877)  # page 65: below and above are reserves, measured but not specified
 _PROMPT = b"->"
@@ -113,7 +114,7 @@ class Optoncdt1420:
         self._arrival = asyncio.Event()
         self._parser = StreamParser()
         self._batches: list[NDArray[np.int64]] = []
-        self._gate = exchange.StepGate(self._config.step_max_um)
+        self._gate = step_gate.StepGate(self._config.step_max_um)
         self._counted = 0
         self._arrived_s = 0.0
         self._silent = 0

@@ -14,7 +14,7 @@ import re
 from dataclasses import dataclass
 
 from firmware_iface import roles, settings
-from firmware_iface.links import exchange, serial_port
+from firmware_iface.links import line_link, serial_port
 
 FORMAT = '4.3 P " " U3 " " ERR " " MCTR " " SN " " CS4 #r #n'
 PA_PER_HPA = 100.0
@@ -42,7 +42,7 @@ class BarometerMessage:
     serial: str
 
 
-class VaisalaPtb330(exchange.LineDriver):
+class VaisalaPtb330(line_link.LineDriver):
     """A `Barometer`. A task polls it every `period_s`; the newest value is served.
 
     `port` stands in for the configured one.
@@ -54,7 +54,7 @@ class VaisalaPtb330(exchange.LineDriver):
         self, config: settings.VaisalaPtb330Config, port: serial_port.SerialPort | None = None
     ) -> None:
         settings = serial_port.SerialSettings(config.baud, data_bits=7, parity="E")
-        fence = exchange.LineFence("VERS", _VERSION)
+        fence = line_link.LineFence("VERS", _VERSION)
         super().__init__(
             port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence
         )

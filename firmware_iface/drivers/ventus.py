@@ -13,7 +13,7 @@ import contextlib
 import re
 
 from firmware_iface import roles, settings
-from firmware_iface.links import exchange, serial_port
+from firmware_iface.links import line_link, serial_port
 
 ENABLE, POWER_LIMIT_MW, STREAM, MODE, MANUAL_SOURCE, SET_VALUE, ERROR = 0, 1, 2, 10, 11, 23, 31
 FIRMWARE, DEVICE_TYPE, FIRMWARE_MINOR = 36, 37, 38
@@ -26,7 +26,7 @@ _NUMBER = r"-?\d+(?:\.\d+)?"
 _STEP_MW = 0.0011  # values are written with three decimals
 
 
-class Ventus(exchange.LineDriver):
+class Ventus(line_link.LineDriver):
     """A `Pump`: the fraction is that of `power_max_mw`; `port` stands in for the configured one."""
 
     manual = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
@@ -37,7 +37,7 @@ class Ventus(exchange.LineDriver):
         self._power_max_mw = config.power_max_mw
         # streamed lines may be on their way when the stream is switched off
         answer = re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n")
-        fence = exchange.LineFence(f"#R{DEVICE_TYPE}", answer)
+        fence = line_link.LineFence(f"#R{DEVICE_TYPE}", answer)
         port = port or serial_port.SerialPort(config.port, serial_port.SerialSettings(115_200))
         super().__init__(port, "\n", config.timeout_s, fence)
         self._commanded_mw = 0.0

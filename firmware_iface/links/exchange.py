@@ -15,14 +15,13 @@ back before the answer (local echo of an RS-485 adapter), and a valid answer com
 """
 
 import asyncio
-import re
 from collections import defaultdict, deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from firmware_iface.links.late_answers import LateAnswers
 from firmware_iface.links.serial_port import SerialPort
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
+from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 
 _ECHO = (
     "the adapter echoes what is sent; switch its local echo off (on RS-485, disable the receiver "
@@ -39,9 +38,7 @@ _FAILURES_MAX = 5
 # bytes beyond the longest answer: noise before it; a device that sends without end must not fill
 # the memory
 _EXTRA_BYTES_MAX = 4096
-_SHOWN_CHARS = 60
 _ABANDONED_MAX = 4  # questions whose late answers are recognised
-_LINE_ENDS = b"\r\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,142 +297,3 @@ class SerialExchange:
         """The line is gone (called by the port)."""
         if self._answer is not None and not self._answer.done():
             self._answer.set_exception(error)
-
-
-# One device that answers lines of text.
-
-
-@dataclass(frozen=True, slots=True)
-class LineFence:
-    """A question whose answer cannot be that of any other (see `exchange`)."""
-
-    command: str
-    answer: re.Pattern[str]
-    longest: int = 80
-
-
-class LineLink:
-    """Commands out, lines of text back, each checked as a whole against its expected form.
-
-    A command ends in `end`. The device has `timeout_s`, plus the time on the wire.
-    """
-
-    def __init__(
-        self, port: SerialPort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1
-    ) -> None:
-        self.port = port
-        self._exchange = SerialExchange(port, gap_s=0.0, quiet_s=quiet_s, blank=_LINE_ENDS)
-        self._end = end
-        self._timeout_s = timeout_s
-        self._fence = fence
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return self.port.name
-
-    def connect(self, greeting: str = "") -> None:
-        """Open the line; see `SerialExchange.connect`. Raises LinkDownError."""
-        self._exchange.connect(greeting.encode("ascii"))
-
-    async def close(self) -> None:
-        """Close the line; a question in flight fails at once."""
-        await self._exchange.close()
-
-    async def query(
-        self, command: str, answer: re.Pattern[str], longest: int = 80
-    ) -> re.Match[str]:
-        """The answer to a command (without its end), whose whole text has the given form, line ends
-        included.
-
-        The pattern must match all that comes, except line ends before it, and nothing that is still
-        incomplete; more than `longest` characters are no answer. Raises LinkError (no answer of
-        this form in time), LinkDownError (the line is gone).
-        """
-        fence = self._question(self._fence.command, self._fence.answer, self._fence.longest)
-        received_bytes = await self._exchange.ask(
-            self._question(command, answer, longest), self._timeout_s, fence
-        )
-        found = answer.fullmatch(received_bytes.decode("ascii"))
-        assert found is not None  # `extract_answer` matched it
-        return found
-
-    def _question(self, command: str, answer: re.Pattern[str], longest: int) -> Question:
-        what = f"{self.name}: {command.splitlines()[-1]}"
-
-        def extract_answer(received_bytes: bytes) -> bytes | None:
-            received_bytes = received_bytes.lstrip(_LINE_ENDS)
-            try:
-                text = received_bytes.decode("ascii")
-            except UnicodeDecodeError:
-                raise LinkError(
-                    f"{what}: not text ({received_bytes[:24].hex(' ')}); noise, or wrong baud rate"
-                ) from None
-            if answer.fullmatch(text):
-                return received_bytes
-            if len(text) > longest:
-                raise LinkError(f"{what}: {text[:_SHOWN_CHARS]!r}... is not a valid answer")
-            return None
-
-        request = command + self._end
-        # a device may confirm a command by repeating it: that is no echo of the adapter
-        repeats = answer.fullmatch(request) is not None
-        return Question(
-            request.encode("ascii"), extract_answer, longest, what, answer_repeats=repeats
-        )
-
-
-class LineDriver:
-    """Base of a driver for a device that answers lines of text on its own serial port."""
-
-    manual = ""
-
-    def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence) -> None:
-        self._link = LineLink(port, end, timeout_s, fence)
-
-    async def _opened(
-        self, begin: Callable[[], Awaitable[DeviceIdentity]], greeting: str = ""
-    ) -> DeviceIdentity:
-        """Open the port and begin; the port is closed again when that fails."""
-        self._link.connect(greeting)
-        try:
-            return await begin()
-        except LinkError:
-            await self._link.close()
-            raise
-
-    async def close(self) -> None:
-        """Close the port. Never raises."""
-        await self._link.close()
-
-    @property
-    def _shown(self) -> str:
-        """The settings in words; a driver may add its own."""
-        return ""
-
-    def describe(self) -> dict[str, str]:
-        """For people: port, settings, manual."""
-        port = f"{self._link.name}, {self._link.port.settings}"
-        return {"port": port, "settings": self._shown, "manual": self.manual}
-
-
-# A reading without a checksum is accepted only near one of the two before it.
-
-
-class StepGate:
-    """Passes a value within `step` of either of the last two, passed or not.
-
-    A corrupted reading stands alone and is stopped; the good one after it still has the good one
-    before. A true step is stopped once and passes with its second reading. Nothing confirms the
-    very first value, so it is stopped.
-    """
-
-    def __init__(self, step: float) -> None:
-        self._step = step
-        self._before: tuple[float, ...] = ()
-
-    def passes(self, value: float) -> bool:
-        """Whether to accept the value; it is remembered either way."""
-        near = any(abs(value - before) <= self._step for before in self._before)
-        self._before = (value, *self._before[:1])
-        return near

@@ -30,7 +30,8 @@ from membrane_ctrl.metrology.calibration import figure_uncertainty, foresight, v
 from membrane_ctrl.metrology.rays import bench_parameters
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
 from membrane_ctrl.sessions.folder import now_utc
-from membrane_ctrl.sessions.live_hold import HoldError, Progress, live_hold
+from membrane_ctrl.sessions.live_hold import HoldError, live_hold
+from membrane_ctrl.sessions.progress import Progress
 
 USUAL_SETS = 5
 _NEARLY_ALL = 0.9  # of the good range: more would hardly help

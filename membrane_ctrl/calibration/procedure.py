@@ -14,7 +14,8 @@ from membrane_ctrl.calibration.setpoints import (
 )
 from membrane_ctrl.calibration.sweep import CaptureLink, Sweep
 from membrane_ctrl.model import errors
-from membrane_ctrl.sessions.live_hold import HoldError, Progress
+from membrane_ctrl.sessions.live_hold import HoldError
+from membrane_ctrl.sessions.progress import Progress
 
 
 @dataclass(frozen=True, slots=True)

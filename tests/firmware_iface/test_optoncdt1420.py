@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420, StreamParser, distance_mm, middle_mean
+from firmware_iface.drivers.step_gate import StepGate
 from firmware_iface.emulators.optoncdt1420 import NO_PEAK, three_bytes
 from firmware_iface.emulators.serial_device import PtyWire
-from firmware_iface.links.exchange import StepGate
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import Optoncdt1420Config
 from tests.support.virtual_time import run_virtual, stand_still

@@ -16,8 +16,7 @@ import pytest
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.sessions import folder, live_hold
-from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions import folder, progress
 from membrane_ctrl.sessions.live_log import (
     ANSWER,
     NAME,
@@ -27,6 +26,7 @@ from membrane_ctrl.sessions.live_log import (
     Progressed,
     write_answer,
 )
+from membrane_ctrl.sessions.progress import Progress
 from tuning import same_bench
 from tuning.explore.live_page import LivePage, status
 
@@ -216,7 +216,7 @@ def test_a_session_goes_on_with_a_later_hold_of_the_same_bench(
 @pytest.fixture
 def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """Where a person types; the program's standard input is the terminal."""
-    monkeypatch.setattr(live_hold, "_POLL_S", 0.01)
+    monkeypatch.setattr(progress, "_POLL_S", 0.01)
     ours, theirs = os.openpty()
     with os.fdopen(theirs) as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)

@@ -23,7 +23,7 @@ from membrane_ctrl.config.schema import Config, EstimatorConfig, ShapeConfig, Tw
 from membrane_ctrl.model.errors import Exit, InputError, RejectedError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder, create_session, open_session
-from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions.progress import Progress
 from tuning import connection, estimator_levels, journal, twin_hold
 from tuning.commands import run
 from tuning.commands.compare import compare_sessions as compare

@@ -23,8 +23,8 @@ from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.sessions.folder import create_session
-from membrane_ctrl.sessions.live_hold import Progress
 from membrane_ctrl.sessions.live_log import LiveLog
+from membrane_ctrl.sessions.progress import Progress
 from membrane_ctrl.web import cli, runs_panel, server
 from tests.support.browser import Tab, browser_tab
 from tests.support.machine_needs import needs

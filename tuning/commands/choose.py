@@ -5,7 +5,7 @@ import sys
 from membrane_ctrl.model import terminal
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions.folder import SessionFolder
-from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions.progress import Progress
 from tuning.proposal import candidate, candidate_table
 from tuning.steps import design, identify
 

@@ -2,7 +2,7 @@
 
 from membrane_ctrl.control.leak_estimate import TOO_TIGHT_UM_PER_S
 from membrane_ctrl.sessions.folder import SessionFolder
-from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions.progress import Progress
 from tuning import connection
 from tuning.commands.conclusion import conclude
 from tuning.identification.pump_survey import TYPICAL_S as PUMP_TYPICAL_S

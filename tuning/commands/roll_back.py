@@ -3,7 +3,8 @@
 import math
 
 from membrane_ctrl.model.errors import DeviceError, Exit
-from membrane_ctrl.sessions.live_hold import HoldError, Progress
+from membrane_ctrl.sessions.live_hold import HoldError
+from membrane_ctrl.sessions.progress import Progress
 from tuning import connection, gains_file, journal
 from tuning.options import TuneOptions
 from tuning.rigs.hold_rig import HoldRig

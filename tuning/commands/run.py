@@ -5,7 +5,7 @@ from types import ModuleType
 
 from membrane_ctrl.model.errors import DeviceError, RejectedError, convert_write_errors
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder
-from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions.progress import Progress
 from tuning import connection, journal
 from tuning.commands import choose
 from tuning.commands.conclusion import conclude

@@ -5,7 +5,7 @@ import sys
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.errors import Exit, RejectedError
 from membrane_ctrl.sessions import folder as session_folder
-from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions.progress import Progress
 from tuning import connection, journal
 from tuning.commands.conclusion import conclude
 from tuning.options import TuneOptions

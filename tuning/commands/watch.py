@@ -4,7 +4,8 @@ import json
 
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
 from membrane_ctrl.sessions import folder as session_folder
-from membrane_ctrl.sessions.live_hold import HoldError, Progress
+from membrane_ctrl.sessions.live_hold import HoldError
+from membrane_ctrl.sessions.progress import Progress
 from tuning import connection, gains_file
 from tuning.options import TuneOptions
 from tuning.rigs.hold_rig import HoldRig
