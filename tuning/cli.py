@@ -158,7 +158,7 @@ def history(logs: LogsOption = Path("logs"), json: JsonOption = False) -> int:
     """List which gains were kept, reverted or rolled back, when, by whom and why."""
     import json as json_module
 
-    from membrane_ctrl.sessions.folder import to_plain
+    from membrane_ctrl.sessions.session_json import to_plain
     from tuning.journal import format_history, read_entries
 
     found = read_entries(logs)

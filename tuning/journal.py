@@ -9,7 +9,7 @@ from typing import Literal
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model import errors, files, plain_json, program
-from membrane_ctrl.sessions import folder as session_folder
+from membrane_ctrl.sessions import session_json
 from tuning.identification import loop_figures
 
 _FILE = "journal.jsonl"
@@ -77,7 +77,7 @@ def append_entry(logs: Path, what: GainsEntry) -> None:
     path = logs / "tuning" / _FILE
     with errors.convert_write_errors(path):
         files.make_folder(path.parent)
-        line = {**program.file_origin(_SCHEMA), **session_folder.to_plain(what)}
+        line = {**program.file_origin(_SCHEMA), **session_json.to_plain(what)}
         files.append_text(path, json.dumps(line, allow_nan=False) + "\n")
         files.sync_data(path)
 
@@ -98,7 +98,7 @@ def read_entries(logs: Path) -> list[GainsEntry]:
         try:
             table = plain_json.loads(line)
             program.remove_origin(table, _SCHEMA)
-            found.append(session_folder.build_value(GainsEntry, table))
+            found.append(session_json.build_value(GainsEntry, table))
         except (ValueError, TypeError, KeyError, AttributeError):
             continue
     return found

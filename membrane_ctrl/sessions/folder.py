@@ -2,35 +2,19 @@
 are done.
 """
 
-import json
-import math
 import re
-import types
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import (
-    Any,
-    Literal,
     Protocol,
     TypeVar,
-    Union,
-    cast,
-    get_args,
-    get_origin,
-    get_type_hints,
 )
 
-import numpy as np
-from pydantic import BaseModel, ValidationError
-
 from membrane_ctrl.config import schema, toml_file
-from membrane_ctrl.model import errors, files, plain_json, program
+from membrane_ctrl.model import errors, files
+from membrane_ctrl.sessions.session_json import SCHEMA, T, read_session_file, write_session_file
 
-T = TypeVar("T")
-_LARGEST = 1e60  # no quantity is near it; its fourth power is still finite
-_PLAIN_BYTES_MAX = 64_000_000  # candidates with their curves take a few megabytes
-SCHEMA = "membrane-session/1"  # of all JSON files of a tuning session
 STEPS = ("characterise", "identify", "observe", "design", "preview", "apply", "verify")
 # The results of a step; the first file marks it as done.
 FILES: dict[str, tuple[str, ...]] = {
@@ -44,106 +28,6 @@ FILES: dict[str, tuple[str, ...]] = {
 }
 _BYTES_MAX = 16_000_000  # a picture is some 100 kB
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-
-
-def to_plain(value: Any) -> Any:
-    """Plain JSON data; numbers that are not finite become words."""
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_plain(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, np.ndarray):
-        return to_plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [to_plain(item) for item in value]
-    if isinstance(value, dict):
-        return {str(key): to_plain(item) for key, item in value.items()}
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value
-
-
-def build_value(kind: type[T], data: Any) -> T:
-    """Build a value of a type from its plain form. Raises TypeError, ValueError or KeyError if it
-    is invalid.
-    """
-    return cast(T, _build_plain(kind, data))
-
-
-def _build_plain(kind: Any, data: Any) -> Any:
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin in (Union, types.UnionType):
-        return (
-            None
-            if data is None
-            else _build_plain(next(a for a in arguments if a is not type(None)), data)
-        )
-    if origin is Literal:
-        if data not in arguments:
-            raise ValueError(f"{data!r} is not one of {arguments}")
-        return data
-    if origin is tuple:
-        inner = [arguments[0]] * len(data) if arguments[-1] is Ellipsis else arguments
-        return tuple(_build_plain(a, item) for a, item in zip(inner, data, strict=True))
-    if origin is np.ndarray:
-        return np.array(data, dtype=float)
-    if isinstance(kind, type) and issubclass(kind, BaseModel):
-        return kind.model_validate(data)
-    if is_dataclass(kind):
-        hints = get_type_hints(kind)
-        return cast(Any, kind)(
-            **{f.name: _build_plain(hints[f.name], data[f.name]) for f in fields(kind)}
-        )
-    value = kind(data)
-    if isinstance(value, float) and _LARGEST < abs(value) < math.inf:
-        raise ValueError(f"{value:g} is not a plausible quantity")
-    return value
-
-
-def write_session_file(path: Path, value: Any, schema: str = SCHEMA) -> None:
-    """Write a JSON file of a session atomically.
-
-    Parameters
-    ----------
-    path : Path
-    value : dataclass or dict
-    schema : str
-        Format with version, which the file states beside the program that writes it.
-    """
-    table = {**program.file_origin(schema), **to_plain(value)}
-    files.write_text_atomic(
-        files.resolve_user_path(path), json.dumps(table, indent=1, allow_nan=False) + "\n"
-    )
-
-
-def read_session_file(path: Path, kind: type[T], schema: str = SCHEMA) -> T:
-    """Read a JSON file of a session.
-
-    Parameters
-    ----------
-    path : Path
-    kind : type
-        Of the dataclass that was written.
-    schema : str
-        Format with version that the file must have.
-
-    Raises
-    ------
-    InputError
-        One line: the file is missing, of another format, or invalid.
-    """
-    try:
-        table = plain_json.loads(files.read_text(files.resolve_user_path(path), _PLAIN_BYTES_MAX))
-        if not isinstance(table, dict):
-            raise ValueError("no JSON object")
-        program.remove_origin(table, schema)
-        return build_value(kind, table)
-    except FileNotFoundError:
-        raise errors.InputError(f"{path}: no such file") from None
-    except (OSError, ValueError, TypeError, KeyError, ValidationError) as error:
-        raise errors.InputError(
-            f"{path}: damaged ({str(error).splitlines()[0]}); repeat the step that wrote it"
-        ) from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import experiment, operating_point
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions import folder, session_json
 from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support import review_runs
 from tests.support.browser import browser_tab
@@ -126,12 +126,12 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (ends_s, ends_s),
         experiment.Finished(experiment.ExperimentEnd.COMPLETED, "done"),
     )
-    folder.write_session_file(opened.file_path("experiments.json"), head)
+    session_json.write_session_file(opened.file_path("experiments.json"), head)
     identify.run_identify(opened)
     quiet = quiet_hold()
     record_file.save_record(opened.file_path("quiet.npz"), quiet)
     found = identify.load_identified(opened).identified.model
-    folder.write_session_file(
+    session_json.write_session_file(
         opened.file_path("disturbance.json"), disturbance.observe_disturbance(quiet, found, LOOP)
     )
     design.run_design(opened)
@@ -167,7 +167,7 @@ def test_a_short_session_takes_the_weather_from_before_its_experiments(
 def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_path: Path) -> None:
     """Not that it then takes no gains; the verification is still to be done."""
     opened = copy_of(template, tmp_path)
-    folder.write_session_file(opened.file_path("applied.json"), {})
+    session_json.write_session_file(opened.file_path("applied.json"), {})
 
     class Lost:
         dt_s, told, pump = 0.02, 0, PumpConfig()
@@ -205,7 +205,7 @@ def test_a_close_verification_goes_on_for_as_long_again(
 ) -> None:
     """Ten minutes tell a standard deviation to 13 %."""
     opened = copy_of(template, tmp_path)
-    folder.write_session_file(opened.file_path("applied.json"), {})
+    session_json.write_session_file(opened.file_path("applied.json"), {})
     left, told = list(growths), []
     held = SimpleNamespace(followed_by=lambda more: held)
     rig = SimpleNamespace(
@@ -248,7 +248,7 @@ def test_a_folder_that_cannot_be_explored_is_refused(tmp_path: Path) -> None:
 
 def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
-    folder.write_session_file(opened.file_path("preview.json"), preview.Previewed((), ()))
+    session_json.write_session_file(opened.file_path("preview.json"), preview.Previewed((), ()))
     save = saver(of_path(opened.path, tmp_path), "ada")
     assert save is not None
     assert "tune apply" in save(GAINS[0])

@@ -4,7 +4,7 @@ import sys
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.errors import Exit, RejectedError
-from membrane_ctrl.sessions import folder as session_folder
+from membrane_ctrl.sessions import session_json
 from membrane_ctrl.sessions.progress import Progress
 from tuning import connection, journal
 from tuning.commands.conclusion import conclude
@@ -36,7 +36,7 @@ def tune_shape_loop(options: TuneOptions) -> int:
             found = shape_loop_fit.fit_shape_loop(levels, steady, assumed)
         except ValueError as error:
             raise RejectedError(f"shape loop: {error}") from None
-        session_folder.write_session_file(folder.file_path("outer.json"), found)
+        session_json.write_session_file(folder.file_path("outer.json"), found)
         progress.print_line(
             f"optical sag per µm of the laser {found.scale:.3f}, noise {found.sigma_um:.2f} "
             "µm per cycle of "
@@ -67,7 +67,7 @@ def tune_shape_loop(options: TuneOptions) -> int:
             times_s,
         )
         journal.append_entry(options.logs, journal.make_entry(what, *entry_values))
-        session_folder.write_session_file(folder.file_path("outer_verified.json"), done)
+        session_json.write_session_file(folder.file_path("outer_verified.json"), done)
         progress.print_line(
             f"taken back: {done.reason}"
             if done.reason

@@ -3,7 +3,7 @@
 import json
 
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
-from membrane_ctrl.sessions import folder as session_folder
+from membrane_ctrl.sessions import session_json
 from membrane_ctrl.sessions.live_hold import HoldError
 from membrane_ctrl.sessions.progress import Progress
 from tuning import connection, gains_file
@@ -29,7 +29,7 @@ def watch_hold(options: TuneOptions) -> int:
         except ValueError as error:
             raise InputError(f"watch: {error}") from None
     if options.json:
-        print(json.dumps(session_folder.to_plain(found)))
+        print(json.dumps(session_json.to_plain(found)))
     progress.print_line(
         f"std {found.std_um:.3f} µm, {found.ratio:.2f} of the lower bound "
         f"({found.ratio_designed:.2f} expected); "

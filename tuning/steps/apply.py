@@ -1,7 +1,7 @@
 """Sixth step of a session: set a candidate, or the gains in `gains.toml`, on trial."""
 
 from membrane_ctrl.config import schema
-from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions import folder, session_json
 from tuning.gains_file import adapt_to_hold, load_gains, require_sound, save_gains
 from tuning.rigs.hold_rig import HoldRig
 from tuning.sentences import describe_gains
@@ -71,7 +71,7 @@ def run_apply(
     loop = load_checked_gains(session)
     session.begin_step("apply")
     rig.set_gains(loop, f"session {session.path.name}", _APPLY_S)
-    folder.write_session_file(
+    session_json.write_session_file(
         session.file_path("applied.json"), {"trial_s": _APPLY_S, "loop": loop}
     )
     return loop

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from membrane_ctrl.control.experiments import experiment, operating_point
 from membrane_ctrl.model import errors
-from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions import folder, session_json
 from tuning.identification import experiments, record_file
 from tuning.rigs.hold_rig import HoldRig
 
@@ -49,7 +49,7 @@ def run_characterise(
     if plan is experiments.SHORT and done.held is not None:
         record_file.save_record(session.file_path(HELD_RECORD), done.held)
     head = ExperimentsHead(done.around, done.relays_s, done.pulses_s, done.finished)
-    folder.write_session_file(session.file_path("experiments.json"), head)
+    session_json.write_session_file(session.file_path("experiments.json"), head)
     return done
 
 

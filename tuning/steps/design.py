@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.report_pages.blocks import PageSection, PageTable, PageText
-from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions import folder, session_json
 from tuning.gains_file import (
     GainsFile,
     PlantSection,
@@ -74,7 +74,7 @@ def run_design(session: folder.SessionFolder, reason: str = "tuning session") ->
         candidate_table.format_markdown(made.candidates) + "\n",
     )
     kept = Design(made.candidates, made.least_std_um, made.preview, made.robustness)
-    folder.write_session_file(session.file_path("proposal.json"), kept)
+    session_json.write_session_file(session.file_path("proposal.json"), kept)
     save_gains(session.file_path("gains.toml"), gains)
     return gains
 

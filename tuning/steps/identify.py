@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from membrane_ctrl.control.leak_estimate import TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model import errors
 from membrane_ctrl.report_pages.blocks import PageBlock, PageSection, PageTable, PageText, TextMark
-from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions import folder, session_json
 from tuning.identification import experiments, fit_quality, plant_fit, plant_model
 from tuning.identification.record import Record
 from tuning.report.pictures import embed_picture, is_outdated, save_figure
@@ -37,7 +37,7 @@ def run_identify(session: folder.SessionFolder) -> IdentifiedPlant:
     except ValueError as error:
         raise errors.RejectedError(f"identify: {error}") from None
     found = IdentifiedPlant(all_of_it.identified, all_of_it.quality, done.record.sha256())
-    folder.write_session_file(session.file_path("identified.json"), found)
+    session_json.write_session_file(session.file_path("identified.json"), found)
     return found
 
 

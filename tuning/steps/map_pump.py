@@ -11,7 +11,7 @@ from membrane_ctrl.control.experiments import operating_point
 from membrane_ctrl.control.experiments.spec import PumpStep
 from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.model import errors, telemetry
-from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions import folder, session_json
 from tuning.gains_file import MS_MAX
 from tuning.identification import (
     closed_loop,
@@ -69,7 +69,7 @@ def has_pump_map(session: folder.SessionFolder) -> bool:
 
 def load_pump_map(session: folder.SessionFolder) -> MappedPump:
     """Result of the pump map."""
-    return folder.read_session_file(session.file_path("pump_map.json"), MappedPump)
+    return session_json.read_session_file(session.file_path("pump_map.json"), MappedPump)
 
 
 def map_pump(
@@ -97,7 +97,7 @@ def map_pump(
     rig.good = loop, found.pump
     session = folder.based_on(session, loop, found.pump)
     done = MappedPump(found, before, gain, sigma)
-    folder.write_session_file(session.file_path("pump_map.json"), done)
+    session_json.write_session_file(session.file_path("pump_map.json"), done)
     return done, session
 
 

@@ -9,7 +9,7 @@ from scipy.signal import welch
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model import errors
 from membrane_ctrl.report_pages.blocks import PageSection, PageText
-from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions import folder, session_json
 from tuning.identification import plant_model, record_file
 from tuning.identification.disturbance import DisturbanceModel, observe_disturbance
 from tuning.identification.record import Record, Series
@@ -42,7 +42,7 @@ def run_observe(
     except ValueError as error:
         raise errors.RejectedError(f"observe: {error}") from None
     record_file.save_record(session.file_path("quiet.npz"), record)
-    folder.write_session_file(session.file_path("disturbance.json"), disturbance)
+    session_json.write_session_file(session.file_path("disturbance.json"), disturbance)
     return disturbance
 
 

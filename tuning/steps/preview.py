@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from membrane_ctrl.report_pages.blocks import PageSection, PageTable
-from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions import folder, session_json
 from tuning.gains_file import load_gains
 from tuning.proposal import preview
 from tuning.steps.identify import load_identified
@@ -38,7 +38,7 @@ def run_preview(session: folder.SessionFolder) -> Previewed:
         for loop in (session.head.before, gains.loop)
     )
     done = Previewed(present, proposed)
-    folder.write_session_file(session.file_path("preview.json"), done)
+    session_json.write_session_file(session.file_path("preview.json"), done)
     return done
 
 

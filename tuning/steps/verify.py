@@ -11,7 +11,7 @@ from scipy.signal import welch
 
 from membrane_ctrl.config import schema
 from membrane_ctrl.report_pages.blocks import PageSection, PageTable, PageText, TextMark
-from membrane_ctrl.sessions import folder, live_hold
+from membrane_ctrl.sessions import folder, live_hold, session_json
 from tuning.gains_file import load_gains
 from tuning.identification import closed_loop, plant_model, record_file
 from tuning.identification.record import Record
@@ -90,7 +90,7 @@ def run_verify(
     done = Verified(not reason, reason, tuple(looks), before, after)
     if record is not None:
         record_file.save_record(session.file_path("verify.npz"), record)
-    folder.write_session_file(session.file_path("verified.json"), done)
+    session_json.write_session_file(session.file_path("verified.json"), done)
     return done
 
 
