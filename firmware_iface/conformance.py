@@ -194,7 +194,8 @@ class Conformance(board_under_test.BoardUnderTest):
             frozen_s == 0 or 1 <= frozen_s <= 600,
             f"gauge_frozen_s is {frozen_s:g}, expected 0 or 1..600",
         )
-        self._gauge_fitted, self._gauge_timeout_s = fitted == 1, timeout_s
+        self._gauge_fitted = fitted == 1
+        self._gauge_timeout_s = timeout_s
         self._interlocks_fitted = int(identity["interlocks_fitted"])
 
     async def _check_blocks(self) -> None:

@@ -33,7 +33,10 @@ class GuardedCamera:
             raise ValueError(
                 f"{name}: the driver has neither grab nor expose and fetch, so it is no camera"
             )
-        self.driver, self._sensor, self._now, self._name = driver, sensor, now, name
+        self.driver = driver
+        self._sensor = sensor
+        self._now = now
+        self._name = name
         self._opened = False
         self._triggered_s = math.nan
         self._grabbed: roles.Frame | roles.FrameLostError | None = None
@@ -88,7 +91,9 @@ class GuardedCamera:
 
     def close(self) -> None:
         """Release the camera. Never raises."""
-        self._opened, self._triggered_s, self._grabbed = False, math.nan, None
+        self._opened = False
+        self._triggered_s = math.nan
+        self._grabbed = None
         close_driver(self.driver)
 
     def describe(self) -> dict[str, str]:

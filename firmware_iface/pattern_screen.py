@@ -34,8 +34,11 @@ class PatternScreen:
     ) -> None:
         self.settle_s = SETTLE_S
         self.response = linear_response()
-        self._display, self._raster, self._patterns = display, raster, patterns
-        self._clock, self._name = clock, name
+        self._display = display
+        self._raster = raster
+        self._patterns = patterns
+        self._clock = clock
+        self._name = name
         self._opened = False
         self._prepared: dict[Pattern, Any] = {}
         self._shown_s = 0.0

@@ -99,7 +99,8 @@ class RoleBench:
                 await self.close()
                 raise type(error)(f"{role}: {error}") from error
         await self._stop_watchdog()
-        self._fed_s, self._commanded = self._clock(), 0.0
+        self._fed_s = self._clock()
+        self._commanded = 0.0
         self._watchdog = asyncio.create_task(self._run_watchdog(), name="software watchdog")
         kinds = ", ".join(f"{role} {identity.kind}" for role, identity in self.identities.items())
         firmware = ", ".join(

@@ -65,7 +65,8 @@ class AravisCamera:
         self.counts = FrameCounts()
         self._name = f"camera {config.camera}" if config.camera else "camera"
         self._size = (sensor.width_px, sensor.height_px)
-        self._now, self._sleep = clock.now, clock.sleep
+        self._now = clock.now
+        self._sleep = clock.sleep
         self._camera: int | None = None
         self._stream: int | None = None
         self._opened = False

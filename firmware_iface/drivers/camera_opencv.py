@@ -57,8 +57,10 @@ class UvcCamera:
         clock: roles.DriverClock = _REAL_TIME,
         capture: Callable[[int | str], VideoCapture] = cv2.VideoCapture,  # type: ignore[assignment]  # the stubs differ
     ) -> None:
-        self._config, self._size = config, (sensor.width_px, sensor.height_px)
-        self._now, self._make = clock.now, capture
+        self._config = config
+        self._size = (sensor.width_px, sensor.height_px)
+        self._now = clock.now
+        self._make = capture
         self._capture: VideoCapture | None = None
 
     def open(self) -> roles.DeviceIdentity:
@@ -153,11 +155,9 @@ class FolderCamera:
         sensor: roles.SensorFormat,
         clock: roles.DriverClock = _REAL_TIME,
     ) -> None:
-        self._folder, self._size, self._now = (
-            Path(config.folder).expanduser(),
-            sensor.shape,
-            clock.now,
-        )
+        self._folder = Path(config.folder).expanduser()
+        self._size = sensor.shape
+        self._now = clock.now
         self._files: list[Path] = []
         self._next = 0
 
@@ -205,7 +205,8 @@ class FolderCamera:
 
     def close(self) -> None:
         """Start from the first picture next time."""
-        self._files, self._next = [], 0
+        self._files = []
+        self._next = 0
 
     def describe(self) -> dict[str, str]:
         """For people."""

@@ -152,7 +152,8 @@ class PumpBoard:
             )
         # continue from the heartbeat that last fed the board: the first write must differ from it
         self._heartbeat = int(sensors["heartbeat_echo"])
-        self._armed, self._busy_writes = True, 0
+        self._armed = True
+        self._busy_writes = 0
 
     async def _held_by_another(self) -> roles.DeviceBusyError:
         sensors = await self._read_sensors()

@@ -58,7 +58,8 @@ class VaisalaPtb330(line_link.LineDriver):
         super().__init__(
             port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence
         )
-        self._period_s, self._age_max_s = config.period_s, config.age_max_s
+        self._period_s = config.period_s
+        self._age_max_s = config.age_max_s
         self._task: asyncio.Task[None] | None = None
         self._newest = BarometerMessage(math.nan, -1, "")
         self._newest_s = -math.inf
@@ -73,11 +74,9 @@ class VaisalaPtb330(line_link.LineDriver):
         (another instrument, or a format that it does not take).
         """
         await self.close()
-        self._newest, self._newest_s, self._down = (
-            BarometerMessage(math.nan, -1, ""),
-            -math.inf,
-            None,
-        )
+        self._newest = BarometerMessage(math.nan, -1, "")
+        self._newest_s = -math.inf
+        self._down = None
         identity = await self._opened(self._begin, "\r\nS\r\nECHO OFF\r\n")
         self._task = asyncio.create_task(self._keep_reading(), name="barometer")
         return identity
@@ -145,7 +144,8 @@ class VaisalaPtb330(line_link.LineDriver):
             )
         if message.counter == self._newest.counter:
             return
-        self._newest, self._newest_s = message, asyncio.get_running_loop().time()
+        self._newest = message
+        self._newest_s = asyncio.get_running_loop().time()
 
     async def ambient_pressure_pa(self) -> float:
         """The newest value, NaN when it is too old or the instrument has none.

@@ -36,7 +36,9 @@ class EmulatedGpio:
         """Settings of a line, as the package takes them."""
 
         def __init__(self, direction: str, bias: str, active_low: bool) -> None:
-            self.direction, self.bias, self.active_low = direction, bias, active_low
+            self.direction = direction
+            self.bias = bias
+            self.active_low = active_low
 
     def __init__(self, contacts: dict[tuple[str, int], Literal["closed", "open", "cut"]]) -> None:
         self.contacts = contacts
@@ -65,7 +67,9 @@ class EmulatedRequest:
     def __init__(
         self, gpio: EmulatedGpio, chip: str, config: Mapping[int, EmulatedGpio.LineSettings]
     ) -> None:
-        self._gpio, self._chip, self._config = gpio, chip, config
+        self._gpio = gpio
+        self._chip = chip
+        self._config = config
         self.released = False
 
     def get_values(self, lines: list[int]) -> list[str]:

@@ -31,11 +31,14 @@ class Mks937bEmulator(LineDevice):
         channel: int = 1,
     ):
         super().__init__(baud, parity=parity)
-        self.model, self.serial, self.unit = "937B", "0123456789", "TORR"
+        self.model = "937B"
+        self.serial = "0123456789"
+        self.unit = "TORR"
         self.sensors = ["NG"] * 6
         self.sensors[channel - 1] = "CM"
         self.locked = False  # parameter setting disabled at the front panel
-        self._gauge_pa, self._address = gauge_pa, address
+        self._gauge_pa = gauge_pa
+        self._address = address
         self._held = ""
 
     def line(self, text: str) -> None:
@@ -90,9 +93,12 @@ class VaisalaPtb330Emulator(LineDevice):
         self.serial = "A1234567"
         self._ambient_pressure_pa = ambient_pressure_pa
         self._model = model
-        self._format, self._unit, self._echo = _DEFAULT_FORMAT, "hPa", True
+        self._format = _DEFAULT_FORMAT
+        self._unit = "hPa"
+        self._echo = True
         self._running = running
-        self._pressure_pa, self._counter = math.nan, 0
+        self._pressure_pa = math.nan
+        self._counter = 0
         self._stream: asyncio.TimerHandle | None = None
 
     def restart(self) -> None:

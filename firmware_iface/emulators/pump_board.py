@@ -266,7 +266,8 @@ class BoardState:
             return
         if written["claim_key"] != self._claim_key:
             self._fed_s = self._now_s
-        self._claim_id, self._claim_key = written["claim_id"], written["claim_key"]
+        self._claim_id = written["claim_id"]
+        self._claim_key = written["claim_key"]
 
     def _written_block(self, address: int, count: int) -> Block:
         whole = self._by_span.get((address, count))

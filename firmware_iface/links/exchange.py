@@ -112,7 +112,8 @@ class SerialExchange:
         self._failures = 0
         self._noisy = True
         self._abandoned.clear()
-        self._repeated, self._echoes = b"", False
+        self._repeated = b""
+        self._echoes = False
         self._last_byte_s = asyncio.get_running_loop().time()
         if greeting:
             self.port.write(greeting)
@@ -191,11 +192,13 @@ class SerialExchange:
     async def _ask_once(self, question: Question, timeout_s: float) -> bytes:
         self._require_open(question.what)
         if self._echoes:
-            self._echoes, self._repeated = False, b""
+            self._echoes = False
+            self._repeated = b""
             raise DeviceRefusedError(f"{question.what}: {_ECHO}")
         loop = asyncio.get_running_loop()
         self.port.write(question.data)
-        self._buffer, self._question = b"", question
+        self._buffer = b""
+        self._question = question
         request_s = loop.time()
         self._late.note_question()
         answer: asyncio.Future[bytes] = loop.create_future()

@@ -61,7 +61,8 @@ class GuardedModbusTcp:
     def __init__(
         self, host: str, port: int, unit_id: int, timeout_s: float, clock: Clock = time.monotonic
     ) -> None:
-        self._host, self._port = host, port
+        self._host = host
+        self._port = port
         self._unit_id = unit_id
         self._timeout_s = timeout_s
         self._clock = clock

@@ -193,7 +193,9 @@ class SerialPort:
         """Close; never raises."""
         if self._serial is None:
             return
-        port, self._serial, self._receiver = self._serial, None, None
+        port = self._serial
+        self._serial = None
+        self._receiver = None
         asyncio.get_running_loop().remove_reader(port.fileno())
         with contextlib.suppress(OSError, termios.error):
             # closing a tty waits up to 30 s for its output to drain when the line is held

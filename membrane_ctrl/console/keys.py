@@ -38,7 +38,8 @@ class Desk:
     def bottom_line(self) -> str:
         """The console's last line."""
         if self._answer is not None and self._answer.done():
-            self._status_line, self._answer = self._answer.result(), None
+            self._status_line = self._answer.result()
+            self._answer = None
         match self._prompt:
             case "mark":
                 return f"mark: {self._text}▏ (Enter sends, Esc cancels)"
@@ -70,7 +71,8 @@ class Desk:
             case "p":
                 self._send_request({"do": "resume" if paused else "pause"})
             case "m":
-                self._prompt, self._text = "mark", ""
+                self._prompt = "mark"
+                self._text = ""
             case "s":
                 self._prompt = "stop"
             case "?":

@@ -123,7 +123,8 @@ class ConsoleModel:
         ctl: str = "membrane-ctrl ctl",
         keys: bool = False,
     ) -> None:
-        self._ctl, self._keys = ctl, keys
+        self._ctl = ctl
+        self._keys = keys
         self._config = config
         self._duration_s = math.inf if duration_s is None else duration_s
         self._status = run_status.RunStatus()

@@ -149,8 +149,12 @@ class ConsolePage:
         asks: bool = False,
         help_: bool = False,
     ) -> None:
-        self._view, self._config, self._run = view, config, run
-        self._foot, self._asks, self._help = foot, asks, help_
+        self._view = view
+        self._config = config
+        self._run = run
+        self._foot = foot
+        self._asks = asks
+        self._help = help_
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         height = options.height or console.height

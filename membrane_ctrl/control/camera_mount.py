@@ -25,10 +25,8 @@ class CameraMountGrowth:
     """
 
     def __init__(self, config: EstimatorConfig, memory: CameraMountState | None = None) -> None:
-        self._um_per_k, self._sigma_um_per_k = (
-            config.camera_mount_um_per_k,
-            config.camera_mount_sigma_um_per_k,
-        )
+        self._um_per_k = config.camera_mount_um_per_k
+        self._sigma_um_per_k = config.camera_mount_sigma_um_per_k
         self._follows_air_s = config.camera_mount_follows_air_s
         self.memory = memory or CameraMountState()
 

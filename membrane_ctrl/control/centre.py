@@ -134,7 +134,8 @@ class CentreFilter:
     def __init__(
         self, config: EstimatorConfig, loop: LoopConfig, memory: CentreState | None = None
     ) -> None:
-        self._config, self._rate_hz = config, loop.rate_hz
+        self._config = config
+        self._rate_hz = loop.rate_hz
         self.set_gains(loop)
         self._every = max(1, round(_CLONE_S * loop.rate_hz))
         self.memory = memory or CentreState()
@@ -218,7 +219,8 @@ class CentreFilter:
         """Take the optics' next readings as a new zero."""
         memory = self.memory
         memory.p[_OPTICS_ZERO] = memory.p[:, _OPTICS_ZERO] = 0.0
-        memory.p[_OPTICS_ZERO, _OPTICS_ZERO], memory.x[_OPTICS_ZERO] = _UNKNOWN_UM2, 0.0
+        memory.p[_OPTICS_ZERO, _OPTICS_ZERO] = _UNKNOWN_UM2
+        memory.x[_OPTICS_ZERO] = 0.0
         memory.origin.sag_um = math.nan
         memory.frames = 0
         memory.watches[Sensor.OPTICS] = SensorWatch()
@@ -417,7 +419,8 @@ class CentreFilter:
         gain = ph / spread
         x += gain * innovation
         p -= gain[:, None] * ph
-        watch.seen_s, watch.taken_s = now_s, taken_s
+        watch.seen_s = now_s
+        watch.taken_s = taken_s
         if sensor in (Sensor.LASER, Sensor.OPTICS):
             watch.pull += abs(float(self._centre @ gain))
 

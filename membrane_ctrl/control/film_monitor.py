@@ -153,7 +153,8 @@ class FilmMonitor:
     ) -> None:
         self.memory = memory or FilmMonitorState()
         self._limits = limits
-        self._sag_um, self._pressure_pa = 1e3 * mirror.sag_mm, mirror.pressure_pa
+        self._sag_um = 1e3 * mirror.sag_mm
+        self._pressure_pa = mirror.pressure_pa
         self._minutes = _GaugeComparison(sensor, SINCE_MINUTES_S, limits.laser_gauge_apart_max_um)
         self._hour = _GaugeComparison(sensor, SINCE_HOUR_S, limits.laser_gauge_drift_max_um)
         self._day = _GaugeComparison(sensor, SINCE_DAY_S, limits.laser_gauge_day_max_um)

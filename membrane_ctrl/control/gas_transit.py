@@ -24,7 +24,9 @@ class Transit:
     ) -> None:
         self._ticks = int(delay_s / period_s + 1e-9)
         self._rest = max(0.0, delay_s / period_s - self._ticks)
-        self._delay_s, self._lag_s, self._period_s = delay_s, lag_s, period_s
+        self._delay_s = delay_s
+        self._lag_s = lag_s
+        self._period_s = period_s
         self.memory = memory or TransitState()
         if not self.memory.flows:
             self.memory.flows.extend([0.0] * (self._ticks + 2))

@@ -326,10 +326,8 @@ class InnerLoop:
         """Take new settings without a bump in the flow."""
         flow_max_um_per_s = min(loop.flow_max_um_per_s, self._flow_full_um_per_s)
         self._loop = loop
-        self._ramp.rate_um_per_s, self._ramp.flow_max_um_per_s = (
-            loop.setpoint_ramp_um_per_s,
-            flow_max_um_per_s,
-        )
+        self._ramp.rate_um_per_s = loop.setpoint_ramp_um_per_s
+        self._ramp.flow_max_um_per_s = flow_max_um_per_s
         self._weight.weight = loop.setpoint_weight
         self._weight.ti_s = loop.ti_s
         self._weight.reset(self.memory.shaped_um)

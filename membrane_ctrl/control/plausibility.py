@@ -153,7 +153,9 @@ class PlausibilityCheck:
         figure_lag_s: float = 0.0,
         memory: PlausibilityState | None = None,
     ) -> None:
-        self._limit_um, self._sag_um, self._figure_lag_s = limit_um, sag_um, figure_lag_s
+        self._limit_um = limit_um
+        self._sag_um = sag_um
+        self._figure_lag_s = figure_lag_s
         self._slow_limit_um = SLOW_SHARE * limit_um
         self.memory = memory or PlausibilityState()
 

@@ -34,7 +34,8 @@ class _StraightLine:
     lowest_fraction, highest_fraction = 0.0, 1.0
 
     def __init__(self, pump: PumpConfig) -> None:
-        self._full, self._dead = pump.flow_full_um_per_s, pump.dead_fraction
+        self._full = pump.flow_full_um_per_s
+        self._dead = pump.dead_fraction
 
     def flow(self, fraction: float) -> float:
         return max(0.0, self._full * (fraction - self._dead) / (1.0 - self._dead))
@@ -52,7 +53,8 @@ class _Measured:
 
     def __init__(self, fractions: Sequence[float], flows_um_per_s: Sequence[float]) -> None:
         self._fractions, self._flows = _tabulate_monotone_cubic(fractions, flows_um_per_s)
-        self.lowest_fraction, self.highest_fraction = fractions[0], fractions[-1]
+        self.lowest_fraction = fractions[0]
+        self.highest_fraction = fractions[-1]
 
     def flow(self, fraction: float) -> float:
         return (

@@ -268,7 +268,8 @@ class Controller:
         context.state_age_s = inputs.now_s - self.memory.state_since_s
         context.found_response = None
         events += context.interlocks.observe_reading(inputs.reading, self.state)
-        self._answers, self._clear_mask = [], 0
+        self._answers = []
+        self._clear_mask = 0
         obeyed: set[str] = set()
         for command in commands.sort_commands(inputs.commands):
             if self._handle_command(command, obeyed, events):
@@ -384,7 +385,8 @@ class Controller:
         context, pump = self._context, self._gains.present.pump
         if pump != context.pump_config:
             context.loop.set_pump(pump)
-        context.loop_config, context.pump_config = loop, pump
+        context.loop_config = loop
+        context.pump_config = pump
         context.loop.set_gains(loop)
         self._estimation.set_gains(loop)
         self._consistency.set_gains(loop, pump)
@@ -473,7 +475,9 @@ class Controller:
     def _run_state(self, events: list[Event]) -> None:
         """Run the state's handler; everything is off unless it sets it."""
         context = self._context
-        context.output, context.pump_fraction, context.vent_fraction = None, 0.0, 0.0
+        context.output = None
+        context.pump_fraction = 0.0
+        context.vent_fraction = 0.0
         try:
             wanted = states.run_state(self.state, context)
         except Exception as error:
@@ -489,7 +493,8 @@ class Controller:
                 self.memory.tick_error = (
                     f"{name} command {fraction} from state {self.state.name.lower()}"
                 )
-                context.pump_fraction, context.vent_fraction = 0.0, 0.0
+                context.pump_fraction = 0.0
+                context.vent_fraction = 0.0
         if wanted != self.state:
             self._enter_state(wanted, context.why.text, events)
 

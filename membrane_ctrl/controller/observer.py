@@ -143,7 +143,8 @@ class Observer:
         """Let the figures show the displacement; a stuck laser stays where they show none."""
         if self.laser_stuck and math.isnan(self.figures.guard_um):
             return
-        self.displacement_um, self.guard_um = self.figures.loop_um, self.figures.guard_um
+        self.displacement_um = self.figures.loop_um
+        self.guard_um = self.figures.guard_um
         self.optics_replace_laser = math.isfinite(self.guard_um)
 
     @property

@@ -32,7 +32,8 @@ class ResumeRule:
     def __init__(
         self, config: ResumeConfig, limits: LimitsConfig, memory: ResumeState | None = None
     ) -> None:
-        self._config, self._limits = config, limits
+        self._config = config
+        self._limits = limits
         self.memory = memory or ResumeState()
         self.possible = False
         self.clear_mask = 0

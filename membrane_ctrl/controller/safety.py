@@ -617,7 +617,8 @@ class SafetyTable:
         table: tuple[Rule, ...] = TABLE,
         memory: SafetyState | None = None,
     ) -> None:
-        self._limits, self._table = limits, table
+        self._limits = limits
+        self._table = table
         self.memory = memory or SafetyState()
 
     def judge(self, state: State, observation: Observation) -> Verdict:

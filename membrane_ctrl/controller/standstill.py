@@ -95,7 +95,8 @@ class Standstill:
     def __init__(
         self, loop: LoopConfig, states: StatesConfig, memory: StandstillState | None = None
     ) -> None:
-        self._loop, self._states = loop, states
+        self._loop = loop
+        self._states = states
         self.memory = memory or StandstillState()
 
     @property

@@ -106,7 +106,8 @@ def inflate(context: TickContext) -> State:
     if math.isfinite(to_go_um) and (
         rises or to_go_um <= 0.0
     ):  # from above the leak lowers it, however slowly
-        context.highest_um, context.highest_s = output.filtered_um, context.now_s
+        context.highest_um = output.filtered_um
+        context.highest_s = context.now_s
     if context.now_s - context.highest_s > states.inflate_stall_s:
         context.overdue = (
             f"no rise in {states.inflate_stall_s:g} s, {to_go_um:.0f} µm below the setpoint"
@@ -377,7 +378,8 @@ def _test_actuators(context: TickContext) -> State:
     test.step(context.observer.displacement_um, context.dt_s)
     part = test.part
     if part is not None:
-        context.pump_fraction, context.vent_fraction = part.pump_fraction, part.vent_fraction
+        context.pump_fraction = part.pump_fraction
+        context.vent_fraction = part.vent_fraction
         context.explain(WhyCode.TESTING_ACTUATORS, f"testing the actuators: {part.name}", part.name)
         return State.CHECK
     if _list_missing_checks(context) != NO_REASON:

@@ -121,7 +121,8 @@ def pack_row(tick: int, row: telemetry.TelemetryRow) -> bytes:
     record = np.zeros(1, dtype=RECORD)
     for name, field in SAME.items():
         record[name] = getattr(row, field)
-    record["tick"], record["tail_bytes"] = tick, _TAIL_LOST
+    record["tick"] = tick
+    record["tail_bytes"] = _TAIL_LOST
     return TICK + record.tobytes() + row.pack()
 
 

@@ -115,7 +115,8 @@ class TickContext(TickContextState):
 
     def drive_by(self, output: inner_loop.LoopOutput) -> None:
         """Let the loop's output drive the pump, with the bleed open."""
-        self.output, self.pump_fraction = output, output.pump_fraction
+        self.output = output
+        self.pump_fraction = output.pump_fraction
         self.vent_fraction = self.loop_config.bleed_fraction
 
     def keep_flowing(self) -> None:
@@ -155,7 +156,8 @@ def apply_command(context: TickContext, command: commands.Command, state: teleme
         case "hold":
             context.hold_wanted = True
         case "manual":
-            context.manual_wanted, context.manual_um_per_s = True, command.value
+            context.manual_wanted = True
+            context.manual_um_per_s = command.value
             context.manual_since_s = context.now_s
         case "pause" | "resume":
             context.paused = command.kind == "pause"

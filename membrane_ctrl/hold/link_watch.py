@@ -110,7 +110,8 @@ class FailureCounter:
             self._repeat_s = min(2 * self._repeat_s, _LAST_REPEAT_S)
             self._messages.clear()
         self._messages.add(message)
-        self._standing, self._reported_s = True, now_s
+        self._standing = True
+        self._reported_s = now_s
         self._count_and_report(message, works=False)
 
     def note_success(self, now_s: float) -> None:
@@ -119,7 +120,8 @@ class FailureCounter:
             return
         if self._standing:
             self._count_and_report("answers again", works=True)
-        self._standing, self._unreported = False, 0
+        self._standing = False
+        self._unreported = 0
         self._repeat_s = _FIRST_REPEAT_S
         self._messages.clear()
 

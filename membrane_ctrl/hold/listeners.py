@@ -49,13 +49,11 @@ class FaultLatch:
         utc: Callable[[float], datetime],
         report: Callable[[events.Event], None],
     ) -> None:
-        self._file, self._resumes, self._run, self._utc, self._report = (
-            file,
-            resumes,
-            run,
-            utc,
-            report,
-        )
+        self._file = file
+        self._resumes = resumes
+        self._run = run
+        self._utc = utc
+        self._report = report
         # one thread, so that a fault and its acknowledgement stay in order; started by the first
         # fault
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
@@ -182,7 +180,8 @@ class SystemdNotify:
         if row.mono_s < self._next_s and row.state == self._state:
             return
         ready = "READY=1\n" if math.isinf(self._next_s) else ""
-        self._next_s, self._state = row.mono_s + _NOTIFY_S, row.state
+        self._next_s = row.mono_s + _NOTIFY_S
+        self._state = row.state
         error = (
             f", {row.format_labelled('error_um', sign=True)}" if math.isfinite(row.error_um) else ""
         )

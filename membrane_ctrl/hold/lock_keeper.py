@@ -59,7 +59,9 @@ class LockKeeper:
         report: Callable[[events.Event], None],
         send_command: Callable[[Command], None] = lambda command: None,
     ) -> None:
-        self._storage, self._report, self._send_command = storage, report, send_command
+        self._storage = storage
+        self._report = report
+        self._send_command = send_command
         # one thread, so that a lock and its removal stay in order
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="locks")
         self._files: dict[str, Path | None] = {}  # by word; of the disk thread after the start

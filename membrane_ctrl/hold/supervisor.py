@@ -231,7 +231,8 @@ class Supervisor:
         except LinkError as error:  # e.g. the device answers, but another program holds it
             self._link_failed(error)
             return
-        self._link_up, self._link_error = True, ""
+        self._link_up = True
+        self._link_error = ""
         self._link_failures.note_connection()
 
     async def _clear_board(self, mask: int) -> None:

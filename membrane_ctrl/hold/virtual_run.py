@@ -89,7 +89,8 @@ class VirtualRun:
     ) -> None:
         self._bench = bench
         self._rings = rings or {}
-        self._shape, self._alter = shape, alter
+        self._shape = shape
+        self._alter = alter
         track = config.shape.mode == "track"
         self._shape_period_s = 1 / config.shape.track_rate_hz if track else config.shape.period_s
         self._shape_due_s = 0.0
@@ -185,7 +186,8 @@ class _AtOnce:
         bench: virtual_bench.VirtualBench,
         altered: Callable[[roles.BenchReading], roles.BenchReading],
     ) -> None:
-        self._bench, self._altered = bench, altered
+        self._bench = bench
+        self._altered = altered
 
     async def open(self) -> roles.BenchIdentity:
         return self._bench.open()

@@ -85,10 +85,16 @@ class Event:
         urgent: bool = False,
     ) -> None:
         dataclass(frozen=True)(cls)
-        cls.line_kind, cls._template, cls._level = kind, sentence, level
-        cls.opens, cls.closes, cls._subject = opens, closes, subject
-        cls._severity, cls._delay_s = severity, delay_s
-        cls._notable, cls.urgent = notable, urgent
+        cls.line_kind = kind
+        cls._template = sentence
+        cls._level = level
+        cls.opens = opens
+        cls.closes = closes
+        cls._subject = subject
+        cls._severity = severity
+        cls._delay_s = delay_s
+        cls._notable = notable
+        cls.urgent = urgent
         cls.keys = tuple((field, field.name.rstrip("_")) for field in fields(cls))
         if kind:
             KINDS[kind] = cls

@@ -20,7 +20,9 @@ class CommandProcess:
 
     def __init__(self, name: str, arguments: Sequence[str], log: Path, nice: int) -> None:
         self.name = name
-        self._arguments, self._log, self._nice = arguments, log, nice
+        self._arguments = arguments
+        self._log = log
+        self._nice = nice
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:

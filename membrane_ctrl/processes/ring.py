@@ -63,7 +63,9 @@ class Ring:
         self.address = RingAddress(self._memory.name, slots, slot_bytes)
         assert self._memory.buf is not None  # None only after close()
         with self._memory.buf[:_HEADER_BYTES].cast("Q") as words:
-            words[_IS_RING], words[_SLOTS], words[_SLOT_BYTES] = _MAGIC, slots, slot_bytes
+            words[_IS_RING] = _MAGIC
+            words[_SLOTS] = slots
+            words[_SLOT_BYTES] = slot_bytes
 
     def close(self) -> None:
         """Free the memory; attached readers keep theirs."""
@@ -77,7 +79,8 @@ class _Slots:
     def __init__(self, memory: SharedMemory | mmap, address: RingAddress) -> None:
         whole = memoryview(memory) if isinstance(memory, mmap) else memory.buf
         assert whole is not None  # None only after close()
-        self._memory, self._views = memory, [whole]
+        self._memory = memory
+        self._views = [whole]
         size_bytes = address.size_bytes
         if whole.nbytes < size_bytes:
             raise RingError(
@@ -86,7 +89,8 @@ class _Slots:
         self.bytes = whole[:size_bytes]
         self.words = self.bytes.cast("Q")
         self._views[:0] = self.words, self.bytes
-        self.count, self._stride = address.slots, _slot_stride(address.slot_bytes)
+        self.count = address.slots
+        self._stride = _slot_stride(address.slot_bytes)
         head = [self.words[word] for word in (_IS_RING, _SLOTS, _SLOT_BYTES)]
         if head != [_MAGIC, address.slots, address.slot_bytes]:
             raise RingError(f"{address.name}: not the expected ring of {address.slots} slots")

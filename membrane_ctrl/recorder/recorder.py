@@ -92,7 +92,8 @@ class Recorder:
             run_dir, clock, config.recording, self._errors
         )
         self._rerun = rerun_output.RerunOutput(recording, config, self._errors, self._summary_page)
-        self._rerun.shapes.reference, self._rerun.state = before.reference, before.state
+        self._rerun.shapes.reference = before.reference
+        self._rerun.state = before.state
         self._events_file = events_file.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
         self._summary = before.summary
@@ -158,7 +159,9 @@ class Recorder:
         self._errors.run_guarded("new run folder", lambda: self._see_folder(now_s))
         batch = self._assembler.add_messages(self._messages)
         rows, shapes, new_events = batch.rows, self._shapes, self._events
-        self._messages, self._shapes, self._events = [], [], []
+        self._messages = []
+        self._shapes = []
+        self._events = []
         self.urgent = False
         guarded = self._errors.run_guarded
         guarded("summary", lambda: self._summary.add_rows(rows))

@@ -108,8 +108,10 @@ class ShapeStreams:
             self.reference is None
             or self.reference.time_s < self._reference_from_s <= estimate.time_s
         ):
-            self.reference, self._next_difference_s = estimate, -math.inf
-            self._next_map_s, self._scatter = -math.inf, shapes.Scatter()
+            self.reference = estimate
+            self._next_difference_s = -math.inf
+            self._next_map_s = -math.inf
+            self._scatter = shapes.Scatter()
         self._scatter.add(estimate.coeffs_um)
         self._recording.send_scalars(streams.ZERNIKE.path, time_s, estimate.coeffs_um[np.newaxis])
         for stream, (values, variances) in _make_change_scalars(estimate, self.reference).items():

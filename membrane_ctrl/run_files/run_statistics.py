@@ -124,7 +124,9 @@ class SecondMeans(StateNode):
         starts = np.flatnonzero(np.diff(second, prepend=np.nan))
         counts = np.add.reduceat(np.append(self.count, np.ones(second.size - 1)), starts)
         sums = np.add.reduceat(np.append(self.sum, values[there]), starts)
-        self.second, self.count, self.sum = float(second[-1]), float(counts[-1]), float(sums[-1])
+        self.second = float(second[-1])
+        self.count = float(counts[-1])
+        self.sum = float(sums[-1])
         self._add_sums(counts[:-1], sums[:-1])
 
     def _add_sums(self, counts: Column, sums: Column) -> None:
@@ -133,10 +135,8 @@ class SecondMeans(StateNode):
         self.means.add(means)
         self.inside += int((np.abs(means) <= self.band).sum())
         if means.size:
-            self.first, self.last = (
-                float(means[0]) if math.isnan(self.first) else self.first,
-                float(means[-1]),
-            )
+            self.first = float(means[0]) if math.isnan(self.first) else self.first
+            self.last = float(means[-1])
 
     def result(self) -> dict[str, float]:
         """Number of seconds; mean, standard deviation, first and last of their means; share within

@@ -96,7 +96,8 @@ class LiveHold:
         self, client: PortClient, run_dir: str | Path, take_over: bool = False, session: str = ""
     ) -> None:
         run_dir = Path(run_dir)
-        self._client, self._take_over = client, take_over
+        self._client = client
+        self._take_over = take_over
         if client.greeting["run"] != run_dir.resolve().name:
             raise errors.InputError(f"{run_dir}: is not running; {client.greeting['run']} is")
         answer = client.status()
@@ -104,7 +105,8 @@ class LiveHold:
         pump = _read_settings(schema.PumpConfig, answer, "pump")
         config = toml_file.load_toml(run_dir / "config.toml", schema.Config)
         self.config = config.model_copy(update={"loop": loop, "pump": pump})
-        self.name, self.run_dir = run_dir.name, run_dir
+        self.name = run_dir.name
+        self.run_dir = run_dir
         if session:
             self._claim_command(session)
         try:

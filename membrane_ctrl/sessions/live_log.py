@@ -36,7 +36,8 @@ class LiveLog:
     def __init__(
         self, session: Path, rate_hz: float, report_failure: Callable[[str], None]
     ) -> None:
-        self._path, self._report_failure = files.resolve_user_path(session / NAME), report_failure
+        self._path = files.resolve_user_path(session / NAME)
+        self._report_failure = report_failure
         self._ticks_a_point = max(1, round(EVERY_S * rate_hz))
         self._every_s = self._ticks_a_point / rate_hz
         self._rows: list[telemetry.TelemetryRow] = []

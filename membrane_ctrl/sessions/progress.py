@@ -22,14 +22,18 @@ class Progress:
     def __init__(self) -> None:
         self.log: LiveLog | None = None  # of the session, once it is known
         self._live = sys.stderr.isatty()
-        self._step, self._planned_s, self._after_s = "", 0.0, 0.0
+        self._step = ""
+        self._planned_s = 0.0
+        self._after_s = 0.0
         self._done_s = self._shown_s = 0.0
         self._asking = False
         self.interrupted = False
 
     def begin_step(self, step: str, planned_s: float, after_s: float) -> None:
         """Start a step with its planned duration, and that of the later steps."""
-        self._step, self._planned_s, self._after_s = step, planned_s, after_s
+        self._step = step
+        self._planned_s = planned_s
+        self._after_s = after_s
         self._done_s = self._shown_s = 0.0
         self._print_text(f"{step}" + (f": about {_format_clock(planned_s)}" if planned_s else ""))
         self.log_entry("step", step, planned_s=planned_s, after_s=after_s)

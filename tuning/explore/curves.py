@@ -238,7 +238,9 @@ class _Setpoint:
     """The setpoint behind its weight b: (1 + b Ti s) / (1 + Ti s), as the hold shapes it."""
 
     def __init__(self, loop: LoopConfig, ti_s: float, dt_s: float) -> None:
-        self._weight, self._slow, self._share = loop.setpoint_weight, 0.0, -math.expm1(-dt_s / ti_s)
+        self._weight = loop.setpoint_weight
+        self._slow = 0.0
+        self._share = -math.expm1(-dt_s / ti_s)
 
     def at(self, setpoint_um: float) -> float:
         self._slow += self._share * (setpoint_um - self._slow)

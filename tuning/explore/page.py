@@ -77,7 +77,8 @@ class Page:
     """
 
     def __init__(self, of: Workpiece, save: Save | None) -> None:
-        self._of, self._save = of, save
+        self._of = of
+        self._save = save
         self._dt_s = of.weather.rest.dt_s
         self._fixed = {"present": closed_loop.Gains.of(of.loop)}
         if of.proposed is not None:
@@ -186,7 +187,8 @@ class Page:
             return
         at = Sliders.near(gains, self._of.model, self._dt_s)
         self._moving = True
-        self._speed.value, self._damping.value = math.log10(at.closed_loop_s), at.damping
+        self._speed.value = math.log10(at.closed_loop_s)
+        self._damping.value = at.damping
         self._filter.value = _filter_place(at.filter_s)
         self._moving = False
         self._show(gains)

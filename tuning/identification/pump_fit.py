@@ -141,7 +141,8 @@ class _Mirror:
     """
 
     def __init__(self, blocks: Sequence[_Blocks], levels: int) -> None:
-        self._blocks, self._levels = blocks, levels
+        self._blocks = blocks
+        self._levels = levels
         self._has_pressure = all(np.isfinite(block.pressure_pa).all() for block in blocks)
         bends = np.hstack([np.diff(block.displacement_um, 2) for block in blocks])
         self._noise_um = float(np.median(np.abs(bends))) / 0.6745 / math.sqrt(6)

@@ -18,7 +18,8 @@ class DrivenCentre:
     def __init__(
         self, model: plant_model.PlantModel, pump: PumpConfig, flow_um_per_s: float, dt_s: float
     ) -> None:
-        self._model, self._pump = model, pump
+        self._model = model
+        self._pump = pump
         self._curve = pump_curve.make_branch(pump, pump.curve_um_per_s)
         self._step_s = dt_s / _SUBSTEPS
         self._tube = deque([flow_um_per_s] * (1 + round(model.dead_time_s / self._step_s)))

@@ -34,7 +34,8 @@ class ModelBench:
         seed: int,
         leak_step: tuple[float, float] = (math.inf, 0.0),
     ) -> None:
-        self._model, self._disturbance = model, disturbance
+        self._model = model
+        self._disturbance = disturbance
         self._leak_step = leak_step
         self._rng = np.random.default_rng(seed)
         self._dt_s = disturbance.rest.dt_s

@@ -25,7 +25,8 @@ class Rig:
         self, bench: DrivenBench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float
     ) -> None:
         self._bench = bench
-        self._config, self._pump = loop, pump
+        self._config = loop
+        self._pump = pump
         self._loop = inner_loop.InnerLoop(loop, pump)
         self.dt_s = 1 / loop.rate_hz
         fraction = (

@@ -35,7 +35,9 @@ class HoldRig:
     """
 
     def __init__(self, link: HoldLink, who: str, progress: Progress = lambda seconds: None) -> None:
-        self._link, self._who, self._progress = link, who, progress
+        self._link = link
+        self._who = who
+        self._progress = progress
         self.seen: Callable[[telemetry.TelemetryRow], None] = lambda row: None  # each recorded tick
         self._rows: deque[telemetry.TelemetryRow] = deque()
         self._events: deque[events.Event] = deque()
@@ -116,7 +118,8 @@ class HoldRig:
             "gains", self._who, why, trial_s, loop=loop, shape_time_constant_s=shape_s, pump=pump
         )
         self._link.send_command(replace(end, setpoint_step_um=setpoint_step_um))
-        self.loop, self.pump = loop, pump or self.pump
+        self.loop = loop
+        self.pump = pump or self.pump
 
     def keep(self) -> None:
         """Keep the gains that are on trial."""

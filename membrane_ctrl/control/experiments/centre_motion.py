@@ -33,7 +33,8 @@ class CentreMotion:
         self, stretch: float = 1.0, late_s: float = USUAL_LATE_S, memory: MotionState | None = None
     ) -> None:
         self.memory = memory or MotionState()
-        self._fast_s, self._slow_s = stretch * FAST_S, stretch * SLOW_S
+        self._fast_s = stretch * FAST_S
+        self._slow_s = stretch * SLOW_S
         # from a reading to its effect: the filter is late as well
         self.coast_s = min(max(late_s, USUAL_LATE_S), _LATE_MOST_S) + self._fast_s
 

@@ -57,7 +57,8 @@ class ExcursionGuard:
     ) -> None:
         self.memory = memory or GuardState()
         self._experiment = experiment
-        self._around, self._raw = around, raw
+        self._around = around
+        self._raw = raw
         self._motion = CentreMotion(around.stretch, around.late_s, self.memory.motion)
         self._centre_um = centre_um
         in_hand_um = (

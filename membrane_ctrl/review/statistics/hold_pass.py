@@ -92,7 +92,8 @@ class _Collector:
         self._reading = np.full(size, np.nan, dtype=np.float32)
         self._true = np.full(size, np.nan, dtype=np.float32)
         self._seconds = window_means.SecondSums(2), window_means.SecondSums(2)
-        self._raw_reading, self._raw_true = run_statistics.Moments(), run_statistics.Moments()
+        self._raw_reading = run_statistics.Moments()
+        self._raw_true = run_statistics.Moments()
         reach_um = _HISTOGRAM_BANDS * self._band_um
         self._edges_um = np.linspace(-reach_um, reach_um, _HISTOGRAM_BINS + 1)
         self._histogram = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)

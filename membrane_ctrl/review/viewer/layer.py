@@ -121,7 +121,8 @@ class Layer:
             Requested part: shown tick by tick unless too long; logs and maps hold only this part,
             as otherwise a cursor at the end of the recording would show those of the end.
         """
-        self._prefix, self._shift_s = prefix_of(label), zero_s
+        self._prefix = prefix_of(label)
+        self._shift_s = zero_s
         self._label = f"{label}: " if label else ""
         self._number += 1
         self._origin = np.datetime64(run.origin_utc.replace(tzinfo=None), "ns")

@@ -88,7 +88,8 @@ class LiveView:
         )
         state = load_state(run.folder)
         if state is not None:
-            self._output.shapes.reference, self._output.state = state.reference, state.state
+            self._output.shapes.reference = state.reference
+            self._output.state = state.state
         self._summary = run.summary or {}
         self._now_s = _open_newest(run.folder, table_specs.TICKS.time_name, table_specs.TICKS)
         after_s = self._now_s - RECENT_S

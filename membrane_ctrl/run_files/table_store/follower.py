@@ -54,7 +54,9 @@ class TableFollower:
         found = map(spec.file_number, self._folder.glob(f"*{spec.JOURNAL_SUFFIX}"))
         for number in sorted(n for n in found if n is not None and n >= self._number):
             if number > self._number:
-                self._number, self._place, self._is_ours = number, 0, False
+                self._number = number
+                self._place = 0
+                self._is_ours = False
             yield from self._read_frames(spec.journal_path(self._folder, number))
 
     def _read_frames(self, path: Path) -> Iterator[pa.Table]:
