@@ -85,7 +85,7 @@ class InnerLoopState(StateNode):
     curve: pump_curve.PumpCurveState = field(default_factory=pump_curve.PumpCurveState)
     drift: pump_drift.PumpDriftState = field(default_factory=pump_drift.PumpDriftState)
     leak: leak_estimate.LeakEstimate = field(default_factory=leak_estimate.LeakEstimate)
-    learned: bool = False  # the last tick has ended a segment that told something of the pump
+    learned: bool = False  # the last tick has ended a segment of the probe
 
 
 class InnerLoop:
@@ -127,7 +127,7 @@ class InnerLoop:
 
     @property
     def learned(self) -> bool:
-        """Whether the last tick has ended a segment that told something of the pump."""
+        """Whether the last tick has ended a segment of the probe."""
         return self.memory.learned
 
     @property
@@ -170,11 +170,13 @@ class InnerLoop:
     def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """Run one automatic tick, on the estimate if there is one; `dt_s` must exceed 0.
 
-        Without either, the reading counts as missing (`step_without_reading`).
+        Without either, the reading counts as missing (`step_without_reading`). Source:
+        docs/explanation/control.md, eq. 2; with an estimate docs/explanation/estimator.md, eq. 2.
         """
         self.memory.learned = False
         if given.estimate is None and not math.isfinite(given.displacement_um):
             return self.step_without_reading(given, dt_s)
+        # 1. The wanted flow: the terms of the controller, the known disturbances, the ramp's speed
         weather_um_per_s = self._feedforward.update(
             given.ambient_pressure_pa, given.air_temperature_c, dt_s
         )
@@ -186,16 +188,19 @@ class InnerLoop:
             known_um_per_s = given.estimate.drift_um_per_s - given.estimate.leak_um_per_s
         filtered_um = self.memory.measured.value
         wanted_um_per_s = terms.sum_um_per_s + known_um_per_s + ramp_um_per_s
+        # 2. The probe of the pump, at a setpoint that rests
         probing = (
             self.may_probe
             and self._probe_um > 0.0
             and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
         )
         probe_um_per_s = self._drift.flow_um_per_s(self._probe_um) if probing else 0.0
+        # 3. The limits, from which the integrator is back-calculated; then the pump's command
         limited_um_per_s = self._limiter.limit(wanted_um_per_s + probe_um_per_s, dt_s)
         if given.estimate is None:
             self._pid.integrate(dt_s)
         fraction = self._pump_command(limited_um_per_s, dt_s)
+        # 4. What this tick shows of the pump and of the leak
         if probing and math.isfinite(given.displacement_um):
             self.memory.learned = self._drift.step(
                 given.displacement_um, self._curve.flow(fraction), dt_s
@@ -338,16 +343,7 @@ class InnerLoop:
 
     def set_pump_lag(self, estimator: EstimatorConfig) -> None:
         """Take the gains of the loop on the estimate from other settings."""
-        lag_s, tick_s = estimator.pump_lag_s, 1 / self._loop.rate_hz
-        # A faster loop drives a slow pump from limit to limit
-        own_s = max(1 / estimator.gain_per_s, lag_s / 3)
-        # Both poles of the loop, its own and the pump's or a faster one, by what a tick leaves
-        # (docs/explanation/estimator.md)
-        slow_per_s, fast_per_s = (
-            filters.lag_step_fraction(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s))
-        )
-        self._error_gain_per_s = lag_s * slow_per_s * fast_per_s if lag_s > 0 else slow_per_s
-        self._due_gain = (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
+        self._error_gain_per_s, self._due_gain = _place_poles(estimator, 1 / self._loop.rate_hz)
 
     def _filter_reading(self, displacement_um: float, dt_s: float) -> float:
         return self.memory.measured.update(displacement_um, dt_s, self._loop.measurement_filter_s)
@@ -364,8 +360,8 @@ class InnerLoop:
         self._drift.discard_segment()
 
     def set_pump(self, pump: PumpConfig) -> None:
-        """Take another curve of the pump: the mean flow becomes what
-        that says of the mean command.
+        """Take another curve of the pump; the mean command stays, and the mean flow becomes the
+        flow that the new curve has there.
         """
         mean_fraction = self._curve.fraction(self._pid.integral_um_per_s / self._drift.correction)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
@@ -381,7 +377,7 @@ class InnerLoop:
         self.memory.leak.skip_step()
 
     def _hold_setpoint_at(self, setpoint_um: float) -> None:
-        """Put everything that follows the setpoint to rest there."""
+        """Set everything that follows the setpoint to this value."""
         self.memory.setpoint_um = setpoint_um
         self.memory.shaped_um = setpoint_um
         self._weight.reset(setpoint_um)
@@ -415,7 +411,7 @@ class InnerLoop:
         fraction: float,
         filtered_um: float,
     ) -> LoopOutput:
-        """The outputs of the tick; flows in µm/s."""
+        """Return the outputs of the tick; flows in µm/s."""
         return LoopOutput(
             setpoint_um=self.memory.setpoint_um,
             filtered_um=filtered_um,
@@ -431,6 +427,29 @@ class InnerLoop:
             leak_um_per_s=self.memory.leak.leak_um_per_s,
             too_tight=self.memory.leak.too_tight,
         )
+
+
+def _place_poles(estimator: EstimatorConfig, tick_s: float) -> tuple[float, float]:
+    """Return the gains of the loop on the estimate, in 1/s and without unit.
+
+    They stand before the predicted error and before the flow that is due at the end of the dead
+    time (docs/explanation/estimator.md, eq. 2: p_1 p_2 L and (1 - p_1 L) (1 - p_2 L)).
+
+    Parameters
+    ----------
+    estimator : EstimatorConfig
+        Its wanted pole, 1/s, and the lag L of the pump, s.
+    tick_s : float
+        Between two ticks; (1 - exp(-p h)) / h stands for a pole p in ticks of h.
+    """
+    lag_s = estimator.pump_lag_s
+    # The loop's own pole; a faster one would drive a slow pump from limit to limit
+    own_s = max(1 / estimator.gain_per_s, lag_s / 3)
+    slow_per_s = filters.lag_step_fraction(tick_s, own_s) / tick_s
+    # The pump's pole, or the loop's own if that is faster
+    fast_per_s = filters.lag_step_fraction(tick_s, min(own_s, lag_s)) / tick_s
+    error_gain_per_s = lag_s * slow_per_s * fast_per_s if lag_s > 0 else slow_per_s
+    return error_gain_per_s, (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
 
 
 def _make_pid_gains(loop: LoopConfig) -> pid.PidGains:

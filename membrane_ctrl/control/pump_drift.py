@@ -1,22 +1,21 @@
 """The pump's flow relative to its configured curve, learned while the mirror is held. Pure.
 
-While a loop holds, weather and laser noise move the flow, and the flow moves the mirror. What such
-readings tell of the pump depends on the model of the noise, and may be wrong by a factor of two. A
-probe does not: a small sine on the flow whose sign alternates at random from segment to segment,
-independent of everything else. The centre is the integral of the flow, so at the probe's frequency
-w, with the flow that the loop really gave (its answer included),
+While a loop holds, weather and laser noise move the flow, and the flow moves the mirror. An
+estimate from such readings depends on the model of the noise, and may be wrong by a factor of two.
+A probe does not depend on it: a small sine on the flow whose sign alternates at random from segment
+to segment, independent of everything else. The centre is the integral of the flow, so at the
+probe's frequency w, with the flow that the loop really gave (its answer included),
 
-    Y = s U exp(-j w d) / (j w (1 + j w T)),    Y, U: correlations of centre and flow with the probe,
+    Y = s U exp(-j w d) / (j w (1 + j w T))                                                    (1)
 
-and s is the scale sought, whatever loop, weather and noise are. Doors and lifts do not know the
-signs. The delay d is assumed for an hour, then seen in the phase; the lag T is assumed: 0.15 s more
-of it read as 5 % less of s.
+Y, U: correlations of centre and flow with the probe. s is the scale sought, whatever loop, weather
+and noise are. Doors and lifts are independent of the signs. The delay d is assumed for an hour,
+then seen in the phase; the lag T is assumed: 0.15 s more of it read as 5 % less of s.
 
 s changes at a rate that wanders (without it the estimate trails a wearing pump by hours). The error
 bar comes from the scatter of the segments. An offset of the curve and the film's leak are a
-constant flow each and cannot be told
-apart: the leak that is reported is their sum.
-"""  # noqa: E501
+constant flow each and cannot be separated: the leak that is reported is their sum.
+"""
 
 import cmath
 import math
@@ -147,8 +146,19 @@ class PumpDrift:
         return used
 
     def _learn_segment(self, centre: complex, expected: complex) -> None:
-        """Compare a segment's motion with that expected of the configured curve."""
+        """Compare a segment's motion with that expected of the configured curve.
+
+        A Kalman filter of scale and rate; its reading is the motion along the usual phase.
+
+        Parameters
+        ----------
+        centre : complex
+            Correlation of the centre with the probe, Y in eq. 1.
+        expected : complex
+            The same for s = 1: U and the path.
+        """
         memory = self.memory
+        # 1. Means over the last hour: of the motion (its phase holds the true delay), and expected
         memory.count += 1
         share = 1 / min(memory.count, _SEGMENTS)
         memory.means += share * (np.array([centre, expected]) - memory.means)
@@ -157,6 +167,7 @@ class PumpDrift:
         size = abs(usual)
         if not size * abs(along):
             return
+        # 2. Innovation: this segment's motion along that phase, less the predicted one
         scale = memory.known.scale + memory.rate_per_s * SEGMENT_S
         off = (centre * along.conjugate()).real / abs(along) - scale * (
             expected * usual.conjugate()
@@ -164,8 +175,10 @@ class PumpDrift:
         if memory.count <= _LEARNED:
             memory.scatter += share * (off**2 - memory.scatter)
             return
+        # 3. A gust counts as much as the largest likely deviation
         most = _CLIP * math.sqrt(memory.scatter)
         off = min(max(off, -most), most)
+        # 4. Prediction of the covariance, gain, update
         spread = _PASSES @ memory.spread @ _PASSES.T + _WANDERS
         gain = spread[0] * size / (memory.scatter + spread[0, 0] * size**2)
         memory.spread = spread - np.outer(gain, spread[0]) * size
