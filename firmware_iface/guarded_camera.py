@@ -97,7 +97,7 @@ class GuardedCamera:
         close_driver(self.driver)
 
     def describe(self) -> dict[str, str]:
-        """For people: what the driver says."""
+        """For people: what the driver states."""
         found: dict[str, str] = call_driver(self._name, self.driver, "describe", returns=dict)
         return {"port": self._name, **found}
 

@@ -74,8 +74,8 @@ class CircuitPoller:
         self.problem = "not read yet"  # why there is no newer answer; empty if there is one
 
     async def start(self) -> None:
-        """Wait for the first answer, not longer than `first_s`, and go on in the background; again:
-        no effect.
+        """Wait for the first answer, not longer than `first_s`, and continue in the background;
+        again: no effect.
         """
         if self._task is not None and not self._task.done():
             return
@@ -135,7 +135,9 @@ class CircuitPoller:
             asked_s = self._clock()
             self._memory.take(await answer("interlock", source.closed_circuits()), asked_s)
         except roles.LinkWaitsError as error:
-            self.problem = self.problem or str(error)  # the failure that it waits after says more
+            self.problem = self.problem or str(
+                error
+            )  # the failure after which it waits states more
         except roles.LinkError as error:
             self.problem = str(error)
             if isinstance(error, roles.LinkDownError | roles.DeviceRefusedError):

@@ -96,7 +96,7 @@ class PatternScreen:
         close_driver(self._display)
 
     def describe(self) -> dict[str, str]:
-        """For people: what the display says, and the settle time."""
+        """For people: what the display states, and the settle time."""
         found: dict[str, str] = call_driver(self._name, self._display, "describe", returns=dict)
         return {"port": self._name, **found, "settle": f"{1000 * self.settle_s:.0f} ms"}
 

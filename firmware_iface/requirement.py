@@ -6,7 +6,7 @@ from firmware_iface.roles import LinkError
 
 
 class ConformanceError(Exception):
-    """A device or driver violated a requirement; the message says how."""
+    """A device or driver violated a requirement; the message states how."""
 
 
 def require(right: bool, problem: str) -> None:

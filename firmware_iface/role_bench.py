@@ -269,7 +269,7 @@ class RoleBench:
                     break
                 self._silent[role] = "another device than before answers; open the bench again"
             except roles.LinkWaitsError:
-                pass  # the failure that it waits after says more
+                pass  # the failure after which it waits states more
             except roles.LinkError as error:
                 self._silent[role] = str(error)
             await asyncio.sleep(_RETRY_S)

@@ -29,7 +29,7 @@ Pixels = Levels | NDArray[np.uint16]
 
 
 class LinkError(Exception):
-    """A device gave no valid answer. The message says what, where and what to do."""
+    """A device gave no valid answer. The message states what, where and what to do."""
 
 
 class LinkDownError(LinkError):
@@ -95,7 +95,7 @@ class BenchReading:
 
     `sample_counter` and `device_time_s` advance with every sample of the device, to reveal frozen
     values. Quantities the bench lacks are NaN. `displacement_quality` is 0 when good (else the
-    laser's error code). `foreign` tells which of claim and watchdog another program has changed
+    laser's error code). `foreign` shows which of claim and watchdog another program has changed
     (FOREIGN_ bits). Bit i of `interlocks_open` is set while the circuit of the configuration's
     interlock i is open, or its signal is lost.
     """

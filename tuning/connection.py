@@ -26,8 +26,8 @@ def open_on_hold(
     again: str = "resume it with `membrane-ctrl tune run --resume {}`",
     refusal: Callable[[Config], str] = lambda config: "",
 ) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
-    """Yield a session's folder and hold; restore the last good gains if it ends early, and say how
-    to go on.
+    """Yield a session's folder and hold; restore the last good gains if it ends early, and print
+    how to continue.
     """
     progress = Progress()
     with connect_to_hold(options, f"tune {options.name}") as link:

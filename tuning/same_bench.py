@@ -22,7 +22,7 @@ INDEPENDENT_KEYS = ("setpoint_um", "bleed_fraction", "probe_um", "change_max")
 
 
 def continue_on_hold(folder: SessionFolder, link: HoldLink) -> SessionFolder:
-    """The session, if it can go on with this hold, perhaps a later one than it began on.
+    """The session, if it can continue with this hold, perhaps a later one than it began on.
 
     Raises InputError if pump, loop or present gains are not those that its data are for.
     """

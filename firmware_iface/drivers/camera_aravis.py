@@ -206,7 +206,7 @@ class AravisCamera:
         call("arv_camera_get_sensor_size", camera, *map(ctypes.byref, sensor))
         if (found := (sensor[0].value, sensor[1].value)) != self._size:
             raise roles.DeviceRefusedError(
-                f"its sensor has {found[0]} x {found[1]} pixels, [optics.camera] says "
+                f"its sensor has {found[0]} x {found[1]} pixels, [optics.camera] states "
                 f"{self._size[0]} x {self._size[1]}"
             )
         call("arv_camera_set_pixel_format_from_string", camera, config.pixel_format.encode())

@@ -222,7 +222,7 @@ class FolderCamera:
             )
         if image.shape != self._size:
             raise roles.DeviceRefusedError(
-                f"camera: {path}: {image.shape[1]} x {image.shape[0]} pixels, [optics.camera] says "
-                f"{self._size[1]} x {self._size[0]}"
+                f"camera: {path}: {image.shape[1]} x {image.shape[0]} pixels, [optics.camera] "
+                f"states {self._size[1]} x {self._size[0]}"
             )
         return image  # type: ignore[return-value]  # OpenCV's stubs know only its general array

@@ -190,7 +190,7 @@ class ModbusValue:
         if not self._map.allows(value):
             low, high = self._map.limits
             raise LinkError(
-                f"{self._link.name}: register {self._map.address} says {value:g}, not "
+                f"{self._link.name}: register {self._map.address} reads {value:g}, not "
                 f"{low:g} .. {high:g}"
             )
         return value

@@ -197,7 +197,7 @@ class PumpBoard:
 
     def _find_foreign_settings(self, sensors: Mapping[str, float]) -> int:
         """Which of the board's claim and period differ from what this object set; a board without
-        claims cannot tell.
+        claims cannot show that.
         """
         if self._registers.map_version == 1:
             return 0

@@ -96,7 +96,7 @@ class PygameDisplay:
     def _must_be(self, name: str, found: tuple[int, int], wanted: tuple[int, int]) -> None:
         if tuple(found) != wanted:
             raise DeviceRefusedError(
-                f"{self._name}: {name} is {found[0]} x {found[1]}, [devices.screen] says "
+                f"{self._name}: {name} is {found[0]} x {found[1]}, [devices.screen] states "
                 f"{wanted[0]} x "
                 f"{wanted[1]}; set the panel's own resolution without scaling, or correct "
                 "the configuration"

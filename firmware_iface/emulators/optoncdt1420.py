@@ -64,7 +64,7 @@ class Optoncdt1420Emulator(LineDevice):
         super().detach()
 
     def attach(self, transmit: Transmit) -> None:
-        """The wire is plugged in; it goes on streaming if it was."""
+        """The wire is plugged in; a stream continues."""
         super().attach(transmit)
         if self._register["OUTPUT"] == "RS422":
             self._start_stream()

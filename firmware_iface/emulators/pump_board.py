@@ -183,9 +183,9 @@ class BoardState:
         """Stop a pump whose gauge is lost, and latch an open interlock.
 
         Judged with every sample and after every write, so that no command drives the pump even for
-        a moment. The gauge's age goes on while the fault is latched and when it is cleared: without
-        a new value the pump does not run again. An open circuit latches even if the pump is off: an
-        emergency stop must not be forgotten.
+        a moment. The gauge's age counts on while the fault is latched and when it is cleared:
+        without a new value the pump does not run again. An open circuit latches even if the pump is
+        off: an emergency stop must not be forgotten.
         """
         if not self._guards:
             return

@@ -84,7 +84,7 @@ def hold(
     ] = True,
     json: JsonOption = False,
 ) -> int:
-    """Hold the mirror until told to stop."""
+    """Hold the mirror until stopped."""
     settings = _started(_with_devices(config, devices, twin), from_flat)
     duration_s = None if duration is None else durations.parse_duration_s(duration)
     terminal.print_progress("loading the control program")

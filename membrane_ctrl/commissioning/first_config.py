@@ -17,7 +17,7 @@ from membrane_ctrl.instruments import bench
 from membrane_ctrl.model import errors
 
 _HEAD = """\
-# Configuration of membrane-ctrl. Omitted keys use their defaults; `membrane-ctrl config explain KEY` tells what a key
+# Configuration of membrane-ctrl. Omitted keys use their defaults; `membrane-ctrl config explain KEY` shows what a key
 # means, docs/reference/configuration.md lists them all, and `membrane-ctrl check {name}` checks this file and its devices.
 """  # noqa: E501
 _TWIN = "tcp://127.0.0.1:{port}"
@@ -26,7 +26,7 @@ TomlTable = dict[str, Any]
 
 
 def write_first_config(path: Path, twin: bool, ask: bool) -> int:
-    """Write the file: for the twin, from answers, or, with nobody to ask, for the twin with what is
+    """Write the file: for the twin, from answers, or, without a terminal, for the twin with what is
     connected.
 
     Raises InputError for a file that exists or cannot be written, and for answers that contradict

@@ -181,7 +181,7 @@ def _format_devices(devices: dict[str, str]) -> str:
 
 
 def _make_instrument_terms(role: str) -> dict[str, Any]:
-    """Return what the templates of an instrument say of its role."""
+    """Return what the templates of an instrument state of its role."""
     reads = roles.ROLES[role].reads
     words = _WORDS[reads]
     first, second = _EXAMPLES.get(reads, (21.5, 23.0))

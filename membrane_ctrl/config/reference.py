@@ -63,7 +63,7 @@ The configuration is one TOML file in UTF-8. Omitted keys use their defaults; mo
 
 An editor can complete and check keys. Write the schema beside the file with
 `membrane-ctrl config schema > membrane-ctrl.schema.json`, and make `#:schema ./membrane-ctrl.schema.json` the file's
-first line (taplo, or Even Better TOML in VS Code). The schema knows each key by itself; `check` also compares keys
+first line (taplo, or Even Better TOML in VS Code). The schema checks each key alone; `check` also compares keys
 with each other and with the devices.
 
 Relative file names start at the configuration's folder. Numbers have a decimal point. The default `none` means that
@@ -72,7 +72,7 @@ the key is absent."""  # noqa: E501
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key of a table, as text; `unit` is empty for what is no quantity, `advice` says when to
+    """A key of a table, as text; `unit` is empty for what is no quantity, `advice` states when to
     change it.
     """
 

@@ -4,9 +4,9 @@ Every field that holds a quantity ends in its unit. Values that no real bench co
 refused, so that a wrong unit (metres for millimetres) shows when the file is read and not at the
 mirror.
 
-The text below a key says what it means and, from its first imperative ("Change", "Leave", "Lower",
-"Raise", "Set"), when to change it. Everything that explains the configuration is made from these
-texts (`config/reference.py`).
+The text below a key states what it means and, from its first imperative ("Change", "Leave",
+"Lower", "Raise", "Set"), when to change it. Everything that explains the configuration is made from
+these texts (`config/reference.py`).
 """
 
 import math

@@ -70,7 +70,7 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
 
 
 def _describe_cause(message: str, text: str) -> str:
-    """Return the parser's message, with the usual cause for two that do not tell it."""
+    """Return the parser's message, with the usual cause for two that do not name it."""
     found = re.search(r"at line (\d+)", message)
     line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
     if number := re.search(r"=\s*([-+]?\d+),(\d+)\s*(#|$)", line):

@@ -1,1 +1,1 @@
-"""The loops: pure and clock-free, so that they run in a test, in a replay and in the twin alike."""
+"""The loops: pure and clock-free, so that a test, a replay and the twin run the same code."""

@@ -10,18 +10,17 @@ from membrane_ctrl.model.state_tree import StateNode
 
 @dataclass(slots=True)
 class CameraMountState(StateNode):
-    """Temperatures of the stand: the present one, and at the lock."""
+    """Temperatures of the mount: the present one, and at the lock."""
 
     mount_c: LowPass = field(default_factory=LowPass)
     locked_c: float = math.nan
 
 
 class CameraMountGrowth:
-    """The sag that the optics see too much because their stand has become warmer since the lock.
+    """Error of the measured sag by a camera mount that has become warmer since the lock.
 
-    Nothing on the bench sees it: laser and optics differ by the laser's mount, too, and a gauge's
-    zero drifts more. What is known of it comes from the air's temperature, which the stand follows
-    late.
+    No sensor shows it: laser and optics differ by the laser's mount, too, and a gauge's zero drifts
+    more. It is computed from the air's temperature, which the mount follows with a lag.
     """
 
     def __init__(self, config: EstimatorConfig, memory: CameraMountState | None = None) -> None:
@@ -43,7 +42,7 @@ class CameraMountGrowth:
 
     @property
     def warmed_k(self) -> float:
-        """By how much the stand is warmer than at the lock; 0 if unknown."""
+        """By how much the mount is warmer than at the lock; 0 if unknown."""
         locked_c = self.memory.locked_c
         return 0.0 if math.isnan(locked_c) else self.memory.mount_c.value - locked_c
 

@@ -5,11 +5,11 @@ Pure. docs/explanation/estimator.md derives it.
     centre  c = z + g_p p + g_T T_gas           z: the gas in the mirror, as height of the centre
     dz/dt   = q - leak                          q: the pump's flow, after dead time and lag
     dT_gas/dt = (T_air - T_gas) / T_g
-    laser   = c + mount      optics = c - stand      barometer = p      thermometer = T_air
+    laser   = c + mount      optics = c - zero       barometer = p      thermometer = T_air
 
-z, leak, p, T_air and mount are random walks; `stand` is what the optics' zero differs from the
-laser's at lock. A frame shows the centre of some time ago: the centre at each of the last ticks is
-a state of its own (a clone), so a late reading is exact, whenever it comes.
+z, leak, p, T_air and mount are random walks; `zero` is by how much the optics' zero differs from
+the laser's at lock. A frame shows the centre of some time ago: the centre at each of the last ticks
+is a state of its own (a clone), so a late reading is exact, whenever it comes.
 """
 
 import math
@@ -351,7 +351,7 @@ class CentreFilter:
     def _lock_figure(self) -> None:
         """Make the mean figure since lock the one to hold: its uncertainty becomes the laser's.
 
-        A change of coordinates: with e the error of `stand`, the centre becomes c - e, the mount's
+        A change of coordinates: with e the error of `zero`, the centre becomes c - e, the mount's
         displacement mount + e.
         """
         for matrix in (self.memory.p, self.memory.p.T):

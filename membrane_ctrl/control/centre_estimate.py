@@ -81,7 +81,7 @@ class CentreEstimate(StateNode):
     jumped_sensors: tuple[Sensor, ...] = ()
 
     def telemetry(self) -> dict[str, float]:
-        """What a telemetry row says of it."""
+        """Its columns of a telemetry row."""
         values = {
             f"{sensor.name.lower()}_innovation": view.innovation
             for sensor, view in zip(Sensor, self.sensors, strict=True)

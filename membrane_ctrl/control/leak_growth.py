@@ -24,7 +24,7 @@ CONTRADICTED_MOST = 1.25
 
 @dataclass(slots=True)
 class LeakGrowth(StateNode):
-    """Whether the film takes far more gas than it used to."""
+    """Whether the film takes far more gas than before."""
 
     usual: LowPass = field(default_factory=LowPass)
     flow: LowPass = field(default_factory=LowPass)

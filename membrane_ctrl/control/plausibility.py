@@ -28,7 +28,7 @@ REFERENCE_S = 120.0
 SLOW_REFERENCE_S = 600.0
 # Of the limit between laser and optics.
 SLOW_SHARE = 2.0
-# The gauge must be nearer to one of them by this factor to speak.
+# The gauge must be nearer to one of them by this factor to decide.
 CLEARER = 2.0
 # A laser without a reading for this long is not compared; its mean then begins with its next
 # reading.
@@ -197,7 +197,7 @@ class PlausibilityCheck:
 
     @property
     def judges(self) -> bool:
-        """Whether it would tell a moved laser from a moved film."""
+        """Whether it can distinguish a moved laser from a moved film."""
         return self.memory.fast.known
 
     @property

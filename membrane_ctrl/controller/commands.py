@@ -39,7 +39,7 @@ Role = Literal["read", "operate", "tune"]
 
 AT_START = "command line"  # sender of the first commands
 AT_END = "duration"  # sender of the last `stop`
-TRIAL_MAX_S = 7200.0  # nobody watches a trial for longer
+TRIAL_MAX_S = 7200.0  # a longer trial would be unattended
 MEMORY_MAX_S = 1e5  # of the shape loop, as in the configuration
 
 # People lock the mirror with `lock`; `latch` is the name of that command in the protocol, in the
@@ -86,7 +86,7 @@ class Command:
     # `latch`: the lock, with author, word and time; None: made of the other fields
     lock: Lock | None = None
     account: str = ""  # login of the sender; empty: none, or not proven
-    from_person: bool = True  # False: sent by a bridge, which speaks for nobody
+    from_person: bool = True  # False: sent by a bridge, which represents no person
 
 
 @dataclass(frozen=True, slots=True)

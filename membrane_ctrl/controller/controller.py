@@ -1,5 +1,5 @@
 """One tick of control: observe, judge, act. Without I/O and clock, so that a run, a replay and a
-test are alike.
+test run the same code.
 
 The order is fixed: the inputs become an observation; the safety table judges it; only then the
 state's handler runs, and an active safe level overrules its output. Every path through a tick ends
@@ -275,7 +275,7 @@ class Controller:
             if self._handle_command(command, obeyed, events):
                 obeyed.add(command.kind)
         if self._gains.is_overdue(context.now_s):
-            self._revert_gains("nobody kept them in time", events)
+            self._revert_gains("the trial expired before they were kept", events)
         context.loop.may_probe = not self._gains.on_trial
 
     def _handle_command(
@@ -548,7 +548,7 @@ class Controller:
         context.test_memory = None
 
     def _report_experiment(self, why: str, events: list[Event]) -> None:
-        """Report how the experiment ended: by itself, or because the state changed."""
+        """Report how the experiment ended: as planned, or because the state changed."""
         experiment = self._context.trial
         assert experiment is not None
         ended = self._context.trial_ended or Finished(ExperimentEnd.INTERRUPTED, why)

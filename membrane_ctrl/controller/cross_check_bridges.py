@@ -12,7 +12,7 @@ _REMEDIES = {
 
 
 def judge_bridges(config: Config, findings: ConfigFindings) -> None:
-    """Warn of bridges through which clients may act whom nobody knows."""
+    """Warn of bridges through which unidentified clients may act."""
     for bridge in bridge_accesses(config.bridges):
         acts = bridge.unknown and config.bridges.role != "read"
         findings.warn(

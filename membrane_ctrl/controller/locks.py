@@ -86,7 +86,8 @@ def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
     """Decide on an `unlock`.
 
     Without a word it removes the sender's own lock, if there is exactly one. With a word it removes
-    the lock of that word, whoever its author is. A bridge removes none: nobody has read the word.
+    the lock of that word, whoever its author is. A bridge removes none: no person has read the
+    word.
 
     Parameters
     ----------
@@ -123,7 +124,7 @@ def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
 
 
 def is_author(command: Command, lock: Lock) -> bool:
-    """Return whether the sender of a command has set a lock. Without a login nobody has.
+    """Return whether the sender of a command has set a lock. Without a login the answer is no.
 
     Parameters
     ----------

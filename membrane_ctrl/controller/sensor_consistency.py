@@ -239,7 +239,7 @@ class SensorConsistency:
         self._pump.set_pump(pump.change_max)
 
     def report_pump_curve(self, loop: inner_loop.InnerLoop) -> list[Event]:
-        """Events on what a segment of probing has told of the pump."""
+        """Return the events after a segment of the pump's probe."""
         report, warnings = self._pump.step(loop.pump_known)
         events: list[Event] = [_to_event(warning) for warning in warnings]
         if report:

@@ -15,7 +15,7 @@ from membrane_ctrl.model.state_tree import StateError, decode_state, encode_stat
 
 
 class UnknownSnapshotError(ValueError):
-    """The snapshot is damaged or of another layout; the message says which."""
+    """The snapshot is damaged or of another layout; the message states which."""
 
 
 def take_snapshot(controller: Controller) -> bytes:

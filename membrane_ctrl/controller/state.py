@@ -49,7 +49,7 @@ class ControllerState(StateNode):
     why_since_s: float = 0.0
     reported_shape: ReportedShape | None = None
     setpoint_back_um: float = math.nan  # after a trial that steps the setpoint
-    shape_back: bool = False  # likewise: the shape loop is on again
+    shape_back: bool = False  # the shape loop is on again
     safety: SafetyState = field(default_factory=SafetyState)
     levels: SafeLevelsState = field(default_factory=SafeLevelsState)
     resume: ResumeState = field(default_factory=ResumeState)

@@ -14,7 +14,7 @@ from membrane_ctrl.hold.virtual_run import Rings, TruthShape, VirtualRun, Virtua
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.sim import bench_events, plant, virtual_bench, virtual_interlocks
 
-_AFTERMATH_S = 60.0  # a run whose process stands still never ends by itself
+_AFTERMATH_S = 60.0  # a run whose process hangs never ends
 _EVENTS: dict[str, Callable[[ScenarioStep], bench_events.BenchEvent]] = {
     "ambient": lambda at: bench_events.AmbientChange(at.time_s, at.value, at.over_s),
     "air_temperature": lambda at: bench_events.AirTemperatureChange(at.time_s, at.value, at.over_s),

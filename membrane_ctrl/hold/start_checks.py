@@ -121,7 +121,7 @@ async def identify_board(
             "(docs/reference/registers.md)"
         )
         # the last controller was killed, and nothing else happened if no other fault is latched and
-        # nobody vented
+        # it was not vented
         vented = reading.vent_fraction > safe_levels.VENTED_FRACTION
         if (
             faults == safe_levels.WATCHDOG_MASK

@@ -162,7 +162,7 @@ class LockStore:
 
 
 def require_unlocked(store: LockStore, devices: Collection[str], remedy: str = "") -> None:
-    """Refuse to go on if a device is locked. Every command that can move gas calls this after it
+    """Refuse to continue if a device is locked. Every command that can move gas calls this after it
     has the devices.
 
     Parameters

@@ -58,7 +58,7 @@ class Capture(
 
 class Vibrations(Event, kind="vibrations", sentence="Vibrations of the mirror: {message}"):
     """The mirror's vibrations in a minute of tracked frames; a mode keeps its place, None where it
-    was not heard.
+    was not found.
     """
 
     frequency_hz: Any  # list of numbers and None

@@ -146,7 +146,7 @@ class TelemetryColumn:
     description : str
         What it is, as a phrase.
     plot : Plot
-        Where it is drawn, which also says to which group it belongs.
+        Where it is drawn, which also determines its group.
     entity : str
         Rerun entity. Columns that are known together share one: m scalars of one entity cost the
         writer and the viewer far less than m entities. Empty: not drawn, or a time axis.

@@ -22,7 +22,7 @@ _EMPTY: dict[object, object] = {str: "", int: 0, float: math.nan, bool: False}
 
 
 def parse_event(message: bytes) -> EventLine:
-    """The event in a ring message; anything but a JSON object becomes an event that says so."""
+    """The event in a ring message; anything but a JSON object becomes an `UnreadableEvent`."""
     try:
         event = json.loads(message)
     except (ValueError, RecursionError):

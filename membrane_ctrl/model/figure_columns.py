@@ -26,7 +26,7 @@ SAG_CHANGE = Plot("Sag change by camera and laser", Group.SHAPE)
 SLOPE_RESIDUAL = Plot("Slope residual", Group.SHAPE)
 FRINGE_QUALITY = Plot("Fringe quality", Group.SHAPE)
 MODULATION = Plot("Modulation of the fringes", Group.SHAPE)
-VIBRATIONS = Plot("Vibrations heard in each minute", Group.SHAPE)
+VIBRATIONS = Plot("Vibrations found in each minute", Group.SHAPE)
 LATENCY = Plot("Last frame to result", Group.TIMING)
 PUMP_CURVE = Plot("Pump against its curve", Group.PUMP)
 

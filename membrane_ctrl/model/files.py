@@ -52,7 +52,7 @@ def folder_handle(folder: Path) -> Iterator[int]:
 def open_plain(path: Path, follow: bool = False) -> BinaryIO:
     """A plain file, opened for reading; `follow` links of a path that the user named.
 
-    Raises OSError if it is missing, a link, in a linked folder, or no plain file; `strerror` says
+    Raises OSError if it is missing, a link, in a linked folder, or no plain file; `strerror` states
     which.
     """
     with contextlib.ExitStack() as stack:

@@ -1,7 +1,7 @@
 """Compiles loops with Numba, and stores the compiled code where a folder can be written.
 
 A container with a foreign user id, a read-only disk or a full one has no such folder. Then each
-start compiles, which takes up to a minute, and one note says so.
+start compiles, which takes up to a minute, and one note announces it.
 """
 
 import os

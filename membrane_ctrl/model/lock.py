@@ -17,7 +17,7 @@ class Lock:
     word: str  # names the lock; typing it removes another person's lock
     text: str  # why the mirror must not move
     author: str  # who set it, for people
-    # login of its author; empty: set without a login, so that nobody is its author
+    # login of its author; empty: set without a login, so that it has no author
     account: str = ""
     session: str = ""  # connection of its author
     set_utc: str = ""  # when, ISO 8601

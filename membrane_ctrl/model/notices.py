@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 Severity = Literal["warning", "critical"]
 
-# A condition that lasts shorter than this, as a fault for a few samples, wakes nobody.
+# A condition that lasts shorter than this, such as a fault for a few samples, raises no alarm.
 GLITCH_S = 5.0
 _SHORT_CHARACTERS = 300
 

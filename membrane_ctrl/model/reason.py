@@ -53,7 +53,7 @@ class Reason(StateNode):
         What decides whether it is another reason: a code, and what else distinguishes it, after
         points.
     text : str
-        For people, with numbers; empty if there is nothing to say.
+        For people, with numbers; may be empty.
     """
 
     code: str = ""

@@ -43,7 +43,7 @@ class Ended(
 
     @property
     def stands(self) -> bool:
-        """Whether it ended by itself, not because a person or its duration ended it."""
+        """Whether neither a person nor its duration ended it."""
         return self.exit not in _ENDED_WELL
 
 
@@ -87,7 +87,7 @@ class SensorLink(
     subject="role",
     delay_s=GLITCH_S,
 ):
-    """The link to a sensor with a line of its own failed or returned."""
+    """The link to a sensor on a separate line failed or returned."""
 
     role: str
     message: str

@@ -33,7 +33,7 @@ class CommandProcess:
             self._process = subprocess.Popen(
                 program, stdin=stdin, stdout=log, stderr=log, process_group=0
             )
-            # a child never gets more of the processor than whoever started it
+            # a child never gets a higher priority than the program that started it
             own_niceness = os.getpriority(os.PRIO_PROCESS, 0)
             niceness = max(own_niceness, self._nice)
             os.setpriority(os.PRIO_PROCESS, self._process.pid, niceness)

@@ -24,7 +24,7 @@ _RUN = "retention: "  # followed by the run that cannot be deleted
 
 
 class Housekeeping:
-    """Works once a second; `detail` says what to omit."""
+    """Works once a second; `detail` states what to omit."""
 
     def __init__(
         self, run_dir: Path, clock: RunClock, config: RecordingConfig, errors: RecorderErrors

@@ -46,7 +46,7 @@ class RunEntry:
     marks: int  # annotations
     kept: bool  # the folder has a file `.keep` and is never pruned
     geometry: str  # hash of the last one in use; empty without a camera
-    held_s: float = math.nan  # these are the parts of a run as `hold_parts.HoldParts` tells them
+    held_s: float = math.nan  # these are the parts of a run by `hold_parts.HoldParts`
     faults_s: float = math.nan
     paused_s: float = math.nan
     moving_s: float = math.nan
@@ -105,7 +105,7 @@ def require_folder(logs_dir: Path) -> None:
 
 
 def _entry_or_why(folder: Path) -> RunEntry:
-    """An entry; an unreadable folder gives a line that says so, not an error."""
+    """An entry; an unreadable folder gives a line that states it, not an error."""
     try:
         return read_entry(folder)
     except OSError as error:
@@ -189,7 +189,7 @@ def list_run_folders(logs_dir: Path) -> list[Path]:
 
 
 def may_be_run(folder: Path) -> bool:
-    """Whether a folder is a run, as far as can be told."""
+    """Whether a folder is a run, as far as can be seen."""
     try:
         return run_folder.is_run(folder)
     except OSError:  # unreadable: unknown whether it is a run

@@ -22,13 +22,13 @@ _RUN_MAX_S = 1e9  # thirty years
 class LoggedEvent:
     """A line of a run's events, and what it means."""
 
-    mono_s: float  # second of the run; 0 if the line does not say
+    mono_s: float  # second of the run; 0 if the line does not state it
     event: events.Event
     line: events.EventLine
 
 
 def parse_logged_line(line: events.EventLine) -> LoggedEvent:
-    """What a line means; a mark made while the run went on (`ctl
+    """What a line means; a mark made during the run (`ctl
     mark`) is recorded as a command.
     """
     event = event_lines.from_dict(line)

@@ -23,7 +23,7 @@ Columns = dict[str, Column]
 _StoredColumns = dict[str, Annotated[Column, ArrayShape((-1,))]]
 
 WINDOWS_S: tuple[float, ...] = (1.0, 10.0, 60.0)
-# Minimum, mean and maximum of these, and the codes, as the table of columns says.
+# Minimum, mean and maximum of these, and the codes, by the table of columns.
 SIGNALS: tuple[str, ...] = tuple(each.name for each in AGGREGATED)
 # Of these also the standard deviation of the ticks: that of a month follows from its windows.
 SPREAD_SIGNALS: tuple[str, ...] = ("error_um", TRUE_ERROR_COLUMN.name)
@@ -237,7 +237,7 @@ def _require_columns(rows: Columns, names: tuple[str, ...]) -> None:
 
 
 def _finished_count(time_s: Column, window_s: float, is_over: bool) -> int:
-    """Number of rows in finished windows: while the run goes on, those before the last window."""
+    """Number of rows in finished windows: during the run, those before the last window."""
     if is_over or not time_s.size:
         return time_s.size
     number = _window_numbers(time_s, window_s)

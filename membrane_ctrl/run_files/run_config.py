@@ -23,7 +23,7 @@ _NAMED_MAX = 20
 def keep_understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
     """Return a configuration without unknown keys and invalid values, and the names of those.
 
-    An unknown key says nothing about its neighbours: they keep their values.
+    An unknown key does not affect the others: they keep their values.
     """
     tables = _copy_value(tables)
     left_out: list[str] = []

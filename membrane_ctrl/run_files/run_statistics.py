@@ -16,7 +16,7 @@ _LOWEST, _HIGHEST = 1e-3, 1e5
 _BIN_RATIO = 1.02
 _LOG_RATIO = math.log(_BIN_RATIO)
 _BINS = math.ceil(math.log(_HIGHEST / _LOWEST) / _LOG_RATIO)
-# A window with fewer of its ticks than this says nothing of its length.
+# A window with fewer of its ticks than this does not represent its length.
 _LEAST_SHARE = 0.9
 
 

@@ -127,7 +127,7 @@ def _mean_of_finite(values: list[float]) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Progressed:
-    """What the log says so far."""
+    """The session's progress by its log so far."""
 
     step: str = ""  # the one that runs, or ran last
     planned_s: float = 0.0  # of the step

@@ -109,7 +109,7 @@ class Progress:
 
 
 def _has_typed_line(within_s: float) -> bool:
-    """Whether a line waits on the terminal, or its end; also if it cannot tell."""
+    """Whether a line waits on the terminal, or its end; also if that is unknown."""
     try:
         return bool(select.select([sys.stdin], [], [], within_s)[0])
     except (OSError, ValueError):  # not a file

@@ -193,7 +193,7 @@ def test_check_names_what_is_wrong_with_the_screen(
     path.write_text(dump_toml(CONFIG.model_copy(update={"devices": devices})))
     assert command(["check", str(path), "--json"]) == 4
     probes = {probe["role"]: probe for probe in json.loads(capsys.readouterr().out)["devices"]}
-    assert "is 420 x 300, [devices.screen] says 640 x 300" in probes["camera"]["problem"]
+    assert "is 420 x 300, [devices.screen] states 640 x 300" in probes["camera"]["problem"]
     path.write_text(dump_toml(CONFIG))
     assert command(["check", str(path), "--json"]) == 4  # there is no board
     probes = {probe["role"]: probe for probe in json.loads(capsys.readouterr().out)["devices"]}

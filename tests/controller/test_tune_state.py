@@ -275,7 +275,7 @@ def test_gains_on_trial_revert_after_their_time() -> None:
     held.go(10.0, gains(0.3, 12.0))
     assert kp_of(held) == pytest.approx(0.3, rel=0.02)
     held.go(8.0)
-    assert held.of("gains_reverted")[-1]["why"] == "nobody kept them in time"
+    assert held.of("gains_reverted")[-1]["why"] == "the trial expired before they were kept"
     assert kp_of(held) == pytest.approx(CONFIG.loop.kp_per_s, rel=0.02)
 
 
@@ -412,7 +412,7 @@ def test_a_curve_on_trial_rescales_the_flow_without_moving_the_mirror_and_revert
     assert mean_flow(held) == pytest.approx(2 * 1.24, rel=0.15)
     assert held.of("command")[-1]["loop"]["pump"]["flow_full_um_per_s"] == 10.6
     held.go(10.0)
-    assert held.of("gains_reverted")[-1]["why"] == "nobody kept them in time"
+    assert held.of("gains_reverted")[-1]["why"] == "the trial expired before they were kept"
     assert mean_flow(held) == pytest.approx(1.24, rel=0.15)
     assert held._run._supervisor._controller.pump_config == CONFIG.pump
     assert held.furthest_um(BEGIN_S) < 2.0

@@ -13,7 +13,7 @@ _COLUMNS_ELSEWHERE = 170  # of the table, if it is not shown on a terminal
 
 
 def require_answer(yes: bool, name: str) -> None:
-    """Raises InputError before anything moves if nobody could choose the gains, or the name is no
+    """Raises InputError before anything moves if no person can choose the gains, or the name is no
     candidate's.
     """
     if not (yes or name or sys.stdin.isatty()):

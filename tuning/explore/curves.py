@@ -41,7 +41,7 @@ class Workpiece:
     source: str  # where plant and weather come from, for the page
     model: plant_model.PlantModel
     weather: disturbance.DisturbanceModel
-    loop: LoopConfig  # in force when plant and weather were recorded
+    loop: LoopConfig  # in use when plant and weather were recorded
     proposed: closed_loop.Gains | None  # of the session
     session: folder.SessionFolder | None  # receives the gains that a person saves
 

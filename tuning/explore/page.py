@@ -70,9 +70,9 @@ Save = Callable[[closed_loop.Gains], str]
 
 
 class Page:
-    """One viewer's page; each has sliders of its own.
+    """One viewer's page; each has separate sliders.
 
-    `save` receives the gains that a person saves and returns what the page then says; None: there
+    `save` receives the gains that a person saves and returns what the page then shows; None: there
     is no session to save into.
     """
 
@@ -333,7 +333,7 @@ def _table(rows: list[list[str]]) -> str:
 
 
 def saver(of: Workpiece, author: str) -> Save | None:
-    """What the page's button does: put the gains into the session's design, or say why not. None
+    """What the page's button does: put the gains into the session's design, or return why not. None
     without a design.
     """
     opened = of.session

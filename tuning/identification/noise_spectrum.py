@@ -11,7 +11,7 @@ r: laser noise (µm^2 per sample), q_fast: a random walk (air pressure), q_slow:
 reaches the gas through the film, tau = 12 s (air temperature), s_i: movement of any other colour,
 for weather is no random walk at all frequencies and the standard deviation of a loop depends on
 those about its bandwidth. The tau_i stand in equal ratios; log s_i bends little from one to the
-next, so that the spectrum goes on as it was where noise hides it. The intensities maximise
+next, so that the spectrum continues where noise hides it. The intensities maximise
 Whittle's likelihood, sum of log S + I / S over the periodogram I of the tapered increments, times
 that prior.
 Source: Percival and Walden, Spectral Analysis for Univariate Time Series (2020), sections 6.3 and

@@ -17,7 +17,7 @@ _USEFUL_SHARE = 0.02  # standard error of a level, of the full flow; beyond it t
 _STUCK_LEAKS = 0.3
 _STUCK_UM_PER_S = 0.2
 _REACHES_LEAKS = 1.2
-_FEW_S = 300.0  # of experiments: fewer say nothing of the noise
+_FEW_S = 300.0  # of experiments: fewer do not show the noise
 # a pump that starts with more than the mirror loses, between two commands
 _STEP_LEAKS = 4.0
 _STEP_MOST = 0.105

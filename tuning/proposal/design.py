@@ -38,7 +38,7 @@ class Proposal:
 
 
 class RefusedError(Exception):
-    """The data do not support a proposal; the message says why and which experiment would help."""
+    """The data do not support a proposal; the message states why, and an experiment that helps."""
 
 
 def choose_feedforward(loop: LoopConfig, disturbance: DisturbanceModel) -> LoopConfig:

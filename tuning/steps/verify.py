@@ -83,7 +83,7 @@ def run_verify(
     if reason:
         try:
             rig.set_gains(before, f"verification failed: {reason}"[:250])
-        except live_hold.HoldError:  # the hold has gone, and takes them back by itself
+        except live_hold.HoldError:  # the hold has ended; with it the gains on trial
             raise live_hold.HoldError(reason) from None
     else:
         rig.keep()

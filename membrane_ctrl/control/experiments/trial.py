@@ -62,7 +62,7 @@ class Trial:
     """An experiment inside its guard.
 
     Raises ValueError if the pump has no room around the holding flow, or the noise fills the limit;
-    the message says what would help.
+    the message names what would help.
 
     Parameters
     ----------

@@ -156,7 +156,7 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
     for each in given:
         folder, inside = catalogue.resolve_run(each).resolve(), []
         if folder.is_dir() and not catalogue.may_be_run(folder):
-            with suppress(OSError):  # its line will tell
+            with suppress(OSError):  # its line will show it
                 inside = catalogue.list_run_folders(folder)
         found += inside or [folder]
     return list(dict.fromkeys(found))

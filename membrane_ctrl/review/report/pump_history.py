@@ -84,7 +84,7 @@ def pump_history(newest: Path) -> list[PumpSeen]:
 
 
 def _last_learned(log: Sequence[LoggedEvent]) -> tuple[events.PumpLearned, dict[str, Any]] | None:
-    """What a run told last of its pump, and the gains and curve then set."""
+    """The last event on a run's pump, and the gains and curve then set."""
     status, last = RunStatus(), None
     for each in log:
         status = status.after_event(each.event, each.mono_s)

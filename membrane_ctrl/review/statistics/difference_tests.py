@@ -66,7 +66,7 @@ def window_means(time_s: Column, values: Column, window_s: float) -> tuple[Colum
 
 
 def spread_p(a: Column, b: Column, window_s: float = 1.0) -> float:
-    """Chance of spreads as different between alike series (2, n) of times and values; NaN: too
+    """Chance of spreads as different between equal processes (2, n) of times and values; NaN: too
     short.
 
     Two tests, each of half the level. Within blocks: Welch's of log variances, which sees any

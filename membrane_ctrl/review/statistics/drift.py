@@ -68,7 +68,7 @@ def correlation_time(residual: Column) -> float:
 
 
 def correlation_times(residual: Column) -> tuple[float, float]:
-    """1 + 2 sum of the autocorrelation, and of its square, which tells of a variance; in samples,
+    """1 + 2 sum of the autocorrelation, and of its square, for a variance; in samples,
     at least 1.
     """
     size = residual.size

@@ -30,7 +30,7 @@ _AHEAD = 2.0  # longest look ahead over the time of the readings
 
 @dataclass(frozen=True)
 class FilmCreep:
-    """What the readings say of one film."""
+    """What the readings show of one film."""
 
     span_s: float  # from the first reading to the last
     per_decade: float  # of y, at the end, when the time since the load grows tenfold

@@ -42,7 +42,7 @@ def film_run_command(
         creep = fit_creep(time_s, np.log(stiffness), _DAY_S)
     except ValueError as error:
         raise errors.RejectedError(f"film: {error}") from None
-    # at the same pressure a softer film is deeper, as the law says
+    # at the same pressure a softer film is deeper by the law
     now = law.with_sag(sag_mm[np.argmax(time_s)])
     softer = FilmLaw(prestrain, poisson, math.exp(-1e-3), radius_mm).under(law.pressure_pa(now))
     um_per_log = -1e6 * float(softer.sag_mm - now.sag_mm)

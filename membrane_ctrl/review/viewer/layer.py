@@ -334,8 +334,8 @@ class Layer:
         )
 
     def _send_names(self, lines: Iterable[tuple[str, Colour]], width: float) -> dict[str, Any]:
-        """Names, colours and widths of the lines of an entity; those of overlaid runs tell the runs
-        apart.
+        """Names, colours and widths of the lines of an entity; those of overlaid runs distinguish
+        the runs apart.
         """
         names, colours = zip(*lines, strict=True)
         if self._prefix:

@@ -152,8 +152,8 @@ def _unpack_frame(frame: JournalFrame) -> pa.Buffer:
 
 
 def _is_compressed(message: memoryview) -> bool:
-    """Whether a record batch says that its buffers are compressed. Raises ValueError for a damaged
-    header.
+    """Whether a record batch states that its buffers are compressed. Raises ValueError for a
+    damaged header.
     """
     try:
         batch = _table_at(message, _field_place(message, _table_at(message, 0), _HEADER_FIELD))

@@ -38,7 +38,7 @@ _FAULTS = (pa.ArrowException, OSError, ValueError)
 
 
 class PartError(ValueError):
-    """A part that cannot be read at all; the message says why."""
+    """A part that cannot be read at all; the message states why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class PartReader:
 
     @property
     def first_row(self) -> int:
-        """Number of the first row in the table; 0 if the file does not say."""
+        """Number of the first row in the table; 0 if the file does not state it."""
         text = (self.schema.metadata or {}).get(FIRST_ROW, b"0")
         return int(text) if text.isdigit() and len(text) < 18 else 0
 

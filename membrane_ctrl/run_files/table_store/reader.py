@@ -197,7 +197,7 @@ class TableReader:
                     else:
                         yield group
         except FileNotFoundError:
-            return  # `note_missing` says so
+            return  # `note_missing` reports it
         except _FAULTS as error:
             self._note_damage(path, f"cannot be read ({_describe_reason(error)})")
 
