@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 
 CHANNELS = (
     "displacement_um",
@@ -122,7 +122,7 @@ def _interlock_mask(table: Mapping[str, Any]) -> int:
 
 def _read_scale(name: str, table: Mapping[str, Any]) -> bytes:
     _check_keys(f"channel.{name}.", table, _CHANNEL_KEYS)
-    counts_per_unit = default_map().register(name).counts_per_unit
+    counts_per_unit = load_default_map().register(name).counts_per_unit
     points = table.get("points", [[0, 0.0], [1, 1 / counts_per_unit]])
     low, high = table.get("plausible_raw", [-_I32_MAX, _I32_MAX])
     try:

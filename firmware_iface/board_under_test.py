@@ -26,7 +26,7 @@ class BoardUnderTest:
         self._link = link
         self._sleep = sleep
         self._registers: register_map.RegisterMap = (
-            register_map.default_map()
+            register_map.load_default_map()
         )  # of the board, once it has said its version
         # its own protections, from map version 3 on
         self._gauge_fitted = False
@@ -94,7 +94,7 @@ class BoardUnderTest:
         found = await self._read_sensors()
         value = found["pump_readback_fraction"]
         require(value == 0, f"holds the pump at {value:g} after {after}")
-        mask = self._registers.fault_mask("watchdog")
+        mask = self._registers.make_fault_mask("watchdog")
         require(found["watchdog_tripped"] == 1, f"does not report watchdog_tripped after {after}")
         require(
             bool(int(found["latched_faults"]) & mask),

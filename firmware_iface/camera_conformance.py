@@ -209,7 +209,7 @@ def check_lost_frame(bench: CameraBench) -> None:
         camera.expose()
         require_error(camera.fetch, roles.FrameLostError)
         scene = bench.change_scene()
-        _require_picture(_retake_frame(camera), scene, "the frame after a lost one")
+        _require_picture(_capture_again(camera), scene, "the frame after a lost one")
 
 
 def check_late_frame(bench: CameraBench) -> None:
@@ -222,7 +222,7 @@ def check_late_frame(bench: CameraBench) -> None:
         require_error(camera.fetch, roles.FrameLostError)
         for _ in range(_REPEATS):
             scene = bench.change_scene()
-            _require_picture(_retake_frame(camera), scene, "a frame after a late one")
+            _require_picture(_capture_again(camera), scene, "a frame after a late one")
 
 
 def check_frozen_camera(bench: CameraBench) -> None:
@@ -310,7 +310,7 @@ def _open_camera(bench: CameraBench) -> Iterator[GuardedCamera]:
         yield camera
 
 
-def _retake_frame(camera: GuardedCamera) -> roles.Frame:
+def _capture_again(camera: GuardedCamera) -> roles.Frame:
     camera.expose()
     return camera.fetch()
 

@@ -19,7 +19,7 @@ _HALF_RANGE = (0.40, 0.60)
 _LARGEST_BAND = 0.10
 
 
-def checkerboard_problem(seen: ArrayLike, white: ArrayLike, black: ArrayLike) -> str:
+def explain_checkerboard(seen: ArrayLike, white: ArrayLike, black: ArrayLike) -> str:
     """The problem and its remedy, from frames (H, W) of checkerboard, white and black; empty if
     none.
     """

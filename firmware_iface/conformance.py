@@ -170,12 +170,12 @@ class Conformance(board_under_test.BoardUnderTest):
         kind, version = await self._link.read_holding(self._registers.block("identity").address, 2)
         wanted = self._registers.device_kind
         require(kind == wanted, f"device kind is {kind}, expected {wanted}")
-        known = ", ".join(str(known) for known in register_map.known_maps())
+        known = ", ".join(str(known) for known in register_map.list_known_maps())
         require(
-            version in register_map.known_maps(),
+            version in register_map.list_known_maps(),
             f"map version is {version}, this test knows {known}",
         )
-        self._registers = register_map.known_maps()[version]
+        self._registers = register_map.list_known_maps()[version]
         found = await self._read_block(self._registers.block("identity"))
         require(found["gauge_pressure_limit_pa"] > 0, "gauge_pressure_limit_pa is not above 0")
         require(0 < found["pump_limit_fraction"] <= 1, "pump_limit_fraction is not within 0..1")
@@ -447,7 +447,7 @@ class Conformance(board_under_test.BoardUnderTest):
         await self._write_block("stop", {"stop": 1.0})
         await self._write_command(PUMP_FRACTION, 0.25)
         found = await self._read_sensors()
-        value, mask = found["pump_readback_fraction"], self._registers.fault_mask("stopped")
+        value, mask = found["pump_readback_fraction"], self._registers.make_fault_mask("stopped")
         require(value == 0, f"runs the pump at {value:g} after stop")
         require(abs(found["vent_readback_fraction"] - 0.25) < _NEAR, "moves the vent at stop")
         require(bool(int(found["latched_faults"]) & mask), "does not latch the fault `stopped`")
@@ -491,7 +491,7 @@ class Conformance(board_under_test.BoardUnderTest):
         found = await self._read_sensors()
         value = found["pump_readback_fraction"]
         require(value == 0, f"runs the pump at {value:g} after {after}")
-        latched = int(found["latched_faults"]) & self._registers.fault_mask(fault)
+        latched = int(found["latched_faults"]) & self._registers.make_fault_mask(fault)
         require(bool(latched), f"does not latch the fault `{fault}` after {after}")
         require(
             abs(found["vent_readback_fraction"] - 0.25) < _NEAR, f"moves the vent after {after}"

@@ -62,7 +62,7 @@ class ScreenRaster:
         return np.asarray(pixels * self.pixel_mm + self.half_side_mm, np.float64)
 
 
-def pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]:
+def compute_pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]:
     """Light (0..1) of every pixel, (height, width); dark outside the region.
 
     Raises ValueError for a role or Gray bit that is unknown.

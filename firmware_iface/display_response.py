@@ -30,7 +30,7 @@ class DisplayResponse:
         x, y = np.log(self.levels[middle] / 255.0), np.log(self.light[middle])
         return float(np.sum(x * y) / np.sum(x * x))
 
-    def levels_of(self, light: ArrayLike) -> NDArray[np.uint8]:
+    def find_levels(self, light: ArrayLike) -> NDArray[np.uint8]:
         """Levels that give this light (0..1), to the nearest of 256."""
         from scipy.interpolate import PchipInterpolator
 
@@ -40,12 +40,12 @@ class DisplayResponse:
         return np.asarray(np.rint(np.interp(wanted, curve, level)), np.uint8)
 
 
-def linear_response() -> DisplayResponse:
+def make_linear_response() -> DisplayResponse:
     """A display whose light is proportional to its level."""
     return DisplayResponse(np.array([0.0, 255.0]), np.array([0.0, 1.0]))
 
 
-def measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayResponse:
+def make_measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayResponse:
     """The response from a ramp: `levels` (K,) rising from 0 to 255, and `seen_adu` (K,),
     unsaturated.
 

@@ -10,7 +10,7 @@ _LEAST = 0.25  # below, noise and converter steps are three times larger than ne
 _LEAST_CONTRAST = 3.0
 
 
-def exposure_problem(white: Pixels, black: Pixels, full_scale_adu: int, exposure_ms: float) -> str:
+def explain_exposure(white: Pixels, black: Pixels, full_scale_adu: int, exposure_ms: float) -> str:
     """The problem and its remedy, from frames (H, W) of a white and a black screen;
     empty if none.
     """

@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from firmware_iface.register_map import I32_NO_VALUE, Block, Register, RegisterMap, default_map
+from firmware_iface.register_map import I32_NO_VALUE, Block, Register, RegisterMap, load_default_map
 
 _HERE = Path(__file__).resolve().parent
 HEADER_PATH = _HERE / "membrane_board.h"
@@ -190,7 +190,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--check", action="store_true", help="write nothing; exit with 1 when a file is out of date"
     )
     check = parser.parse_args(arguments).check
-    registers = default_map()
+    registers = load_default_map()
     stale = False
     files = {
         DOCS_PATH: make_markdown(registers),

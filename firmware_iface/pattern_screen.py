@@ -8,8 +8,8 @@ not when it is lit: `wait` lasts for the settle time, which `display_settling.py
 from collections.abc import Sequence
 from typing import Any
 
-from firmware_iface.display_patterns import ScreenRaster, pattern_light
-from firmware_iface.display_response import DisplayResponse, linear_response
+from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light
+from firmware_iface.display_response import DisplayResponse, make_linear_response
 from firmware_iface.driver_calls import call_driver, close_driver
 from firmware_iface.roles import DeviceIdentity, Display, DriverClock, Levels, LinkError, Pattern
 
@@ -33,7 +33,7 @@ class PatternScreen:
         name: str,
     ) -> None:
         self.settle_s = SETTLE_S
-        self.response = linear_response()
+        self.response = make_linear_response()
         self._display = display
         self._raster = raster
         self._patterns = patterns
@@ -56,7 +56,7 @@ class PatternScreen:
         self.response = response
         self._prepared = {
             pattern: self._call_display(
-                "prepare", response.levels_of(pattern_light(pattern, self._raster))
+                "prepare", response.find_levels(compute_pattern_light(pattern, self._raster))
             )
             for pattern in self._patterns
         }

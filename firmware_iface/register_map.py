@@ -161,7 +161,7 @@ class RegisterMap:
         """The register of that name. Raises KeyError."""
         return {register.name: register for register in self}[name]
 
-    def fault_mask(self, name: str) -> int:
+    def make_fault_mask(self, name: str) -> int:
         """The bit of the fault of that name, as a number. Raises KeyError."""
         return {fault.name: fault.mask for fault in self.faults}[name]
 
@@ -195,15 +195,15 @@ def make_block(name: str, access: str, meaning: str, registers: Sequence[Registe
 
 
 @cache
-def default_map() -> RegisterMap:
+def load_default_map() -> RegisterMap:
     """The map that comes with this package."""
     return load_map(DEFAULT_PATH)
 
 
 @cache
-def known_maps() -> dict[int, RegisterMap]:
+def list_known_maps() -> dict[int, RegisterMap]:
     """The maps by version: that of this package, and the earlier ones whose boards still run."""
-    newest = default_map()
+    newest = load_default_map()
     return {version: newest.of_version(version) for version in range(1, newest.map_version + 1)}
 
 

@@ -46,7 +46,7 @@ class Section(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _only_numbers_are_numbers(cls, table: Any) -> Any:
+    def _refuse_other_types(cls, table: Any) -> Any:
         """Refuse `true` and "1" for a number, 1 for a switch: pydantic takes them all for what they
         are not.
         """

@@ -8,7 +8,7 @@ from membrane_ctrl.model.errors import DeviceError, InputError, convert_write_er
 from membrane_ctrl.sessions.folder import (
     SessionFolder,
     create_session,
-    newest_session,
+    find_newest_session,
     open_session,
 )
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, live_hold
@@ -45,7 +45,7 @@ def open_on_hold(
                     yield folder, rig, progress
                 progress.log_entry("ended", "done")
             except BaseException as error:
-                _go_back(rig, progress)
+                _restore_gains(rig, progress)
                 progress.log_entry("ended", str(error) or "interrupted")
                 progress.print_line(again.format(folder.path))
                 if isinstance(error, HoldError):
@@ -53,7 +53,7 @@ def open_on_hold(
                 raise
 
 
-def _go_back(rig: HoldRig, progress: Progress) -> None:
+def _restore_gains(rig: HoldRig, progress: Progress) -> None:
     progress.interrupted = False
     try:
         rig.go_back()
@@ -82,7 +82,7 @@ def find_session(options: TuneOptions, link: HoldLink | None, fresh: bool = Fals
     """Return the named session, else the newest, or a new one if there is a hold to start it on."""
     if link is None:
         return (
-            newest_session(options.logs)
+            find_newest_session(options.logs)
             if options.session is None
             else open_session(options.session)
         )
@@ -91,7 +91,7 @@ def find_session(options: TuneOptions, link: HoldLink | None, fresh: bool = Fals
     begun: SessionFolder | None = None
     if not fresh:
         with contextlib.suppress(InputError):
-            begun = newest_session(options.logs)
+            begun = find_newest_session(options.logs)
     of = None if begun is None else (begun.head.source, begun.head.name)
     if begun is not None and of == (link.name, options.name) and not begun.is_done("verify"):
         return same_bench.continue_on_hold(begun, link)

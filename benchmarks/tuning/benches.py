@@ -31,7 +31,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.errors import CommandError
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.sessions.folder import newest_session
+from membrane_ctrl.sessions.folder import find_newest_session
 from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support.figures import Figure, at_least, at_most
 from tests.worlds import foreign_plant
@@ -254,7 +254,7 @@ def _options(config: Config, logs: Path, limit_um: float, short: bool = False) -
 
 
 def _kept(bench: DrawnBench, logs: Path, config: Config) -> dict[str, Any]:
-    folder = newest_session(logs)
+    folder = find_newest_session(logs)
     done = verify.load_verified(folder)
     gains = gains_file.load_gains(folder.file_path("gains.toml"))
     sigma = design.load_candidates(folder)[1].sigma

@@ -266,9 +266,9 @@ class AravisCamera:
             library.call("arv_stream_push_buffer", self._stream, buffer)
         library.call("arv_camera_start_acquisition", camera)
         self._sleep(_STREAM_READY_S)
-        self._throw_one_away()
+        self._discard_frame()
 
-    def _throw_one_away(self) -> None:
+    def _discard_frame(self) -> None:
         """The first frame after a start may be exposed up to 0.1 s after its trigger, with the next
         pattern lit.
         """

@@ -106,10 +106,10 @@ class GpioLines:
         return [f"line {circuit.line} {circuit.wiring}" for circuit in self._circuits]
 
     def _request_lines(self) -> Any:
-        settings = {circuit.line: self._line_settings(circuit) for circuit in self._circuits}
+        settings = {circuit.line: self._make_line_settings(circuit) for circuit in self._circuits}
         return self._gpiod.request_lines(self._chip, consumer=_CONSUMER, config=settings)
 
-    def _line_settings(self, circuit: GpioCircuit) -> Any:
+    def _make_line_settings(self, circuit: GpioCircuit) -> Any:
         """An input that is ACTIVE while the contact is closed."""
         line = self._gpiod.line
         to_ground = circuit.wiring == "to_ground"

@@ -232,7 +232,7 @@ class Optoncdt1420:
             values = self._take_batches()
             good = values[values <= _RAW_MAX]
             if len(good):
-                self._gate.passes(self._displacement_um(middle_mean(good)))
+                self._gate.passes(self._displacement_um(mean_of_middle(good)))
 
     async def displacement(self) -> roles.DisplacementSample:
         """Mean of the middle half of all values since the last call; waits for one when there is
@@ -262,7 +262,7 @@ class Optoncdt1420:
             return roles.DisplacementSample(
                 math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s
             )
-        raw = middle_mean(good)
+        raw = mean_of_middle(good)
         displacement_um = self._displacement_um(raw)
         if not self._gate.passes(displacement_um):
             raise roles.LinkError(
@@ -343,7 +343,7 @@ def _format_rate(value: str) -> str:
     return f"{float(rate[1]):g}" if rate else value
 
 
-def middle_mean(values: NDArray[np.int64]) -> float:
+def mean_of_middle(values: NDArray[np.int64]) -> float:
     """Mean of the middle half of values (n,), the median of a few."""
     if len(values) < _MIDDLE_MIN:
         return float(np.median(values))

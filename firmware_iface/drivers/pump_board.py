@@ -52,7 +52,7 @@ class PumpBoard:
         if link is None:
             link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)
         self._registers = (
-            register_map.default_map()
+            register_map.load_default_map()
         )  # of the board that answers, once its version is known
         period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
@@ -104,20 +104,20 @@ class PumpBoard:
 
     async def _identify(self) -> roles.BenchIdentity:
         # these two never move; the other registers are valid only if they match
-        identity = register_map.default_map().block("identity")
+        identity = register_map.load_default_map().block("identity")
         kind, version = await self._link.read_holding(identity.address, 2)
-        if kind != register_map.default_map().device_kind:
+        if kind != register_map.load_default_map().device_kind:
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: device kind {kind} is not a {_KIND} "
-                f"({register_map.default_map().device_kind})"
+                f"({register_map.load_default_map().device_kind})"
             )
-        if version not in register_map.known_maps():
-            known = ", ".join(str(known) for known in register_map.known_maps())
+        if version not in register_map.list_known_maps():
+            known = ", ".join(str(known) for known in register_map.list_known_maps())
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: register map version {version}, this program knows {known}; "
                 "update the firmware or the program"
             )
-        self._registers = register_map.known_maps()[version]
+        self._registers = register_map.list_known_maps()[version]
         found = await self._read_block(self._registers.block("identity"))
         firmware = int(found["firmware_version"])
         return roles.BenchIdentity(

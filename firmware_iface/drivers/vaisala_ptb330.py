@@ -82,7 +82,7 @@ class VaisalaPtb330(line_link.LineDriver):
         return identity
 
     async def _begin(self) -> roles.DeviceIdentity:
-        identity = await self._known_again()
+        identity = await self._accept_reading()
         if identity is None:
             identity = await self._identify()
             await self._apply_settings()
@@ -90,7 +90,7 @@ class VaisalaPtb330(line_link.LineDriver):
             await self._read_message()
         return identity
 
-    async def _known_again(self) -> roles.DeviceIdentity | None:
+    async def _accept_reading(self) -> roles.DeviceIdentity | None:
         """The known identity, if a message of the right form and serial number comes at once; this
         saves a second.
         """

@@ -58,33 +58,33 @@ def exception_pdu(pdu: bytes, code: int) -> bytes:
 def _answer_function(function_code: int, data: bytes, table: RegisterTable) -> bytes:
     if function_code == READ_HOLDING:
         address, count = struct.unpack(">HH", data)
-        return _words_read(table, address, count)
+        return _read_words(table, address, count)
     if function_code == WRITE_SINGLE:
         address, word = struct.unpack(">HH", data)
         table.write(address, [word])
         return data
     if function_code == WRITE_MULTIPLE:
-        address, words = _words_written(data, _WRITE_MAX)
+        address, words = _decode_written_words(data, _WRITE_MAX)
         table.write(address, words)
         return data[:4]
     if function_code == READ_WRITE:
         read_address, read_count = struct.unpack_from(">HH", data)
-        address, words = _words_written(data[4:], _READ_WRITE_MAX)
-        _words_read(
+        address, words = _decode_written_words(data[4:], _READ_WRITE_MAX)
+        _read_words(
             table, read_address, read_count
         )  # refused as a whole: a wrong read writes nothing
         table.write(address, words)
-        return _words_read(table, read_address, read_count)
+        return _read_words(table, read_address, read_count)
     raise RegisterRefusal(ILLEGAL_FUNCTION)
 
 
-def _words_read(table: RegisterTable, address: int, count: int) -> bytes:
+def _read_words(table: RegisterTable, address: int, count: int) -> bytes:
     if not 1 <= count <= _READ_MAX:
         raise RegisterRefusal(ILLEGAL_VALUE)
     return struct.pack(f">B{count}H", 2 * count, *table.read(address, count))
 
 
-def _words_written(data: bytes, most: int) -> tuple[int, list[int]]:
+def _decode_written_words(data: bytes, most: int) -> tuple[int, list[int]]:
     address, count, size = struct.unpack_from(">HHB", data)
     if not 1 <= count <= most or size != 2 * count or len(data) != 5 + size:
         raise RegisterRefusal(ILLEGAL_VALUE)

@@ -140,13 +140,13 @@ class Optoncdt1420Emulator(LineDevice):
         if not self.frozen:
             self._raw = self.digital(displacement_um)
             self._counter = (self._counter + 1) % 2**18
-        data = three_bytes(self._raw, first=True)
+        data = encode_three_bytes(self._raw, first=True)
         if self._register["OUTADD_RS422"] == "COUNTER":
-            data += three_bytes(self._counter, first=False)
+            data += encode_three_bytes(self._counter, first=False)
         return data
 
 
-def three_bytes(value: int, first: bool) -> bytes:
+def encode_three_bytes(value: int, first: bool) -> bytes:
     """18 bits as low, middle and high byte with their marks (page 67)."""
     low, middle, high = value & 0x3F, value >> 6 & 0x3F, value >> 12 & 0x3F
     return bytes([low, 0x40 | middle, (0x80 if first else 0xC0) | high])

@@ -18,14 +18,14 @@ from firmware_iface.emulators.modbus_pdu import (
     ILLEGAL_VALUE,
     RegisterRefusal,
 )
-from firmware_iface.register_map import Block, Register, RegisterMap, default_map, make_block
+from firmware_iface.register_map import Block, Register, RegisterMap, load_default_map, make_block
 
 FIRMWARE_VERSION = 0x00_01_01_00  # 1.1.0
 # the paper's mirror works at 600 Pa; the controller's own limit (750 Pa) is to act first
 GAUGE_PRESSURE_LIMIT_PA = 800.0
 PUMP_LIMIT_FRACTION = 1.0
 WATCHDOG_PERIOD_S = 1.0  # after power-up; the watchdog itself is then off, as on most devices
-_GAUGE_RANGE_PA = default_map().register("gauge_pressure_pa").to_value(2**31 - 1)
+_GAUGE_RANGE_PA = load_default_map().register("gauge_pressure_pa").to_value(2**31 - 1)
 _SECRETS = dict.fromkeys(
     ("claim_key", "command_key", "clear_key", "stop"), 0.0
 )  # registers that read as 0
@@ -90,12 +90,12 @@ class BoardState:
         self._by_span = {(block.address, block.count): block for block in registers.blocks}
         self._command = registers.block("command")
         self._claims = registers.map_version >= 2
-        self._watchdog_mask = registers.fault_mask("watchdog")
-        self._over_pressure_mask = registers.fault_mask("over_pressure")
-        self._stopped_mask = registers.fault_mask("stopped") if self._claims else 0
+        self._watchdog_mask = registers.make_fault_mask("watchdog")
+        self._over_pressure_mask = registers.make_fault_mask("over_pressure")
+        self._stopped_mask = registers.make_fault_mask("stopped") if self._claims else 0
         self._guards = registers.map_version >= 3
-        self._gauge_lost_mask = registers.fault_mask("gauge_lost") if self._guards else 0
-        self._interlock_mask = registers.fault_mask("interlock") if self._guards else 0
+        self._gauge_lost_mask = registers.make_fault_mask("gauge_lost") if self._guards else 0
+        self._interlock_mask = registers.make_fault_mask("interlock") if self._guards else 0
         self._sample = sample
         self._now_s = 0.0
         self.restart()
@@ -235,7 +235,7 @@ class BoardState:
         commanded. With claims, illegal address for a part of a block, busy while another holds the
         board, illegal value without any claim.
         """
-        target = self._written_block(address, len(words))
+        target = self._find_written_block(address, len(words))
         written = target.decode(words)
         if not all(register.allows(written[register.name]) for register in target.registers):
             raise RegisterRefusal(ILLEGAL_VALUE)
@@ -269,7 +269,7 @@ class BoardState:
         self._claim_id = written["claim_id"]
         self._claim_key = written["claim_key"]
 
-    def _written_block(self, address: int, count: int) -> Block:
+    def _find_written_block(self, address: int, count: int) -> Block:
         whole = self._by_span.get((address, count))
         if whole is not None and whole.access == "rw":
             return whole
@@ -375,7 +375,7 @@ class PumpBoardEmulator:
         self._clock = clock or (lambda: asyncio.get_running_loop().time())
         self._unit_id = unit_id
         self._sample = plant.sample()
-        self.state = BoardState(registers or default_map(), self._sample, stored)
+        self.state = BoardState(registers or load_default_map(), self._sample, stored)
         self._actuated = (0.0, 0.0)
         self._server = modbus_server.ModbusTcpServer(self._handle, host, port)
         self._task: asyncio.Task[None] | None = None

@@ -38,12 +38,14 @@ class RtuBusEmulator(SerialDevice):
         self._buffer = data if now_s - self._received_s > _SILENCE_S else self._buffer + data
         self._received_s = now_s
         frame = self._buffer = self._buffer[-_LONGEST:]
-        if len(frame) < _SHORTEST or struct.unpack("<H", frame[-2:])[0] != bitwise_crc(frame[:-2]):
+        if len(frame) < _SHORTEST or struct.unpack("<H", frame[-2:])[0] != compute_bitwise_crc(
+            frame[:-2]
+        ):
             return
         self._buffer = b""
         unit, pdu = frame[0], frame[1:-2]
         if unit in self._slaves and (body := self.answer(unit, pdu)):
-            self.send_answer(body + struct.pack("<H", bitwise_crc(body)))
+            self.send_answer(body + struct.pack("<H", compute_bitwise_crc(body)))
 
     def answer(self, unit: int, pdu: bytes) -> bytes:
         """Unit id and answer PDU to a request; empty for none."""
@@ -52,7 +54,7 @@ class RtuBusEmulator(SerialDevice):
         return bytes([unit]) + reply if reply else b""
 
 
-def bitwise_crc(data: bytes) -> int:
+def compute_bitwise_crc(data: bytes) -> int:
     """The CRC of Modbus, bit by bit as in the standard's figure:
     independent of the link's table.
     """

@@ -96,7 +96,7 @@ class RtuBus:
         """The device with this unit id (1..247). Raises ValueError."""
         return GuardedModbusRtu(self, unit_id, timeout_s, fence)
 
-    def next_token(self) -> int:
+    def find_token(self) -> int:
         """A number not used by recent fences."""
         self._tokens = (self._tokens + 1) % _TOKENS
         return self._tokens
@@ -216,7 +216,7 @@ class GuardedModbusRtu:
     def _fence_question(self) -> exchange.Question | None:
         if not self._fence:
             return None
-        pdu = struct.pack(">BHH", modbus_link.DIAGNOSTICS, 0, self._bus.next_token())
+        pdu = struct.pack(">BHH", modbus_link.DIAGNOSTICS, 0, self._bus.find_token())
         return self._question(
             pdu,
             _WRITE_BYTES,

@@ -23,7 +23,9 @@ class PortInfo:
     description: str
 
 
-def serial_ports(comports: Callable[[], Iterable[Any]] = list_ports.comports) -> list[PortInfo]:
+def list_serial_ports(
+    comports: Callable[[], Iterable[Any]] = list_ports.comports,
+) -> list[PortInfo]:
     """The serial ports of this machine, by path; `usb_name` is empty
     when the port is not on USB.
     """
@@ -40,7 +42,9 @@ def check_port_name(name: str) -> str:
     )
 
 
-def port_path(name: str, comports: Callable[[], Iterable[Any]] = list_ports.comports) -> str:
+def resolve_port_path(
+    name: str, comports: Callable[[], Iterable[Any]] = list_ports.comports
+) -> str:
     """Present path of the port with this name.
 
     Raises LinkDownError (not plugged in), DeviceRefusedError (several adapters have the name).

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import serial
 
-from firmware_iface.links.port_names import check_port_name, port_path
+from firmware_iface.links.port_names import check_port_name, resolve_port_path
 from firmware_iface.roles import Clock, DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
 
 # fast enough for a replugged cable, slow enough not to hammer a server that accepts and hangs up
@@ -205,7 +205,7 @@ class SerialPort:
 
     def _locate_port(self) -> str:
         try:
-            path = port_path(self._port)
+            path = resolve_port_path(self._port)
         except LinkDownError:
             self._absent_until_s = self._clock() + _ABSENT_S
             raise

@@ -59,7 +59,7 @@ class DisplayTest:
             self._expose_still(self._make_grey(255)),
             self._expose_still(self._make_grey(0)),
         )
-        return exposure_check.exposure_problem(white, black, full_scale_adu, exposure_ms)
+        return exposure_check.explain_exposure(white, black, full_scale_adu, exposure_ms)
 
     def check_checkerboard(self) -> str:
         """Any problem with pixel-for-pixel display, else empty."""
@@ -67,7 +67,7 @@ class DisplayTest:
             self._expose_still(self._make_grey(255)),
             self._expose_still(self._make_grey(0)),
         )
-        return checkerboard_check.checkerboard_problem(
+        return checkerboard_check.explain_checkerboard(
             self._expose_still(display_patterns.make_checkerboard(self._size[1], self._size[0])),
             white,
             black,
@@ -110,7 +110,7 @@ class DisplayTest:
         ]
         swing = frames[-1].astype(np.float64) - frames[0]
         lit = swing > 0.5 * np.quantile(swing, 0.99)
-        return display_response.measured_response(
+        return display_response.make_measured_response(
             display_response.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames]
         )
 

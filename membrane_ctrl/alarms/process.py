@@ -49,7 +49,7 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     child.leave_at_stop()
     senders = apprise_senders(spec.config, spec.run_dir.name)
     with limited_memory():
-        watch_run(spec, senders, event_pipe.event_sender(status), child.parent_lives)
+        watch_run(spec, senders, event_pipe.make_event_sender(status), child.parent_lives)
 
 
 def watch_run(

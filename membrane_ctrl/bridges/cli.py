@@ -45,10 +45,10 @@ def bridges(
 
     from membrane_ctrl.bridges.names import Bridge
     from membrane_ctrl.cli.options import load_configuration
-    from membrane_ctrl.config.needed_packages import missing_packages
+    from membrane_ctrl.config.needed_packages import list_missing_packages
 
     settings = load_configuration(config)
-    for needed in missing_packages(settings):
+    for needed in list_missing_packages(settings):
         raise errors.InputError(needed.missing_line)
     if not any(getattr(settings.bridges, name) for name in _BRIDGES):
         raise errors.InputError(

@@ -90,7 +90,7 @@ def fringe_error_mm(response: DisplayResponse, pattern: PatternConfig, corrected
     phase = 2 * np.pi * np.arange(_PHASES) / _PHASES
     shifts = 2 * np.pi * np.arange(pattern.steps) / pattern.steps
     wanted = (1 + np.cos(phase + shifts[:, None])) / 2
-    levels = response.levels_of(wanted) if corrected else np.rint(255 * wanted)
+    levels = response.find_levels(wanted) if corrected else np.rint(255 * wanted)
     light = np.interp(levels, response.levels, response.light)
     seen = np.arctan2(-np.sin(shifts) @ light, np.cos(shifts) @ light)
     error = np.angle(np.exp(1j * (seen - phase)))

@@ -47,7 +47,9 @@ def run(arguments: Sequence[str]) -> int:
                 print(f"membrane-ctrl: {terminal.one_line(message)} (see --help)", file=sys.stderr)
             return errors.Exit.BAD_INPUT
         except OSError as error:  # a file error that the command itself should have caught
-            print(f"membrane-ctrl: {terminal.one_line(_file_trouble(error))}", file=sys.stderr)
+            print(
+                f"membrane-ctrl: {terminal.one_line(_explain_file_error(error))}", file=sys.stderr
+            )
             return errors.Exit.DEVICE_FAILED
         except (KeyboardInterrupt, typer.Abort):
             print("membrane-ctrl: interrupted", file=sys.stderr)
@@ -96,7 +98,7 @@ def _add_commands_of_packages(word: str = "") -> None:
                 ) from None
 
 
-def _file_trouble(error: OSError) -> str:
+def _explain_file_error(error: OSError) -> str:
     where = error.filename or "a file or connection"
     return (
         f"{where}: {errors.os_reason(error)}; check that it exists, its permissions and the free "

@@ -85,7 +85,7 @@ def hold(
     json: JsonOption = False,
 ) -> int:
     """Hold the mirror until stopped."""
-    settings = _started(_with_devices(config, devices, twin), from_flat)
+    settings = _start_from_flat(_with_devices(config, devices, twin), from_flat)
     duration_s = None if duration is None else durations.parse_duration_s(duration)
     terminal.print_progress("loading the control program")
     from membrane_ctrl.hold.hold_options import HoldOptions
@@ -126,7 +126,7 @@ def twin(
         return errors.Exit.DONE
     from membrane_ctrl.sim.twin_command import serve_twin
 
-    return serve_twin(_started(load_configuration(config), from_flat), speed)
+    return serve_twin(_start_from_flat(load_configuration(config), from_flat), speed)
 
 
 @twin_app.command()
@@ -295,7 +295,7 @@ def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> "Con
     )
 
 
-def _started(config: "Config", from_flat: bool) -> "Config":
+def _start_from_flat(config: "Config", from_flat: bool) -> "Config":
     if not from_flat:
         return config
     return config.model_copy(update={"twin": config.twin.model_copy(update={"from_flat": True})})

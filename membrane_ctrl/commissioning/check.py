@@ -21,7 +21,7 @@ from membrane_ctrl.acquisition import driver_check, optical_bench, waiting_clock
 from membrane_ctrl.alarms.addresses import require_sendable
 from membrane_ctrl.commissioning import interlock_check
 from membrane_ctrl.config.bridge_access import describe_bridges
-from membrane_ctrl.config.needed_packages import NeededPackage, missing_packages
+from membrane_ctrl.config.needed_packages import NeededPackage, list_missing_packages
 from membrane_ctrl.config.port import SOCKET_NAME, AlarmsConfig, PortConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
@@ -74,8 +74,8 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     probes, circuits = _probe_all(config)
     for probe in probes:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
-    missing = missing_packages(config)
-    would = _what_would_happen(config)
+    missing = list_missing_packages(config)
+    would = _describe_hold(config)
     if config.interlocks:
         would["interlocks"] = interlock_check.describe_effect(circuits)
     if as_json:
@@ -170,7 +170,7 @@ def _print_probes(
             if line:
                 console.print(f"{probe.role}: {word}: {line}", soft_wrap=True)
     if circuits:
-        console.print(interlock_check.interlock_table(circuits))
+        console.print(interlock_check.make_interlock_table(circuits))
         console.print(interlock_check.HOW_TO_TEST, soft_wrap=True)
     for circuit in circuits:
         if circuit.problem:
@@ -183,7 +183,7 @@ def _print_probes(
     console.print(table)
 
 
-def _what_would_happen(config: Config) -> dict[str, str]:
+def _describe_hold(config: Config) -> dict[str, str]:
     loop, limits, shape = config.loop, config.limits, config.shape
     feedforward = [
         name
@@ -245,8 +245,8 @@ def _describe_locks(config: Config) -> str:
     """The locks that keep a hold down."""
     if config.devices is None:
         return "none"
-    found = lock_store.LockStore.of_machine().find_locks(lock_keys.device_keys(config.devices))
-    return lock_store.locked_line([each.lock for each in found]) if found else "none"
+    found = lock_store.LockStore.of_machine().find_locks(lock_keys.list_device_keys(config.devices))
+    return lock_store.format_locked_line([each.lock for each in found]) if found else "none"
 
 
 def _describe_alarms(alarms: AlarmsConfig) -> str:
@@ -282,19 +282,19 @@ async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> Device
     finally:
         await board.close()
     who = f"{identity.kind} {identity.firmware}, map {identity.map_version}"
-    said, problem = _board_reading(reading), _board_problem(reading, laser)
+    said, problem = _describe_board_reading(reading), _find_board_problem(reading, laser)
     notes = NO_CLAIM if identity.map_version == 1 else ""
     return DeviceProbe("board", name, who, said, p50_ms, p99_ms, problem, notes, identity)
 
 
-def _board_reading(reading: roles.BenchReading) -> str:
+def _describe_board_reading(reading: roles.BenchReading) -> str:
     return (
         f"{reading.displacement_um:.2f} µm, {reading.gauge_pressure_pa:.1f} Pa gauge, "
         f"{reading.ambient_pressure_pa:.1f} Pa ambient, {reading.air_temperature_c:.2f} degC"
     )
 
 
-def _board_problem(reading: roles.BenchReading, laser: bool) -> str:
+def _find_board_problem(reading: roles.BenchReading, laser: bool) -> str:
     if reading.latched_faults:
         return (
             f"faults {reading.latched_faults:#x} are latched (docs/reference/registers.md); "

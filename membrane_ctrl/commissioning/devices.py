@@ -8,7 +8,7 @@ from rich.table import Table
 
 from firmware_iface import drivers, roles
 from firmware_iface.links import aravis
-from firmware_iface.links.port_names import serial_ports
+from firmware_iface.links.port_names import list_serial_ports
 from membrane_ctrl.model import errors, terminal
 
 _DRM = Path("/sys/class/drm")
@@ -48,7 +48,7 @@ def find_ports() -> list[FoundDevice]:
         FoundDevice(
             "port", f"{port.path}: {port.description}", f'port = "{port.usb_name or port.path}"'
         )
-        for port in serial_ports()
+        for port in list_serial_ports()
     ]
 
 

@@ -46,7 +46,7 @@ def write_first_config(path: Path, twin: bool, ask: bool) -> int:
     if parsed.devices is not None:
         bench.require_separate_ports(parsed.devices)
     text = "\n".join(
-        [_HEAD.format(name=path.name), *_comment_found(found), *_format_tables("", tables)]
+        [_HEAD.format(name=path.name), *_make_found_comments(found), *_format_tables("", tables)]
     )
     with errors.convert_write_errors(path), path.open("x", encoding="utf-8") as file:
         file.write(text + "\n")
@@ -62,7 +62,7 @@ def _find_connected() -> list[FoundDevice]:
     return [*find_ports(), *cameras, *find_displays()]
 
 
-def _comment_found(found: list[FoundDevice]) -> list[str]:
+def _make_found_comments(found: list[FoundDevice]) -> list[str]:
     """Return what is connected, as comments to paste from."""
     lines = [
         f"# {found_one.kind} {found_one.name}: {' '.join(found_one.paste.split(chr(10)))}"
@@ -73,7 +73,7 @@ def _comment_found(found: list[FoundDevice]) -> list[str]:
 
 def _ask_devices(found: list[FoundDevice]) -> TomlTable:
     """Ask for the devices; everything that follows from their absence is set as well."""
-    for line in _comment_found(found):
+    for line in _make_found_comments(found):
         typer.echo(line, err=True)
     board = _ask_question(
         "pump board, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200 (empty: single instruments)"

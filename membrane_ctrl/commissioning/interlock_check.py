@@ -39,7 +39,7 @@ async def probe_interlocks(devices: DevicesConfig) -> list[InterlockProbe]:
     """
     if not devices.interlocks:
         return []
-    polled = interlock_sources.polled_sources(devices, modbus_rtu.ModbusLinks())
+    polled = interlock_sources.list_polled_sources(devices, modbus_rtu.ModbusLinks())
     found = await _board_circuits(devices)
     for source in polled:
         found |= await _polled_circuits(devices, source)
@@ -54,7 +54,7 @@ def describe_effect(probes: list[InterlockProbe]) -> str:
     return f"all {len(probes)} closed" if probes else "none configured"
 
 
-def interlock_table(probes: list[InterlockProbe]) -> Table:
+def make_interlock_table(probes: list[InterlockProbe]) -> Table:
     """The circuits for people."""
     table = Table("interlock", "source", "now", "enters", "text")
     for probe in probes:
@@ -107,7 +107,7 @@ def _probe_interlock(
     devices: DevicesConfig, bit: int, is_open: bool, problem: str
 ) -> InterlockProbe:
     interlock = devices.interlocks[bit]
-    source = device_places.circuit_place("", interlock, device_places.plain_link).words
+    source = device_places.find_circuit_place("", interlock, device_places.normalise_link).words
     state = OPEN if is_open else CLOSED
     if problem:
         state = NO_SIGNAL

@@ -17,7 +17,7 @@ class BridgeAccess:
     unknown: bool  # whether clients act that neither this program nor a broker's log-in can name
 
 
-def bridge_accesses(bridges: BridgesConfig) -> list[BridgeAccess]:
+def list_bridge_accesses(bridges: BridgesConfig) -> list[BridgeAccess]:
     """The configured bridges."""
     found = []
     if bridges.mqtt is not None:
@@ -45,7 +45,7 @@ def bridge_accesses(bridges: BridgesConfig) -> list[BridgeAccess]:
 
 def describe_bridges(bridges: BridgesConfig) -> str:
     """The configured bridges, and who may do what through them, in one line."""
-    accesses = bridge_accesses(bridges)
+    accesses = list_bridge_accesses(bridges)
     if not accesses:
         return "none"
     may = (

@@ -120,7 +120,7 @@ class PumpConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _full_flow_of_the_curve(cls, table: Any) -> Any:
+    def _set_full_flow(cls, table: Any) -> Any:
         """The full flow of a measured curve is its last one."""
         flows = table.get("curve_um_per_s") if isinstance(table, dict) else None
         if isinstance(flows, list | tuple) and flows and isinstance(flows[-1], int | float):
@@ -128,7 +128,7 @@ class PumpConfig(Section):
         return table
 
     @model_validator(mode="after")
-    def _curve_rises(self) -> "PumpConfig":
+    def _require_rising_curve(self) -> "PumpConfig":
         commands, flows, falling = (
             self.curve_fraction,
             self.curve_um_per_s,

@@ -45,7 +45,7 @@ def find_shared(
     far as it can be without asking the machine.
     """
     seen: dict[Hashable, DevicePlace] = {}
-    for place in list_places(roles, interlocks, name_link or plain_link):
+    for place in list_places(roles, interlocks, name_link or normalise_link):
         other = seen.setdefault(place.where, place)
         if other.key != place.key:
             return (
@@ -77,7 +77,7 @@ def list_places(
                         f"register {address} of {unit}",
                     )
     for index, interlock in enumerate(interlocks):
-        yield circuit_place(f"devices.interlocks.{index}", interlock, name_link)
+        yield find_circuit_place(f"devices.interlocks.{index}", interlock, name_link)
 
 
 def _list_registers(
@@ -108,7 +108,7 @@ def _load_preset(name: str) -> dict[str, Any]:
         return {}
 
 
-def circuit_place(
+def find_circuit_place(
     key: str, interlock: settings.InterlockDriver, name_link: Callable[[str], Hashable]
 ) -> DevicePlace:
     """The place of an interlock's circuit; `key` is that of its table."""
@@ -132,7 +132,7 @@ def circuit_place(
             return DevicePlace(f"{key}.address", where, words)
 
 
-def plain_link(link: str) -> Hashable:
+def normalise_link(link: str) -> Hashable:
     """A link by its text: host and port, or the serial port without its settings; of a file its
     path.
     """

@@ -44,6 +44,6 @@ def needed_packages(config: Config) -> Iterator[NeededPackage]:
             yield NeededPackage(f"bridges.{bridge}", package, bridge)
 
 
-def missing_packages(config: Config) -> list[NeededPackage]:
+def list_missing_packages(config: Config) -> list[NeededPackage]:
     """Those that are not installed."""
     return [each for each in needed_packages(config) if not is_installed(each.package)]

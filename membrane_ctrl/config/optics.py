@@ -243,7 +243,7 @@ class GeometryConfig(Section):
     screen: ScreenPoseConfig | None = None
 
     @model_validator(mode="after")
-    def _one_form(self) -> "GeometryConfig":
+    def _require_one_form(self) -> "GeometryConfig":
         short = (self.a_mm, self.b_mm, self.alpha_deg)
         general = (self.camera, None if self.screen is None else self.screen.pose)
         if all(v is not None for v in short) and all(v is None for v in general):

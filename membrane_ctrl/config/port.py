@@ -59,7 +59,7 @@ class FleetHold(Section):
     """CA of the service's certificate. Set it if the system does not know it."""
 
     @model_validator(mode="after")
-    def _one_place(self) -> "FleetHold":
+    def _require_one_place(self) -> "FleetHold":
         if bool(self.socket) == bool(self.url):
             raise ValueError("give either socket or url")
         return self
@@ -128,7 +128,7 @@ class OpcuaConfig(Section):
         return self.certificate_file is not None and self.key_file is not None
 
     @model_validator(mode="after")
-    def _certificate_with_key(self) -> "OpcuaConfig":
+    def _require_certificate_with_key(self) -> "OpcuaConfig":
         if (self.certificate_file is None) != (self.key_file is None):
             raise ValueError("certificate and key: give both files, or none")
         if self.host not in LOCAL_HOSTS and self.users_file is not None and not self.encrypted:
@@ -165,7 +165,7 @@ class BridgesConfig(Section):
     epics: EpicsConfig | None = None
 
     @model_validator(mode="after")
-    def _only_people_we_know_act(self) -> "BridgesConfig":
+    def _require_identified_clients(self) -> "BridgesConfig":
         for name, bridge in (("opcua", self.opcua), ("epics", self.epics)):
             known = isinstance(bridge, OpcuaConfig) and bridge.users_file is not None
             if (

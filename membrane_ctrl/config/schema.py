@@ -101,7 +101,7 @@ class DevicesConfig(SensorTables):
     """
 
     @model_validator(mode="after")
-    def _board_or_roles(self) -> "DevicesConfig":
+    def _require_board_or_roles(self) -> "DevicesConfig":
         filled = [role for role in ROLES if getattr(self, role) is not None]
         if self.board is not None and filled:
             raise ValueError(f"give either board or one table per role, not board and {filled[0]}")
@@ -126,7 +126,7 @@ class DevicesConfig(SensorTables):
         return self
 
     @model_validator(mode="after")
-    def _one_owner_a_port(self) -> "DevicesConfig":
+    def _require_one_owner_a_port(self) -> "DevicesConfig":
         owners: dict[str, tuple[str, str]] = {}
         for role, port, link in self.list_ports():
             other, other_link = owners.setdefault(port, (role, link))
@@ -151,7 +151,7 @@ class DevicesConfig(SensorTables):
                 yield f"interlocks.{index}", _port_of(interlock.link), interlock.link
 
     @model_validator(mode="after")
-    def _interlocks_have_sources(self) -> "DevicesConfig":
+    def _require_interlock_sources(self) -> "DevicesConfig":
         names = [interlock.name for interlock in self.interlocks]
         for index, interlock in enumerate(self.interlocks):
             if interlock.name in names[:index]:

@@ -262,7 +262,9 @@ def find_doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
         "mirror"
     )
     if geometry.alpha_deg is not None:
-        return Doubt(hopeless, "alpha_deg", why, _angle_hint(optics, geometry.alpha_deg, depths_mm))
+        return Doubt(
+            hopeless, "alpha_deg", why, _find_angle_hint(optics, geometry.alpha_deg, depths_mm)
+        )
     if math.isinf(best.centre_off_mm):
         why += ": the camera's ray by the vertex meets the screen never"
     elif best.centre_off_mm > half_mm:
@@ -271,7 +273,7 @@ def find_doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
     return Doubt(hopeless, "screen.origin_mm", why, "check the poses, [pattern] and mirror.sag_mm")
 
 
-def _angle_hint(optics: OpticsConfig, alpha_deg: float, depths_mm: list[float]) -> str:
+def _find_angle_hint(optics: OpticsConfig, alpha_deg: float, depths_mm: list[float]) -> str:
     """What the angle may be instead, if the bench is plausible with that."""
     alternatives = (
         ("as radians", math.degrees(alpha_deg)),

@@ -48,7 +48,7 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
         text = read_text(path, _BYTES_MAX, follow=follow).removeprefix(
             "\ufeff"
         )  # as some editors begin a file
-        if any(map(_too_many_parts, text.splitlines())):
+        if any(map(_has_too_many_parts, text.splitlines())):
             raise InputError(f"{path}: not valid TOML: a key of more than {_PARTS_MAX} parts")
         return tomllib.loads(text)
     except FileNotFoundError:
@@ -82,7 +82,7 @@ def _describe_cause(message: str, text: str) -> str:
     )
 
 
-def _too_many_parts(line: str) -> bool:
+def _has_too_many_parts(line: str) -> bool:
     """Whether a line may hold such a key, i.e. too many dots between commas (only quoted keys
     contain commas).
     """

@@ -8,7 +8,12 @@ from dataclasses import dataclass
 from statistics import fmean, pstdev
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.why import explain_state, format_duration, format_number, go_on
+from membrane_ctrl.console.why import (
+    explain_next_step,
+    explain_state,
+    format_duration,
+    format_number,
+)
 from membrane_ctrl.control.leak_estimate import JUDGE_S, TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model import (
     acquisition_events,
@@ -43,7 +48,7 @@ class Trend:
         if math.isfinite(value):
             self._seconds[-1][1].append(value)
 
-    def second_means(self) -> tuple[float, ...]:
+    def mean_by_seconds(self) -> tuple[float, ...]:
         """Mean of each of the last `TREND_S` seconds, oldest first; NaN for a gap."""
         if not self._seconds:
             return (math.nan,) * TREND_S
@@ -85,7 +90,7 @@ class ConsoleView:
     row: telemetry.TelemetryRow | None  # the newest tick; None before the first
     why: str  # the answer in one line
     locks: tuple[str, ...]  # each lock in words
-    go_on: str  # how to go on, if that takes a person
+    next_step: str  # how to continue, if that takes a person
     paused: bool
     silent_s: float  # age of the row if it deserves a warning, else 0
     state: telemetry.State
@@ -179,33 +184,40 @@ class ConsoleModel:
     def make_view(self, now_s: float) -> ConsoleView:
         """The content at a time of the run's clock."""
         status, row = self._status, self._status.row
+        state, next_step, age_s, held_s = telemetry.State.STANDBY, "", 0.0, 0.0
+        if row is not None:
+            state = telemetry.State(int(row.state))
+            next_step = explain_next_step(
+                row, status.paused, self._ctl, self._keys, status.locks, status.latched
+            )
+            age_s = now_s - row.mono_s
+            held_s = now_s - self._started_s
+        errors_um = self._error.finite_values()
+        std_um = in_band = math.nan
+        if errors_um:
+            std_um = pstdev(errors_um)
+            in_band = fmean(abs(error) <= self._config.limits.band_um for error in errors_um)
         present = self._config.with_gains(status.loop)
-        errors = self._error.finite_values()
-        band_um = self._config.limits.band_um
-        age_s = now_s - row.mono_s if row else 0.0
         return ConsoleView(
             row=row,
             why=self._explain_state(),
             locks=tuple(map(describe_lock, status.locks)),
-            go_on=go_on(row, status.paused, self._ctl, self._keys, status.locks, status.latched)
-            if row
-            else "",
+            next_step=next_step,
             paused=status.paused,
             silent_s=age_s if age_s > SILENT_S else 0.0,
-            state=telemetry.State(int(row.state)) if row else telemetry.State.STANDBY,
-            state_age_s=max(0.0, now_s - self._status.since_s),
+            state=state,
+            state_age_s=max(0.0, now_s - status.since_s),
             elapsed_s=now_s,
-            left_s=max(0.0, self._duration_s - (now_s - self._started_s if row else 0.0)),
-            trend_um=self._error.second_means(),
+            left_s=max(0.0, self._duration_s - held_s),
+            trend_um=self._error.mean_by_seconds(),
             held=self._held.result(),
-            error_std_um=pstdev(errors) if errors else math.nan,
-            in_band_fraction=fmean(abs(e) <= band_um for e in errors) if errors else math.nan,
+            error_std_um=std_um,
+            in_band_fraction=in_band,
             lateness_max_ms=max(self._lateness.finite_values(), default=math.nan),
-            fault=fault_words(status.fault),
+            fault=describe_fault_state(status.fault),
             remedy=status.fault.remedy if status.fault else "",
             faults=status.faults,
-            last_fault=f"{fault_words(status.last_fault)} at {format_duration(status.last_fault_s)}"
-            * bool(status.faults),
+            last_fault=self._describe_last_fault(),
             too_tight=self._too_tight(now_s),
             gains=run_status.gains_words(vars(present.loop), status.trial_left_s),
             flow_most_um_per_s=present.loop.flow_most_um_per_s(present.pump),
@@ -213,6 +225,13 @@ class ConsoleModel:
             events=tuple(self._events),
             shape=self._make_shape_view(now_s),
         )
+
+    def _describe_last_fault(self) -> str:
+        status = self._status
+        if not status.faults:
+            return ""
+        time = format_duration(status.last_fault_s)
+        return f"{describe_fault_state(status.last_fault)} at {time}"
 
     def _too_tight(self, now_s: float) -> bool:
         row = self._status.row
@@ -228,47 +247,47 @@ class ConsoleModel:
         if status.row is None:
             return status.why or "starting: no tick yet"
         return explain_state(
-            status.row, status.why, fault_words(status.fault), self._config, status.paused
+            status.row, status.why, describe_fault_state(status.fault), self._config, status.paused
         )
 
     def _make_shape_view(self, now_s: float) -> ShapeView:
-        estimate, since, row, status = (
-            self._estimate,
-            self._reference,
-            self._status.row,
-            self._status,
-        )
-        state = telemetry.ShapeState(int(row.shape_state)) if row else telemetry.ShapeState.OFF
-        reason = estimate.reason if estimate and estimate.verdict != "ok" else ""
-        loop = (
-            status.shape_reason
-            if state in (telemetry.ShapeState.WAITING, telemetry.ShapeState.SUSPENDED)
-            else ""
-        )
+        """The figure's part of the view; NaN for what is not known yet."""
+        estimate, reference, status = self._estimate, self._reference, self._status
+        state = telemetry.ShapeState.OFF
+        if status.row is not None:
+            state = telemetry.ShapeState(int(status.row.shape_state))
+        age_s = change_um = sigma_um = reference_s = math.nan
+        doubt = ""  # about the figure
+        if estimate is not None:
+            age_s = now_s - estimate.time_s
+            doubt = estimate.reason if estimate.verdict != "ok" else ""
+        if reference is not None:
+            reference_s = reference.time_s
+        if estimate is not None and reference is not None:
+            change_um = estimate.sag_um - reference.sag_um
+            sigma_um = math.hypot(estimate.sag_sigma_um, reference.sag_sigma_um)
+        waits = state in (telemetry.ShapeState.WAITING, telemetry.ShapeState.SUSPENDED)
+        loop = status.shape_reason if waits else ""
         return ShapeView(
             state=state,
             estimate=estimate,
-            age_s=now_s - estimate.time_s if estimate else math.nan,
-            sag_change_um=estimate.sag_um - since.sag_um if estimate and since else math.nan,
-            change_sigma_um=math.hypot(estimate.sag_sigma_um, since.sag_sigma_um)
-            if estimate and since
-            else math.nan,
-            reference_s=since.time_s if since else math.nan,
+            age_s=age_s,
+            sag_change_um=change_um,
+            change_sigma_um=sigma_um,
+            reference_s=reference_s,
             cycles=self._cycles,
             rejected=self._rejected,
-            note=_acquisition_words(status.acquisition) or loop or reason,
+            note=_describe_acquisition(status.acquisition) or loop or doubt,
         )
 
 
-def _acquisition_words(reported: acquisition_events.AcquisitionState | None) -> str:
-    return (
-        ""
-        if reported is None or reported.state == "running"
-        else ": ".join(w for w in (reported.state, reported.message) if w)
-    )
+def _describe_acquisition(reported: acquisition_events.AcquisitionState | None) -> str:
+    if reported is None or reported.state == "running":
+        return ""
+    return ": ".join(words for words in (reported.state, reported.message) if words)
 
 
-def fault_words(fault: events.Fault | None) -> str:
+def describe_fault_state(fault: events.Fault | None) -> str:
     """Name, cause and observed value of a fault; empty without one."""
     if fault is None:
         return ""

@@ -60,8 +60,8 @@ def format_line(view: model.ConsoleView) -> str:
         view.why,
     ]
     parts += [f"LOCKED {lock}" for lock in view.locks]
-    if view.go_on:
-        parts.append(view.go_on)
+    if view.next_step:
+        parts.append(view.next_step)
     parts += view.notices
     if math.isfinite(view.left_s):
         parts.append(f"{why.format_duration(view.left_s)} left")
@@ -102,7 +102,7 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     signal.signal(
         signal.SIGTTOU, signal.SIG_IGN
     )  # it may restore a terminal that has passed to the shell
-    report = event_pipe.event_sender(status)
+    report = event_pipe.make_event_sender(status)
     with closing(_Feed(spec)) as feed:
 
         def rounds(show: Callable[[], object]) -> None:

@@ -263,7 +263,7 @@ def _make_headline(view: ConsoleView, config: Config) -> Text:
             f"LOCKED by {len(view.locks) - _LOCKS_SHOWN} more locks\n", style="bold white on red"
         )
     line.append(view.why, style=style)
-    return line.append(f"\n{view.go_on}", style="default") if view.go_on else line
+    return line.append(f"\n{view.next_step}", style="default") if view.next_step else line
 
 
 def _make_figures_table(

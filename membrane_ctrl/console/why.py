@@ -25,7 +25,7 @@ _STATES = {
     State.FAULT: "pump is off: a person must clear the latched fault",
 }
 # the command that ends a state in which somebody is waited for, and its key
-_GO_ON = {
+_NEXT_COMMANDS = {
     State.STANDBY: ("hold", " or key h"),
     State.MANUAL: ("hold", " or key h"),
     State.FAULT: ("ack", ""),
@@ -101,7 +101,7 @@ def _level_words(safe_level: SafeLevel, row: TelemetryRow, config: Config) -> st
     return _LEVELS[safe_level]
 
 
-def go_on(
+def explain_next_step(
     row: TelemetryRow,
     paused: bool,
     ctl: str,
@@ -109,16 +109,16 @@ def go_on(
     locks: Sequence[Lock] = (),
     latched: str = "",
 ) -> str:
-    """How to go on from a state that waits for a person, empty in others; `ctl` begins a command
+    """How to continue from a state that waits for a person, empty in others; `ctl` begins a command
     for this run.
     """
     state = State(int(row.state))
     if locks:
-        return f"go on: ask {locks[0].author}, then `{ctl} unlock {locks[0].word}`"
+        return f"next: ask {locks[0].author}, then `{ctl} unlock {locks[0].word}`"
     if state == State.STANDBY and latched:
         state = State.FAULT
-    command, key = ("resume", " or key p") if paused else _GO_ON.get(state, ("", ""))
-    return f"go on: `{ctl} {command}`{key if keys else ''}" if command else ""
+    command, key = ("resume", " or key p") if paused else _NEXT_COMMANDS.get(state, ("", ""))
+    return f"next: `{ctl} {command}`{key if keys else ''}" if command else ""
 
 
 def _describe_deviation(row: TelemetryRow) -> str:

@@ -225,7 +225,7 @@ class CentreFilter:
         memory.frames = 0
         memory.watches[Sensor.OPTICS] = SensorWatch()
 
-    def blame_optics(self, mount_um: float) -> None:
+    def undo_optics_jump(self, mount_um: float) -> None:
         """Undo what wrong optics did to the mount, and lock them again.
 
         What the mount has moved from `mount_um` was the centre's motion: it is added to the gas and

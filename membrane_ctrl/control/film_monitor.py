@@ -183,7 +183,7 @@ class FilmMonitor:
         root = memory.root.update(math.cbrt(gauge_pressure_pa), dt_s, SMOOTH_S)
         memory.seen_s += dt_s
         memory.readings += 1
-        if strange := self._not_nominal(laser_um, root**3):
+        if strange := self._explain_not_nominal(laser_um, root**3):
             return strange
         sag_um = self._sag_um + laser_um
         if not are_means_known(memory.seen_s, memory.readings) or not (
@@ -226,7 +226,7 @@ class FilmMonitor:
         """
         return math.isfinite(self.memory.minutes.root)
 
-    def _not_nominal(self, laser_um: float, gauge_pa: float) -> str:
+    def _explain_not_nominal(self, laser_um: float, gauge_pa: float) -> str:
         if self._pressure_pa == 0.0 or self.memory.seen_s < NOMINAL_S:
             return ""
         wanted_pa = self._pressure_pa * max(1 + laser_um / self._sag_um, 0.0) ** 3

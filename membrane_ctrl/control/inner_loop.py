@@ -182,9 +182,9 @@ class InnerLoop:
         )
         known_um_per_s = weather_um_per_s
         if given.estimate is None:
-            terms, ramp_um_per_s = self._on_laser(given, dt_s)
+            terms, ramp_um_per_s = self._step_on_laser(given, dt_s)
         else:
-            terms, ramp_um_per_s = self._on_estimate(given, given.estimate, dt_s)
+            terms, ramp_um_per_s = self._step_on_estimate(given, given.estimate, dt_s)
             known_um_per_s = given.estimate.drift_um_per_s - given.estimate.leak_um_per_s
         filtered_um = self.memory.measured.value
         wanted_um_per_s = terms.sum_um_per_s + known_um_per_s + ramp_um_per_s
@@ -220,7 +220,7 @@ class InnerLoop:
             terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um
         )
 
-    def _on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
+    def _step_on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
         """PI(D) on the filtered reading: its terms, and the ramp's own speed."""
         before_um = self.memory.measured.value
         filtered_um = self._filter_reading(given.displacement_um, dt_s)
@@ -230,15 +230,15 @@ class InnerLoop:
         rate_um_per_s = 0.0 if math.isnan(before_um) else (filtered_um - before_um) / dt_s
         return self._pid.terms(error_um, rate_um_per_s), ramp_um_per_s
 
-    def _on_estimate(
+    def _step_on_estimate(
         self, given: LoopInput, estimate: CentreEstimate, dt_s: float
     ) -> tuple[pid.PidTerms, float]:
         """P on the centre that the gas in transit leads to, and the ramp's own speed; the leak is
         the integrator.
 
         The prediction takes dead time and lag out of the loop, and the filter, which knows the flow
-        after its limits, cannot wind up. Everything that `_on_laser` needs follows, so that either
-        may take over at any tick.
+        after its limits, cannot wind up. Everything that `_step_on_laser` needs follows, so that
+        either may take over at any tick.
         """
         self.memory.measured.reset(estimate.um)
         shaped_um, ramp_um_per_s = self._shape_setpoint(given, estimate.um, dt_s)

@@ -7,7 +7,7 @@ _PRESSURE_PA = (50e3, 110e3)
 _TEMPERATURE_C = (-20.0, 60.0)
 
 
-def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
+def explain_weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
     """Name the sensor with an impossible reading; absent ones (NaN) do not count."""
     if not _is_possible(ambient_pressure_pa, _PRESSURE_PA):
         return (

@@ -266,7 +266,7 @@ class CentreEstimation:
             agreed = (
                 memory.slowly_agreed_mount if consistency.camera_drifts else memory.agreed_mount
             )
-            centre.blame_optics(agreed.value)
+            centre.undo_optics_jump(agreed.value)
         unusable = off or bool(consistency.camera_fault_text) or self._mount_drift.beyond_limit
         return None if unusable else figure
 

@@ -33,7 +33,7 @@ from membrane_ctrl.controller import (
     states,
 )
 from membrane_ctrl.controller.observer import Observer
-from membrane_ctrl.controller.state import ControllerState, ReportedShape, first_state
+from membrane_ctrl.controller.state import ControllerState, ReportedShape, make_first_state
 from membrane_ctrl.controller.telemetry_row import make_telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_context import TickContext, apply_command, collect_state_fields
@@ -80,7 +80,7 @@ class Controller:
         memory: ControllerState | None = None,
     ) -> None:
         self._config = config
-        self.memory = memory = memory or first_state(config)
+        self.memory = memory = memory or make_first_state(config)
         self._gains = gains_trial.GainsTrial(memory.gains)
         present = self._present_config
         self._safety = safety.SafetyTable(config.limits, memory=memory.safety)

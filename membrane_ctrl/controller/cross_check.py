@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import ModbusInputConfig, VaisalaPtb330Config
 from membrane_ctrl.config.schema import Config, DevicesConfig
@@ -36,7 +36,7 @@ _PAUSE_S = 3600.0  # the laser still guards the limits, but no loop holds the mi
 _PUMP_STANDS_S = 0.5  # lag and transport
 _GAUGE_NOISE_PA = 1.0
 _PRESSURE_MISSING = next(rule for rule in safety.TABLE if rule.name == "pressure_missing")
-_GUARDED_SINCE = default_map().fault_since("gauge_lost")
+_GUARDED_SINCE = load_default_map().fault_since("gauge_lost")
 _UNKNOWN = BenchIdentity("", 0, "", math.nan)
 _TWIN_BOARD = DevicesConfig(board="tcp://twin")  # the device of `--twin` if none are named
 

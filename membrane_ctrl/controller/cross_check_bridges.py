@@ -1,6 +1,6 @@
 """Findings on the bridges to other systems: who may act without being known."""
 
-from membrane_ctrl.config.bridge_access import bridge_accesses
+from membrane_ctrl.config.bridge_access import list_bridge_accesses
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.cross_check_plant import ConfigFindings
 
@@ -13,7 +13,7 @@ _REMEDIES = {
 
 def judge_bridges(config: Config, findings: ConfigFindings) -> None:
     """Warn of bridges through which unidentified clients may act."""
-    for bridge in bridge_accesses(config.bridges):
+    for bridge in list_bridge_accesses(config.bridges):
         acts = bridge.unknown and config.bridges.role != "read"
         findings.warn(
             acts, "bridges.role", f"{bridge.where}: {bridge.who} may act", _REMEDIES[bridge.field]

@@ -7,13 +7,13 @@ cause present more than half of the time also times out.
 
 from dataclasses import dataclass
 
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from membrane_ctrl.config.schema import StatesConfig
 from membrane_ctrl.model.state_tree import StateNode
 from membrane_ctrl.model.telemetry import SafeLevel
 
 DAY_S = 86_400.0
-WATCHDOG_MASK = default_map().fault_mask("watchdog")
+WATCHDOG_MASK = load_default_map().make_fault_mask("watchdog")
 # A bleed, the actuator test and `lower` open the vent at most this far; a board that vents by
 # itself opens it fully
 VENTED_FRACTION = 0.5

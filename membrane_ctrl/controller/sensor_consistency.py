@@ -179,7 +179,7 @@ class SensorConsistency:
             max(self.memory.laser_missing_s + change_s, 0.0), _MISSING_MAX_S
         )
         self._compare_with_gauge(state, dt_s, held)
-        events = self._doubt_sag(state) + self._notice_drift(state)
+        events = self._report_doubtful_sag(state) + self._notice_drift(state)
         events += self._watch_redundancy(inputs.now_s, state, held)
         if state not in safety.ESTIMATED:
             return events + self._reset_comparisons()
@@ -211,7 +211,7 @@ class SensorConsistency:
         if moves or state == State.SETTLE:
             return events
         self.memory.gas_excess = self.memory.growth.step(
-            held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s
+            held.leak_um_per_s, held.flow_um_per_s, self._limit_growth(inputs), dt_s
         )
         events += [
             _to_event(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)
@@ -314,7 +314,7 @@ class SensorConsistency:
         }
         return self._redundancy.step(now_s, state in safety.MOVING, present)
 
-    def _doubt_sag(self, state: State) -> list[Event]:
+    def _report_doubtful_sag(self, state: State) -> list[Event]:
         """Report once that optics without a laser may have missed a jump of the film, until the
         next start.
         """
@@ -344,7 +344,7 @@ class SensorConsistency:
         )
         self.memory.sag_um = estimate.sag_um
 
-    def _most_growth(self, inputs: TickInputs) -> float:
+    def _limit_growth(self, inputs: TickInputs) -> float:
         """Allowed growth of the leak: unlimited while the camera
         agrees with a laser that is there.
         """
@@ -363,7 +363,7 @@ class SensorConsistency:
         reading = inputs.reading
         if reading is None:
             return []
-        failure = weather_limits.weather_fault(
+        failure = weather_limits.explain_weather_fault(
             reading.ambient_pressure_pa, reading.air_temperature_c
         )
         self.memory.weather_s = (

@@ -61,7 +61,7 @@ class ControllerState(StateNode):
     holders: CentreEstimationState = field(default_factory=CentreEstimationState)
 
 
-def first_state(config: Config) -> ControllerState:
+def make_first_state(config: Config) -> ControllerState:
     """The state before a run's first tick."""
     gains = GainsInForce(config.loop, config.shape.time_constant_s, config.pump)
     return ControllerState(

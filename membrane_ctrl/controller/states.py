@@ -166,7 +166,7 @@ def manual(context: TickContext) -> State:
         context.explain(WhyCode.HOLD_REQUESTED, f"{context.asked_by} requested a hold again")
         context.keep_flowing()
         return State.INFLATE
-    over = _manual_over(context)
+    over = _explain_manual_end(context)
     flow_um_per_s = context.mean_flow_um_per_s if over else context.manual_um_per_s
     context.drive_by(
         context.loop.follow_flow(
@@ -278,7 +278,7 @@ def fault(context: TickContext) -> State:
         context.explain(WhyCode.RESUMING, "the cause is gone; resuming automatically")
         return State.STANDBY
     may_end = stops or not (context.config.states.stay_after_trip or context.resume_possible)
-    if may_end and (stand.at_rest or silent or _nothing_left_to_do(context, safe_level)):
+    if may_end and (stand.at_rest or silent or _is_lowered(context, safe_level)):
         context.finished = Exit.SAFETY_TRIP
     return State.FAULT
 
@@ -290,7 +290,7 @@ def _level_words(safe_level: SafeLevel, context: TickContext) -> str:
     return safe_level.name.lower().replace("_", " ")
 
 
-def _nothing_left_to_do(context: TickContext, safe_level: SafeLevel) -> bool:
+def _is_lowered(context: TickContext, safe_level: SafeLevel) -> bool:
     """Whether, with a pump that does not obey, the vent is open and the mirror empty or given time
     to empty.
 
@@ -343,7 +343,7 @@ def _explain_way_down(context: TickContext, more: str = "") -> None:
     context.explain(WhyCode.GOING_DOWN, f"{who}{more}", way, context.asked_by, bool(more))
 
 
-def _manual_over(context: TickContext) -> str:
+def _explain_manual_end(context: TickContext) -> str:
     """Why the loop takes over from manual flow; empty if it does not."""
     states = context.config.states
     if context.levels.safe_level != SafeLevel.NONE:
@@ -374,7 +374,7 @@ def _find_requested_state(context: TickContext) -> State | None:
 
 
 def _test_actuators(context: TickContext) -> State:
-    test = _running_test(context)
+    test = _get_actuator_test(context)
     test.step(context.observer.displacement_um, context.dt_s)
     part = test.part
     if part is not None:
@@ -394,7 +394,7 @@ def _test_actuators(context: TickContext) -> State:
     return _begin_loop(context, test.leak_um_per_s)
 
 
-def _running_test(context: TickContext) -> actuator_test.ActuatorTest:
+def _get_actuator_test(context: TickContext) -> actuator_test.ActuatorTest:
     """The actuator test, which begins with this tick if there is none."""
     memory, rate_hz = context.test_memory, context.config.loop.rate_hz
     if memory is not None:

@@ -134,7 +134,7 @@ def read_geometry(path: str | Path) -> GeometryFile:
     calibrated = tables.get("schema") == geometry_hash.SCHEMA
     table = tables.get("geometry", tables)
     toml_file.with_height_map(table, path)
-    hashed = geometry_hash.content_hash(tables if "geometry" in tables else {"geometry": tables})
+    hashed = geometry_hash.hash_content(tables if "geometry" in tables else {"geometry": tables})
     text = tomli_w.dumps(tables)
     if isinstance(table, dict):
         toml_file.prune_unknown_keys(table, GeometryConfig)
@@ -169,7 +169,7 @@ def stated_origin(optics: OpticsConfig) -> GeometryOrigin:
         "camera": {**lens, "principal_px": optics.camera.principal},
         "pattern": {"period_mm": optics.pattern.period_mm},
     }
-    return GeometryOrigin(geometry_hash.content_hash(tables))
+    return GeometryOrigin(geometry_hash.hash_content(tables))
 
 
 def _optional_table(

@@ -43,7 +43,7 @@ class Rings:
     truth: RingAddress | None
 
 
-def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Rings:
+def make_rings(config: Config, truth: RingAddress | None, stack: ExitStack) -> Rings:
     """Make the rings; the stack frees their memory."""
     kept = round(_TELEMETRY_KEPT_S * config.loop.rate_hz)
     rows = stack.enter_context(open_ring(kept, telemetry.ROW_BYTES))

@@ -60,7 +60,7 @@ class RunEnd:
             self.fault = standing_fault_after(self.fault, event)
 
 
-def closing_lines(closing: RunEnd) -> list[str]:
+def make_closing_lines(closing: RunEnd) -> list[str]:
     """The lines about a fault: code and name, what was seen, what to do; nothing for a run that
     ended well.
     """
@@ -81,7 +81,7 @@ def print_closing_report(
     run_dir: Path, as_json: bool, closing: RunEnd | None = None, link: str = ""
 ) -> None:
     """Print how the run ended, a fault first, then its result, its folder and the page's link."""
-    for line in closing_lines(closing) if closing is not None else ():
+    for line in make_closing_lines(closing) if closing is not None else ():
         print(line, file=sys.stderr)
     summary_path = run_dir / "summary.json"
     if as_json:

@@ -53,7 +53,7 @@ class ScenarioStep(Section):
     text: str = ""
 
     @model_validator(mode="after")
-    def _one_thing(self) -> ScenarioStep:
+    def _require_one_action(self) -> ScenarioStep:
         if sum(thing is not None for thing in (self.wrong, self.event, self.command)) != 1:
             raise ValueError("give exactly one of wrong, event and command")
         if (
@@ -97,7 +97,7 @@ class Scenario(Section):
     expect: dict[str, Any] | None = None
 
     @model_validator(mode="after")
-    def _before_the_end(self) -> Scenario:
+    def _require_times_in_run(self) -> Scenario:
         names = [interlock.name for interlock in self.config.interlocks]
         for number, at in enumerate(self.at):
             if at.interlock is not None and at.interlock not in names:

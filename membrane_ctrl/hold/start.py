@@ -80,7 +80,7 @@ def hold_mirror(options: HoldOptions) -> int:
         board = asyncio.run(identify_board(make_bench(config.devices), config, options, resumes))
         run_dir = run_folder.create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         geometry.copy_to_run(run_dir)
-        rings = child_processes.rings_for(config, twin.truth if twin else None, stack)
+        rings = child_processes.make_rings(config, twin.truth if twin else None, stack)
         published_rings.publish_rings(
             run_dir,
             {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes},

@@ -11,7 +11,7 @@ from membrane_ctrl.controller import cross_check, interlocks, safe_levels
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.lock_keeper import LockStorage
 from membrane_ctrl.instruments.bench import connect_bench, make_bench, require_separate_ports
-from membrane_ctrl.instruments.lock_keys import device_keys
+from membrane_ctrl.instruments.lock_keys import list_device_keys
 from membrane_ctrl.instruments.lock_store import LockStore, require_unlocked
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.run_files import latched_fault
@@ -79,7 +79,7 @@ def find_locks(config: Config, options: HoldOptions) -> LockStorage | None:
     devices = (
         frozenset({f"twin port {options.config.twin.port}"})
         if options.twin
-        else device_keys(config.devices)
+        else list_device_keys(config.devices)
     )
     if not options.standby:
         require_unlocked(store, devices, _UNLOCKS)

@@ -34,7 +34,7 @@ def make_bench(devices: DevicesConfig) -> roles.Bench:
     if not devices.interlocks:
         return made
     return interlocks.InterlockBench(
-        made, board_inputs(devices), interlock_sources.polled_sources(devices, links)
+        made, board_inputs(devices), interlock_sources.list_polled_sources(devices, links)
     )
 
 
@@ -80,7 +80,7 @@ def _device_of_link(link: str) -> Hashable:
     """One value for all spellings of a link: of a TCP link the host's addresses, else the serial
     port or file.
     """
-    plain = device_places.plain_link(link)
+    plain = device_places.normalise_link(link)
     if isinstance(plain, tuple):
         host, port = plain
         return frozenset(host_addresses(host)), port

@@ -48,7 +48,7 @@ def modbus_names(url: str, unit_id: int) -> set[str]:
 
 def serial_name(port: str) -> str:
     try:
-        return os.path.realpath(port_names.port_path(port))
+        return os.path.realpath(port_names.resolve_port_path(port))
     except roles.LinkError:
         return port  # not plugged in, or ambiguous
 

@@ -21,7 +21,7 @@ _GPIO_FIRST_S = 0.5
 Member = tuple[int, settings.ModbusInputConfig | settings.GpioLineConfig]
 
 
-def polled_sources(devices: DevicesConfig, links: ModbusLinks) -> list[PolledSource]:
+def list_polled_sources(devices: DevicesConfig, links: ModbusLinks) -> list[PolledSource]:
     """The sources, not yet opened. Raises InputError for a link or a missing package."""
     return [_make_source(members, links) for members in _by_device(devices).values()]
 

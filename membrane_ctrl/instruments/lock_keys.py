@@ -12,7 +12,7 @@ from membrane_ctrl.instruments import device_names
 _BY_ID = Path("/dev/serial/by-id")
 
 
-def device_keys(devices: DevicesConfig) -> frozenset[str]:
+def list_device_keys(devices: DevicesConfig) -> frozenset[str]:
     """Return the names by which a bench's devices are known to the lock store.
 
     Besides the present names (`device_names.device_names`), by which programs exclude each other,
@@ -39,7 +39,7 @@ def device_keys(devices: DevicesConfig) -> frozenset[str]:
 
 
 def modbus_keys(url: str, unit_id: int) -> frozenset[str]:
-    """Return the names of a Modbus device, as `device_keys` does.
+    """Return the names of a Modbus device, as `list_device_keys` does.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ from pathlib import Path
 from membrane_ctrl.model import files
 from membrane_ctrl.model.errors import DeviceError, os_reason
 from membrane_ctrl.model.lock import Lock, describe_locks
-from membrane_ctrl.model.lock_words import WORDS, distinct_word, word_of_number
+from membrane_ctrl.model.lock_words import WORDS, distinct_word, make_word
 from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.state_folder import find_state_folder
 
@@ -81,7 +81,7 @@ class LockStore:
         Parameters
         ----------
         devices : collection of str, optional
-            Keys of `device_keys` or `modbus_keys`; None: locks on any device.
+            Keys of `list_device_keys` or `modbus_keys`; None: locks on any device.
 
         Returns
         -------
@@ -180,10 +180,10 @@ def require_unlocked(store: LockStore, devices: Collection[str], remedy: str = "
     """
     found = store.find_locks(devices)
     if found:
-        raise DeviceError(locked_line([each.lock for each in found], remedy))
+        raise DeviceError(format_locked_line([each.lock for each in found], remedy))
 
 
-def locked_line(locks: Sequence[Lock], remedy: str = "") -> str:
+def format_locked_line(locks: Sequence[Lock], remedy: str = "") -> str:
     """Return the line with which a command refuses locked devices.
 
     Parameters
@@ -214,7 +214,7 @@ def draw_word(taken: Collection[str]) -> str:
     -------
     str
     """
-    return distinct_word(word_of_number(secrets.randbelow(WORDS)), taken)
+    return distinct_word(make_word(secrets.randbelow(WORDS)), taken)
 
 
 def _find_own_folder() -> Path | None:
@@ -284,5 +284,5 @@ def _read_file(file: Path) -> StoredLock:
 
 def _doubtful_lock(path: Path, why: str) -> Lock:
     """Return the lock for a file or folder that cannot be read; its word follows from the path."""
-    word = word_of_number(zlib.crc32(os.fsencode(path)))
+    word = make_word(zlib.crc32(os.fsencode(path)))
     return Lock(word, f"{path} cannot be read ({why[:100]})", _UNKNOWN, set_utc="unknown time")

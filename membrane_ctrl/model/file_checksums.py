@@ -29,12 +29,12 @@ def pop_checksum(table: dict[str, Any]) -> bool:
     return stored is None or stored == _table_crc(table)
 
 
-def with_comment(text: str) -> str:
+def add_checksum_comment(text: str) -> str:
     """The text, preceded by its checksum."""
     return f"{_COMMENT}{zlib.crc32(text.encode()):08x}\n{text}"
 
 
-def comment_is_right(text: str) -> bool:
+def is_comment_checksum_correct(text: str) -> bool:
     """Whether the checksum in the first line is correct; True without one."""
     line = _LINE.match(text)
     if line is None:

@@ -9,7 +9,7 @@ SCHEMA = "membrane-geometry/1"
 _HASHED = ("geometry", "covariance", "parameters", "camera", "pattern")
 
 
-def content_hash(tables: Mapping[str, Any]) -> str:
+def hash_content(tables: Mapping[str, Any]) -> str:
     """Sixteen digits that identify a geometry in results and runs, whatever the order or layout of
     its tables.
     """

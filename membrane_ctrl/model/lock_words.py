@@ -8,7 +8,7 @@ _SHAPE = (_CONSONANTS, _VOWELS, _CONSONANTS, _VOWELS, _CONSONANTS)
 WORDS = len(_CONSONANTS) ** 3 * len(_VOWELS) ** 2  # number of different words
 
 
-def word_of_number(number: int) -> str:
+def make_word(number: int) -> str:
     """Return the pronounceable word with this number (modulo `WORDS`).
 
     Parameters
@@ -44,6 +44,6 @@ def distinct_word(word: str, taken: Collection[str]) -> str:
     if word and word not in taken:
         return word
     number = 0
-    while (candidate := word_of_number(number)) in taken:
+    while (candidate := make_word(number)) in taken:
         number += 1
     return candidate

@@ -102,10 +102,10 @@ def pack_estimate(estimate: ShapeEstimate) -> bytes:
         for field in fields(ShapeEstimate)
         if field.name not in _ARRAYS
     }
-    return packed_parts(head, estimate.coeffs_um, upper_half(estimate.covariance_um2))
+    return packed_parts(head, estimate.coeffs_um, take_upper_half(estimate.covariance_um2))
 
 
-def upper_half(covariance_um2: FloatArray) -> NDArray[np.float32]:
+def take_upper_half(covariance_um2: FloatArray) -> NDArray[np.float32]:
     """(COVARIANCE_UPPER_SIZE,) float32: the upper half of a symmetric (terms, terms) matrix, row by
     row.
     """

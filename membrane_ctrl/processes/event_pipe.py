@@ -14,7 +14,7 @@ def make_pipe() -> Any:
     return SPAWN_CONTEXT.Pipe()
 
 
-def event_sender(status: Connection | None) -> Callable[[events.Event], None]:
+def make_event_sender(status: Connection | None) -> Callable[[events.Event], None]:
     """Return a function that sends an event over `status`, or drops it if the pipe is full; it
     never waits.
     """

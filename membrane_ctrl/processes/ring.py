@@ -131,7 +131,7 @@ class RingWriter:
         first, last = self._slots.span(self._next)
         sequence = self._next + 1
         words[first] = sequence
-        words[first + 1] = _message_seal(message, sequence)
+        words[first + 1] = _compute_seal(message, sequence)
         self._slots.bytes[8 * first + 16 : 8 * first + 16 + length] = message
         words[last] = sequence
         self._next = sequence
@@ -212,7 +212,7 @@ class RingReader:
         before = slots.words[first]
         return (
             message
-            if before == after == index + 1 and seal == _message_seal(message, index + 1)
+            if before == after == index + 1 and seal == _compute_seal(message, index + 1)
             else None
         )
 
@@ -231,7 +231,7 @@ def open_ring(slots: int, slot_bytes: int) -> Iterator[RingAddress]:
         owner.close()
 
 
-def _message_seal(message: bytes, sequence: int) -> int:
+def _compute_seal(message: bytes, sequence: int) -> int:
     """Length and CRC-32 of a message, in one word."""
     return len(message) | zlib.crc32(message, sequence & 0xFFFFFFFF) << 32
 

@@ -33,7 +33,7 @@ class EventsFile:
 
     def __init__(self, path: Path, resumed: bool = False) -> None:
         self._path = path
-        self._written = _mend_tail(path) if resumed else frozenset()
+        self._written = _repair_tail(path) if resumed else frozenset()
         self._waiting: deque[bytes] = deque()
         self._sync = False
         self._descriptor: int | None = None
@@ -88,7 +88,7 @@ class EventsFile:
             self._descriptor = None
 
 
-def _mend_tail(path: Path) -> frozenset[bytes]:
+def _repair_tail(path: Path) -> frozenset[bytes]:
     """Cut a torn line off the end; return the last whole lines."""
     if not path.exists():
         return frozenset()

@@ -79,7 +79,7 @@ class Housekeeping:
         # the run's own axis: a wall clock set wrong meanwhile must delete nothing
         now_utc = self._clock.utc(self._clock.now())
         retention.delete_remains(self._run_dir.parent)
-        runs = retention.deletable_runs(self._run_dir.parent, self._run_dir, now_utc)
+        runs = retention.list_deletable_runs(self._run_dir.parent, self._run_dir, now_utc)
         expired = retention.find_expired(
             runs, retention.size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc
         )

@@ -19,7 +19,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.run_events import Ended
 from membrane_ctrl.processes.child import STOP, parent_lives
-from membrane_ctrl.processes.event_pipe import event_sender
+from membrane_ctrl.processes.event_pipe import make_event_sender
 from membrane_ctrl.processes.frame_address import FrameAddress
 from membrane_ctrl.processes.ring import RingAddress, RingReader
 from membrane_ctrl.recorder.thumbnails import Thumbnails
@@ -67,7 +67,7 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     signal.signal(STOP, lambda *_: is_stop_requested.set())
     prepare_rerun()
     if not _record_run(
-        spec, event_sender(status), is_stop_requested.is_set, lambda: not parent_lives()
+        spec, make_event_sender(status), is_stop_requested.is_set, lambda: not parent_lives()
     ):
         os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
 

@@ -156,7 +156,7 @@ class Recorder:
     def write_second(self) -> None:
         """Write everything since the last call to disk, and sync it."""
         now_s = self._clock.now()
-        self._errors.run_guarded("new run folder", lambda: self._see_folder(now_s))
+        self._errors.run_guarded("new run folder", lambda: self._watch_folder(now_s))
         batch = self._assembler.add_messages(self._messages)
         rows, shapes, new_events = batch.rows, self._shapes, self._events
         self._messages = []
@@ -175,7 +175,7 @@ class Recorder:
             now_s, rows, new_events, shapes, self._thumbnails, self._housekeeping.detail
         ):
             self._rows_lost += len(rows)
-        guarded("state file", self._hand_on)
+        guarded("state file", self._write_handover)
 
     def _add_thumbnails(self, now_s: float) -> None:
         self._thumbnails = []
@@ -190,7 +190,7 @@ class Recorder:
             self._summary.as_dict(self._report_dropped(), {}), self._status, self._config
         )
 
-    def _see_folder(self, now_s: float) -> None:
+    def _watch_folder(self, now_s: float) -> None:
         """Continue in a new folder if the run's was removed: writing to a deleted file raises no
         error.
         """
@@ -205,7 +205,7 @@ class Recorder:
         self._rerun.leave_folder()
         self._events_file.restart(self._events)
 
-    def _hand_on(self) -> None:
+    def _write_handover(self) -> None:
         """Save the state that a successor would need."""
         state = RecorderState(
             self._summary,

@@ -114,8 +114,8 @@ def open_recorded(folder: Path) -> RecordedRun:
     cut = not any(isinstance(each.event, run_events.Ended) for each in log)
     decisions = replays.decisions_of((each.mono_s, each.event) for each in log)
     log_end_s = max((each.mono_s for each in log), default=0.0) if cut else math.inf
-    config = run_config.exact_config(folder)
-    right = file_checksums.comment_is_right(files.read_text(folder / "config.toml"))
+    config = run_config.read_exact_config(folder)
+    right = file_checksums.is_comment_checksum_correct(files.read_text(folder / "config.toml"))
     damage = "" if right else "config.toml: checksum mismatch (damaged or edited)"
     return RecordedRun(folder, config, inputs, decisions, log_end_s, damage)
 
@@ -182,7 +182,7 @@ def _replay_part(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, rep
     today's layout.
     """
     inputs = run.inputs.start_at_snapshot(from_s)
-    begin = replays.tick_to_begin_with(inputs, from_s)
+    begin = replays.find_first_tick(inputs, from_s)
     if begin > 1:
         try:
             return begin, _replay_ticks(run, replays.recorded_ticks(inputs, begin), from_s, to_s)
@@ -355,7 +355,7 @@ def write_incident(
         "recorded_by": run.inputs.program,
         "decisions": [
             {"time_s": round(d.time_s, 3), "what": d.description}
-            for d in replays.without_repeats(found.decisions)
+            for d in replays.drop_repeats(found.decisions)
         ],
     }
     (folder / "incident.toml").write_text(tomli_w.dumps(about), encoding="utf-8")

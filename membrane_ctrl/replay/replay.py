@@ -223,7 +223,7 @@ def decisions_of(logged: Iterable[tuple[float, Event]]) -> list[Decision]:
     return found
 
 
-def tick_to_begin_with(frames: Iterable[InputsFrame], from_s: float) -> int:
+def find_first_tick(frames: Iterable[InputsFrame], from_s: float) -> int:
     """The last tick before a time of the run that has a snapshot; 1 if there is none."""
     begin = 1
     for frame in frames:
@@ -273,7 +273,7 @@ def differing_fields(
     return fields
 
 
-def without_repeats(decisions: list[Decision]) -> list[Decision]:
+def drop_repeats(decisions: list[Decision]) -> list[Decision]:
     """Drop shape-loop decisions that only give another reason for the same state."""
     kept: list[Decision] = []
     shape = ""
@@ -289,7 +289,7 @@ def without_repeats(decisions: list[Decision]) -> list[Decision]:
 def find_unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -> list[str]:
     """Differences between two lists of decisions, as sentences; times may differ by `slack_s`."""
     lines: list[str] = []
-    recorded, today = without_repeats(recorded), without_repeats(today)
+    recorded, today = drop_repeats(recorded), drop_repeats(today)
     for place in range(max(len(recorded), len(today))):
         then = recorded[place] if place < len(recorded) else None
         now = today[place] if place < len(today) else None

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from membrane_ctrl.model import errors
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.run_times import end_s, moment_s, not_in
+from membrane_ctrl.review.run_times import end_s, make_outside_error, moment_s
 from membrane_ctrl.run_files.annotations import add_mark
 from membrane_ctrl.run_files.run import open_run
 
@@ -23,7 +23,7 @@ def mark_command(words: Sequence[str], at: str | None) -> int:
     opened = open_run(catalogue.resolve_run(Path(words[0])))
     at_s = moment_s(at, opened.origin_utc)
     if not 0 <= at_s <= end_s(opened):
-        raise not_in(opened, f"--at {at}")
+        raise make_outside_error(opened, f"--at {at}")
     mark = add_mark(opened.folder, opened.origin_utc, at_s, words[1])
     print(f"marked {mark['time_utc']} in {opened.name}")
     return 0

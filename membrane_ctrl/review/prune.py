@@ -18,7 +18,7 @@ def to_prune(
     require_folder(logs_dir)
     if keep_days is None and keep_gb is None:
         raise errors.InputError("runs prune: give --keep-days, --keep-gb or both")
-    runs = retention.deletable_runs(logs_dir, logs_dir / "none", now_utc)
+    runs = retention.list_deletable_runs(logs_dir, logs_dir / "none", now_utc)
     return retention.find_expired(runs, 0, keep_gb, keep_days, now_utc)
 
 

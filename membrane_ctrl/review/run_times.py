@@ -65,7 +65,7 @@ def end_s(run: Run) -> float:
     return float(time_s[-1]) + _END_LEVEL_S if time_s.size else 0.0
 
 
-def not_in(run: Run, wanted: str) -> errors.InputError:
+def make_outside_error(run: Run, wanted: str) -> errors.InputError:
     """The error for a time outside a run."""
     went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(end_s(run)):%Y-%m-%d %H:%M} UTC"
     return errors.InputError(f"{wanted}: not in the run, which lasted from {went}")

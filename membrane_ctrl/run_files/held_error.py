@@ -15,7 +15,7 @@ from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import BoolArray
 from membrane_ctrl.model.state_tree import StateNode
 from membrane_ctrl.run_files.hold_parts import PARTS, HoldParts
-from membrane_ctrl.run_files.run_statistics import SecondMeans, least_ticks
+from membrane_ctrl.run_files.run_statistics import SecondMeans, count_least_ticks
 
 ErrorOf = Literal["true", "reading"]
 _NAMES: dict[ErrorOf, str] = {"true": "true centre", "reading": "reading"}
@@ -110,7 +110,7 @@ class HeldErrorMeter(StateNode):
     @classmethod
     def for_config(cls, config: Config) -> HeldErrorMeter:
         """Return a meter without rows."""
-        band_um, least = config.limits.band_um, least_ticks(1.0, config.loop.rate_hz)
+        band_um, least = config.limits.band_um, count_least_ticks(1.0, config.loop.rate_hz)
         return cls(HoldParts(band_um), SecondMeans(band_um, least), SecondMeans(band_um, least))
 
     def add_rows(self, rows: telemetry.Rows) -> BoolArray:

@@ -42,10 +42,10 @@ def mark_lines(
     for stream in MARKS:
         found = [mono_s for mono_s, event in events if event.plot_mark == stream.lines[0].field]
         if found:
-            yield stream, *vertical_lines(np.array(found))
+            yield stream, *make_vertical_lines(np.array(found))
 
 
-def vertical_lines(time_s: Column) -> tuple[Column, FloatArray]:
+def make_vertical_lines(time_s: Column) -> tuple[Column, FloatArray]:
     """Times (3 n,) and values (3 n, 1) that draw a vertical line at each of n times."""
     values = np.tile([-_MARK_HALF_HEIGHT, _MARK_HALF_HEIGHT, np.nan], time_s.size)
     return (time_s[:, np.newaxis] + [0.0, 0.0, 1e-9]).ravel(), values[:, np.newaxis]

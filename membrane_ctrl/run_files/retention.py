@@ -28,7 +28,7 @@ class OldRun:
     size_bytes: int
 
 
-def deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[OldRun]:
+def list_deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[OldRun]:
     """Runs in `logs_dir`, oldest first, except the present one, those that may still run, and those
     with a `.keep`.
 

@@ -63,7 +63,7 @@ def _copy_value(value: Any) -> Any:
     return [_copy_value(inner) for inner in value] if isinstance(value, list) else value
 
 
-def exact_config(folder: Path) -> Config:
+def read_exact_config(folder: Path) -> Config:
     """`config.toml` as it was in use. Raises InputError if this version does not understand all
     of it.
     """
@@ -83,9 +83,9 @@ def read_config(folder: Path, notes: list[str]) -> Config:
         return toml_file.parse_tables(tables, Config, "config.toml")
     except errors.InputError as error:
         config, left_out = keep_understood(tables)
-        named = ", ".join(left_out[:_NAMED_MAX]) + (
-            f" and {len(left_out) - _NAMED_MAX} more" * (len(left_out) > _NAMED_MAX)
-        )
+        named = ", ".join(left_out[:_NAMED_MAX])
+        if len(left_out) > _NAMED_MAX:
+            named += f" and {len(left_out) - _NAMED_MAX} more"
         notes.append(f"{error}; omitted or at its default: {named}")
         return config
 
@@ -97,7 +97,7 @@ def _config_damage(path: Path) -> list[str]:
         return []
     if not text:
         return ["config.toml: empty; all defaults are used"]
-    right = file_checksums.comment_is_right(text)
+    right = file_checksums.is_comment_checksum_correct(text)
     return (
         []
         if right

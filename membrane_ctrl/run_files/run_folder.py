@@ -55,7 +55,7 @@ def write_heads(run_dir: Path, config: Config) -> None:
     """Write `run.json`, and `config.toml` with every default. Raises OSError."""
     run_head.write_run_head(run_dir)
     text = f"# {program.program_identity()}\n{toml_file.dump_toml(config)}"
-    files.write_text_atomic(run_dir / CONFIG, file_checksums.with_comment(text))
+    files.write_text_atomic(run_dir / CONFIG, file_checksums.add_checksum_comment(text))
 
 
 def free_mb(folder: Path) -> float:

@@ -90,7 +90,7 @@ class LogHistogram(StateNode):
         return _LOWEST * math.exp((place + 0.5) * _LOG_RATIO)
 
 
-def least_ticks(window_s: float, rate_hz: float) -> float:
+def count_least_ticks(window_s: float, rate_hz: float) -> float:
     """Ticks that a window must have: nine tenths, or all but one, which may have come just behind
     its end.
     """

@@ -91,7 +91,7 @@ class RunTables:
         arrays = {
             "coeffs_um": np.asarray(estimate.coeffs_um, dtype=np.float64),
             "sigma_um": np.sqrt(variances_um2).astype(np.float32),
-            "upper_um2": shape_estimate.upper_half(estimate.covariance_um2),
+            "upper_um2": shape_estimate.take_upper_half(estimate.covariance_um2),
         }
         self._add_dicts(spec, [{**row, **numbers, **arrays}])
         self._add_figure_minute(self._windows.figures.add_figure(estimate))

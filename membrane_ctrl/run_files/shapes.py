@@ -108,7 +108,7 @@ class Shapes:
 
     def heights_um(self, x: Column, y: Column) -> Column:
         """(n, points) height above the vertex at points of the unit disc (mirror radius 1), µm."""
-        return self.parameters_um() @ height_basis(x, y)
+        return self.parameters_um() @ make_height_basis(x, y)
 
     def parameters_um(self) -> Column:
         """(n, terms + 1): the coefficients and the amplitude of the additional Hencky part."""
@@ -121,7 +121,7 @@ class Shapes:
         return np.asarray(self.covariance_um2[np.argmin(np.abs(self.covariance_time_s - time_s))])
 
 
-def height_basis(x: Column, y: Column) -> Column:
+def make_height_basis(x: Column, y: Column) -> Column:
     """(terms + 1, points): height above the vertex per unit of each parameter."""
     units = np.eye(ZERNIKE_TERMS + 1)
     return np.stack([Surface(unit[:-1], unit[-1], 1.0).height(x, y) for unit in units])
@@ -309,7 +309,7 @@ def _value_range(values: NDArray[np.float64]) -> Map:
 @cache
 def _height_basis() -> NDArray[np.float64]:
     """(terms + 1, points) height per unit of each parameter."""
-    return height_basis(*_disc_points())
+    return make_height_basis(*_disc_points())
 
 
 @cache

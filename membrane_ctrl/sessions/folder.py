@@ -103,7 +103,7 @@ class SessionFolder:
                     ) from None
 
 
-def based_on(
+def restart_session(
     session: SessionFolder, before: schema.LoopConfig, pump: schema.PumpConfig
 ) -> SessionFolder:
     """Restart the session on other gains and another curve of the pump, which are in use."""
@@ -115,7 +115,7 @@ def based_on(
     return SessionFolder(session.path, head, config)
 
 
-def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
+def make_session_folder(parent: Path, name: str, now: datetime) -> Path:
     """Make `<UTC>-<name>` in a folder; raises like `begin_session`."""
     if not _NAME.fullmatch(name):
         raise errors.InputError(
@@ -156,7 +156,7 @@ def begin_session(
 
     Raises InputError for a bad name, DeviceError if it cannot be written.
     """
-    path = fresh_folder(parent, name, datetime.fromisoformat(head.created_utc))
+    path = make_session_folder(parent, name, datetime.fromisoformat(head.created_utc))
     with errors.convert_write_errors(path, errors.DeviceError):
         files.write_text_atomic(path / "config.toml", toml_file.dump_toml(config))
         write_session_file(path / "session.json", head, head_schema)
@@ -194,7 +194,7 @@ def open_session(path: Path) -> SessionFolder:
     return SessionFolder(path, *read_session(path, SessionHead))
 
 
-def newest_session(logs: Path) -> SessionFolder:
+def find_newest_session(logs: Path) -> SessionFolder:
     """The newest session, to continue. Raises InputError if there is none."""
     found = max((logs / "tuning").glob("*/session.json"), default=None)
     if found is None:

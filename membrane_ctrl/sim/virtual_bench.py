@@ -70,7 +70,7 @@ class VirtualBench:
         self.interlocks = interlocks or VirtualInterlocks()
         self._sample = self._sample_sensors(None)
         self.board = pump_board.BoardState(
-            register_map.default_map(), self._sample, stored or pump_board.StoredSettings()
+            register_map.load_default_map(), self._sample, stored or pump_board.StoredSettings()
         )
         self._driver = PumpBoard("", watchdog_s=watchdog_s, link=MemoryLink(self))
 

@@ -52,7 +52,7 @@ class SessionWatch:
     def look(self) -> SessionSeen | None:
         """The session now; None if there is none."""
         try:
-            newest = folders.newest_session(self._logs)
+            newest = folders.find_newest_session(self._logs)
         except (errors.CommandError, OSError):
             return None
         if self._reader is None or self._reader.session != newest.path:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_acquisition_display_test import HEIGHT_PX, WIDTH_PX, Bench
 
-from firmware_iface.display_response import RAMP_LEVELS, measured_response
+from firmware_iface.display_response import RAMP_LEVELS, make_measured_response
 from membrane_ctrl.acquisition.optical_bench import OpticalBench
 from membrane_ctrl.calibration.display import (
     display_report,
@@ -47,7 +47,7 @@ def test_a_panel_is_measured_and_its_worth_said() -> None:
 def test_four_steps_take_the_third_harmonic_for_phase() -> None:
     # light ((1 + cos) / 2)^2 = 3/8 + cos / 2 + cos(2 phi) / 8: of its harmonics four steps are
     # blind to the second
-    square = measured_response(RAMP_LEVELS, power_law(2.0))
+    square = make_measured_response(RAMP_LEVELS, power_law(2.0))
     assert fringe_error_mm(square, PatternConfig(steps=4), corrected=False) < 0.05
     # to three steps it is a phase error of sin(3 phi) / 4
     expected_mm = mm_per_rad(PatternConfig(steps=3)) / 4 / np.sqrt(2)
@@ -57,7 +57,7 @@ def test_four_steps_take_the_third_harmonic_for_phase() -> None:
 
 
 def test_the_correction_leaves_the_rounding_of_levels() -> None:
-    response = measured_response(RAMP_LEVELS, power_law(2.2))
+    response = make_measured_response(RAMP_LEVELS, power_law(2.2))
     bare, corrected = (
         fringe_error_mm(response, PatternConfig(), linear) for linear in (False, True)
     )

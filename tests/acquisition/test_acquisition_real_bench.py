@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_iface.display_patterns import ScreenRaster, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light
 from membrane_ctrl.acquisition.process import acquisition_main
 from membrane_ctrl.acquisition.spec import AcquisitionSpec
 from membrane_ctrl.cli import run as command
@@ -71,7 +71,9 @@ class Sight:
         renderer = OpticsRenderer(CONFIG.optics, typical_film(37.1, 500.0, 1), seed=1)
         self._pictures = {}
         for shown in full_sequence(pattern):
-            levels = np.rint(255 * pattern_light(shown, raster).astype(np.float64)).astype(np.uint8)
+            levels = np.rint(255 * compute_pattern_light(shown, raster).astype(np.float64)).astype(
+                np.uint8
+            )
             self._pictures[levels.tobytes()] = renderer.render_picture(shown, 0.0).copy()
         self._dark = np.zeros((256, 306), np.uint8)
 

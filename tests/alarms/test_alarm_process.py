@@ -26,7 +26,7 @@ from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.port_events import AlarmSent
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
-from membrane_ctrl.processes.event_pipe import event_sender
+from membrane_ctrl.processes.event_pipe import make_event_sender
 from membrane_ctrl.processes.ring import RingWriter, open_ring
 
 CONFIG = AlarmsConfig(silent_s=5.0)
@@ -193,7 +193,7 @@ def test_a_control_process_that_vanishes_is_reported(tmp_path: Path) -> None:
     theirs, ours = Pipe()
     theirs.close()
     with open_ring(16, ROW_BYTES) as telemetry, open_ring(16, 4096) as events:
-        watch_run(spec(telemetry, events, tmp_path), [sender], event_sender(ours), lambda: False)
+        watch_run(spec(telemetry, events, tmp_path), [sender], make_event_sender(ours), lambda: False)
     assert told(sender) == [("control_gone", "raised")]
 
 

@@ -9,7 +9,7 @@ import math
 
 from firmware_iface.board_settings import CHANNELS
 from firmware_iface.emulators.pump_board import BoardPlant
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from tests.board.virtual_board import NO_VALUE
 
 _PERIOD_S = 0.01  # the age that a sample may have
@@ -75,7 +75,7 @@ class FilmWire:
 def sample_line(plant: BoardPlant) -> str:
     """The newest sample as the wire carries it: counts of the registers."""
     sample = plant.sample()
-    registers = default_map()
+    registers = load_default_map()
     counts = [
         _counts(getattr(sample, name), registers.register(name).counts_per_unit)
         for name in CHANNELS

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from firmware_iface.board_settings import make_record
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from tests.board.virtual_board import NO_VALUE, SETTINGS, VirtualBoard, rtu_frame
 
 _KEY = 0x1234_5678
-_MAP = default_map()
+_MAP = load_default_map()
 _TICK_US = 1000
 _STALLED_MS = 20  # BOARD_STALLED_TICKS
 _HARDWARE_MS = 100  # HAL_WATCHDOG_MAX_MS
@@ -75,7 +75,7 @@ def test_the_pump_is_off_in_the_first_millisecond_after_the_period(
     assert virtual_board.outputs == (25_000, 12_500)
     virtual_board.pass_us(_TICK_US)
     assert virtual_board.outputs == (0, 12_500)
-    assert sensors(virtual_board)["latched_faults"] == _MAP.fault_mask("watchdog")
+    assert sensors(virtual_board)["latched_faults"] == _MAP.make_fault_mask("watchdog")
 
 
 def test_the_period_counts_from_the_write_not_from_the_tick_before_it(
@@ -101,7 +101,7 @@ def test_clearing_another_fault_does_not_feed(virtual_board: VirtualBoard) -> No
     virtual_board.pass_us(10_000)
     virtual_board.ask(write("reset", {"clear_faults": 0xFFFF, "clear_key": _KEY}))
     virtual_board.pass_us(20_000)
-    assert sensors(virtual_board)["latched_faults"] == _MAP.fault_mask("watchdog")
+    assert sensors(virtual_board)["latched_faults"] == _MAP.make_fault_mask("watchdog")
 
 
 def test_a_watchdog_trip_does_not_expire(virtual_board: VirtualBoard) -> None:

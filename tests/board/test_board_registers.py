@@ -14,14 +14,14 @@ import pytest
 from firmware_iface.board_settings import make_record
 from firmware_iface.emulators import pump_board
 from firmware_iface.emulators.modbus_pdu import answer_request
-from firmware_iface.register_map import Block, default_map
+from firmware_iface.register_map import Block, load_default_map
 from tests.board.virtual_board import NO_VALUE, SETTINGS, VirtualBoard
 
 # after a request until the outputs are compared: a sample lies in it, so that both boards know the
 # same
 _SETTLED_MS = 7
 _KEYS = (0x12345678, 0x12340000, 0x00005678, 0xFFFFFFFF, 0)
-_MAP = default_map()
+_MAP = load_default_map()
 _WRITABLE = [block for block in _MAP.blocks if block.access == "rw"]
 # odd, and what happens comes at even distances: no feed is exactly a period old, where one clock
 # rounds up

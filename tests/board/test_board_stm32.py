@@ -28,7 +28,7 @@ import pytest
 from firmware_iface import conformance, roles
 from firmware_iface.board_settings import make_record
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.optoncdt1420 import three_bytes
+from firmware_iface.emulators.optoncdt1420 import encode_three_bytes
 from tests.board.gdb_wire import StoppedBoard, stopped
 from tests.board.qemu_board import addresses
 from tests.support.machine_needs import require
@@ -152,7 +152,8 @@ def written(log: Path) -> list[tuple[str, int, int]]:
 def frames(displacement_raw: int, first: int, count: int) -> bytes:
     """What the sensor streams: distance and counter, six bytes a value."""
     return b"".join(
-        three_bytes(displacement_raw, first=True) + three_bytes((first + n) % 2**18, first=False)
+        encode_three_bytes(displacement_raw, first=True)
+        + encode_three_bytes((first + n) % 2**18, first=False)
         for n in range(count)
     )
 

@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 
 from firmware_iface.board_settings import make_record
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from tests.board.test_board_faults import command, run_pump, sensors, write
 from tests.board.virtual_board import NO_VALUE, SETTINGS, VirtualBoard
 
 _KEY = 0x1234_5678
-_MAP = default_map()
-_GAUGE_LOST, _INTERLOCK = (_MAP.fault_mask(name) for name in ("gauge_lost", "interlock"))
+_MAP = load_default_map()
+_GAUGE_LOST, _INTERLOCK = (_MAP.make_fault_mask(name) for name in ("gauge_lost", "interlock"))
 _TICK_US, _SAMPLE_US = 1000, 5000
 _RUNNING, _STOPPED = (25_000, 12_500), (0, 12_500)
 _CLEAR = write("reset", {"clear_faults": 0xFFFF, "clear_key": _KEY})

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from firmware_iface.board_settings import make_record
-from firmware_iface.emulators.rtu_bus import bitwise_crc
+from firmware_iface.emulators.rtu_bus import compute_bitwise_crc
 from firmware_iface.links.modbus_link import exception_error
 
 NO_VALUE = -(2**31)
@@ -24,7 +24,7 @@ _ASKED_US = 4000
 def rtu_frame(unit: int, pdu: bytes) -> bytes:
     """A frame with its CRC, which is not the link's."""
     body = bytes([unit]) + pdu
-    return body + struct.pack("<H", bitwise_crc(body))
+    return body + struct.pack("<H", compute_bitwise_crc(body))
 
 
 class VirtualBoard:

@@ -12,7 +12,7 @@ from campaign_times import BOARD_PRESSURE_MAX_PA, TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant
 
 from firmware_iface.emulators.modbus_pdu import RegisterRefusal
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from firmware_iface.roles import BenchCommand, LinkError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.virtual_bench import VirtualBench, at_once
@@ -31,7 +31,7 @@ def a_gateway_repeats_the_last_write() -> list[str]:
     watchdog.
     """
     stage = Stage()
-    board, command = stage.bench.board, default_map().block("command")
+    board, command = stage.bench.board, load_default_map().block("command")
     written: list[list[int]] = []
     write = board.write
 
@@ -44,7 +44,7 @@ def a_gateway_repeats_the_last_write() -> list[str]:
     stage.held()
     board.write = write  # type: ignore[method-assign]
     stage.bench.wrong.stalled = True
-    sensors = default_map().block("sensors")
+    sensors = load_default_map().block("sensors")
     died_s = stage.run.now_s
 
     def repeat() -> str:
@@ -62,8 +62,8 @@ def others_disarm_the_watchdog() -> list[str]:
     controller dies.
     """
     stage = Stage().held()
-    settings = default_map().block("settings")
-    arm = default_map().register("watchdog_arm")
+    settings = load_default_map().block("settings")
+    arm = load_default_map().register("watchdog_arm")
     off = settings.encode(
         {register.name: 0.0 for register in settings.registers} | {"watchdog_period_s": 10.0}
     )
@@ -83,7 +83,7 @@ def a_stranger_writes_the_command() -> list[str]:
     the pump.
     """
     stage = Stage().held()
-    command = default_map().block("command")
+    command = load_default_map().block("command")
     values = dict.fromkeys((register.name for register in command.registers), 0.0) | {
         "pump_command_fraction": 1.0
     }
@@ -103,7 +103,7 @@ def a_board_that_takes_no_settings() -> list[str]:
     bench = VirtualBench(
         WatchedPlant(stage.world, stage.config.twin, stage.config.pump), WATCHDOG_S
     )
-    settings, write = default_map().block("settings"), bench.board.write
+    settings, write = load_default_map().block("settings"), bench.board.write
 
     def deaf(address: int, words: Sequence[int]) -> None:
         if address != settings.address:

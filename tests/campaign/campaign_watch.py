@@ -25,7 +25,7 @@ from campaign_times import (
 )
 from campaign_world import WatchedPlant
 
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from membrane_ctrl.hold.child_processes import EVENT_BYTES
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.model.events import Fault
@@ -33,7 +33,7 @@ from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _STILL = {State.STANDBY, State.LOWER}
-_LATCHED_FAULTS = default_map().register("latched_faults").address
+_LATCHED_FAULTS = load_default_map().register("latched_faults").address
 # two readings and the tick between at full pump, its lag, and three sigma of the reading
 _OVERSHOOT_UM = 8.0
 # 22 s on the mean flow and down again, in the strongest weather

@@ -21,7 +21,7 @@ def test_a_usb_port_is_named_by_what_survives_a_replug(
         PortInfo("/dev/ttyS0", "", "n/a"),
         PortInfo("/dev/ttyUSB0", "usb:0403:6001:A5", "FT232R"),
     ]
-    monkeypatch.setattr(devices, "serial_ports", lambda: ports)
+    monkeypatch.setattr(devices, "list_serial_ports", lambda: ports)
     first, second = devices.find_ports()
     path = tmp_path / "paste.toml"
     path.write_text(second.paste)
@@ -58,7 +58,7 @@ def test_without_aravis_the_rest_is_listed_and_the_remedy_named(
 ) -> None:
     monkeypatch.setattr(aravis, "_LIBRARY", "libaravis-not-there.so")
     aravis.load_aravis.cache_clear()
-    monkeypatch.setattr(devices, "serial_ports", lambda: [PortInfo("/dev/ttyS0", "", "n/a")])
+    monkeypatch.setattr(devices, "list_serial_ports", lambda: [PortInfo("/dev/ttyS0", "", "n/a")])
     assert run(["devices", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["devices"][0]["paste"] == 'port = "/dev/ttyS0"'

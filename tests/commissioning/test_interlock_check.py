@@ -151,7 +151,7 @@ async def test_a_lost_signal_is_an_error_after_the_report(
 
 
 async def test_inputs_of_a_board_of_an_earlier_map_are_refused(rig: Rig) -> None:
-    board = PumpBoardEmulator(rig.plant, registers=register_map.known_maps()[2])
+    board = PumpBoardEmulator(rig.plant, registers=register_map.list_known_maps()[2])
     await board.start()
     config = parse_tables(
         {

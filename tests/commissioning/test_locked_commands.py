@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.commissioning.check import _what_would_happen, run_conformance
+from membrane_ctrl.commissioning.check import _describe_hold, run_conformance
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.instruments.device_claim import claim_devices
 from membrane_ctrl.instruments.lock_keys import modbus_keys
@@ -40,10 +40,10 @@ def test_conformance_does_not_touch_a_locked_board(url: str) -> None:
 
 def test_check_names_the_locks_that_keep_a_hold_down() -> None:
     config = Config(devices=DevicesConfig(board=URL))
-    assert _what_would_happen(config)["locks"] == "none"
+    assert _describe_hold(config)["locks"] == "none"
     LockStore.of_machine().write_lock(ANN, KEYS)
-    assert "hands inside" in _what_would_happen(config)["locks"]
-    assert _what_would_happen(Config())["locks"] == "none"
+    assert "hands inside" in _describe_hold(config)["locks"]
+    assert _describe_hold(Config())["locks"] == "none"
 
 
 class Client:

@@ -15,7 +15,7 @@ import pytest
 
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.pump_board import BoardSample
-from firmware_iface.register_map import default_map, known_maps
+from firmware_iface.register_map import list_known_maps, load_default_map
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.commissioning.check import probe_board
 from membrane_ctrl.commissioning.safe import make_safe
@@ -23,7 +23,7 @@ from membrane_ctrl.config.schema import Config, DevicesConfig, RecordingConfig
 from membrane_ctrl.instruments.bench import make_pump_board
 from membrane_ctrl.instruments.device_claim import claim_devices
 from membrane_ctrl.instruments.device_names import device_names
-from membrane_ctrl.instruments.lock_keys import device_keys
+from membrane_ctrl.instruments.lock_keys import list_device_keys
 from membrane_ctrl.instruments.lock_store import VARIABLE, LockStore
 from membrane_ctrl.model.errors import DeviceError
 from tests.worlds.faulty_board import PumpBoardEmulator
@@ -62,7 +62,7 @@ class Bench:
 
     async def _emulator(self, version: int) -> PumpBoardEmulator:
         board = PumpBoardEmulator(
-            Still(), clock=lambda: self.now_s, registers=known_maps()[version]
+            Still(), clock=lambda: self.now_s, registers=list_known_maps()[version]
         )
         await board.start()
         return board
@@ -88,7 +88,7 @@ class Bench:
 
 @pytest.fixture
 def version() -> int:
-    return default_map().map_version
+    return load_default_map().map_version
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def test_it_stops_the_pump_under_a_holder_and_changes_nothing_of_his(
     assert bench.board.state.read(48, 2) == before
     bench.now_s += 0.51
     assert bench.read().watchdog_tripped  # it has not fed
-    (stored,) = LockStore.of_machine().find_locks(device_keys(bench.devices))
+    (stored,) = LockStore.of_machine().find_locks(list_device_keys(bench.devices))
     assert stored.lock.text == "made safe by hand"
     assert stored.lock.account == f"unix:{getpass.getuser()}"
 

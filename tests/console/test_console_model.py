@@ -9,7 +9,7 @@ import pytest
 from console_feed import FAULT, HOLDING, event, rows, shape
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import TREND_S, ConsoleModel, Trend, fault_words
+from membrane_ctrl.console.model import TREND_S, ConsoleModel, Trend, describe_fault_state
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, SafeLevel, ShapeState, State
@@ -21,10 +21,10 @@ def model(duration_s: float | None = None) -> ConsoleModel:
 
 def test_trend_is_the_mean_of_each_second_with_gaps() -> None:
     trend = Trend()
-    assert all(math.isnan(mean) for mean in trend.second_means())
+    assert all(math.isnan(mean) for mean in trend.mean_by_seconds())
     for mono_s, value in ((1.0, 1.0), (1.5, 3.0), (2.0, math.nan), (3.9, 5.0)):
         trend.add(mono_s, value)
-    means = trend.second_means()
+    means = trend.mean_by_seconds()
     assert len(means) == TREND_S
     assert means[-3] == 2.0
     assert math.isnan(means[-2])
@@ -37,8 +37,8 @@ def test_trend_forgets_after_a_minute_even_across_a_gap() -> None:
     trend.add(0.0, 1.0)
     trend.add(70.0, 2.0)
     assert trend.finite_values() == [2.0]
-    assert [mean for mean in trend.second_means() if math.isfinite(mean)] == [1.0, 2.0]
-    assert all(math.isnan(mean) for mean in trend.second_means()[-70:-1])
+    assert [mean for mean in trend.mean_by_seconds() if math.isfinite(mean)] == [1.0, 2.0]
+    assert all(math.isnan(mean) for mean in trend.mean_by_seconds()[-70:-1])
 
 
 def test_last_minute_of_the_error() -> None:
@@ -167,8 +167,8 @@ def test_end_event_ends() -> None:
 def test_words_of_a_fault(given: dict[str, object], words: str) -> None:
     fault = from_dict({"kind": "fault", **given})
     assert isinstance(fault, Fault)
-    assert fault_words(fault) == words
-    assert fault_words(None) == ""
+    assert describe_fault_state(fault) == words
+    assert describe_fault_state(None) == ""
 
 
 def test_gains_in_force_and_the_countdown_of_a_trial_are_shown() -> None:

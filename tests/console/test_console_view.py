@@ -161,26 +161,26 @@ def test_a_large_terminal_lists_the_last_events_with_those_who_caused_them() -> 
     assert "only the headline" not in page
 
 
-def test_who_waits_for_a_person_says_how_to_go_on() -> None:
+def test_a_state_that_waits_for_a_person_shows_the_next_command() -> None:
     model = ConsoleModel(CONFIG, ctl="membrane-ctrl ctl --socket x/control.sock", keys=True)
     model.add_row(replace(HOLDING, state=State.STANDBY))
     assert any(
-        "go on: `membrane-ctrl ctl --socket x/control.sock hold` or key h" in row
+        "next: `membrane-ctrl ctl --socket x/control.sock hold` or key h" in row
         for row in drawn(model, 0.0)
     )
     model.add_event(
         event(0.0, "command", command="latched", who="command line", why="", text="over_pressure")
     )
     view = model.make_view(0.0)
-    assert view.go_on == "go on: `membrane-ctrl ctl --socket x/control.sock ack`"
-    assert format_line(view).endswith(view.go_on)
+    assert view.next_step == "next: `membrane-ctrl ctl --socket x/control.sock ack`"
+    assert format_line(view).endswith(view.next_step)
     model.add_row(HOLDING)
-    assert model.make_view(0.0).go_on == ""
+    assert model.make_view(0.0).next_step == ""
     model.add_event(
         event(0.0, "why", why="held up by ann: the pump keeps its mean flow", code="paused")
     )
     assert model.make_view(0.0).paused
-    assert model.make_view(0.0).go_on.endswith("resume` or key p")
+    assert model.make_view(0.0).next_step.endswith("resume` or key p")
 
 
 def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_removed() -> None:
@@ -202,13 +202,13 @@ def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_rem
         assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in format_line(
             model.make_view(0.0)
         )
-    assert model.make_view(0.0).go_on == "go on: ask unix:ann, then `ctl unlock bofak`"
+    assert model.make_view(0.0).next_step == "next: ask unix:ann, then `ctl unlock bofak`"
     removed = {"text": "", "author": "", "set_utc": "", "remover": "", "how": "word", "number": 2}
     model.add_event(event(0.0, "unlock", word="bofak", **removed))
-    assert model.make_view(0.0).go_on == "go on: ask page:bob, then `ctl unlock gumil`"
+    assert model.make_view(0.0).next_step == "next: ask page:bob, then `ctl unlock gumil`"
     model.add_event(event(0.0, "unlock", word="gumil", **removed))
     assert model.make_view(0.0).locks == ()
-    assert "hold" in model.make_view(0.0).go_on
+    assert "hold" in model.make_view(0.0).next_step
 
 
 def test_fault_and_its_remedy_are_seen() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.control.feedforward import FeedForward
-from membrane_ctrl.control.weather_limits import weather_fault
+from membrane_ctrl.control.weather_limits import explain_weather_fault
 
 DT_S = 0.02
 
@@ -91,15 +91,15 @@ def test_a_weather_sensor_in_a_wrong_unit_is_ignored_and_reported(
     pressure_pa: float, air_c: float
 ) -> None:
     wave = np.sin(np.arange(200) / 10)
-    wrong_pressure = weather_fault(pressure_pa, 20.0) != ""
+    wrong_pressure = explain_weather_fault(pressure_pa, 20.0) != ""
     pressure = pressure_pa + (wave if wrong_pressure else 0.0 * wave)
     air = air_c + (0.0 * wave if wrong_pressure else wave)
     assert not answered(LoopConfig(), pressure, air).any()
-    assert "check its unit" in weather_fault(pressure_pa, air_c)
+    assert "check its unit" in explain_weather_fault(pressure_pa, air_c)
 
 
 @pytest.mark.parametrize(
     ("pressure_pa", "air_c"), [(101_325.0, 20.0), (54_000.0, -5.0), (math.nan, math.nan)]
 )
 def test_weather_within_habitable_ranges_is_accepted(pressure_pa: float, air_c: float) -> None:
-    assert weather_fault(pressure_pa, air_c) == ""
+    assert explain_weather_fault(pressure_pa, air_c) == ""

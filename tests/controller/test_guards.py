@@ -30,7 +30,7 @@ from membrane_ctrl.control_port.server import Port
 from membrane_ctrl.control_port.sockets import Listeners
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
-from membrane_ctrl.hold.child_processes import ChildProcesses, rings_for
+from membrane_ctrl.hold.child_processes import ChildProcesses, make_rings
 from membrane_ctrl.hold.closing_words import RunEnd
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
@@ -115,7 +115,7 @@ class Bench:
         )
         port = partial(Port, CONFIG.port, Listeners(), "run")
         with ExitStack() as stack:
-            rings = rings_for(CONFIG, None, stack)
+            rings = make_rings(CONFIG, None, stack)
             events = RingReader(rings.events)
             stack.callback(events.close)
 

@@ -18,7 +18,7 @@ from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, pack_tick, unpack
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import CommandTaken, LockRemoved, LockSet
 from membrane_ctrl.model.lock import LOCKS_MOST, Lock, describe_locks
-from membrane_ctrl.model.lock_words import WORDS, distinct_word, word_of_number
+from membrane_ctrl.model.lock_words import WORDS, distinct_word, make_word
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 
@@ -258,14 +258,14 @@ def test_the_status_has_the_locks_until_each_is_removed() -> None:
 
 
 def test_words_are_short_distinct_and_as_many_as_stated() -> None:
-    some = {word_of_number(number) for number in range(WORDS)}
+    some = {make_word(number) for number in range(WORDS)}
     assert len(some) == WORDS
     assert {len(word) for word in some} == {5}
-    assert word_of_number(WORDS) == word_of_number(0)
-    first = word_of_number(0)
+    assert make_word(WORDS) == make_word(0)
+    first = make_word(0)
     assert distinct_word("", ()) == first
     assert distinct_word("bofak", {"gumil"}) == "bofak"
-    assert distinct_word("bofak", {"bofak", first}) == word_of_number(1)
+    assert distinct_word("bofak", {"bofak", first}) == make_word(1)
 
 
 def test_many_locks_are_counted_in_one_line() -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import (
     Config,
@@ -33,7 +33,9 @@ from tests.support.scenario import CheckedScenario, Expectation, play
 RULES = {rule.name: rule for rule in TABLE}
 LINK_LOST, LATE = RULES["link_lost"], RULES["late"]
 CONFIG = ResumeConfig(faults=("link_lost",), wait_s=10.0, most_per_day=2)
-WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
+WATCHDOG, OVER_PRESSURE = (
+    load_default_map().make_fault_mask(name) for name in ("watchdog", "over_pressure")
+)
 SHUT = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, 1, 0.0, False, 0)
 GONE = Observation(
     link_up=True,

@@ -23,7 +23,7 @@ from patience import slow_machine
 from pymodbus.client import ModbusTcpClient
 from rerun.chunk import RrdReader
 
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from membrane_ctrl.cli import run
 from membrane_ctrl.measure.capture_set import read_head
 
@@ -102,7 +102,7 @@ def board_of(folder: Path) -> ModbusTcpClient:
 
 
 def read_board(client: ModbusTcpClient) -> dict[str, float]:
-    block = default_map().block("sensors")
+    block = load_default_map().block("sensors")
     reply = client.read_holding_registers(block.address, count=block.count, device_id=1)
     assert not reply.isError()
     return block.decode(reply.registers)

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 import pytest
 from counting_plant import CountingPlant, ManualClock
 
-from firmware_iface.register_map import default_map, known_maps
+from firmware_iface.register_map import list_known_maps, load_default_map
 from tests.worlds.faulty_board import PumpBoardEmulator
 
 
@@ -24,7 +24,7 @@ async def plant() -> CountingPlant:
 @pytest.fixture
 def map_version() -> int:
     """Of the emulated board; a module whose tests run on an earlier one as well parametrizes it."""
-    return default_map().map_version
+    return load_default_map().map_version
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ async def board(
     plant: CountingPlant, clock: ManualClock, map_version: int
 ) -> AsyncIterator[PumpBoardEmulator]:
     """The emulated board, running."""
-    emulator = PumpBoardEmulator(plant, clock=clock, registers=known_maps()[map_version])
+    emulator = PumpBoardEmulator(plant, clock=clock, registers=list_known_maps()[map_version])
     await emulator.start()
     yield emulator
     await emulator.stop()

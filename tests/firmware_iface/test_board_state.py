@@ -15,7 +15,7 @@ from firmware_iface.emulators.pump_board import (
     BoardState,
     StoredSettings,
 )
-from firmware_iface.register_map import known_maps
+from firmware_iface.register_map import list_known_maps
 
 SAMPLE = BoardSample(1.5, 0, 600.0, 101_325.0, 20.0, 21.0, 7, 3.25)
 PERIOD_S = 0.5
@@ -33,7 +33,7 @@ class Bench:
         stored: StoredSettings = DELIVERED,
         sample: BoardSample = SAMPLE,
     ) -> None:
-        self.map = known_maps()[version]
+        self.map = list_known_maps()[version]
         self.state = BoardState(self.map, sample, stored)
         self.now_s = 0.0
         self.claim = {"claim_id": 7, "claim_key": key, "command_key": key, "clear_key": key}
@@ -195,8 +195,8 @@ def test_over_pressure_stops_the_pump_and_opens_the_vent(bench: Bench) -> None:
     bench.at(0.2, replace(SAMPLE, gauge_pressure_pa=GAUGE_PRESSURE_LIMIT_PA + 0.1))
     bench.at(0.3)
     assert (bench.state.pump_fraction, bench.state.vent_fraction) == (0.0, 1.0)
-    assert bench.get("sensors")["latched_faults"] == bench.map.fault_mask("over_pressure")
-    bench.clear(bench.map.fault_mask("watchdog"))  # the other fault's bit clears nothing
+    assert bench.get("sensors")["latched_faults"] == bench.map.make_fault_mask("over_pressure")
+    bench.clear(bench.map.make_fault_mask("watchdog"))  # the other fault's bit clears nothing
     assert bench.state.vent_fraction == 1.0
     bench.clear()
     assert (bench.state.pump_fraction, bench.state.vent_fraction) == (0.0, 0.0)
@@ -394,7 +394,7 @@ def test_a_claim_lapses_with_its_watchdog_and_the_next_one_has_a_whole_period(
     claimed.put("settings", watchdog_period_s=0.25, watchdog_arm=1, claim_id=9, claim_key=9)
     sensors = claimed.get("sensors")
     assert (sensors["claim_in_force"], sensors["period_in_force_s"]) == (9, 0.25)
-    assert sensors["latched_faults"] == claimed.map.fault_mask(
+    assert sensors["latched_faults"] == claimed.map.make_fault_mask(
         "watchdog"
     )  # the claim clears nothing
     with refused(6):  # the former holder has lost it, although the fault stays latched
@@ -433,7 +433,7 @@ def test_anybody_may_stop_and_only_the_holder_clears_it(claimed: Bench) -> None:
         claimed.state.write(stop.address, [0])
     claimed.state.write(stop.address, [1])
     assert (claimed.state.pump_fraction, claimed.state.vent_fraction) == (0.0, 0.25)
-    assert claimed.get("sensors")["latched_faults"] == claimed.map.fault_mask("stopped")
+    assert claimed.get("sensors")["latched_faults"] == claimed.map.make_fault_mask("stopped")
     assert claimed.get("stop")["stop"] == 0
     claimed.command(0.5, 2)
     assert claimed.state.pump_fraction == 0.0

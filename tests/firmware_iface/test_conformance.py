@@ -19,7 +19,7 @@ from firmware_iface.emulators.pump_board import BoardSample, BoardState, StoredS
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
-from firmware_iface.register_map import known_maps
+from firmware_iface.register_map import list_known_maps
 from firmware_iface.roles import BenchCommand, DeviceBusyError, LinkError
 from tests.worlds.faulty_board import PumpBoardEmulator
 from tests.worlds.faulty_devices import RtuBusEmulator
@@ -271,7 +271,7 @@ async def serve() -> AsyncIterator[Serve]:
     ) -> Bench:
         clock = ManualClock()
         plant = ClockedPlant(clock)
-        registers = known_maps()[version]
+        registers = list_known_maps()[version]
         bench = Bench(PumpBoardEmulator(plant, clock=clock, registers=registers), clock, plant)
         bench.board.state = kind(registers, plant.sample(), stored)
         benches.append(bench)

@@ -12,11 +12,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from firmware_iface.checkerboard_check import checkerboard_problem
-from firmware_iface.display_patterns import ScreenRaster, make_checkerboard, pattern_light
-from firmware_iface.display_response import RAMP_LEVELS, linear_response, measured_response
+from firmware_iface.checkerboard_check import explain_checkerboard
+from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light, make_checkerboard
+from firmware_iface.display_response import (
+    RAMP_LEVELS,
+    make_linear_response,
+    make_measured_response,
+)
 from firmware_iface.display_settling import fit_settling, share_left
-from firmware_iface.exposure_check import exposure_problem
+from firmware_iface.exposure_check import explain_exposure
 from firmware_iface.roles import Pattern
 from tests.worlds.panel import EmulatedPanel, PanelResponse
 
@@ -27,23 +31,25 @@ def test_sinusoids_have_the_stated_phase() -> None:
     column, row = 180, 100
     for axis, s_mm in (("x", (column - 170) * 0.25 + 28), ("y", (128 - row) * 0.25 + 28)):
         for k in range(4):
-            light = pattern_light(Pattern("sin", axis, k, k * math.pi / 2), RASTER)[row, column]
+            light = compute_pattern_light(Pattern("sin", axis, k, k * math.pi / 2), RASTER)[
+                row, column
+            ]
             phi = 2 * math.pi * s_mm / 14.0 - math.pi
             assert light == pytest.approx(0.5 + 0.5 * math.cos(phi + k * math.pi / 2), abs=1e-6)
 
 
 def test_crossed_fringes_share_the_light_of_both_axes() -> None:
-    light = pattern_light(Pattern("crossed", "", 7, 0.3, shift_y_rad=1.1), RASTER)
+    light = compute_pattern_light(Pattern("crossed", "", 7, 0.3, shift_y_rad=1.1), RASTER)
     phi_x = 2 * math.pi * ((180 - 170) * 0.25 + 28) / 8 - math.pi
     phi_y = 2 * math.pi * ((128 - 100) * 0.25 + 28) / 8 - math.pi
     assert light[100, 180] == pytest.approx(
         0.5 + 0.25 * (math.cos(phi_x + 0.3) + math.cos(phi_y + 1.1)), abs=1e-6
     )
-    assert not light[pattern_light(Pattern("white"), RASTER) == 0].any()
+    assert not light[compute_pattern_light(Pattern("white"), RASTER) == 0].any()
 
 
 def test_gray_codes_number_the_half_periods() -> None:
-    bits = [pattern_light(Pattern("gray", "x", bit), RASTER)[128] for bit in range(1, 5)]
+    bits = [compute_pattern_light(Pattern("gray", "x", bit), RASTER)[128] for bit in range(1, 5)]
     code = sum(bit.astype(int) << (3 - k) for k, bit in enumerate(bits))
     value = code ^ (code >> 1) ^ (code >> 2) ^ (code >> 3)
     s_mm = RASTER.from_low_edge_mm("x")
@@ -53,13 +59,13 @@ def test_gray_codes_number_the_half_periods() -> None:
 
 
 def test_outside_of_the_region_it_is_dark() -> None:
-    white, black = (pattern_light(Pattern(role), RASTER) for role in ("white", "black"))
+    white, black = (compute_pattern_light(Pattern(role), RASTER) for role in ("white", "black"))
     assert white.sum() == pytest.approx((56 / 0.25) ** 2, rel=0.01)
     assert white[128, 170] == 1.0
     assert white[0, 0] == 0.0
     assert not black.any()
     with pytest.raises(ValueError, match="role must be"):
-        pattern_light(Pattern("gray", "x", 5), RASTER)
+        compute_pattern_light(Pattern("gray", "x", 5), RASTER)
 
 
 def test_a_region_larger_than_the_screen_is_refused() -> None:
@@ -126,16 +132,18 @@ def test_panel_is_first_order_from_its_refresh_on() -> None:
 def test_response_makes_light_linear(gamma: float) -> None:
     levels = np.array(RAMP_LEVELS)
     seen = 6.0 + 190.0 * (levels / 255) ** gamma
-    response = measured_response(levels, seen)
+    response = make_measured_response(levels, seen)
     assert response.gamma == pytest.approx(gamma, rel=0.02)
     wanted = np.linspace(0.05, 1.0, 200)
-    light = (response.levels_of(wanted) / 255.0) ** gamma
+    light = (response.find_levels(wanted) / 255.0) ** gamma
     half_a_step = 0.5 * gamma / 255  # at the bright end, where the curve is steepest
     assert np.abs(light - wanted).max() < half_a_step + 0.002
 
 
 def test_a_linear_response_changes_nothing() -> None:
-    assert np.array_equal(linear_response().levels_of(np.arange(256) / 255.0), np.arange(256))
+    assert np.array_equal(
+        make_linear_response().find_levels(np.arange(256) / 255.0), np.arange(256)
+    )
 
 
 @pytest.mark.parametrize(
@@ -149,7 +157,7 @@ def test_a_linear_response_changes_nothing() -> None:
 )
 def test_a_ramp_that_is_none(seen: np.ndarray, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        measured_response(RAMP_LEVELS, seen)
+        make_measured_response(RAMP_LEVELS, seen)
 
 
 def seen_through(levels: np.ndarray, scale: float = 1.0) -> np.ndarray:
@@ -169,11 +177,11 @@ def seen_through(levels: np.ndarray, scale: float = 1.0) -> np.ndarray:
 def test_checkerboard_shown_as_sent_and_scaled() -> None:
     white, black = seen_through(np.full((256, 1280), 255)), seen_through(np.zeros((256, 1280)))
     board = make_checkerboard(1280, 256)
-    assert checkerboard_problem(seen_through(board), white, black) == ""
-    assert "bands" in checkerboard_problem(seen_through(board, 1366 / 1360), white, black)
+    assert explain_checkerboard(seen_through(board), white, black) == ""
+    assert "bands" in explain_checkerboard(seen_through(board, 1366 / 1360), white, black)
     half = np.full((256, 1280), 127.5)  # mixed everywhere
-    assert "22 % of white instead of 50" in checkerboard_problem(seen_through(half), white, black)
-    assert "does not see the screen" in checkerboard_problem(black, black, black)
+    assert "22 % of white instead of 50" in explain_checkerboard(seen_through(half), white, black)
+    assert "does not see the screen" in explain_checkerboard(black, black, black)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +195,7 @@ def test_checkerboard_shown_as_sent_and_scaled() -> None:
 )
 def test_exposure(white: int, black: int, words: str) -> None:
     frames = (np.full((64, 64), level, np.uint8) for level in (white, black))
-    problem = exposure_problem(*frames, 255, 20.0)
+    problem = explain_exposure(*frames, 255, 20.0)
     assert bool(problem) == bool(words)
     if words:
         assert re.search(words, problem), problem

@@ -10,12 +10,14 @@ import pytest
 from test_board_state import SAMPLE, Bench, pumping
 
 from firmware_iface.emulators.pump_board import GAUGE_PRESSURE_LIMIT_PA, BoardSample, StoredSettings
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 
 TIMEOUT_S = 15.0
 FROZEN_S = 60.0
 TICK_S = 0.25  # below the watchdog's period
-GAUGE_LOST, INTERLOCK = (default_map().fault_mask(name) for name in ("gauge_lost", "interlock"))
+GAUGE_LOST, INTERLOCK = (
+    load_default_map().make_fault_mask(name) for name in ("gauge_lost", "interlock")
+)
 NO_GAUGE = replace(SAMPLE, gauge_pressure_pa=math.nan)
 
 
@@ -280,4 +282,4 @@ def test_over_pressure_opens_the_vent_although_another_fault_came_first() -> Non
     run.bench.at(0.01, with_inputs(0))
     run.bench.at(0.02, replace(SAMPLE, gauge_pressure_pa=GAUGE_PRESSURE_LIMIT_PA + 1.0))
     assert run.outputs == (0.0, 1.0)
-    assert run.faults == INTERLOCK | default_map().fault_mask("over_pressure")
+    assert run.faults == INTERLOCK | load_default_map().make_fault_mask("over_pressure")

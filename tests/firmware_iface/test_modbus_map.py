@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_iface.drivers.modbus_map import ModbusValue, ValueMap, make_map
-from firmware_iface.emulators.rtu_bus import bitwise_crc
+from firmware_iface.emulators.rtu_bus import compute_bitwise_crc
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkError
@@ -52,7 +52,9 @@ def test_a_value_outside_the_limits_is_never_encoded(value: float) -> None:
 
 def test_the_frame_of_the_vendor() -> None:
     frame = bytes.fromhex("01060000 03E8")
-    assert frame + bitwise_crc(frame).to_bytes(2, "little") == bytes.fromhex("0106000003E88974")
+    assert frame + compute_bitwise_crc(frame).to_bytes(2, "little") == bytes.fromhex(
+        "0106000003E88974"
+    )
 
 
 def test_an_output_is_set_read_back_and_left_at_rest() -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from firmware_iface.emulators.modbus_pdu import answer_request
-from firmware_iface.emulators.rtu_bus import bitwise_crc
+from firmware_iface.emulators.rtu_bus import compute_bitwise_crc
 from firmware_iface.links.modbus_rtu import (
     RtuBus,
     compute_crc16,
@@ -90,7 +90,7 @@ def on_bus(test: Callable[[Bus], Coroutine[Any, Any, None]], echo_test: bool = T
 )
 def test_crc_vectors(body: bytes, crc: int) -> None:
     assert compute_crc16(body) == crc
-    assert bitwise_crc(body) == crc
+    assert compute_bitwise_crc(body) == crc
 
 
 def test_the_vendors_frame() -> None:

@@ -12,9 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_iface.drivers.optoncdt1420 import Optoncdt1420, StreamParser, distance_mm, middle_mean
+from firmware_iface.drivers.optoncdt1420 import (
+    Optoncdt1420,
+    StreamParser,
+    distance_mm,
+    mean_of_middle,
+)
 from firmware_iface.drivers.step_gate import StepGate
-from firmware_iface.emulators.optoncdt1420 import NO_PEAK, three_bytes
+from firmware_iface.emulators.optoncdt1420 import NO_PEAK, encode_three_bytes
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import Optoncdt1420Config
@@ -50,14 +55,14 @@ def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], **settings: Any
 
 
 def measurement(raw: int, counter: int) -> bytes:
-    return three_bytes(raw, first=True) + three_bytes(counter, first=False)
+    return encode_three_bytes(raw, first=True) + encode_three_bytes(counter, first=False)
 
 
 def test_the_marks_of_the_three_bytes() -> None:
-    assert three_bytes(0b101010_110011_001111, first=True) == bytes(
+    assert encode_three_bytes(0b101010_110011_001111, first=True) == bytes(
         [0b00_001111, 0b01_110011, 0b10_101010]
     )
-    assert three_bytes(0, first=False) == bytes([0, 0x40, 0xC0])
+    assert encode_three_bytes(0, first=False) == bytes([0, 0x40, 0xC0])
 
 
 @pytest.mark.parametrize(
@@ -95,8 +100,8 @@ def test_the_counter_runs_over() -> None:
 
 def test_the_middle_of_many_ignores_a_quarter() -> None:
     values = np.array([100] * 30 + [101] * 30 + [60_000] * 20)
-    assert 100.0 < middle_mean(values) < 102.0
-    assert middle_mean(np.array([1, 2, 60_000])) == 2.0
+    assert 100.0 < mean_of_middle(values) < 102.0
+    assert mean_of_middle(np.array([1, 2, 60_000])) == 2.0
 
 
 def test_the_gate_wants_a_second_reading() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_iface.display_patterns import ScreenRaster, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light
 from firmware_iface.display_response import DisplayResponse
 from firmware_iface.pattern_screen import SETTLE_S, PatternScreen
 from firmware_iface.roles import DeviceIdentity, DriverClock, LinkDownError, LinkError, Pattern
@@ -88,7 +88,7 @@ def test_patterns_are_prepared_once_and_shown_pixel_by_pixel(
     for pattern in PATTERNS * 2:
         screen.begin(pattern)
         assert np.array_equal(
-            display.shown, np.rint(255 * pattern_light(pattern, RASTER).astype(float))
+            display.shown, np.rint(255 * compute_pattern_light(pattern, RASTER).astype(float))
         )
     assert display.prepared == len(PATTERNS)
 
@@ -99,7 +99,7 @@ def test_a_response_is_corrected(screen: PatternScreen, display: Display) -> Non
     screen.linearise(DisplayResponse(levels, (levels / 255) ** 2.2))
     screen.begin(PATTERNS[0])
     light = (display.shown / 255.0) ** 2.2
-    assert np.abs(light - pattern_light(PATTERNS[0], RASTER)).max() < 0.01
+    assert np.abs(light - compute_pattern_light(PATTERNS[0], RASTER)).max() < 0.01
 
 
 def test_a_picture_stands_after_the_settle_time(screen: PatternScreen, time: Time) -> None:

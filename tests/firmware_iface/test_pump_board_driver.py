@@ -14,7 +14,7 @@ from pymodbus.client import AsyncModbusTcpClient
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.pump_board import StoredSettings
 from firmware_iface.links.modbus_rtu import parse_tcp_url
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from firmware_iface.roles import (
     ALL_FAULTS,
     BenchCommand,
@@ -284,7 +284,7 @@ async def test_watchdog_trips_when_the_client_stops(
     await plant.reaches((0.0, 0.25))  # by the board's own task: nobody talks to it
     reading = await driver.read()
     assert reading.watchdog_tripped
-    assert reading.latched_faults == default_map().fault_mask("watchdog")
+    assert reading.latched_faults == load_default_map().make_fault_mask("watchdog")
 
 
 async def test_watchdog_trips_when_only_readers_are_there(
@@ -400,7 +400,9 @@ async def test_over_pressure_is_acted_on_by_the_board_itself(
     await driver.write(BenchCommand(0.5, 0.0))
     plant.gauge_pressure_pa = 801.0
     await plant.reaches((0.0, 1.0))
-    assert (await driver.read()).latched_faults == default_map().fault_mask("over_pressure")
+    assert (await driver.read()).latched_faults == load_default_map().make_fault_mask(
+        "over_pressure"
+    )
 
 
 @every_map

@@ -10,7 +10,7 @@ from counting_plant import CountingPlant, ManualClock
 from pymodbus.client import AsyncModbusTcpClient
 
 from firmware_iface.generate import DOCS_PATH
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from tests.worlds.faulty_board import PumpBoardEmulator
 
 DOCS = DOCS_PATH.read_text(encoding="utf-8")
@@ -50,7 +50,7 @@ async def test_a_plain_client_reads_what_the_documentation_says(
     board.faults.frozen = True  # so that all reads see the same sample
     sample = board._sample
     values = await _documented(client, DOCS)
-    assert set(values) == {register.name for register in default_map()}
+    assert set(values) == {register.name for register in load_default_map()}
     assert values["displacement_um"] == pytest.approx(sample.displacement_um, abs=0.0005)
     assert values["ambient_pressure_pa"] == pytest.approx(sample.ambient_pressure_pa, abs=0.0005)
     assert values["gas_temperature_c"] == -3.125

@@ -15,7 +15,7 @@ from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.modbus_pdu import answer_request
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from firmware_iface.roles import BenchCommand, LinkDownError
 from tests.worlds.faulty_board import PumpBoardEmulator
 from tests.worlds.faulty_devices import RtuBusEmulator
@@ -72,7 +72,7 @@ async def test_a_pulled_cable_is_a_lost_link_and_its_watchdog_acts(
 async def test_a_plain_pymodbus_client_reads_and_writes_the_board(
     wire: PtyWire, board: PumpBoardEmulator
 ) -> None:
-    block = default_map().block("identity")
+    block = load_default_map().block("identity")
 
     def plain() -> tuple[list[int], bool, bool]:
         client = ModbusSerialClient(
@@ -91,7 +91,7 @@ async def test_a_plain_pymodbus_client_reads_and_writes_the_board(
             client.close()
 
     words, failed, refused = await asyncio.to_thread(plain)
-    assert block.decode(words)["device_kind"] == default_map().device_kind
+    assert block.decode(words)["device_kind"] == load_default_map().device_kind
     assert not failed
     assert refused
     assert (board.state.pump_fraction, board.state.vent_fraction) == (0.125, 0.5)

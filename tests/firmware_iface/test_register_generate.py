@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from firmware_iface import generate
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from tests.support.machine_needs import needs
 
 
@@ -33,7 +33,7 @@ def test_check_reports_a_stale_file_and_writes_nothing(
 
 @needs("cc")
 def test_c_header_compiles_and_agrees_with_the_map(tmp_path: Path) -> None:
-    registers = default_map()
+    registers = load_default_map()
     wanted = {f"{register.name.upper()}_ADDRESS": register.address for register in registers}
     wanted |= {f"BLOCK_{block.name.upper()}_WORDS": block.count for block in registers.blocks}
     wanted |= {f"FAULT_{fault.name.upper()}": fault.mask for fault in registers.faults}

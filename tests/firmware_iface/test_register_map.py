@@ -17,8 +17,8 @@ from firmware_iface.register_map import (
     DEFAULT_PATH,
     I32_NO_VALUE,
     RegisterMapError,
-    default_map,
-    known_maps,
+    list_known_maps,
+    load_default_map,
     load_map,
     parse_map,
 )
@@ -30,7 +30,7 @@ def table() -> dict[str, Any]:
 
 
 def test_sensor_and_command_blocks_are_one_transaction_each() -> None:
-    registers = default_map()
+    registers = load_default_map()
     for name in ("identity", "sensors", "settings", "command"):
         block = registers.block(name)
         addresses = [
@@ -42,7 +42,7 @@ def test_sensor_and_command_blocks_are_one_transaction_each() -> None:
 
 
 def test_an_earlier_map_is_the_newest_without_what_came_later() -> None:
-    newest, second, first = default_map(), known_maps()[2], known_maps()[1]
+    newest, second, first = load_default_map(), list_known_maps()[2], list_known_maps()[1]
     assert (newest.map_version, second.map_version, first.map_version) == (3, 2, 1)
     assert [register for register in newest if register.since <= 2] == list(second)
     assert [fault.name for fault in second.faults] == ["watchdog", "over_pressure", "stopped"]
@@ -61,7 +61,7 @@ def test_an_earlier_map_is_the_newest_without_what_came_later() -> None:
 
 
 def test_resolutions_are_finer_than_the_sensors() -> None:
-    registers = default_map()
+    registers = load_default_map()
     assert 1 / registers.register("displacement_um").counts_per_unit <= 0.001
     assert 1 / registers.register("gauge_pressure_pa").counts_per_unit <= 0.01
     assert 1 / registers.register("ambient_pressure_pa").counts_per_unit <= 0.01
@@ -75,7 +75,7 @@ def test_resolutions_are_finer_than_the_sensors() -> None:
 def test_values_survive_to_half_a_count(
     displacement_um: float, pressure_pa: float, pump: float, counter: int
 ) -> None:
-    block = default_map().block("sensors")
+    block = load_default_map().block("sensors")
     sent = dict.fromkeys((register.name for register in block.registers), 0.0)
     sent |= {
         "displacement_um": displacement_um,
@@ -89,7 +89,7 @@ def test_values_survive_to_half_a_count(
 
 
 def test_big_word_comes_first() -> None:
-    block = default_map().block("sensors")
+    block = load_default_map().block("sensors")
     values = dict.fromkeys((register.name for register in block.registers), 0.0)
     words = block.encode(values | {"sample_counter": 0x00010002, "displacement_um": -0.001})
     assert words[:2] == [1, 2]
@@ -97,7 +97,7 @@ def test_big_word_comes_first() -> None:
 
 
 def test_f32_registers_are_ieee() -> None:
-    block = default_map().block("identity")
+    block = load_default_map().block("identity")
     values = dict.fromkeys((register.name for register in block.registers), 0.0) | {
         "gauge_pressure_limit_pa": 812.5
     }
@@ -107,7 +107,7 @@ def test_f32_registers_are_ieee() -> None:
 
 
 def test_a_missing_value_is_nan_on_both_sides() -> None:
-    register = default_map().register("displacement_um")
+    register = load_default_map().register("displacement_um")
     assert register.to_raw(math.nan) == I32_NO_VALUE
     assert math.isnan(register.to_value(I32_NO_VALUE))
 
@@ -123,12 +123,12 @@ def test_a_missing_value_is_nan_on_both_sides() -> None:
 )
 def test_a_value_that_does_not_fit_is_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
-        default_map().register(name).to_raw(value)
+        load_default_map().register(name).to_raw(value)
 
 
 def test_a_block_of_wrong_length_is_refused() -> None:
     with pytest.raises(ValueError, match="command has 5 registers, not 2"):
-        default_map().block("command").decode([0, 0])
+        load_default_map().block("command").decode([0, 0])
 
 
 def _edit(table: dict[str, Any], block: int, register: int, **changes: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from firmware_iface import display_conformance
-from firmware_iface.display_patterns import ScreenRaster, make_checkerboard, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light, make_checkerboard
 from firmware_iface.display_response import DisplayResponse
 from firmware_iface.drivers.screen_pygame import PygameDisplay
 from firmware_iface.pattern_screen import PatternScreen
@@ -98,7 +98,7 @@ def screen(framebuffer: Path) -> Iterator[PatternScreen]:
 
 
 def levels(pattern: Pattern) -> np.ndarray:
-    return np.rint(255 * pattern_light(pattern, RASTER).astype(np.float64)).astype(np.uint8)
+    return np.rint(255 * compute_pattern_light(pattern, RASTER).astype(np.float64)).astype(np.uint8)
 
 
 def test_every_pattern_is_on_the_screen_byte_for_byte(
@@ -125,7 +125,7 @@ def test_light_is_made_linear(screen: PatternScreen, framebuffer: Path) -> None:
     screen.show(pattern)
     light = (screenshot(framebuffer)[:, :, 0] / 255.0) ** 2.2
     assert (
-        np.abs(light - pattern_light(pattern, RASTER)).max() < 0.01
+        np.abs(light - compute_pattern_light(pattern, RASTER)).max() < 0.01
     )  # half a level at the steepest is 0.0043
     assert not np.array_equal(screenshot(framebuffer)[:, :, 0], levels(pattern))
 

@@ -13,7 +13,7 @@ import pytest
 
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
-from firmware_iface.links.port_names import check_port_name, port_path, serial_ports
+from firmware_iface.links.port_names import check_port_name, list_serial_ports, resolve_port_path
 from firmware_iface.links.serial_port import SerialPort, SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from tests.worlds.faulty_devices import RtuBusEmulator, SerialDevice
@@ -178,19 +178,19 @@ PORTS = [
 
 
 def test_a_usb_name_finds_its_adapter() -> None:
-    assert port_path("usb:0403:6001:B2", lambda: PORTS) == "/dev/ttyUSB1"
-    assert port_path("usb:0403:6001", lambda: PORTS[:1]) == "/dev/ttyUSB1"
-    assert port_path("/dev/anything", lambda: PORTS) == "/dev/anything"
+    assert resolve_port_path("usb:0403:6001:B2", lambda: PORTS) == "/dev/ttyUSB1"
+    assert resolve_port_path("usb:0403:6001", lambda: PORTS[:1]) == "/dev/ttyUSB1"
+    assert resolve_port_path("/dev/anything", lambda: PORTS) == "/dev/anything"
     with pytest.raises(LinkDownError, match="no such USB adapter"):
-        port_path("usb:0403:6015", lambda: PORTS)
+        resolve_port_path("usb:0403:6015", lambda: PORTS)
     with pytest.raises(
         DeviceRefusedError, match=r"2 adapters match.*usb:0403:6001:A1, usb:0403:6001:B2"
     ):
-        port_path("usb:0403:6001", lambda: PORTS)
+        resolve_port_path("usb:0403:6001", lambda: PORTS)
 
 
 def test_ports_are_listed_with_the_name_to_use() -> None:
-    listed = serial_ports(lambda: PORTS)
+    listed = list_serial_ports(lambda: PORTS)
     assert [(port.path, port.usb_name) for port in listed] == [
         ("/dev/ttyS0", ""),
         ("/dev/ttyUSB0", "usb:0403:6001:A1"),

@@ -13,7 +13,7 @@ import numpy as np
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.toml_file import dump_toml
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.file_checksums import dumps_checked, with_comment
+from membrane_ctrl.model.file_checksums import add_checksum_comment, dumps_checked
 from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.telemetry import unpack_rows
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -37,7 +37,7 @@ def good_run(logs: Path) -> Path:
     folder.mkdir(parents=True)
     ticks = kept_ticks(_SECONDS)
     write_record(folder, ticks, snapshots={101: snapshot_at(ticks, 101)})
-    (folder / "config.toml").write_text(with_comment(dump_toml(CONFIG)))
+    (folder / "config.toml").write_text(add_checksum_comment(dump_toml(CONFIG)))
     rows = unpack_rows([outputs.row.pack() for _, outputs in ticks])
     summary = Summary.for_config(CONFIG)
     summary.add_rows(rows)

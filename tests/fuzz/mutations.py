@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import tomli_w
 
-from membrane_ctrl.model.file_checksums import KEY, dumps_checked, with_comment
+from membrane_ctrl.model.file_checksums import KEY, add_checksum_comment, dumps_checked
 from membrane_ctrl.run_files.table_store.journal import MAGIC
 
 CANARY = "canary.txt"  # beside the folder: what nobody may read, change or remove
@@ -265,7 +265,7 @@ def toml(path: Path, rng: random.Random) -> None:
         text += rng.choice(extra) + "\n"
     if rng.random() < 0.2:
         text = "".join(rng.sample(lines := text.splitlines(keepends=True), len(lines)))
-    path.write_text(with_comment(text) if path.name == "config.toml" else text)
+    path.write_text(add_checksum_comment(text) if path.name == "config.toml" else text)
 
 
 def _without_none(value: Any) -> Any:

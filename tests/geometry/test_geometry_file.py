@@ -21,7 +21,7 @@ from membrane_ctrl.geometry.run_geometry import (
     read_run_geometry,
 )
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.geometry_hash import SCHEMA, content_hash
+from membrane_ctrl.model.geometry_hash import SCHEMA, hash_content
 
 CAMERA = CameraConfig(width_px=306, height_px=256, pixel_um=27.6)
 LENS = {
@@ -46,7 +46,7 @@ def calibrated(path: Path, **more: object) -> Path:
         "slope_residual_urad": 2.0,
         "slope_noise_urad": 1.5,
         "ring_um": [0.0] * 14,
-        "hash": content_hash(tables),
+        "hash": hash_content(tables),
     }
     path.write_text(tomli_w.dumps(tables))
     return path

@@ -12,7 +12,7 @@ import pytest
 import pytest_asyncio
 
 from firmware_iface.emulators.pump_board import BoardSample
-from firmware_iface.register_map import default_map, known_maps
+from firmware_iface.register_map import list_known_maps, load_default_map
 from membrane_ctrl.config.schema import Config, DevicesConfig, ResumeConfig
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.start_checks import BoardAtStart, identify_board, open_latched_fault
@@ -21,7 +21,9 @@ from membrane_ctrl.model.errors import DeviceError, FindingsError
 from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile, ResumeLog
 from tests.worlds.faulty_board import PumpBoardEmulator
 
-WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
+WATCHDOG, OVER_PRESSURE = (
+    load_default_map().make_fault_mask(name) for name in ("watchdog", "over_pressure")
+)
 
 
 class Still:
@@ -85,7 +87,7 @@ async def test_the_watchdogs_own_trip_is_cleared_only_if_the_resume_rule_names_i
     assert await identified(board, options()) == BoardAtStart()
 
 
-@pytest.mark.parametrize("other", [OVER_PRESSURE, default_map().fault_mask("stopped")])
+@pytest.mark.parametrize("other", [OVER_PRESSURE, load_default_map().make_fault_mask("stopped")])
 async def test_the_watchdog_beside_another_fault_is_not_cleared(
     board: PumpBoardEmulator, other: int
 ) -> None:
@@ -198,7 +200,7 @@ async def test_an_open_interlock_is_refused_and_standby_waits_for_it() -> None:
 
 
 async def test_an_input_of_a_board_of_an_earlier_map_is_refused() -> None:
-    emulator = PumpBoardEmulator(Still(), registers=known_maps()[2])
+    emulator = PumpBoardEmulator(Still(), registers=list_known_maps()[2])
     await emulator.start()
     devices = DevicesConfig.model_validate(
         {"board": f"tcp://127.0.0.1:{emulator.port}", "interlocks": [DOOR]}

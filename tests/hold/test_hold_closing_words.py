@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl import cli
-from membrane_ctrl.hold.closing_words import RunEnd, closing_lines, print_closing_report
+from membrane_ctrl.hold.closing_words import RunEnd, make_closing_lines, print_closing_report
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Cleared, Event, Fault, StateEntered
 from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
@@ -94,7 +94,7 @@ def test_a_run_that_ends_in_a_fault_states_the_fault_first(
     (tmp_path / "summary.json").write_text(json.dumps({"recorder": {}, "missed_ticks": 3}))
     print_closing_report(tmp_path, False, closing)
     lines = capsys.readouterr().err.splitlines()
-    count = len(closing_lines(closing))
+    count = len(make_closing_lines(closing))
     first = "\n".join(lines[:count])
     assert all(part in first for part in says)
     assert (count > 0) == bool(says)

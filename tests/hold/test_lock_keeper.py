@@ -22,7 +22,7 @@ from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.lock_keeper import LockKeeper, LockStorage
 from membrane_ctrl.hold.start_checks import BoardAtStart, find_locks
 from membrane_ctrl.hold.tick_run import _send_first_commands
-from membrane_ctrl.instruments.lock_keys import device_keys
+from membrane_ctrl.instruments.lock_keys import list_device_keys
 from membrane_ctrl.instruments.lock_store import LockStore
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.events import Event, LockRemoved, LockSet
@@ -198,7 +198,7 @@ def options(config: Config, **changes: Any) -> HoldOptions:
 def test_a_hold_does_not_start_on_a_locked_device(changes: dict[str, Any]) -> None:
     assert find_locks(BOARD, options(BOARD, **changes)) is not None
     LockStore.of_machine().write_lock(
-        Lock("bofak", "hands inside", "unix:ann"), device_keys(BOARD.devices or no())
+        Lock("bofak", "hands inside", "unix:ann"), list_device_keys(BOARD.devices or no())
     )
     with pytest.raises(DeviceError, match="hands inside"):
         find_locks(BOARD, options(BOARD, **changes))
@@ -212,7 +212,7 @@ def no() -> DevicesConfig:
 
 def test_in_standby_it_starts_with_the_locks() -> None:
     LockStore.of_machine().write_lock(
-        Lock("bofak", "hands inside", "unix:ann"), device_keys(BOARD.devices or no())
+        Lock("bofak", "hands inside", "unix:ann"), list_device_keys(BOARD.devices or no())
     )
     storage = find_locks(BOARD, options(BOARD, standby=True))
     assert storage is not None

@@ -11,7 +11,7 @@ import pytest
 
 from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import lock_keys, lock_store
-from membrane_ctrl.instruments.lock_keys import device_keys, modbus_keys
+from membrane_ctrl.instruments.lock_keys import list_device_keys, modbus_keys
 from membrane_ctrl.instruments.lock_store import LockStore, StoredLock, require_unlocked
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.lock import Lock
@@ -208,7 +208,7 @@ def test_a_device_is_known_by_every_name_it_may_get(
     assert modbus_keys("tcp://LOCALHOST:5020", 1) & modbus_keys("tcp://127.0.0.1:5020", 1)
     assert not modbus_keys("tcp://127.0.0.1:5020", 2) & modbus_keys("tcp://127.0.0.1:5020", 1)
     board = DevicesConfig(board="tcp://127.0.0.1:5020")
-    assert device_keys(board) == modbus_keys("tcp://127.0.0.1:5020", 1)
+    assert list_device_keys(board) == modbus_keys("tcp://127.0.0.1:5020", 1)
     by_id = tmp_path / "by-id"
     by_id.mkdir()
     (tmp_path / "ttyUSB0").write_text("")
@@ -227,7 +227,7 @@ def test_single_instruments_are_each_locked() -> None:
         "pump": {"driver": "ventus", "port": "/dev/pump"},
         "gauge_pressure": {"driver": "bronkhorst_propar", "port": "/dev/gauge"},
     }
-    assert {"/dev/laser", "/dev/pump", "/dev/gauge"} <= device_keys(
+    assert {"/dev/laser", "/dev/pump", "/dev/gauge"} <= list_device_keys(
         DevicesConfig.model_validate(roles)
     )
 

@@ -29,7 +29,7 @@ from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import COLUMN, unpack_rows
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.processes.child import STOP
-from membrane_ctrl.processes.event_pipe import event_sender
+from membrane_ctrl.processes.event_pipe import make_event_sender
 from membrane_ctrl.processes.ring import RingWriter, open_ring
 from membrane_ctrl.recorder.process import RecorderSpec, recorder_main
 from membrane_ctrl.run_files.run_folder import create_run_folder
@@ -308,7 +308,7 @@ def test_a_writer_that_dies_is_reported_and_the_recording_goes_on(feed: Feed) ->
 
 def test_a_report_nobody_takes_does_not_block() -> None:
     ours, theirs = SPAWN.Pipe()
-    report = event_sender(theirs)
+    report = make_event_sender(theirs)
     for _ in range(10_000):
         report(RecorderError("x", "x" * 5000))
     first = ours.recv()

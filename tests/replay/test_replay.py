@@ -25,7 +25,7 @@ from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, pack_tick, unpack
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Fault
-from membrane_ctrl.model.file_checksums import with_comment
+from membrane_ctrl.model.file_checksums import add_checksum_comment
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
 from membrane_ctrl.replay import replay as replay_module
 from membrane_ctrl.replay.replay import Gap, RecordedTick, recorded_ticks, replay_record
@@ -131,7 +131,9 @@ def test_a_changed_gain_shows_as_another_pump_but_the_same_states(record: Path) 
 def test_another_configuration_than_the_run_had_is_named(
     record: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = with_comment(config_file.dump_toml(CONFIG)).replace("kp_per_s = 0.61", "kp_per_s = 0.5")
+    text = add_checksum_comment(config_file.dump_toml(CONFIG)).replace(
+        "kp_per_s = 0.61", "kp_per_s = 0.5"
+    )
     (record / "config.toml").write_text(text)
     assert run(["replay", str(record)]) == Exit.REJECTED
     assert "config.toml: checksum mismatch" in capsys.readouterr().out

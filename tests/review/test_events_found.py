@@ -11,9 +11,9 @@ from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import COLUMN, Rows, State, get_column
 from membrane_ctrl.review.events.found import (
     find_events,
-    laser_losses,
-    noise_changes,
-    weather_losses,
+    find_laser_losses,
+    find_noise_changes,
+    find_weather_losses,
 )
 from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.review.events.steps import find_steps, step_confidence
@@ -69,7 +69,7 @@ def test_a_change_of_noise_is_found() -> None:
     rows, _ = night(3, HOURS, "typical", [])
     later = get_column(rows, "mono_s") > 3600
     rows[later, COLUMN["error_um"]] *= 2.5
-    found = noise_changes(level_of(rows))
+    found = find_noise_changes(level_of(rows))
     assert [round(item.size, 1) for item in found] == [pytest.approx(2.5, rel=0.2)]
     assert abs(found[0].time_s - 3600) < 300
 
@@ -84,10 +84,10 @@ def test_lost_weather_is_found_once_it_was_there(field: str, kind: str) -> None:
     rows[
         (time_s < 20.0) | ((time_s >= 300.0) & (time_s < 360.0)) | (time_s == 100.0), COLUMN[field]
     ] = np.nan
-    (found,) = weather_losses(level_of(rows))
+    (found,) = find_weather_losses(level_of(rows))
     assert (found.kind, found.time_s, found.size) == (kind, 300.0, 60.0)
     rows[:, COLUMN[field]] = np.nan  # a bench without one
-    assert weather_losses(level_of(rows)) == []
+    assert find_weather_losses(level_of(rows)) == []
 
 
 @pytest.mark.parametrize(("quality", "kind"), [(0.0, "laser lost"), (np.nan, "optics lost")])
@@ -96,7 +96,7 @@ def test_what_a_bench_is_held_by_is_what_it_has_lost(quality: float, kind: str) 
     rows[:, COLUMN["displacement_quality"]] = quality  # figures have no code
     time_s = get_column(rows, "mono_s")
     rows[(time_s >= 300.0) & (time_s < 304.0), COLUMN["displacement_um"]] = np.nan
-    (found,) = laser_losses(level_of(rows))
+    (found,) = find_laser_losses(level_of(rows))
     assert (found.kind, found.time_s, found.size) == (kind, 300.0, 4.0)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.model.telemetry import COLUMN, Rows, get_column
-from membrane_ctrl.review.events.found import laser_glitches
+from membrane_ctrl.review.events.found import find_laser_glitches
 from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
 from tests.worlds.nights import DOOR, GLITCH, Planted, night
@@ -17,7 +17,7 @@ READING = COLUMN["displacement_um"]
 
 
 def glitches_in(rows: Rows) -> list[FoundEvent]:
-    return laser_glitches(first_level({name: get_column(rows, name) for name in TICK_FIELDS}))
+    return find_laser_glitches(first_level({name: get_column(rows, name) for name in TICK_FIELDS}))
 
 
 def wrong_for(rows: Rows, size_um: float, lasts_s: float) -> None:

@@ -104,7 +104,7 @@ def test_the_benefit_of_the_feedforward_is_that_of_a_loop_without() -> None:
     )
     kept = WithoutFeedforward(0.61, 6.5, 0.02)
     computed = with_it + np.concatenate(
-        [kept.kept_away_um(part) for part in np.array_split(feedforward, 7)]
+        [kept.estimate_kept_away_um(part) for part in np.array_split(feedforward, 7)]
     )
     assert np.std(computed - without) < 0.03 * np.std(without)
     assert np.std(without) > 3 * np.std(with_it)

@@ -33,7 +33,7 @@ from membrane_ctrl.review.catalogue import Filter, list_entries, resolve_run
 from membrane_ctrl.review.export import export_run
 from membrane_ctrl.review.formatting import format_number, format_span, one_line
 from membrane_ctrl.review.prune import to_prune
-from membrane_ctrl.review.report.pump_history import PumpSeen, pump_change, pump_history
+from membrane_ctrl.review.report.pump_history import PumpSeen, explain_pump_change, pump_history
 from membrane_ctrl.review.report.run_page import _list_history
 from membrane_ctrl.review.run_times import moment_s
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
@@ -108,24 +108,24 @@ def test_a_pump_that_wears_over_the_weeks_is_told(tmp_path: Path) -> None:
         "the pump gives 20 % less than in 20261001T120000Z-week (+- 4 %): check it, then `tune "
         "pump`"
     )
-    assert pump_change(seen, 0.12) == said
-    assert pump_change(seen, 0.25) == ""
+    assert explain_pump_change(seen, 0.12) == said
+    assert explain_pump_change(seen, 0.25) == ""
     page = render_history(seen, 0.12)
     assert said in page
     assert "0.800 ± 0.030" in page
     assert "<svg" in page
     assert said not in render_history(seen, 0.25)
-    assert pump_change([], 0.12) == ""
+    assert explain_pump_change([], 0.12) == ""
 
 
 def test_a_change_within_its_error_or_of_another_curve_is_none(tmp_path: Path) -> None:
     week(tmp_path, 1, 1.0, sigma=0.1)
     vague = pump_history(week(tmp_path, 2, 0.8, sigma=0.1))
-    assert pump_change(vague, 0.12) == ""
+    assert explain_pump_change(vague, 0.12) == ""
     anew = pump_history(week(tmp_path, 3, 0.98, curve=TWICE))
     assert [round(each.scale, 3) for each in anew] == [0.5, 0.4, 0.98]
     assert [each.same_curve for each in anew] == [False, False, True]
-    assert pump_change(anew, 0.12) == ""
+    assert explain_pump_change(anew, 0.12) == ""
 
 
 def test_the_catalogue_lists_and_filters(logs: Path) -> None:

@@ -27,4 +27,4 @@ def test_a_slow_viewer_is_named(source: Path | str, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(screenshot, "_start_headless_viewer", start)
     expected = "the viewer did not answer in time .*deadline expired.*try again when the machine"
     with pytest.raises(RuntimeError, match=expected):
-        screenshot.screenshot_of(source)
+        screenshot.take_screenshot(source)

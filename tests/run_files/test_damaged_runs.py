@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 
 from membrane_ctrl.cli import run as cli
-from membrane_ctrl.model.file_checksums import dumps_checked, with_comment
+from membrane_ctrl.model.file_checksums import add_checksum_comment, dumps_checked
 from membrane_ctrl.review import open_run
 from tests.support.review_runs import segment, set_summary, written
 from tests.worlds.nights import night
@@ -75,7 +75,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
         checked = [dumps_checked(table) for table in _objects(path)]
         path.write_text("\n".join(checked) + "\n")
     config = folder / "config.toml"
-    config.write_text(with_comment(config.read_text()))
+    config.write_text(add_checksum_comment(config.read_text()))
     return folder
 
 

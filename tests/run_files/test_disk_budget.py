@@ -15,7 +15,7 @@ from membrane_ctrl.model.recorder_events import RecorderError, RecorderRecovered
 from membrane_ctrl.recorder.housekeeping import RETENTION_INTERVAL_S, Housekeeping
 from membrane_ctrl.recorder.recorder_errors import RecorderErrors
 from membrane_ctrl.run_files.detail_level import DetailLevel, detail_level
-from membrane_ctrl.run_files.retention import OldRun, deletable_runs, delete_run, find_expired
+from membrane_ctrl.run_files.retention import OldRun, delete_run, find_expired, list_deletable_runs
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 
@@ -94,7 +94,7 @@ def test_only_runs_that_are_over_and_nobody_keeps_may_go(tmp_path: Path) -> None
     make_run(tmp_path, "thesis")
     (tmp_path / "20261104T110000Z-notes").mkdir()
     (tmp_path / "notes.txt").touch()
-    found = deletable_runs(tmp_path, present, NOW)
+    found = list_deletable_runs(tmp_path, present, NOW)
     assert [run.folder.name for run in found] == [
         "20261101T110000Z-over",
         "20261102T110000Z-crashed",
@@ -104,7 +104,7 @@ def test_only_runs_that_are_over_and_nobody_keeps_may_go(tmp_path: Path) -> None
 
 def test_a_deleted_run_is_gone(tmp_path: Path) -> None:
     folder = make_run(tmp_path, "20261101T110000Z-over")
-    delete_run(deletable_runs(tmp_path, tmp_path / "x", NOW)[0])
+    delete_run(list_deletable_runs(tmp_path, tmp_path / "x", NOW)[0])
     assert not folder.exists()
     assert not list(tmp_path.iterdir())
 

@@ -23,7 +23,7 @@ for folder in (ROOT / "tests" / "mutants", ROOT):
 
 from mutants import Verdict, current_verdicts, load, removes  # noqa: E402
 
-from firmware_iface.register_map import default_map  # noqa: E402
+from firmware_iface.register_map import load_default_map  # noqa: E402
 from membrane_ctrl.controller.protection import Guard  # noqa: E402
 from membrane_ctrl.controller.safety import TABLE, Rule  # noqa: E402
 
@@ -142,7 +142,7 @@ def find_gaps(case: SafetyCase) -> Iterator[str]:
     board = {name for constraint in case.constraints for name in constraint.board}
     yield from (
         f"board fault {f.name}: enforces no constraint"
-        for f in default_map().faults
+        for f in load_default_map().faults
         if f.name not in board
     )
 
@@ -175,7 +175,7 @@ def _find_gaps_of(constraint: Constraint, case: SafetyCase) -> Iterator[str]:
             yield f"{name}: there is no guard {guard}"
         elif guard not in killed:
             yield f"{name}: no killed mutant removes guard {guard}"
-    faults = {fault.name for fault in default_map().faults}
+    faults = {fault.name for fault in load_default_map().faults}
     for fault in constraint.board:
         if fault not in faults:
             yield f"{name}: the board has no fault {fault}"
@@ -287,7 +287,7 @@ def _describe(constraint: Constraint) -> list[str]:
             f"| guard `{name.lower()}` | {Guard[name].value} | {by} | {_mutant(verdicts)} |"
         )
     for name in constraint.board:
-        fault = next(fault for fault in default_map().faults if fault.name == name)
+        fault = next(fault for fault in load_default_map().faults if fault.name == name)
         by = ", ".join(f"`{Path(path).name}`" for path in _tests_of_board_fault(name)[:2])
         lines.append(f"| board fault {fault.bit} `{name}` | {fault.meaning} | {by} | - |")
     lines += [

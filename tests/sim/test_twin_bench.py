@@ -16,7 +16,7 @@ from multiprocessing.process import BaseProcess
 
 import pytest
 
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes.child import STOP
@@ -84,7 +84,7 @@ class Client:
         return data
 
     def read(self, name: str) -> dict[str, float]:
-        block = default_map().block(name)
+        block = load_default_map().block(name)
         data = self._ask(struct.pack(">BHH", 3, block.address, block.count))
         return block.decode(struct.unpack(f">{block.count}H", data[1:]))
 
@@ -102,7 +102,7 @@ class Client:
         self.write("command", values)
 
     def write(self, name: str, values: dict[str, float]) -> None:
-        block = default_map().block(name)
+        block = load_default_map().block(name)
         words = block.encode(values)
         head = struct.pack(">BHHB", 16, block.address, block.count, 2 * block.count)
         self._ask(head + struct.pack(f">{block.count}H", *words))

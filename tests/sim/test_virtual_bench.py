@@ -9,15 +9,17 @@ import math
 import pytest
 
 from firmware_iface.emulators.pump_board import StoredSettings
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from firmware_iface.roles import ALL_FAULTS, BenchCommand, LinkDownError, LinkError
 from membrane_ctrl.config.schema import Config, TwinConfig
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 CONFIG = Config(twin=TwinConfig(scenario="calm"))
-WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
-GAUGE_LOST = default_map().fault_mask("gauge_lost")
+WATCHDOG, OVER_PRESSURE = (
+    load_default_map().make_fault_mask(name) for name in ("watchdog", "over_pressure")
+)
+GAUGE_LOST = load_default_map().make_fault_mask("gauge_lost")
 
 
 @pytest.fixture

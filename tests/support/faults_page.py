@@ -7,7 +7,7 @@ import sys
 from collections.abc import Collection
 from pathlib import Path
 
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import load_default_map
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.protection import (
     Activity,
@@ -118,7 +118,9 @@ def faults_page() -> str:
     lines += ["|---|---|---|---|---|---|---|---|---|"]
     lines += [_row(rule) for rule in sorted(TABLE, key=lambda rule: rule.code)]
     lines += ["", "## Faults of the board", "", "| bit | name | meaning |", "|---|---|---|"]
-    lines += [f"| {fault.bit} | {fault.name} | {fault.meaning} |" for fault in default_map().faults]
+    lines += [
+        f"| {fault.bit} | {fault.name} | {fault.meaning} |" for fault in load_default_map().faults
+    ]
     return "\n".join([*lines, *_protections(), ""])
 
 

@@ -31,7 +31,7 @@ from tests.support.browser import browser_tab
 from tests.support.machine_needs import needs
 from tuning import gains_file
 from tuning.explore.curves import Sliders, Workpiece, curves, of_path, responded
-from tuning.explore.page import saver
+from tuning.explore.page import make_saver
 from tuning.identification import disturbance, noise_spectrum, plant_model, record_file
 from tuning.identification.closed_loop import Gains
 from tuning.identification.experiments import SHORT
@@ -249,7 +249,7 @@ def test_a_folder_that_cannot_be_explored_is_refused(tmp_path: Path) -> None:
 def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
     session_json.write_session_file(opened.file_path("preview.json"), preview.Previewed((), ()))
-    save = saver(of_path(opened.path, tmp_path), "ada")
+    save = make_saver(of_path(opened.path, tmp_path), "ada")
     assert save is not None
     assert "tune apply" in save(GAINS[0])
     assert Gains.of(apply.load_checked_gains(opened)) == GAINS[0]
@@ -261,7 +261,7 @@ def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) 
 def test_gains_without_margin_are_not_saved(gains: Gains, template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
     before = opened.file_path("gains.toml").read_bytes()
-    save = saver(of_path(opened.path, tmp_path), "ada")
+    save = make_saver(of_path(opened.path, tmp_path), "ada")
     assert save is not None
     assert re.search("Not saved: .*(unstable|sensitivity)", save(gains))
     assert opened.file_path("gains.toml").read_bytes() == before

@@ -255,7 +255,7 @@ def mapped_session(logs: Path, text: str) -> Path:
         session.file_path("pump_map.json"), MappedPump(found, config.pump, 1.0, 0.02)
     )
     loop = config.loop.model_copy(update={"kp_per_s": 0.3, "flow_max_um_per_s": 6.0})
-    return plain.based_on(session, loop, CURVE).path
+    return plain.restart_session(session, loop, CURVE).path
 
 
 def test_a_measured_curve_is_saved_with_the_gains_that_suit_it(

@@ -8,7 +8,7 @@ from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.controller.cross_check import require_sound
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.sessions.folder import SessionFolder, newest_session, open_session
+from membrane_ctrl.sessions.folder import SessionFolder, find_newest_session, open_session
 from tuning import estimator_levels, journal
 from tuning.configuration_edit import confirm_and_replace, edit_text, list_changes
 from tuning.same_bench import GAIN_KEYS, require_same_bench, require_same_devices
@@ -28,7 +28,7 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
     config = toml_file.load_toml(path, schema.Config)
     if config.estimator.process_value != "laser":
         return _save_estimator(
-            path, newest_session(logs) if name is None else open_session(name), config, yes
+            path, find_newest_session(logs) if name is None else open_session(name), config, yes
         )
     folder, shape_s = _find_session(name, logs)
     keys: tuple[str, ...] = GAIN_KEYS

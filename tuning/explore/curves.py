@@ -119,7 +119,7 @@ def _plant_for(logs: Path, leak_um_per_s: float) -> tuple[plant_model.PlantModel
     and whose it is.
     """
     try:
-        newest = folder.newest_session(logs)
+        newest = folder.find_newest_session(logs)
         return identify.load_identified(
             newest
         ).identified.model, f"plant of the session {newest.path.name}"
@@ -139,7 +139,9 @@ class Sliders:
 
     def gains(self, model: plant_model.PlantModel, dt_s: float) -> closed_loop.Gains:
         """PI gains, K = 1 / (k (tc + d)), Ti = c (tc + d): SIMC for c = 4 (Skogestad 2003)."""
-        slowed_s = self.closed_loop_s + tuning_rules.effective_delay_s(model, dt_s, self.filter_s)
+        slowed_s = self.closed_loop_s + tuning_rules.compute_effective_delay_s(
+            model, dt_s, self.filter_s
+        )
         return closed_loop.Gains(
             1 / (model.gain * slowed_s), self.damping * slowed_s, 0.0, self.filter_s
         )
@@ -150,7 +152,7 @@ class Sliders:
     ) -> "Sliders":
         """The setting of the sliders that gives these gains, as far as they reach."""
         slowed_s = 1 / (model.gain * max(gains.kp_per_s, 1e-9))
-        delay_s = tuning_rules.effective_delay_s(model, dt_s, gains.filter_s)
+        delay_s = tuning_rules.compute_effective_delay_s(model, dt_s, gains.filter_s)
         within = min(max(slowed_s - delay_s, DELAYS[0] * delay_s), DELAYS[1] * delay_s)
         damping = gains.ti_s / (within + delay_s)
         return cls(within, min(max(damping, DAMPINGS[0]), DAMPINGS[1]), gains.filter_s)
@@ -177,7 +179,7 @@ def curves(name: str, gains: closed_loop.Gains, of: Workpiece, duration_s: float
     demands = gain_search.Demands()
     figures = candidate.evaluate_candidate(name, gains, of.model, of.weather, of.loop, demands)
     w = closed_loop.make_frequencies(dt_s)
-    response = closed_loop.loop_response(gains, of.model, w, dt_s)
+    response = closed_loop.compute_loop_response(gains, of.model, w, dt_s)
     sensitivity = 1 / (1 + response)
     moving, noise = of.weather.psd(w, of.model, of.loop), of.weather.rest.white_psd
     centre = np.abs(sensitivity) ** 2 * moving + np.abs(1 - sensitivity) ** 2 * noise

@@ -137,7 +137,7 @@ class Page:
     def _make_sliders(self) -> None:
         of = self._of
         at = Sliders.near(self._gains, of.model, self._dt_s)
-        delay_s = tuning_rules.effective_delay_s(of.model, self._dt_s, 0.0)
+        delay_s = tuning_rules.compute_effective_delay_s(of.model, self._dt_s, 0.0)
         low, high = (math.log10(share * delay_s) for share in DELAYS)
         self._start = widgets.Select(
             title="start from",
@@ -332,7 +332,7 @@ def _table(rows: list[list[str]]) -> str:
     return f"<table class=gains><tr>{head}</tr>{''.join(lines)}</table>"
 
 
-def saver(of: Workpiece, author: str) -> Save | None:
+def make_saver(of: Workpiece, author: str) -> Save | None:
     """What the page's button does: put the gains into the session's design, or return why not. None
     without a design.
     """
@@ -420,7 +420,7 @@ def _server(path: Path, logs: Path, port: int, author: str) -> Server:
         except errors.InputError:  # a session that has not observed its weather yet
             live(page)
             return
-        Page(found, saver(found, author)).attach(page)
+        Page(found, make_saver(found, author)).attach(page)
 
     apps = {"/": gains} if opened is None else {"/": gains, "/session": live}
     # Bokeh refuses web sockets of any origin but localhost and this port: no other site moves the

@@ -57,7 +57,7 @@ def make_frequencies(dt_s: float, points: int = 400) -> Series:
     return np.geomspace(SLOWEST_RAD_PER_S, np.pi / dt_s, points)
 
 
-def pump_response(model: PlantModel, w_rad_per_s: Series, dt_s: float) -> ComplexArray:
+def compute_pump_response(model: PlantModel, w_rad_per_s: Series, dt_s: float) -> ComplexArray:
     """From commanded flow to speed of the centre, without the leak."""
     s = 1j * w_rad_per_s
     return np.asarray(
@@ -65,7 +65,7 @@ def pump_response(model: PlantModel, w_rad_per_s: Series, dt_s: float) -> Comple
     )
 
 
-def controller_response(gains: Gains, w_rad_per_s: Series) -> ComplexArray:
+def compute_controller_response(gains: Gains, w_rad_per_s: Series) -> ComplexArray:
     """From error to commanded flow."""
     s = 1j * w_rad_per_s
     return np.asarray(
@@ -73,13 +73,13 @@ def controller_response(gains: Gains, w_rad_per_s: Series) -> ComplexArray:
     )
 
 
-def loop_response(
+def compute_loop_response(
     gains: Gains, model: PlantModel, w_rad_per_s: Series, dt_s: float
 ) -> ComplexArray:
     """L."""
     integrator = 1 / (1j * w_rad_per_s)
     return (
-        controller_response(gains, w_rad_per_s)
-        * pump_response(model, w_rad_per_s, dt_s)
+        compute_controller_response(gains, w_rad_per_s)
+        * compute_pump_response(model, w_rad_per_s, dt_s)
         * integrator
     )

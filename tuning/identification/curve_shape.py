@@ -87,7 +87,7 @@ def smooth_flows(
     return full * mean, full**2 * spread
 
 
-def bound_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
+def limit_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
     """By how much the flow may be off the straight line in each interval: where the chords beside
     it would meet.
 

@@ -38,7 +38,7 @@ class DisturbanceModel:
         with H the pump behind the feed-forward's filter; the sensor's noise comes in through H.
         """
         dt_s = self.rest.dt_s
-        pump = closed_loop.pump_response(model, w_rad_per_s, dt_s)
+        pump = closed_loop.compute_pump_response(model, w_rad_per_s, dt_s)
         total = self.rest.moving_psd(w_rad_per_s)
         for weather, used, gain, filter_s in self._list_channels(loop):
             lag = 1 / (1 + 1j * w_rad_per_s * weather.lag_s)

@@ -195,7 +195,7 @@ def _run_relays(
         if not finished.completed and found.largest_residual > JUMP_SIGMAS:
             done = None
             continue
-        if not finished.completed and _too_strong(found):
+        if not finished.completed and _is_too_strong(found):
             raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}", pump_suspected=True)
         around = replace(around, late_s=found.model.delay_s)
         if _has_enough(done, plan) and (
@@ -212,7 +212,7 @@ def _has_enough(relays: Record, plan: Plan) -> bool:
     return relays.duration_s >= plan.relay_s
 
 
-def _too_strong(found: Identified) -> bool:
+def _is_too_strong(found: Identified) -> bool:
     """Whether the pump stopped these relays, and not the weather:
     the next one would end like them.
     """

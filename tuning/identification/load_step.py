@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.identification.closed_loop import SLOWEST_RAD_PER_S, Gains, loop_response
+from tuning.identification.closed_loop import SLOWEST_RAD_PER_S, Gains, compute_loop_response
 from tuning.identification.plant_model import PlantModel
 from tuning.identification.record import Series
 
@@ -36,7 +36,7 @@ def simulate_load_step(
     """
     w: Series = np.asarray(2 * np.pi * np.fft.rfftfreq(_LOOKS, _LOOK_S), dtype=float)
     w[0] = SLOWEST_RAD_PER_S  # L has two integrators: the answer is finite there
-    answer = -step_um_per_s / w**2 / (1 + loop_response(gains, model, w, dt_s))
+    answer = -step_um_per_s / w**2 / (1 + compute_loop_response(gains, model, w, dt_s))
     away_um = np.abs(np.fft.irfft(answer, _LOOKS)[: _LOOKS // 2]) / _LOOK_S
     away = np.flatnonzero(away_um > RECOVERED_UM)
     over_s = (int(away[-1]) + 1) * _LOOK_S if away.size else 0.0

@@ -9,7 +9,7 @@ import control
 import numpy as np
 
 from membrane_ctrl.model.arrays import ComplexArray
-from tuning.identification.closed_loop import Gains, loop_response, make_frequencies
+from tuning.identification.closed_loop import Gains, compute_loop_response, make_frequencies
 from tuning.identification.plant_model import PlantModel
 
 _POINTS = 3000  # 0.3 % apart: margins to better than 1 %
@@ -37,7 +37,7 @@ def compute_margins(gains: Gains, model: PlantModel, dt_s: float) -> Margins:
     the number of turns of 1 + L about 0, which also sees loops with several crossings.
     """
     w = np.geomspace(1e-4, max(np.pi / dt_s, 20 / max(model.delay_s, _FINE_DT_S)), _POINTS)
-    response = loop_response(gains, model, w, dt_s)
+    response = compute_loop_response(gains, model, w, dt_s)
     sensitivity = 1 / (1 + response)
     frd = control.FrequencyResponseData(response, w, smooth=True)
     gain_margin, phase_margin_deg, _, _, crossing, _ = control.stability_margins(frd)
@@ -63,5 +63,5 @@ def is_stable(response: ComplexArray) -> bool:
 
 def find_sensitivity_peak(gains: Gains, model: PlantModel, dt_s: float) -> float:
     """Ms on a coarse grid (to 1 %), for searches; infinite for an unstable loop."""
-    response = loop_response(gains, model, make_frequencies(dt_s), dt_s)
+    response = compute_loop_response(gains, model, make_frequencies(dt_s), dt_s)
     return float(np.max(1 / np.abs(1 + response))) if is_stable(response) else math.inf

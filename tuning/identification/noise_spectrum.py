@@ -42,7 +42,7 @@ _BAND = 0.03  # frequencies nearer than this factor count as one
 Coloured = tuple[tuple[float, float], ...]  # (tau in s, s in unit^2 s) of s / (1 + (w tau)^2)^2
 
 
-def coloured_psd(coloured: Coloured, w_rad_per_s: Series) -> Series:
+def compute_coloured_psd(coloured: Coloured, w_rad_per_s: Series) -> Series:
     parts = [intensity / (1 + (w_rad_per_s * tau_s) ** 2) ** 2 for tau_s, intensity in coloured]
     return np.sum(parts, axis=0) if parts else np.zeros_like(w_rad_per_s)
 
@@ -77,7 +77,7 @@ class Noise:
     def moving_psd(self, w_rad_per_s: Series) -> Series:
         """Two-sided spectrum of the true movement, unit^2 s."""
         walks = (self.fast + self.slow / (1 + (w_rad_per_s * self.slow_s) ** 2)) / w_rad_per_s**2
-        return walks + coloured_psd(self.coloured, w_rad_per_s)
+        return walks + compute_coloured_psd(self.coloured, w_rad_per_s)
 
     @property
     def white_psd(self) -> float:

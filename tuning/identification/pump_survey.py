@@ -18,8 +18,8 @@ from tuning.identification.curve_shape import (
     JUMP_SHARE,
     NO_BRANCH,
     Branch,
-    bound_bend,
     find_first_jump,
+    limit_bend,
     smooth_flows,
 )
 from tuning.identification.pump_fit import NO_FIT, PumpFit, fit_pump
@@ -259,7 +259,7 @@ class PumpSurvey:
         if not rising:
             return found
         leak_um_per_s = self.fit.leak_um_per_s
-        for i, off in enumerate(bound_bend(fractions, flows).tolist()):
+        for i, off in enumerate(limit_bend(fractions, flows).tolist()):
             low, high = fractions[i : i + 2].tolist()
             about = flows[i] < _ABOUT_LEAKS * leak_um_per_s < _ABOUT_LEAKS**2 * flows[i + 1]
             sure = off > _SURE * math.hypot(sigmas[i], sigmas[i + 1])

@@ -20,7 +20,7 @@ from membrane_ctrl.control.filters import lag_step_fraction
 from tuning.identification import plant_model
 from tuning.identification.noise_spectrum import (
     Coloured,
-    coloured_psd,
+    compute_coloured_psd,
     fit_noise,
     remove_pump_motion_um,
 )
@@ -42,7 +42,7 @@ class WeatherGain:
 
     def psd(self, w_rad_per_s: Series) -> Series:
         """Two-sided spectrum of the quantity, unit^2 s."""
-        return self.walk / w_rad_per_s**2 + coloured_psd(self.coloured, w_rad_per_s)
+        return self.walk / w_rad_per_s**2 + compute_coloured_psd(self.coloured, w_rad_per_s)
 
     def agreed(self, configured: float) -> float:
         """Gain to use: the fitted one if known to 10 %, else the configured one if they agree.

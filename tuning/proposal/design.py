@@ -62,7 +62,7 @@ def compute_relay_ultimate(model: plant_model.PlantModel, dt_s: float) -> tuple[
     """Ultimate gain in 1/s and period in s of the integrator with delay: Ku = pi / (2 k d), Tu = 4
     d.
     """
-    delay_s = tuning_rules.effective_delay_s(model, dt_s, 0.0)
+    delay_s = tuning_rules.compute_effective_delay_s(model, dt_s, 0.0)
     return math.pi / (2 * model.gain * delay_s), 4 * delay_s
 
 
@@ -74,7 +74,7 @@ def compute_designs(
 ) -> dict[str, closed_loop.Gains]:
     """Gains by the name of their design (`NAMES`), the proposed ones first."""
     dt_s, filter_s = disturbance.rest.dt_s, _RULE_FILTER_S
-    delay_s = tuning_rules.effective_delay_s(model, dt_s, filter_s)
+    delay_s = tuning_rules.compute_effective_delay_s(model, dt_s, filter_s)
     found = {"least-variance": gain_search.search_least_variance(model, disturbance, loop, demands)}
     step_um_per_s, present = demands.load_step_um_per_s, closed_loop.Gains.of(loop)
     if math.isfinite(margins.find_sensitivity_peak(present, model, dt_s)):

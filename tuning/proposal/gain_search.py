@@ -11,7 +11,7 @@ from membrane_ctrl.config.schema import LoopConfig
 from tuning.identification import closed_loop, load_step, margins, plant_model, record
 from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal.prediction import predict_loop
-from tuning.proposal.tuning_rules import effective_delay_s, make_simc_gains
+from tuning.proposal.tuning_rules import compute_effective_delay_s, make_simc_gains
 
 # Filters tried by the search; none costs too much phase.
 _FILTERS_S = (0.03, 0.05, 0.1, 0.2, 0.4)
@@ -125,7 +125,7 @@ def _search_gains(
     """PI with the least cost at the filter of `start`, with the sensitivity below `ms`; in
     logarithms.
     """
-    delay_s = effective_delay_s(model, dt_s, start.filter_s)
+    delay_s = compute_effective_delay_s(model, dt_s, start.filter_s)
     low = np.log([_GAIN_RANGE[0] / (model.gain * delay_s), _TI_RANGE[0] * delay_s])
     high = np.log([_GAIN_RANGE[1] / (model.gain * delay_s), _TI_RANGE[1] * delay_s])
 

@@ -54,7 +54,7 @@ def judge_health(record: Record, setpoint_um: Series, loop: LoopConfig, made: Ga
     )
     least_um = compute_least_std_um(model, weather, loop)
     designed = predict_loop(closed_loop.Gains.of(loop), model, weather, loop).std_um / least_um
-    gain, gain_sigma = _natural_gain(record, loop)
+    gain, gain_sigma = _compute_natural_gain(record, loop)
     leak_um_per_s = model.gain * float(record.flow_um_per_s.mean())
     found: list[str] = []
     if std_um / least_um > _RATIO_GROWTH * designed:
@@ -72,7 +72,7 @@ def judge_health(record: Record, setpoint_um: Series, loop: LoopConfig, made: Ga
     )
 
 
-def _natural_gain(record: Record, loop: LoopConfig) -> tuple[float, float]:
+def _compute_natural_gain(record: Record, loop: LoopConfig) -> tuple[float, float]:
     """Gain and standard error without any experiment; NaN where the flow hardly moved.
 
     With feed-forward most of the flow responds to the air's temperature, and their effects on the

@@ -41,11 +41,13 @@ def predict_loop(
     w = closed_loop.make_frequencies(dt_s)
     model, moving = linearise_limits(gains, model, disturbance, loop, w)
     sensitivity, noise = (
-        1 / (1 + closed_loop.loop_response(gains, model, w, dt_s)),
+        1 / (1 + closed_loop.compute_loop_response(gains, model, w, dt_s)),
         disturbance.rest.white_psd,
     )
     centre = np.abs(sensitivity) ** 2 * moving + np.abs(1 - sensitivity) ** 2 * noise
-    flow = np.abs(closed_loop.controller_response(gains, w) * sensitivity) ** 2 * (moving + noise)
+    flow = np.abs(closed_loop.compute_controller_response(gains, w) * sensitivity) ** 2 * (
+        moving + noise
+    )
     change = flow * np.abs(2 * np.sin(w * dt_s / 2)) ** 2
     return Predicted(
         *(math.sqrt(_integrate_variance(spectrum, w)) for spectrum in (centre, flow, change))
@@ -73,12 +75,12 @@ def linearise_limits(
     """
     dt_s, noise = disturbance.rest.dt_s, disturbance.rest.white_psd
     controller, forward = (
-        closed_loop.controller_response(gains, w),
+        closed_loop.compute_controller_response(gains, w),
         disturbance.feedforward_psd(w, loop),
     )
     plant, moving = model, disturbance.psd(w, model, loop)
     for _ in range(_ROUNDS):
-        sensitivity = 1 / (1 + closed_loop.loop_response(gains, plant, w, dt_s))
+        sensitivity = 1 / (1 + closed_loop.compute_loop_response(gains, plant, w, dt_s))
         flow = np.abs(controller * sensitivity) ** 2 * (moving + noise) + forward
         variance = _integrate_variance(flow, w)
         share, rest = _clip_changes(
@@ -91,7 +93,7 @@ def linearise_limits(
         added = rest * memory_s / (1 + (w * memory_s / 2) ** 2)
         moving = (
             disturbance.psd(w, plant, loop)
-            + added * np.abs(closed_loop.pump_response(model, w, dt_s) / w) ** 2
+            + added * np.abs(closed_loop.compute_pump_response(model, w, dt_s) / w) ** 2
         )
     return plant, moving
 

@@ -8,7 +8,7 @@ D term.
 from tuning.identification import closed_loop, plant_model
 
 
-def effective_delay_s(model: plant_model.PlantModel, dt_s: float, filter_s: float) -> float:
+def compute_effective_delay_s(model: plant_model.PlantModel, dt_s: float, filter_s: float) -> float:
     """Delay of the integrator-with-delay that stands for the loop."""
     return model.delay_s + dt_s / 2 + filter_s
 
@@ -17,7 +17,7 @@ def make_simc_gains(
     model: plant_model.PlantModel, dt_s: float, filter_s: float, closed_loop_s: float | None = None
 ) -> closed_loop.Gains:
     """SIMC PI: K = 1 / (k (tc + d)), Ti = 4 (tc + d), tc = d unless given (Skogestad 2003)."""
-    delay_s = effective_delay_s(model, dt_s, filter_s)
+    delay_s = compute_effective_delay_s(model, dt_s, filter_s)
     slowed_s = (delay_s if closed_loop_s is None else closed_loop_s) + delay_s
     return closed_loop.Gains(1 / (model.gain * slowed_s), 4 * slowed_s, 0.0, filter_s)
 
@@ -28,7 +28,7 @@ def make_amigo_gains(
     """AMIGO PI for an integrating process: K = 0.35 / (k d), Ti = 13.4 d (Astrom and Hagglund 2006,
     eq. 7.3).
     """
-    delay_s = effective_delay_s(model, dt_s, filter_s)
+    delay_s = compute_effective_delay_s(model, dt_s, filter_s)
     return closed_loop.Gains(0.35 / (model.gain * delay_s), 13.4 * delay_s, 0.0, filter_s)
 
 
@@ -36,7 +36,7 @@ def make_lambda_gains(
     model: plant_model.PlantModel, dt_s: float, filter_s: float, factor: float = 3.0
 ) -> closed_loop.Gains:
     """Lambda PI, lambda = factor x delay: Ti = 2 lambda + d, K = Ti / (k (lambda + d)^2)."""
-    delay_s = effective_delay_s(model, dt_s, filter_s)
+    delay_s = compute_effective_delay_s(model, dt_s, filter_s)
     lambda_s = factor * delay_s
     ti_s = 2 * lambda_s + delay_s
     return closed_loop.Gains(ti_s / (model.gain * (lambda_s + delay_s) ** 2), ti_s, 0.0, filter_s)

@@ -65,7 +65,7 @@ class Stage:
         return self.growth_max < self.growth < _CLOSE * self.growth_max
 
 
-def settling_time_s(loop: LoopConfig) -> float:
+def find_settling_time_s(loop: LoopConfig) -> float:
     """Settling time of the centre after the change to these gains.
 
     Without delay and filter the loop around the film's integral is s^2 + K s + K / Ti = 0 (Td is
@@ -109,7 +109,7 @@ def estimate_centre_std_um(
     gains = closed_loop.Gains.of(loop)
     w = closed_loop.make_frequencies(dt_s, _POINTS)
     model, moving = linearise_limits(gains, trial.model, weather, loop, w)
-    sensitivity = np.abs(1 / (1 + closed_loop.loop_response(gains, model, w, dt_s))) ** 2
+    sensitivity = np.abs(1 / (1 + closed_loop.compute_loop_response(gains, model, w, dt_s))) ** 2
     noise = weather.rest.white_psd
     coloured = sensitivity * (moving + noise) - noise
     expected = np.trapezoid(coloured * np.cos(np.outer(lags * dt_s, w)), w, axis=1) / np.pi
@@ -135,7 +135,7 @@ def estimate_sensitivity(
     used = (w > 2 * np.pi * 3 / _SEGMENT_S) & (w < 2 * fastest)
     w, power = w[used], power[used]
     model, moving = linearise_limits(gains, trial.model, weather, trial.after, w)
-    s = np.abs(1 / (1 + closed_loop.loop_response(gains, model, w, dt_s))) ** 2
+    s = np.abs(1 / (1 + closed_loop.compute_loop_response(gains, model, w, dt_s))) ** 2
     peak = s >= min(
         1.0, s.max()
     )  # slower motion that exceeds the prediction is weather, or a limit of the pump

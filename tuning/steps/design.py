@@ -211,7 +211,7 @@ def _draw_candidates(path: Path, kept: Design, model: plant_model.PlantModel, dt
             axes.axvline(limit, color="tab:red", linestyle="--")
     w = closed_loop.make_frequencies(dt_s)
     for row in rows:
-        size = np.abs(1 / (1 + closed_loop.loop_response(row.gains, model, w, dt_s)))
+        size = np.abs(1 / (1 + closed_loop.compute_loop_response(row.gains, model, w, dt_s)))
         f.semilogx(w, size, linewidth=2 if row is rows[0] else 0.8, label=row.name)
     f.set(xlim=(0.05, w[-1]), xlabel="rad/s", title="|S|")
     f.legend(loc="best", fontsize=6)

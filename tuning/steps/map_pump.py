@@ -95,7 +95,7 @@ def map_pump(
         raise errors.RejectedError(f"pump map: {error}") from None
     rig.keep()
     rig.good = loop, found.pump
-    session = folder.based_on(session, loop, found.pump)
+    session = folder.restart_session(session, loop, found.pump)
     done = MappedPump(found, before, gain, sigma)
     session_json.write_session_file(session.file_path("pump_map.json"), done)
     return done, session

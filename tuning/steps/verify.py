@@ -60,13 +60,13 @@ def run_verify(
     session.begin_step("verify")
     model, weather = load_identified(session).identified.model, load_disturbance(session)
     trial = verification.VerificationTrial(model, weather, before, after, accepted, rig.pump)
-    trial_s = verification.settling_time_s(after) + 2 * stages[-1][0] + _SPARE_S
+    trial_s = verification.find_settling_time_s(after) + 2 * stages[-1][0] + _SPARE_S
     rig.set_gains(after, f"session {session.path.name}: verification", trial_s)
     looks: list[verification.Stage] = []
     record: Record | None = None
     setpoint_um, reason = np.empty(0), ""
     try:
-        rig.hold(verification.settling_time_s(after))
+        rig.hold(verification.find_settling_time_s(after))
         for until_s, growth_max in (*stages, (2 * stages[-1][0], stages[-1][1])):
             more, about_um = rig.hold_about(until_s - setpoint_um.size * rig.dt_s)
             record = more if record is None else record.followed_by(more)
@@ -167,7 +167,7 @@ def _draw_verification(
             1 / dt_s,
             nperseg=min(readings.size, round(SPECTRUM_SEGMENT_S / dt_s)),
         )
-        response = closed_loop.loop_response(
+        response = closed_loop.compute_loop_response(
             closed_loop.Gains.of(loop), model, closed_loop.make_frequencies(dt_s), dt_s
         )
         ms = float(np.max(np.abs(1 / (1 + response))))

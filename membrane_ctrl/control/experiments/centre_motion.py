@@ -63,7 +63,7 @@ class CentreMotion:
         """Filtered speed."""
         return (self.memory.fast.value - self.memory.slow.value) / (self._slow_s - self._fast_s)
 
-    def noise_per_laser_um(self, rate_hz: float) -> float:
+    def compute_noise_per_laser(self, rate_hz: float) -> float:
         """Standard deviation of position + `coast_s` x speed for readings of 1 µm.
 
         It is sigma sqrt(dt / (2 T)) behind a lag.

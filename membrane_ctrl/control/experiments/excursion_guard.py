@@ -62,7 +62,7 @@ class ExcursionGuard:
         self._motion = CentreMotion(around.stretch, around.late_s, self.memory.motion)
         self._centre_um = centre_um
         in_hand_um = (
-            NOISE_MARGIN_SIGMAS * self._motion.noise_per_laser_um(rate_hz) * around.laser_um
+            NOISE_MARGIN_SIGMAS * self._motion.compute_noise_per_laser(rate_hz) * around.laser_um
         )
         if in_hand_um >= around.limit_um:
             raise ValueError(

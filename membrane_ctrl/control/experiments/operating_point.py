@@ -38,7 +38,10 @@ def choose_filters(around: OperatingPoint, rate_hz: float) -> OperatingPoint:
     """
     share_um = _IN_HAND_SHARE * around.limit_um / NOISE_MARGIN_SIGMAS
     for late_s, stretch in product((around.late_s, USUAL_LATE_S), _STRETCHES):
-        if around.laser_um * CentreMotion(stretch, late_s).noise_per_laser_um(rate_hz) <= share_um:
+        if (
+            around.laser_um * CentreMotion(stretch, late_s).compute_noise_per_laser(rate_hz)
+            <= share_um
+        ):
             break
     return replace(around, late_s=late_s, stretch=stretch)
 

@@ -27,7 +27,7 @@ from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.screen_face import BOW_RADIUS_MM
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.geometry_hash import SCHEMA, content_hash
+from membrane_ctrl.model.geometry_hash import SCHEMA, hash_content
 from membrane_ctrl.model.program import file_origin
 
 _LENS = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
@@ -88,7 +88,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
         "ring_um": (1e3 * solution.common[len(bench_parameters.NAMES) + 1 :]).tolist(),
         "condition": origin.condition,
         "notes": list(origin.notes),
-        "hash": content_hash(tables),
+        "hash": hash_content(tables),
     }
     return tables
 

@@ -76,11 +76,11 @@ def find_events(
         even = _fill_missing_seconds(level)
         finders: Iterable[Callable[[found_event.Level], list[found_event.FoundEvent]]] = (
             pressure_steps,
-            laser_glitches,
-            laser_losses,
-            weather_losses,
-            lateness_bursts,
-            noise_changes,
+            find_laser_glitches,
+            find_laser_losses,
+            find_weather_losses,
+            find_lateness_bursts,
+            find_noise_changes,
         )
         for finder in finders:
             found += finder(even)
@@ -122,7 +122,7 @@ def pressure_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
     ]
 
 
-def laser_glitches(level: found_event.Level) -> list[found_event.FoundEvent]:
+def find_laser_glitches(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Readings that jump and jump back, not explained by air pressure or a lost laser."""
     lost = level["max_displacement_quality"] > 0
     barometer = level["mean_ambient_pressure_pa"]
@@ -153,7 +153,7 @@ def laser_glitches(level: found_event.Level) -> list[found_event.FoundEvent]:
     ]
 
 
-def laser_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
+def find_laser_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
     """The laser flagged its reading as bad, or gave none; on a bench held without one,
     the optics.
     """
@@ -164,7 +164,7 @@ def laser_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
     return _find_losses("optics lost" if by_optics else "laser lost", bad, level, 1)
 
 
-def weather_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
+def find_weather_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
     """A barometer or thermometer stops giving values: the feed-forward then misses the weather."""
     found: list[found_event.FoundEvent] = []
     for name, kind in _WEATHER.items():
@@ -185,7 +185,7 @@ def _find_losses(
     ]
 
 
-def lateness_bursts(level: found_event.Level) -> list[found_event.FoundEvent]:
+def find_lateness_bursts(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Several late ticks close together; single ones occur on any machine."""
     worst = level["max_lateness_ms"]
     usual = float(np.nanmedian(worst)) if np.isfinite(worst).any() else 0.0
@@ -205,7 +205,7 @@ def lateness_bursts(level: found_event.Level) -> list[found_event.FoundEvent]:
     ]
 
 
-def noise_changes(level: found_event.Level) -> list[found_event.FoundEvent]:
+def find_noise_changes(level: found_event.Level) -> list[found_event.FoundEvent]:
     """The spread of the error changes for minutes."""
     held = _select_held(level)
     minute = np.floor(held["time_s"] / 60).astype(int)

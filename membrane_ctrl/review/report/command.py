@@ -8,7 +8,7 @@ from pathlib import Path
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.report.json import make_verdict, report_table
-from membrane_ctrl.review.report.pump_history import pump_change, pump_history
+from membrane_ctrl.review.report.pump_history import explain_pump_change, pump_history
 from membrane_ctrl.review.report.run_page import render_report
 from membrane_ctrl.review.run_times import part_s
 from membrane_ctrl.review.statistics import compare
@@ -59,7 +59,7 @@ def report_command(
         print(text)
         return 0
     _print_result(analysis, other, folder, time.monotonic() - began_s)
-    if warning := pump_change(history, opened.config.pump.change_max):
+    if warning := explain_pump_change(history, opened.config.pump.change_max):
         print(f"note: {warning}", file=sys.stderr)
     return 0
 

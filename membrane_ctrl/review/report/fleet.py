@@ -148,7 +148,7 @@ def _make_fleet_entry(analysis: Analysis, table: dict[str, Any]) -> dict[str, An
     }
 
 
-def folders_of(given: Sequence[Path]) -> list[Path]:
+def list_fleet_folders(given: Sequence[Path]) -> list[Path]:
     """The runs that are named, or lie in a named folder, each once; a folder without a run stands
     for itself.
     """
@@ -166,7 +166,7 @@ def fleet_command(options: FleetOptions) -> int:
     """Write the fleet's page, its figures as JSON, and each run's report; see `membrane-ctrl report
     --help`.
     """
-    folders, out = folders_of(options.runs), options.out.resolve()
+    folders, out = list_fleet_folders(options.runs), options.out.resolve()
     common = Path(os.path.commonpath([folder.parent for folder in folders]))
     workers = options.workers or min(os.cpu_count() or 1, len(folders))
     job, rows, entries = partial(run_report, options.start, options.end), [], []

@@ -34,7 +34,7 @@ class PumpSeen:
     same_curve: bool  # as the newest run's
 
 
-def pump_change(history: Sequence[PumpSeen], change_max: float) -> str:
+def explain_pump_change(history: Sequence[PumpSeen], change_max: float) -> str:
     """Words for a certain change beyond the limit since the first run on the present curve; empty
     without one.
     """

@@ -27,7 +27,7 @@ from membrane_ctrl.review.formatting import (
 )
 from membrane_ctrl.review.report import figures
 from membrane_ctrl.review.report.json import make_timeline, make_verdict
-from membrane_ctrl.review.report.pump_history import PumpSeen, pump_change
+from membrane_ctrl.review.report.pump_history import PumpSeen, explain_pump_change
 from membrane_ctrl.review.statistics import compare, drift, power_spectrum, shape_review
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
@@ -256,7 +256,7 @@ def _pump_facts(analysis: Analysis) -> list[tuple[str, str]]:
 
 
 def _list_history(history: Sequence[PumpSeen], change_max: float) -> list[PageBlock]:
-    change = pump_change(history, change_max)
+    change = explain_pump_change(history, change_max)
     rows = [
         [
             f"{seen.started_utc:%Y-%m-%d %H:%M}",

@@ -105,7 +105,7 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
             f"{run.folder}: nothing to report: no telemetry in this part of the run{known}"
         )
     span_s = (float(seconds["time_s"][0]), float(seconds["time_s"][-1]) + 1.0)
-    found, shape = _found_and_shape(run, seconds, start_s, end_s)
+    found, shape = _find_events_and_shape(run, seconds, start_s, end_s)
     unjudged = list_unjudged(seconds)
     del seconds  # a month takes a quarter of a GB, and the next steps need more
     ticks = hold_pass(run, span_s, (start_s, end_s))
@@ -135,7 +135,7 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
     )
 
 
-def _found_and_shape(
+def _find_events_and_shape(
     run: Run, seconds: Block, start_s: float, end_s: float
 ) -> tuple[tuple[FoundEvent, ...], shape_review.ShapeReview | None]:
     """Run the analyses that need the cycles, which are released before the ticks are read."""

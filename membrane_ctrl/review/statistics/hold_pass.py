@@ -111,7 +111,7 @@ class _Collector:
         time_s = block["mono_s"]
         parts = self._parts.classify_block(block)
         mask = parts["held"]
-        kept_away = self._without.kept_away_um(block["feedforward_um_per_s"])[mask]
+        kept_away = self._without.estimate_kept_away_um(block["feedforward_um_per_s"])[mask]
         self._ticks += time_s.size
         self._span = (
             self._span[0] if self._ticks > time_s.size else float(time_s[0]),

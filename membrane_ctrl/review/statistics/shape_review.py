@@ -7,7 +7,7 @@ import numpy as np
 from membrane_ctrl.model.arrays import BoolArray, Column
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.review.statistics.drift import FittedSlope, fit_slope
-from membrane_ctrl.run_files.shapes import Shapes, height_basis
+from membrane_ctrl.run_files.shapes import Shapes, make_height_basis
 
 MAP_PX = 128
 
@@ -74,7 +74,7 @@ def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> Sha
     parameters -= parameters[0].copy()
     sd_um = np.sqrt(np.maximum(_quadratic_form(area.basis, np.cov(parameters.T)), 0.0))
     x, y = (np.array([point[axis] for point in POINTS.values()]) for axis in (0, 1))
-    points = parameters @ height_basis(x, y)
+    points = parameters @ make_height_basis(x, y)
     sag_um = good.sag_um - good.sag_um[0]
     laser_um = good.displacement_um - good.displacement_um[0]
     return ShapeReview(
@@ -105,7 +105,7 @@ class _Area:
         axis = (np.arange(MAP_PX) + 0.5) * 2 / MAP_PX - 1
         x, y = np.meshgrid(axis, -axis)
         self._inside = np.hypot(x, y) <= share
-        self.basis = height_basis(x[self._inside], y[self._inside])
+        self.basis = make_height_basis(x[self._inside], y[self._inside])
         self.gram = self.basis @ self.basis.T / self.basis.shape[1]
 
     def make_map(self, values: Column) -> Column:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.model.arrays import AnyArray, Column, IntArray, Singles
-from membrane_ctrl.run_files.run_statistics import least_ticks
+from membrane_ctrl.run_files.run_statistics import count_least_ticks
 
 # A month has millions: single precision, which counts ticks exactly.
 Seconds = AnyArray
@@ -74,15 +74,15 @@ class SecondSums:
 def window_means(
     second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
 ) -> tuple[Column, Column]:
-    """Middles (k,) in s and means of the windows with at least `least_ticks`, from (n,) sums of
-    `SecondSums`.
+    """Middles (k,) in s and means of the windows with at least `count_least_ticks`, from (n,) sums
+    of `SecondSums`.
     """
     if not second.size:
         return np.empty(0), np.empty(0)
     number = second // window_s
     starts = group_starts(number)
     ticks, total = np.add.reduceat(counts, starts), np.add.reduceat(sums, starts)
-    whole = (ticks >= least_ticks(window_s, rate_hz)) & np.isfinite(total)
+    whole = (ticks >= count_least_ticks(window_s, rate_hz)) & np.isfinite(total)
     return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[
         whole
     ] / ticks[whole]

@@ -24,7 +24,7 @@ class WithoutFeedforward:
         self._numerator, self._denominator = signal.bilinear([1.0, 0.0], loop, 1 / period_s)
         self._state = np.zeros(2)
 
-    def kept_away_um(self, feedforward_um_per_s: Column) -> Column:
+    def estimate_kept_away_um(self, feedforward_um_per_s: Column) -> Column:
         """(n,) µm by which the error would have been larger; gaps count as zero flow."""
         flow = np.nan_to_num(np.asarray(feedforward_um_per_s, dtype=np.float64))
         kept, self._state = signal.lfilter(self._numerator, self._denominator, flow, zi=self._state)

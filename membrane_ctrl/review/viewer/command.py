@@ -110,7 +110,7 @@ def _write_picture(
     target: Path, source: Path | str, cursor: viewer.CursorTime | None = None
 ) -> int:
     try:
-        target.write_bytes(screenshot.screenshot_of(source, cursor))
+        target.write_bytes(screenshot.take_screenshot(source, cursor))
     except RuntimeError as error:
         raise errors.DeviceError(f"no picture: {error}") from None
     return 0
@@ -251,16 +251,16 @@ def _requested_part(run: Run, options: ReviewOptions) -> tuple[float, float] | N
     if options.start is not None or options.end is not None:
         start_s, end_s = run_times.part_s(run.origin_utc, options.start, options.end)
         if start_s >= run_times.end_s(run):
-            raise run_times.not_in(run, f"--from {options.start}")
+            raise run_times.make_outside_error(run, f"--from {options.start}")
         if end_s <= 0:
-            raise run_times.not_in(run, f"--to {options.end}")
+            raise run_times.make_outside_error(run, f"--to {options.end}")
         return (0.0 if options.start is None else start_s), (
             run_times.end_s(run) if options.end is None else end_s
         )
     if options.at is not None:
         at_s = run_times.moment_s(options.at, run.origin_utc)
         if not -_AROUND_S <= at_s <= run_times.end_s(run) + _AROUND_S:
-            raise run_times.not_in(run, f"--at {options.at}")
+            raise run_times.make_outside_error(run, f"--at {options.at}")
     elif options.around is not None:
         at_s = _find_event_time(run, options.around)
     else:

@@ -233,7 +233,7 @@ class Layer:
             self._send_style(
                 path, [(name, _FOUND_COLOURS.get(kind, _OTHER_FOUND))], 1.0, vertical=True
             )
-            time_s, values = plot_marks.vertical_lines(np.array([f.time_s for f in of_kind]))
+            time_s, values = plot_marks.make_vertical_lines(np.array([f.time_s for f in of_kind]))
             self._send_columns(path, time_s, rr.Scalars.columns(scalars=values))
 
     def _send_log(

@@ -15,8 +15,8 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.review.viewer.viewer import (
     CursorTime,
     free_port,
+    make_proxy_url,
     place_cursor,
-    proxy_url,
     viewer_command,
     viewer_environment,
 )
@@ -29,7 +29,7 @@ _TOO_SLOW = "the viewer did not answer in time"
 _TRY_AGAIN = "try again when the machine is less busy"
 
 
-def screenshot_of(source: Path | str, at: CursorTime | None = None) -> bytes:
+def take_screenshot(source: Path | str, at: CursorTime | None = None) -> bytes:
     """PNG of a recording as it opens, at a moment or its end, or of a server's page.
 
     Raises RuntimeError if the viewer does not start (no Vulkan driver), does not answer in time, or
@@ -84,7 +84,7 @@ def _connect_viewer(port: int, process: subprocess.Popen[bytes]) -> ViewerClient
     until_s = time.monotonic() + _WAIT_S
     while time.monotonic() < until_s and process.poll() is None:
         try:
-            viewer = ViewerClient.connect(proxy_url("127.0.0.1", port))
+            viewer = ViewerClient.connect(make_proxy_url("127.0.0.1", port))
             viewer.take_screenshot(max_size=16)
         except (RuntimeError, ConnectionError):
             time.sleep(_BETWEEN_S)

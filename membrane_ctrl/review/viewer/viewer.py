@@ -86,7 +86,7 @@ def put_cursor(
     until_s = time.monotonic() + most_s
     while time.monotonic() < until_s and process.poll() is None:
         try:
-            client = ViewerClient.connect(proxy_url("127.0.0.1", port))
+            client = ViewerClient.connect(make_proxy_url("127.0.0.1", port))
             place_cursor(client, at)
             if any(opened.current_time == at.nanos for opened in client.get_state().recordings):
                 return
@@ -107,7 +107,7 @@ def serve_source(
     port = port or free_port()
     _require_listening(bind, port)
     data_port = free_port()
-    url = source if isinstance(source, str) else proxy_url(_find_host(bind), data_port)
+    url = source if isinstance(source, str) else make_proxy_url(_find_host(bind), data_port)
     _print_address(bind, port, url)
     options = [
         "--serve-web",
@@ -132,7 +132,7 @@ def show_live_run(run: Run, web: bool, port: int = 0) -> int:
     data_port, port = free_port(), port or free_port()
     kind = ["--serve-web", "--web-viewer-port", str(port)] if web else ["--serve-grpc"]
     server = viewer_command(*kind, "--bind", "127.0.0.1", "--port", str(data_port))
-    proxy = proxy_url("127.0.0.1", data_port)
+    proxy = make_proxy_url("127.0.0.1", data_port)
     if web:
         _require_listening("127.0.0.1", port)
         _print_address("127.0.0.1", port, proxy)
@@ -184,7 +184,7 @@ def _find_host(bind: str) -> str:
     return "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
 
 
-def proxy_url(host: str, port: int) -> str:
+def make_proxy_url(host: str, port: int) -> str:
     return f"rerun+http://{host}:{port}/proxy"
 
 

@@ -26,7 +26,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     GeometrySpread,
     change_geometry,
 )
-from membrane_ctrl.model.geometry_hash import content_hash
+from membrane_ctrl.model.geometry_hash import hash_content
 from tests.support.calibration_truth import OPTICS, make
 
 ORIGIN = Origin("2026-01-01T00:00:00+00:00", ("a", "b"), 1.0, 2.0, 1.5, 3.0, ("a note",))
@@ -135,11 +135,11 @@ def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 def test_the_hash_depends_on_the_numbers_alone(solution: Solution) -> None:
     tables = tables_of(solution, OPTICS, ORIGIN)
     there_and_back = tomllib.loads(tomli_w.dumps(tables))
-    assert content_hash(there_and_back) == tables["calibration"]["hash"]
+    assert hash_content(there_and_back) == tables["calibration"]["hash"]
     later = tables_of(
         solution, OPTICS, Origin("2027-01-01T00:00:00+00:00", ("c",), 1.0, 2.0, 1.5, 3.0)
     )
     assert later["calibration"]["hash"] == tables["calibration"]["hash"]
     edited = copy.deepcopy(there_and_back)
     edited["geometry"]["camera"]["position_mm"][0] += 0.001
-    assert content_hash(edited) != tables["calibration"]["hash"]
+    assert hash_content(edited) != tables["calibration"]["hash"]

@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_iface.display_patterns import ScreenRaster, make_checkerboard, pattern_light
-from firmware_iface.display_response import linear_response
+from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light, make_checkerboard
+from firmware_iface.display_response import make_linear_response
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.optics import CameraConfig, DisturbancesConfig, OpticsConfig
 from membrane_ctrl.config.schema import TwinConfig
@@ -37,7 +37,9 @@ def renderer() -> OpticsRenderer:
 
 
 def picture(pattern: Pattern) -> PanelPicture:
-    return PanelPicture(linear_response().levels_of(pattern_light(pattern, RASTER)), RASTER)
+    return PanelPicture(
+        make_linear_response().find_levels(compute_pattern_light(pattern, RASTER)), RASTER
+    )
 
 
 def seen(
