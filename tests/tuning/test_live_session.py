@@ -167,7 +167,7 @@ def test_the_page_s_text_is_text(tmp_path: Path) -> None:
     held(log, 2.0)
     log.log_entry("said", "<script>alert(1)</script>")
     page = LivePage(opened)
-    assert "&lt;script&gt;" in page._said.text
+    assert "&lt;script&gt;" in page._results.text
     assert len(page._points.data["minutes"]) == 10
     assert "class=now>&#9654; characterise" in page._steps.text
 
