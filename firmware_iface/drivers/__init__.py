@@ -26,7 +26,7 @@ class DriverKind:
     built_in: dict[str, str]  # name and object of an entry point
 
 
-SENSORS = DriverKind(
+INSTRUMENTS = DriverKind(
     "driver",
     "membrane_ctrl.drivers",
     "membrane_ctrl.emulators",
@@ -54,7 +54,7 @@ SCREENS = DriverKind(
     "membrane_ctrl.screen_emulators",
     {"pygame": "firmware_iface.drivers.screen_pygame:PygameDisplay"},
 )
-KINDS = (SENSORS, CAMERAS, SCREENS)
+KINDS = (INSTRUMENTS, CAMERAS, SCREENS)
 
 
 def load_built_in(name: str, kind: DriverKind) -> Any:

@@ -14,7 +14,7 @@ from membrane_ctrl.alarms.book import AlarmMessage
 from membrane_ctrl.alarms.outbox import Send
 from membrane_ctrl.alarms.sending import Service, limited_memory, send_to_all
 from membrane_ctrl.config import schema
-from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model import errors, files
 
 _MISSING = "alarms.urls_file: Apprise is not installed; pip install 'membrane-ctrl[alarms]'"

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from membrane_ctrl.config.port import AlarmRule, AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmRule, AlarmsConfig
 from membrane_ctrl.model.notices import NoticeChanges, Severity
 
 # Keys of the configuration that name the lists of services

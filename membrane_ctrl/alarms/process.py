@@ -16,7 +16,7 @@ from membrane_ctrl.alarms.outbox import Send
 from membrane_ctrl.alarms.run_alarms import RunAlarms
 from membrane_ctrl.alarms.sending import limited_memory
 from membrane_ctrl.alarms.sent_log import SentLog
-from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model import child_events, port_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event

@@ -10,7 +10,7 @@ from membrane_ctrl.alarms.book import ESCALATION, LAB, AlarmMessage
 from membrane_ctrl.alarms.outbox import Outbox, Send
 from membrane_ctrl.alarms.sent_log import SentLog
 from membrane_ctrl.alarms.watcher import Watcher
-from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmsConfig
 
 
 class RunAlarms:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from membrane_ctrl.alarms.book import AlarmBook, SentMessage, Sign, sign_of_value, signs_of
 from membrane_ctrl.alarms.outbox import Outbox
-from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model import event_lines, port_events
 from membrane_ctrl.model.events import CommandTaken, EventLine
 from membrane_ctrl.model.run_status import RunStatus

@@ -16,7 +16,7 @@ from typing import Any
 
 from membrane_ctrl.bridges.epics_search import require_unserved
 from membrane_ctrl.bridges.names import TABLE, Bridge, Published, Value
-from membrane_ctrl.config.port import EpicsConfig
+from membrane_ctrl.config.bridges import EpicsConfig
 from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.service.access import Action

@@ -31,7 +31,7 @@ from membrane_ctrl.bridges.mqtt_client import CancellableClient
 from membrane_ctrl.bridges.mqtt_inbox import HandleMessage, Inbox, Reports
 from membrane_ctrl.bridges.mqtt_owner import NameOwnership, OwnerClaim
 from membrane_ctrl.bridges.names import TABLE, Bridge, Published
-from membrane_ctrl.config.port import MqttConfig
+from membrane_ctrl.config.bridges import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY, is_safety_command
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.columns import QUANTITY_OF_UNIT

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 
 from membrane_ctrl.bridges.names import TABLE, Bridge, Value
 from membrane_ctrl.bridges.opcua_server import AnonymousClients, BridgeServer, NamedClients, caller
-from membrane_ctrl.config.port import OpcuaConfig
+from membrane_ctrl.config.bridges import OpcuaConfig
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.service.access import Action
 from membrane_ctrl.service.accounts import KnownUser, known_users

@@ -20,9 +20,10 @@ from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
 from membrane_ctrl.acquisition import driver_check, optical_bench, waiting_clock
 from membrane_ctrl.alarms.addresses import require_sendable
 from membrane_ctrl.commissioning import interlock_check
+from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.config.bridge_access import describe_bridges
 from membrane_ctrl.config.needed_packages import NeededPackage, list_missing_packages
-from membrane_ctrl.config.port import SOCKET_NAME, AlarmsConfig, PortConfig
+from membrane_ctrl.config.port import SOCKET_NAME, PortConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound

@@ -157,7 +157,7 @@ def _find_drivers(section: type[Any]) -> set[str]:
 
 def _make_driver_names(name: str, role: str) -> dict[str, Any]:
     """Return what every template calls the driver and its entry point groups."""
-    kind = {"camera": drivers.CAMERAS, "screen": drivers.SCREENS}.get(role, drivers.SENSORS)
+    kind = {"camera": drivers.CAMERAS, "screen": drivers.SCREENS}.get(role, drivers.INSTRUMENTS)
     return {
         "name": name,
         "dashed": name.replace("_", "-"),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from membrane_ctrl.config.port import LOCAL_HOSTS, BridgesConfig
+from membrane_ctrl.config.bridges import BridgesConfig
+from membrane_ctrl.config.port import LOCAL_HOSTS
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,8 @@ from firmware_iface import settings
 from firmware_iface.roles import ACTUATORS, ROLES, SENSORS
 from firmware_iface.settings import Section
 from membrane_ctrl.config import device_places
+from membrane_ctrl.config.alarms import AlarmsConfig
+from membrane_ctrl.config.bridges import BridgesConfig
 from membrane_ctrl.config.control import (
     EstimatorConfig,
     LimitsConfig,
@@ -36,7 +38,7 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     PatternConfig,
 )
-from membrane_ctrl.config.port import AlarmsConfig, BridgesConfig, PortConfig
+from membrane_ctrl.config.port import PortConfig
 
 __all__ = [
     "CameraConfig",

@@ -8,7 +8,8 @@ from urllib.parse import urlsplit
 from pydantic import Field, field_validator, model_validator
 
 from firmware_iface.settings import Section
-from membrane_ctrl.config.port import LOCAL, LOCAL_HOSTS, BrokerConfig
+from membrane_ctrl.config.broker import BrokerConfig
+from membrane_ctrl.config.port import LOCAL, LOCAL_HOSTS
 
 DEFAULT_PORT = 7480
 _PUBLIC_URL = re.compile(

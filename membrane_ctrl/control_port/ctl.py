@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.config.port import SOCKET_NAME, FleetConfig
+from membrane_ctrl.config.fleet import FleetConfig
+from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.toml_file import load_toml, read_toml
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.commander import CommandSession

@@ -46,7 +46,7 @@ def _make_driver(role: str, section: settings.AnyDriver, links: modbus_rtu.Modbu
                 section.serial,
             )
         case _:
-            device = driver_loading.make_driver(section, f"devices.{role}", drivers.SENSORS)
+            device = driver_loading.make_driver(section, f"devices.{role}", drivers.INSTRUMENTS)
             if not hasattr(device, roles.ROLES[role].reads):
                 name = driver_loading.name_of(section)
                 raise ValueError(

@@ -16,7 +16,7 @@ from pathlib import Path
 from membrane_ctrl.alarms.addresses import apprise_senders
 from membrane_ctrl.alarms.run_alarms import RunAlarms
 from membrane_ctrl.alarms.sent_log import LOG_NAME, SentLog
-from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model import event_lines, telemetry
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.run_events import ENDS_WITHOUT_CONTROL, Ended

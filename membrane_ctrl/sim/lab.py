@@ -225,7 +225,7 @@ class Lab:
                     self._make_actuator(role) if role in self._outputs else self._read_sensor(role)
                 )
                 made: serial_device.SerialDevice = driver_loading.make_emulator(
-                    section, f"devices.{role}", drivers.SENSORS, end
+                    section, f"devices.{role}", drivers.INSTRUMENTS, end
                 )
                 return made
             case _:

@@ -20,7 +20,7 @@ from membrane_ctrl.alarms.book import AlarmMessage
 from membrane_ctrl.alarms.outbox import Outbox
 from membrane_ctrl.alarms.watcher import Watcher
 from membrane_ctrl.cli import run as command_line
-from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from membrane_ctrl.alarms.book import AlarmBook, AlarmMessage, Sign, signs_of
-from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model.child_events import ChildRestarted
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.recorder_events import DiskLow

@@ -20,7 +20,7 @@ from membrane_ctrl.alarms.outbox import Outbox
 from membrane_ctrl.alarms.process import AlarmsSpec, watch_run
 from membrane_ctrl.alarms.watcher import Watcher
 from membrane_ctrl.cli import run
-from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.events import Event, EventLine
@@ -193,7 +193,9 @@ def test_a_control_process_that_vanishes_is_reported(tmp_path: Path) -> None:
     theirs, ours = Pipe()
     theirs.close()
     with open_ring(16, ROW_BYTES) as telemetry, open_ring(16, 4096) as events:
-        watch_run(spec(telemetry, events, tmp_path), [sender], make_event_sender(ours), lambda: False)
+        watch_run(
+            spec(telemetry, events, tmp_path), [sender], make_event_sender(ours), lambda: False
+        )
     assert told(sender) == [("control_gone", "raised")]
 
 

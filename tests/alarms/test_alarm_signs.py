@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from membrane_ctrl.alarms.book import sign_of_value, signs_of
-from membrane_ctrl.config.port import AlarmRule
+from membrane_ctrl.config.alarms import AlarmRule
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import parse_tables
 from membrane_ctrl.model.errors import InputError

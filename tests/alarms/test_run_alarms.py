@@ -15,7 +15,7 @@ from membrane_ctrl.alarms import sent_log
 from membrane_ctrl.alarms.book import AlarmMessage
 from membrane_ctrl.alarms.run_alarms import RunAlarms
 from membrane_ctrl.alarms.sent_log import LOCK_NAME, LOG_NAME, STALE_S, SentLog
-from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
 CONFIG = AlarmsConfig(urls_file="lab", escalation_urls_file="boss")

@@ -8,7 +8,7 @@ import pytest
 
 from membrane_ctrl.commissioning.check import check_config
 from membrane_ctrl.config.bridge_access import describe_bridges
-from membrane_ctrl.config.port import BridgesConfig, EpicsConfig, MqttConfig, OpcuaConfig
+from membrane_ctrl.config.bridges import BridgesConfig, EpicsConfig, MqttConfig, OpcuaConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.cross_check import cross_check
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from membrane_ctrl.bridges import mqtt
 from membrane_ctrl.bridges.cli import app
 from membrane_ctrl.bridges.names import COMMANDS, TABLE, Bridge, values
-from membrane_ctrl.config.port import BridgesConfig, EpicsConfig, MqttConfig, OpcuaConfig
+from membrane_ctrl.config.bridges import BridgesConfig, EpicsConfig, MqttConfig, OpcuaConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.columns import PUBLISHED

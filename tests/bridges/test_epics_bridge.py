@@ -13,7 +13,7 @@ import pytest
 
 from membrane_ctrl.bridges import epics
 from membrane_ctrl.bridges.epics_search import find_server, require_unserved
-from membrane_ctrl.config.port import EpicsConfig
+from membrane_ctrl.config.bridges import EpicsConfig
 from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model.errors import DeviceError
 from tests.bridges.test_bridge_clients import SERVERS, bridges, held, program

@@ -24,7 +24,7 @@ from membrane_ctrl.bridges.mqtt_client import CancellableClient
 from membrane_ctrl.bridges.mqtt_inbox import Reports
 from membrane_ctrl.bridges.mqtt_owner import OwnerClaim
 from membrane_ctrl.bridges.names import Bridge
-from membrane_ctrl.config.port import MqttConfig
+from membrane_ctrl.config.bridges import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.telemetry import State

@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from pydantic import ValidationError
 
 from membrane_ctrl.bridges import opcua
-from membrane_ctrl.config.port import BridgesConfig, OpcuaConfig
+from membrane_ctrl.config.bridges import BridgesConfig, OpcuaConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.service.accounts import known_user

@@ -10,13 +10,9 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.commissioning.check import check_config
-from membrane_ctrl.config.port import (
-    AlarmsConfig,
-    BridgesConfig,
-    MqttConfig,
-    OpcuaConfig,
-    PortConfig,
-)
+from membrane_ctrl.config.alarms import AlarmsConfig
+from membrane_ctrl.config.bridges import BridgesConfig, MqttConfig, OpcuaConfig
+from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.errors import Exit, InputError
 

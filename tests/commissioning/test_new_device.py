@@ -267,7 +267,7 @@ def test_hold_refuses_a_driver_without_an_emulator_to_emulate_it(
     (site / "acme-gauge-0.1.dist-info" / "entry_points.txt").write_text(
         "[membrane_ctrl.drivers]\nacme_gauge = acme_gauge:AcmeGauge\n"
     )
-    assert drivers.load_driver("acme_gauge", drivers.SENSORS).__name__ == "AcmeGauge"
+    assert drivers.load_driver("acme_gauge", drivers.INSTRUMENTS).__name__ == "AcmeGauge"
     with pytest.raises(InputError, match="no emulator 'acme_gauge' is installed; installed: none"):
         Lab(StillPlant(), configured().devices)  # type: ignore[arg-type]
     wrong = tmp_path / "wrong.toml"

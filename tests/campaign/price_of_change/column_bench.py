@@ -20,7 +20,7 @@ from rich.console import Console
 
 from membrane_ctrl.bridges.mqtt import discovery
 from membrane_ctrl.bridges.names import Bridge, values
-from membrane_ctrl.config.port import BridgesConfig
+from membrane_ctrl.config.bridges import BridgesConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import ConsoleModel
 from membrane_ctrl.console.view import ConsolePage
