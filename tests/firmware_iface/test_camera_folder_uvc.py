@@ -50,7 +50,7 @@ def test_a_folder_is_its_own_screen(folder: Path) -> None:
 
 
 def test_a_folder_with_other_pictures_is_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(DeviceRefusedError, match=r"6 x 4 pixels.*says 7 x 4"):
+    with pytest.raises(DeviceRefusedError, match=r"6 x 4 pixels.*states 7 x 4"):
         of_folder(folder, 7).open()
     with pytest.raises(LinkError, match="no pictures"):
         of_folder(tmp_path / "nothing").open()

@@ -83,7 +83,7 @@ def test_an_output_that_lost_its_power_reads_back_as_an_error_not_as_off() -> No
         await pump.open()
         await pump.set_pump(0.25)
         device.restart()  # 0 mA: below what the map knows
-        with pytest.raises(LinkError, match=r"says -0.25, not 0 \.\. 1"):
+        with pytest.raises(LinkError, match=r"reads -0.25, not 0 \.\. 1"):
             await pump.pump_fraction()
         await pump.close()
 

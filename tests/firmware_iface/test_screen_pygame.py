@@ -155,7 +155,7 @@ def test_another_size_is_refused_in_one_line(framebuffer: Path, size: tuple[int,
         screen.open()
     message = str(refused.value)
     assert f"is {WIDTH_PX} x {HEIGHT_PX}" in message
-    assert f"says {size[0]} x {size[1]}" in message
+    assert f"states {size[0]} x {size[1]}" in message
     assert "without scaling" in message
     assert "\n" not in message
 
