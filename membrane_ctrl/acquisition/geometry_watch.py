@@ -11,10 +11,10 @@ from membrane_ctrl.metrology.reconstruction import slope_noise
 from membrane_ctrl.model import acquisition_events, events, shape_estimate
 
 
-def geometry_event(geometry: RunGeometry) -> acquisition_events.GeometryInForce:
+def geometry_event(geometry: RunGeometry) -> acquisition_events.GeometryInUse:
     """The event that records the geometry."""
     origin = geometry.origin
-    return acquisition_events.GeometryInForce(
+    return acquisition_events.GeometryInUse(
         origin.hash, origin.file or None, origin.calibrated_utc or None, geometry.note
     )
 

@@ -9,7 +9,7 @@ from membrane_ctrl.model.state_tree import StateNode
 
 
 @dataclass(frozen=True, slots=True)
-class GainsInForce(StateNode):
+class GainsInUse(StateNode):
     """All settings that a `gains` command changes."""
 
     loop: LoopConfig
@@ -21,8 +21,8 @@ class GainsInForce(StateNode):
 class GainsState(StateNode):
     """The present settings, and those that a trial restores."""
 
-    good: GainsInForce
-    tried: GainsInForce
+    good: GainsInUse
+    tried: GainsInUse
     until_s: float = math.nan  # end of the trial; NaN: there is none
     setpoint_step_um: float = (
         math.nan
@@ -60,7 +60,7 @@ class GainsTrial:
             self.keep()
 
     @property
-    def present(self) -> GainsInForce:
+    def present(self) -> GainsInUse:
         """The present settings."""
         return self.memory.tried
 

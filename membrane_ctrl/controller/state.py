@@ -11,7 +11,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control.inner_loop import InnerLoopState
 from membrane_ctrl.control.shape_loop import ShapeLoopMemory
 from membrane_ctrl.controller.centre_estimation import CentreEstimationState
-from membrane_ctrl.controller.gains_trial import GainsInForce, GainsState
+from membrane_ctrl.controller.gains_trial import GainsInUse, GainsState
 from membrane_ctrl.controller.interlocks import InterlocksState
 from membrane_ctrl.controller.observer import ObserverState
 from membrane_ctrl.controller.resume_rule import ResumeState
@@ -63,7 +63,7 @@ class ControllerState(StateNode):
 
 def make_first_state(config: Config) -> ControllerState:
     """The state before a run's first tick."""
-    gains = GainsInForce(config.loop, config.shape.time_constant_s, config.pump)
+    gains = GainsInUse(config.loop, config.shape.time_constant_s, config.pump)
     return ControllerState(
         gains=GainsState(good=gains, tried=gains),
         context=TickContextState(config.loop.setpoint_um),

@@ -26,7 +26,7 @@ class AcquisitionState(Event, kind="acquisition", sentence="Acquisition {state}[
         return self.state != "running"
 
 
-class GeometryInForce(
+class GeometryInUse(
     Event,
     kind="geometry",
     sentence="Geometry {hash}[ from {file}][, calibrated {calibrated_utc}][; {message}]",

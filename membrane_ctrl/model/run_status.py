@@ -34,7 +34,7 @@ class RunStatus:
     notices: Notices = field(default_factory=dict)
     shape_reason: str = ""  # of the shape loop
     acquisition: acquisition_events.AcquisitionState | None = None  # the acquisition's last report
-    geometry: acquisition_events.GeometryInForce | None = None  # used by the cycles
+    geometry: acquisition_events.GeometryInUse | None = None  # used by the cycles
     # gains set during the run; None: those of the configuration
     loop: Mapping[str, Any] | None = None
     kept_loop: Mapping[str, Any] | None = None  # what a trial goes back to
@@ -123,7 +123,7 @@ class RunStatus:
                 return replace(self, unstored=_remove_standing(self.unstored, event.word))
             case events.GainsReverted():
                 return replace(self, loop=self.kept_loop, trial_ends_s=math.nan)
-            case acquisition_events.GeometryInForce():
+            case acquisition_events.GeometryInUse():
                 return replace(self, geometry=event)
             case acquisition_events.AcquisitionState():
                 return replace(self, acquisition=event)

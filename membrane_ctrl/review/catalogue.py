@@ -145,7 +145,7 @@ def read_entry(folder: Path) -> RunEntry:
             (
                 e.event.hash
                 for e in reversed(log)
-                if isinstance(e.event, acquisition_events.GeometryInForce)
+                if isinstance(e.event, acquisition_events.GeometryInUse)
             ),
             "",
         ),

@@ -104,7 +104,7 @@ class Summary(StateNode):
                 self.fault_count += 1
                 if len(self.faults) < _LISTED_MAX:
                     self.faults.append(line)
-            case acquisition_events.GeometryInForce():
+            case acquisition_events.GeometryInUse():
                 self.geometry = {key: line.get(key) for key in ("hash", "file", "calibrated_utc")}
             case run_events.Ended():
                 self.end = line

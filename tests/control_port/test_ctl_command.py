@@ -14,7 +14,7 @@ from membrane_ctrl.control_port import protocol
 from membrane_ctrl.control_port.ctl import Where, socket_path, status_lines
 from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.controller.commands import SAME_AS, TABLE
-from membrane_ctrl.model.acquisition_events import GeometryInForce
+from membrane_ctrl.model.acquisition_events import GeometryInUse
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import MaintenanceOver
 from membrane_ctrl.model.run_status import RunStatus
@@ -179,7 +179,7 @@ def test_what_stands_until_it_is_over_is_shown() -> None:
     )
     lines = status_lines({"run": "r", **status_table(status)})
     assert "Disk almost full: less than 500 MB free" in lines
-    status = status.after_event(GeometryInForce("12ab", "g.toml", "2026-01-02", ""))
+    status = status.after_event(GeometryInUse("12ab", "g.toml", "2026-01-02", ""))
     status = status.after_event(MaintenanceOver("calibrate", "the geometry fits again"))
     lines = status_lines({"run": "r", **status_table(status)})
     assert not any("Maintenance" in line for line in lines)

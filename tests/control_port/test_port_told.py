@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from membrane_ctrl.model.acquisition_events import GeometryInForce
+from membrane_ctrl.model.acquisition_events import GeometryInUse
 from membrane_ctrl.model.events import Maintenance, MaintenanceOver, StateEntered, Why
 from membrane_ctrl.model.reason import WhyCode
 from membrane_ctrl.model.recorder_events import DiskLow, RecorderError, RecorderRecovered
@@ -13,7 +13,7 @@ from tests.worlds.port_run import port_run
 
 async def test_a_report_of_a_child_stands_in_the_status(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
-        run.port.note_report(GeometryInForce("12ab", None, None, ""))
+        run.port.note_report(GeometryInUse("12ab", None, None, ""))
         run.port.note_report(Maintenance("calibrate", "calibrate again"))
         status = run.port.status()
         assert status["notices"] == [

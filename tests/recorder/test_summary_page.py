@@ -38,7 +38,7 @@ def test_figures_are_those_of_the_summary() -> None:
     summary.add_shape(shape_of(20.0, 1, verdict="rejected"))
     for event in (
         FAULT,
-        acquisition_events.GeometryInForce("0f93", "bench.toml", "2026-11-21", ""),
+        acquisition_events.GeometryInUse("0f93", "bench.toml", "2026-11-21", ""),
     ):
         summary.add_event(event.to_dict())
     gains = dict(vars(Config().loop)) | {"kp_per_s": 0.8}
