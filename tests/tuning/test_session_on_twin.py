@@ -543,7 +543,7 @@ def test_the_candidate_that_a_person_chooses_is_the_one_that_is_applied(
     assert [
         name for name in shown if name in ordered
     ] == 2 * ordered  # the figures, and what gets better and worse
-    assert "in force" in said
+    assert "in use" in said
     assert "simc-slow is on trial" in said
     assert "simc-slow is chosen" in done.file_path("report.html").read_text()
 

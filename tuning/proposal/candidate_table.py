@@ -74,7 +74,7 @@ def describe_change(row: Candidate, present: Candidate | None) -> str:
     not offered.
     """
     if row is present:
-        return "in force"
+        return "in use"
     if why := find_refusal(row):
         return f"not offered: {why}"
     if present is None or present.predicted is None:
