@@ -158,7 +158,7 @@ def test_a_stopped_processor_is_reset(virtual_board: VirtualBoard) -> None:
     assert (virtual_board.outputs, virtual_board.resets) == ((0, 0), 1)
 
 
-def test_a_clock_that_stands_still_resets_the_board(virtual_board: VirtualBoard) -> None:
+def test_a_stopped_clock_resets_the_board(virtual_board: VirtualBoard) -> None:
     run_pump(virtual_board, 10.0)
     virtual_board.chip.board_tick()  # an interrupt, and no microsecond has passed
     assert virtual_board.outputs == (0, 0)
@@ -261,7 +261,7 @@ def test_scales_turn_raw_values_into_counts(firmware_library: Path) -> None:
         assert sensors(board)["gauge_pressure_pa"] != sensors(board)["gauge_pressure_pa"]
 
 
-def test_a_laser_that_says_nothing_is_not_good(virtual_board: VirtualBoard) -> None:
+def test_a_silent_laser_has_no_good_quality(virtual_board: VirtualBoard) -> None:
     assert sensors(virtual_board)["displacement_quality"] == 0xFFFF
 
 
@@ -315,7 +315,7 @@ def test_a_frame_is_one_only_between_silences(virtual_board: VirtualBoard) -> No
     assert virtual_board.said() == answer
 
 
-def test_a_line_that_tears_frames_apart_may_have_a_longer_silence(firmware_library: Path) -> None:
+def test_a_line_that_splits_frames_may_have_a_longer_silence(firmware_library: Path) -> None:
     board = VirtualBoard(firmware_library, {**SETTINGS, "silence_us": 20_000})
     ask = rtu_frame(1, struct.pack(">BHH", 3, 0, 2))
     board.hear(ask[:3])

@@ -157,7 +157,7 @@ async def _restarted(driver: PumpBoard) -> None:
 @pytest.mark.parametrize(
     "damage", [_freeze_main_loop, _freeze_interrupts, _damage_registers, _overflow_stack, _run_wild]
 )
-async def test_a_damaged_board_stops_the_pump_and_starts_anew(
+async def test_a_damaged_board_stops_the_pump_and_restarts(
     rig: _Rig, damage: Callable[[_Rig, StoppedBoard], Awaitable[None]]
 ) -> None:
     driver = await rig.running()

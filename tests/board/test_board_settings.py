@@ -72,7 +72,7 @@ def test_a_wrong_table_is_refused_with_its_key(change: dict[str, Any], said: str
     assert str(found.value).startswith(said)
 
 
-def test_the_command_writes_a_record_or_says_one_line(
+def test_the_command_writes_a_record_or_prints_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, target = tmp_path / "board.toml", tmp_path / "settings.bin"

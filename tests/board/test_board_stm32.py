@@ -250,7 +250,7 @@ async def _run_wild(board: StoppedBoard, at: dict[str, int]) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("damage", [_damage_memory, _overflow_the_stack, _run_wild])
-async def test_a_damaged_board_drives_its_outputs_low_and_starts_anew(
+async def test_a_damaged_board_drives_its_outputs_low_and_restarts(
     tmp_path: Path, damage: Callable[[StoppedBoard, dict[str, int]], Awaitable[None]]
 ) -> None:
     """As far as QEMU goes: what only the hardware watchdog ends, such as a stuck tick,

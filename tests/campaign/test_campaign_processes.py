@@ -112,7 +112,7 @@ async def test_a_latched_hold_starts_again_once_a_person_clears_it(tmp_path: Pat
 
 
 @pytest.mark.campaign
-async def test_after_a_kill_the_next_start_holds_again_only_if_the_resume_rule_says_so(
+async def test_after_a_kill_the_next_start_holds_again_only_if_the_resume_rule_allows_it(
     tmp_path: Path,
 ) -> None:
     plant = make_plant()
@@ -174,7 +174,7 @@ def wait_for_event(folder: Path, patience_s: float, **words: object) -> None:
 @pytest.mark.campaign
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
-def test_the_hold_goes_on_without_its_camera_until_another_takes_its_place(
+def test_the_hold_continues_without_its_camera_until_another_replaces_it(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     """The process that owns screen and camera dies, or is stopped until its 60 s are over."""

@@ -62,7 +62,7 @@ def told(room: Room) -> str:
     return room.run("cat /run/told/told 2> /dev/null || true")
 
 
-def test_it_is_ready_says_how_it_is_and_can_do_no_harm(room: Room) -> None:
+def test_the_service_reports_readiness_and_status_and_can_do_no_harm(room: Room) -> None:
     room.fresh()
     room.start()
     assert room.show("ActiveState", "Type", "WatchdogUSec") == {

@@ -36,7 +36,7 @@ def test_a_laser_that_creeps_leads_the_mirror_no_further_than_this(
     assert story.pumped_um < most_um
 
 
-def test_a_camera_outvoted_by_two_liars_is_heard_when_the_gas_agrees_with_it() -> None:
+def test_a_camera_outvoted_by_two_faulty_sensors_prevails_when_the_gas_agrees_with_it() -> None:
     story = tell((NOISE_ONLY, creep(-2.0)), 1, camera=True, from_start=False)
     assert story.noticed == "sensors: optics"
     assert story.ended_in == State.FAULT

@@ -47,7 +47,7 @@ def test_the_quick_commands_load_what_they_need_alone(words: list[str]) -> None:
     assert loaded(code) <= {"pyarrow"}
 
 
-def test_hold_says_what_it_does_before_it_loads_the_control_program() -> None:
+def test_hold_prints_its_first_line_before_it_loads_the_control_program() -> None:
     code = "from membrane_ctrl.model import terminal\nfrom membrane_ctrl.cli import run\n"
     code += "terminal.print_progress = "
     code += "lambda words: sys.exit(str('membrane_ctrl.hold' in sys.modules))\n"

@@ -30,7 +30,7 @@ def test_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
     assert said["shape loop"] == "a cycle every 2 s"
 
 
-def test_a_hold_that_tracks_is_told_as_such(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_names_a_hold_that_tracks(capsys: pytest.CaptureFixture[str]) -> None:
     config = Config()
     config = config.model_copy(update={"shape": config.shape.model_copy(update={"mode": "track"})})
     assert would(config, capsys)["shape loop"] == "20 figures/s, tracked"

@@ -181,7 +181,7 @@ def test_without_a_latch_a_running_program_is_left_alone(bench: Bench) -> None:
     assert bench.read().pump_fraction == 0.5
 
 
-def test_nobody_there_is_said_in_one_line(
+def test_a_missing_hold_and_board_give_one_line(
     tmp_path: Path, unused_tcp_port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.05)
@@ -277,7 +277,7 @@ def test_a_running_hold_is_locked_and_that_is_enough_where_it_alone_has_the_pump
     assert [request["do"] for request in hold.asked] == ["latch"]
 
 
-def test_the_hold_is_told_also_where_the_board_latches(bench: Bench, tmp_path: Path) -> None:
+def test_the_hold_is_locked_also_where_the_board_latches(bench: Bench, tmp_path: Path) -> None:
     """Its next hold, after a restart of the board that forgets, is then refused as well."""
     hold = Hold(tmp_path / "control.sock", {"ok": True})
     make_safe(bench.config, "lab.toml")
@@ -287,7 +287,7 @@ def test_the_hold_is_told_also_where_the_board_latches(bench: Bench, tmp_path: P
 
 
 @pytest.mark.parametrize("version", [1])
-def test_an_old_board_is_stopped_once_more_after_the_hold_was_told(
+def test_an_old_board_is_stopped_again_after_the_hold_was_locked(
     bench: Bench, version: int, tmp_path: Path
 ) -> None:
     """The hold's last command before it latched came after the first stop."""

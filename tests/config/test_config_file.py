@@ -159,7 +159,9 @@ def test_every_default_is_written_out() -> None:
     ],
     ids=repr,
 )
-def test_the_line_says_what_to_write_instead(tmp_path: Path, text: bytes, words: list[str]) -> None:
+def test_the_error_line_shows_what_to_write_instead(
+    tmp_path: Path, text: bytes, words: list[str]
+) -> None:
     path = tmp_path / "lab.toml"
     path.write_bytes(text)
     with pytest.raises(InputError) as caught:

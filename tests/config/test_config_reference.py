@@ -34,7 +34,7 @@ WITHOUT_UNIT |= {"focal_relative", "pitch_relative", "laser_relative", "k1", "k2
 
 
 @pytest.mark.parametrize(("title", "key"), ALL, ids=lambda value: getattr(value, "name", value))
-def test_a_key_says_what_it_means_and_when_to_change_it(title: str, key: reference.Key) -> None:
+def test_a_key_states_its_meaning_and_when_to_change_it(title: str, key: reference.Key) -> None:
     assert len(key.meaning.split()) >= 2, title
     assert len(key.advice.split()) >= 2, title
     assert key.advice[-1] == "."

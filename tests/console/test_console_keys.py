@@ -71,7 +71,7 @@ def typed(*texts: str, paused: bool = False) -> tuple[Desk, list[Request]]:
         (["x", " ", "\x1a", "?", ""], False, []),
     ],
 )
-def test_what_keys_ask_for(texts: list[str], paused: bool, asked: list[Request]) -> None:
+def test_each_key_sends_its_request(texts: list[str], paused: bool, asked: list[Request]) -> None:
     assert typed(*texts, paused=paused)[1] == asked
 
 

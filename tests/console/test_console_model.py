@@ -95,7 +95,7 @@ def test_fault_stands_until_it_is_cleared_and_is_counted() -> None:
     assert view.last_fault == "link lost: the link to the pump board is down (link down) at 0 s"
 
 
-def test_told_reason_is_that_of_the_newest_state_or_why() -> None:
+def test_the_reason_is_that_of_the_newest_state_or_why() -> None:
     given = model()
     given.add_row(replace(HOLDING, state=State.CHECK))
     given.add_event(event(0.0, "state", state="check", why="entering"))
@@ -134,7 +134,7 @@ def test_sag_change_is_against_the_first_usable_shape_of_a_settled_hold() -> Non
     assert (seen.cycles, seen.rejected, seen.age_s) == (5, 1, 2.0)
 
 
-def test_note_says_what_is_wrong_with_the_shape() -> None:
+def test_the_note_names_the_fault_of_the_shape() -> None:
     given = model()
     given.add_row(HOLDING)
     given.add_shape(shape(verdict="degraded", reason="12 % saturated"))

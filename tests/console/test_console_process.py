@@ -127,7 +127,7 @@ def test_terminal_is_given_back_on_a_stop_and_sigint_is_not_for_us(
     finish(process, ours)
 
 
-def test_plain_lines_and_faults_when_nobody_looks(
+def test_without_a_terminal_lines_and_faults_are_printed(
     run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(signal, "signal", lambda number, handler: None)
@@ -175,7 +175,7 @@ def test_reader_that_went_away_is_no_error_and_none_for_who_watches_the_console(
         assert sys.stderr is gone  # and no exception came out
 
 
-def test_a_console_that_takes_the_place_of_another_does_not_tell_old_news_again(
+def test_a_console_that_replaces_another_does_not_repeat_old_events(
     run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(signal, "signal", lambda number, handler: None)

@@ -299,7 +299,7 @@ def test_plain_events() -> None:
     assert event_line(event(1.0, "raw_frames", message="a\n  b")) == "      1.0 s  A b"
 
 
-def test_what_cannot_wait_a_second() -> None:
+def test_faults_and_state_changes_are_drawn_at_once() -> None:
     kinds = ("fault", "cleared", "state", "link", "child_ended", "end", "command", "start")
     kinds += (
         "recorder_error",

@@ -19,14 +19,14 @@ def line(told: str = "", fault: str = "", **changes: float) -> str:
     return explain_state(replace(HOLDING, **changes), told, fault, CONFIG)
 
 
-def test_hold_names_what_the_flow_is_made_of_largest_first() -> None:
+def test_hold_names_the_terms_of_the_flow_largest_first() -> None:
     assert line() == "pump gives 1.14 µm/s: +1.24 integral, -0.11 feed-forward"
     assert line(p_um_per_s=-2.0, flow_um_per_s=0.0) == (
         "pump is at 0: -2.00 proportional, +1.24 integral, -0.11 feed-forward"
     )
 
 
-def test_settle_says_so() -> None:
+def test_settle_is_named() -> None:
     assert line(state=State.SETTLE).startswith("settling: pump gives 1.14 µm/s")
 
 
@@ -37,11 +37,13 @@ def test_settle_says_so() -> None:
         (-25.0, 0.0, "pump is at 0: waiting for the leak, 25.1 µm to go"),
     ],
 )
-def test_inflate_says_how_far(target_um: float, flow_um_per_s: float, said: str) -> None:
+def test_inflate_states_the_remaining_distance(
+    target_um: float, flow_um_per_s: float, said: str
+) -> None:
     assert line(state=State.INFLATE, target_um=target_um, flow_um_per_s=flow_um_per_s) == said
 
 
-def test_outside_the_band_says_which_way_and_what_is_done() -> None:
+def test_outside_the_band_the_direction_and_the_response_are_named() -> None:
     assert line(error_um=-6.9, flow_um_per_s=0.0) == (
         "outside the band: bowl 6.9 µm too deep, pump is at 0, only the leak can lower it"
     )
@@ -76,7 +78,7 @@ WITH_VENT = Config.model_validate(
 )
 
 
-def test_a_bench_without_a_vent_is_never_said_to_have_it_open() -> None:
+def test_a_bench_without_a_vent_never_shows_an_open_vent() -> None:
     row = replace(
         HOLDING, safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=math.nan
     )
@@ -91,7 +93,7 @@ def test_a_bench_without_a_vent_is_never_said_to_have_it_open() -> None:
 @pytest.mark.parametrize(
     ("readback", "open_"), [(1.0, True), (0.5, True), (0.49, False), (0.0, False)]
 )
-def test_a_vent_whose_read_back_contradicts_its_command_is_not_said_to_be_open(
+def test_a_vent_whose_read_back_contradicts_its_command_is_not_shown_as_open(
     readback: float, open_: bool
 ) -> None:
     said = line(
@@ -111,7 +113,7 @@ def test_without_a_reading_the_pump_keeps_its_flow() -> None:
 @pytest.mark.parametrize(
     "state", [State.STANDBY, State.CHECK, State.LOWER, State.FAULT, State.MANUAL, State.TUNE]
 )
-def test_other_states_say_what_the_controller_told_or_what_is_always_true(state: State) -> None:
+def test_other_states_show_the_controllers_reason_or_a_fixed_text(state: State) -> None:
     assert line(state=state, told="waiting for the gauge") == "waiting for the gauge"
     assert line(state=state).startswith("pump is ")
 

@@ -183,7 +183,7 @@ def test_a_film_that_jumps_with_everything_off_is_named() -> None:
     assert bench.failures(5) == ["its readings jump by micrometres with pump and vent off"] * 5
 
 
-def test_a_test_goes_on_from_its_memory() -> None:
+def test_an_actuator_test_continues_from_its_memory() -> None:
     """As after each tick, and from a snapshot."""
     pump = PumpConfig()
     rng = np.random.default_rng(2)

@@ -293,7 +293,7 @@ def test_slow_drift_of_the_optics_is_outvoted_by_laser_and_gauge(um_per_s: float
     )  # most of it is undone
 
 
-def test_laser_and_optics_may_drift_apart_no_further_than_the_trim() -> None:
+def test_laser_and_optics_cannot_differ_by_more_than_the_trim_limit() -> None:
     shape = ShapeConfig(mode="track", track_rate_hz=RATE_HZ, trim_max_um=10.0)
     held = settled(config_of("estimate", shape=shape), drifting(0.03)).fail(700.0)
     assert "trim_limit" in held.notices

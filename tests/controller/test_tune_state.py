@@ -219,7 +219,7 @@ def test_a_fault_ends_an_experiment_which_is_not_resumed() -> None:
     )  # the board's own limit is the first to see it
 
 
-def test_an_experiment_asked_for_in_the_tick_of_a_fault_never_runs() -> None:
+def test_an_experiment_requested_in_the_tick_of_a_fault_never_runs() -> None:
     held = Held()
     held.bench.wrong.gauge_offset_pa = 500.0
     held.go(0.02)
@@ -296,7 +296,7 @@ def test_a_fault_reverts_gains_on_trial() -> None:
     assert "fault" in held.of("gains_reverted")[-1]["why"]
 
 
-def test_the_shape_loop_s_time_constant_goes_on_trial_with_the_gains() -> None:
+def test_the_time_constant_of_the_shape_loop_is_on_trial_with_the_gains() -> None:
     controller = Controller(CONFIG, zernike_projection())
     now_s = 0.0
 

@@ -240,7 +240,7 @@ def test_a_bad_configuration_is_one_line_and_leaves_nothing(
     assert not (tmp_path / "logs").exists()
 
 
-def test_hold_without_devices_says_what_is_missing(tmp_path: Path) -> None:
+def test_hold_without_devices_names_the_missing_key(tmp_path: Path) -> None:
     assert "--twin" in run_refused(["hold", "--logs", str(tmp_path / "logs")], 2)
     assert not (tmp_path / "logs").exists()
 
@@ -276,7 +276,7 @@ def test_a_full_disk_is_refused_before_anything_exists(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("logs/*"))
 
 
-def test_nobody_at_the_address_is_a_device_failure(
+def test_an_address_without_a_device_is_a_device_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.3)

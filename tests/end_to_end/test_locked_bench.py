@@ -182,7 +182,7 @@ def test_nothing_moves_a_locked_mirror_until_its_lock_is_removed(lab: Lab) -> No
     assert standby.wait(PATIENCE_S) == 130
 
 
-def test_a_lock_that_cannot_be_stored_holds_for_the_run_and_says_so(
+def test_a_lock_that_cannot_be_stored_holds_for_the_run_and_is_reported(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (lab.folder / "file").write_text("")

@@ -150,7 +150,7 @@ def connected_in_any_state(logs: Path) -> LiveHold:
     return LiveHold(client, logs / client.greeting["run"])
 
 
-def test_what_is_refused_says_why(logs: Path) -> None:
+def test_a_refusal_states_its_reason(logs: Path) -> None:
     link = connected(logs)
     rig = HoldRig(link, "tester")
     with pytest.raises(HoldError, match="refused"):

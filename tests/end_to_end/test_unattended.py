@@ -52,7 +52,7 @@ def told_until_it_stops(systemd: socket.socket) -> list[list[str]]:
     return messages
 
 
-def test_standby_is_told_to_systemd_and_a_corrupt_latched_file_keeps_the_hold_down(
+def test_standby_is_reported_to_systemd_and_a_corrupt_latched_file_prevents_the_hold(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "logs").mkdir()

@@ -336,7 +336,7 @@ def test_parts_of_a_block_are_refused_and_do_not_feed(claimed: Bench) -> None:
 
 
 @pytest.mark.parametrize("block", ["command", "reset"])
-def test_without_a_claim_nobody_commands_or_clears(block: str) -> None:
+def test_without_a_claim_no_client_commands_or_clears(block: str) -> None:
     bench = Bench(2)
     with refused(3):
         bench.put(
@@ -405,7 +405,9 @@ def test_a_claim_lapses_with_its_watchdog_and_the_next_one_has_a_whole_period(
     assert not claimed.state.held
 
 
-def test_who_was_stopped_by_the_watchdog_may_go_on_while_nobody_else_came(claimed: Bench) -> None:
+def test_a_client_stopped_by_the_watchdog_may_continue_unless_another_claimed(
+    claimed: Bench,
+) -> None:
     claimed.at(1.0)
     assert not claimed.state.held
     claimed.command(0.3, 2, vent=1.0)  # to vent, for instance
@@ -445,7 +447,7 @@ def test_anybody_may_stop_and_only_the_holder_clears_it(claimed: Bench) -> None:
     assert claimed.state.pump_fraction == 0.5
 
 
-def test_a_board_nobody_holds_can_be_stopped_too_and_stays_stopped() -> None:
+def test_an_unclaimed_board_can_be_stopped_and_stays_stopped() -> None:
     bench = Bench(2)
     bench.state.write(bench.map.register("stop").address, [1])
     bench.arm()

@@ -125,7 +125,7 @@ def test_an_ascii_frame_is_read_back_and_a_broken_one_is_none() -> None:
 
 
 @both
-def test_the_flow_controller_does_as_told(protocol: Callable[[Instrument], Made]) -> None:
+def test_the_flow_controller_follows_the_command(protocol: Callable[[Instrument], Made]) -> None:
     flows: list[float] = []
     instrument = flow(flows)
     _, port, _ = protocol(instrument)

@@ -260,7 +260,7 @@ async def test_a_claim_whose_answer_was_lost_is_made_again_by_the_same_driver(
     await driver.close()
 
 
-async def test_after_a_restart_of_the_board_nobody_commands_before_a_new_claim(
+async def test_after_a_restart_of_the_board_no_client_commands_before_a_new_claim(
     holder: PumpBoard, other: Plain, board: PumpBoardEmulator
 ) -> None:
     board.power_cycle()
@@ -276,7 +276,7 @@ async def test_after_a_restart_of_the_board_nobody_commands_before_a_new_claim(
 
 
 @pytest.mark.parametrize("map_version", [1])
-async def test_a_board_of_map_1_obeys_whoever_writes_and_is_stopped_without_being_fed(
+async def test_a_board_of_map_1_obeys_every_client_and_stops_unless_fed(
     holder: PumpBoard, board: PumpBoardEmulator, plant: CountingPlant, clock: ManualClock
 ) -> None:
     stopper = PumpBoard(f"tcp://127.0.0.1:{board.port}", timeout_s=5.0, watchdog_s=10.0)

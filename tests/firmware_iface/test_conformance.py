@@ -468,6 +468,6 @@ async def test_a_board_that_somebody_holds_is_left_alone(serve: Serve) -> None:
     await holder.close()
 
 
-async def test_nobody_there_is_an_error_and_no_finding() -> None:
+async def test_a_missing_board_is_an_error_and_no_finding() -> None:
     with pytest.raises(LinkError):
         await examine("tcp://127.0.0.1:9")

@@ -87,14 +87,14 @@ def test_settling_finds_what_was_put_in(latency_s: float, tau_s: float, seed: in
     assert 0.85 * true_s < found.settle_s < 1.5 * true_s + 0.02
 
 
-def test_a_slow_tail_is_believed() -> None:
+def test_a_slow_tail_is_part_of_the_settling_time() -> None:
     delay_s = np.linspace(0, 0.5, 100)
     left = 0.8 * np.exp(-delay_s / 0.01) + 0.2 * np.exp(-delay_s / 0.08)
     seen_s = float(delay_s[left > 1 / 32][-1])
     assert fit_settling(delay_s, left).settle_s > seen_s
 
 
-def test_a_display_that_never_settles_is_said() -> None:
+def test_a_display_that_never_settles_is_reported() -> None:
     with pytest.raises(ValueError, match=r"50 % of a step is left after 0\.50 s"):
         fit_settling(np.linspace(0, 0.5, 50), np.full(50, 0.5))
 

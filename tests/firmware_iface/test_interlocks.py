@@ -263,7 +263,7 @@ def test_a_source_that_hangs_delays_the_opening_by_its_limit_only_and_before_the
     in_virtual_time(test)
 
 
-def test_a_bench_that_is_opened_again_goes_on_reading_its_sources() -> None:
+def test_a_reopened_bench_continues_to_read_its_sources() -> None:
     async def test() -> None:
         source = FakeSource(True)
         inner = FakeBench()

@@ -118,7 +118,7 @@ def test_what_is_no_value(displacement_um: float, quality: int) -> None:
     on_bench(test)
 
 
-def test_a_jump_is_believed_when_repeated() -> None:
+def test_a_jump_is_accepted_when_repeated() -> None:
     async def test(bench: Bench) -> None:
         bench.displacement_um = -100.0
         with pytest.raises(LinkError, match="jump to -100 µm"):

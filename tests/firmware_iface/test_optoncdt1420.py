@@ -142,7 +142,7 @@ def test_identity_settings_and_readings() -> None:
     run_virtual(test())
 
 
-def test_what_came_while_the_process_stood_still_is_taken() -> None:
+def test_readings_that_arrived_while_the_process_was_stopped_are_used() -> None:
     async def test() -> None:
         bench = Bench()
         bench.emulator.faults.delay_s = 0.1
@@ -221,7 +221,7 @@ def test_the_reserve_is_no_measuring_range() -> None:
     on_bench(test)
 
 
-def test_a_jump_is_believed_when_repeated() -> None:
+def test_a_jump_is_accepted_when_repeated() -> None:
     async def test(bench: Bench) -> None:
         await bench.tick()
         bench.displacement_um = 500.0
@@ -322,7 +322,7 @@ def test_half_a_command_of_someone_else_is_not_in_the_way() -> None:
         ({"delay_s": 1.0}, "no answer"),
     ],
 )
-def test_open_says_what_is_wrong(faults: dict[str, Any], message: str) -> None:
+def test_open_names_the_fault(faults: dict[str, Any], message: str) -> None:
     async def test() -> None:
         bench = Bench()
         for name, value in faults.items():

@@ -102,7 +102,7 @@ def test_a_response_is_corrected(screen: PatternScreen, display: Display) -> Non
     assert np.abs(light - compute_pattern_light(PATTERNS[0], RASTER)).max() < 0.01
 
 
-def test_a_picture_stands_after_the_settle_time(screen: PatternScreen, time: Time) -> None:
+def test_a_picture_is_complete_after_the_settle_time(screen: PatternScreen, time: Time) -> None:
     screen.show(PATTERNS[0])
     assert time.now_s == pytest.approx(5.0 + SETTLE_S)
     screen.begin(PATTERNS[1])

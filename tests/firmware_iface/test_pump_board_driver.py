@@ -53,7 +53,7 @@ def agrees(reading: BenchReading) -> bool:
 
 
 @every_map
-async def test_open_says_who_answers_and_arms_the_watchdog(
+async def test_open_identifies_the_board_and_arms_the_watchdog(
     driver: PumpBoard, board: PumpBoardEmulator, map_version: int
 ) -> None:
     identity = await driver.open()
@@ -304,7 +304,7 @@ async def test_watchdog_trips_when_only_readers_are_there(
     other.close()
 
 
-async def test_watchdog_trips_when_the_heartbeat_stands(
+async def test_the_watchdog_trips_when_the_heartbeat_stops(
     board: PumpBoardEmulator, driver: PumpBoard, plant: CountingPlant, clock: ManualClock
 ) -> None:
     stuck = AsyncModbusTcpClient(
@@ -360,7 +360,7 @@ async def test_after_a_trip_only_a_person_gets_the_pump_back(
 
 
 @every_map
-async def test_a_reconnect_within_the_period_goes_on_without_a_trip(
+async def test_a_reconnect_within_the_period_causes_no_trip(
     driver: PumpBoard, board: PumpBoardEmulator, plant: CountingPlant, clock: ManualClock
 ) -> None:
     await driver.open()

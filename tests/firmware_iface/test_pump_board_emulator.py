@@ -44,7 +44,7 @@ async def _documented(client: AsyncModbusTcpClient, docs: str) -> dict[str, floa
     return values
 
 
-async def test_a_plain_client_reads_what_the_documentation_says(
+async def test_a_plain_client_reads_the_documented_values(
     board: PumpBoardEmulator, plant: CountingPlant, client: AsyncModbusTcpClient
 ) -> None:
     board.faults.frozen = True  # so that all reads see the same sample

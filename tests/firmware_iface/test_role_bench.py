@@ -219,7 +219,7 @@ def test_a_lost_laser_does_not_stop_the_clock_of_a_bench_whose_gauge_answers() -
     virtual(run())
 
 
-def test_another_sensor_in_its_place_is_not_believed() -> None:
+def test_another_sensor_in_its_place_is_not_used() -> None:
     async def run() -> None:
         devices = Devices()
         await devices.bench.open()
@@ -299,7 +299,7 @@ def test_an_impossible_command_reaches_no_device(command: BenchCommand) -> None:
     virtual(run())
 
 
-def test_the_watchdog_stops_the_pump_of_a_silent_controller_and_says_so_until_a_person_clears_it() -> (  # noqa: E501
+def test_the_watchdog_stops_the_pump_of_a_silent_controller_and_reports_it_until_a_person_clears_it() -> (  # noqa: E501
     None
 ):
     async def run() -> None:
@@ -327,7 +327,7 @@ def test_the_watchdog_stops_the_pump_of_a_silent_controller_and_says_so_until_a_
     virtual(run())
 
 
-def test_the_watchdog_goes_on_trying_while_the_pump_cannot_be_reached() -> None:
+def test_the_watchdog_keeps_trying_while_the_pump_cannot_be_reached() -> None:
     async def run() -> None:
         devices = Devices()
         await devices.bench.open()

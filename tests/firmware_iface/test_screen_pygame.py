@@ -160,7 +160,7 @@ def test_another_size_is_refused_in_one_line(framebuffer: Path, size: tuple[int,
     assert "\n" not in message
 
 
-def test_what_is_not_there_is_said(framebuffer: Path, screen: PatternScreen) -> None:
+def test_what_is_missing_is_named(framebuffer: Path, screen: PatternScreen) -> None:
     with pytest.raises(LinkError, match="there are 1 displays"):
         made(Time(), display=3).open()
     with pytest.raises(LinkError, match="'x_sin_9' was not prepared"):

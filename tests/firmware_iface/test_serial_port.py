@@ -127,7 +127,7 @@ async def test_a_port_that_opens_but_never_answers_is_left_alone(wire: PtyWire) 
     port.close()
 
 
-async def test_a_port_in_use_says_so(wire: PtyWire) -> None:
+async def test_a_port_in_use_is_reported_as_such(wire: PtyWire) -> None:
     first, second = SerialPort(str(wire.path), LINE), SerialPort(str(wire.path), LINE)
     first.open(Ear())
     with pytest.raises(LinkDownError, match="in use by another program"):
@@ -135,7 +135,7 @@ async def test_a_port_in_use_says_so(wire: PtyWire) -> None:
     first.close()
 
 
-async def test_what_is_no_port_says_so(tmp_path: Path) -> None:
+async def test_a_file_that_is_no_port_is_reported_as_such(tmp_path: Path) -> None:
     file = tmp_path / "notes.txt"
     file.write_text("")
     with pytest.raises(DeviceRefusedError, match="not a serial port"):
@@ -221,7 +221,7 @@ async def test_modbus_through_the_kernel_and_a_replug(tmp_path: Path) -> None:
     wire.unplug()
 
 
-async def test_a_wrong_baud_rate_is_garbage_and_said_to_be(tmp_path: Path) -> None:
+async def test_a_wrong_baud_rate_is_named_as_a_possible_cause(tmp_path: Path) -> None:
     wire = PtyWire(Echo(SerialSettings(9600)), tmp_path / "tty")
     wire.plug()
     device = RtuBus(SerialPort(str(wire.path), LINE), quiet_s=0.02).device(1, timeout_s=0.1)

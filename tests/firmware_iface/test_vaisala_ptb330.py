@@ -167,7 +167,7 @@ def test_after_a_pulled_plug_it_is_known_again_at_once() -> None:
     on_bench(test)
 
 
-def test_another_instrument_in_its_place_is_identified_anew() -> None:
+def test_another_instrument_in_its_place_is_identified_again() -> None:
     async def test(bench: Bench) -> None:
         bench.wire.unplug()
         bench.emulator.serial = "B7654321"
@@ -186,7 +186,7 @@ def test_another_instrument_is_refused() -> None:
     run_virtual(test())
 
 
-def test_silence_is_said() -> None:
+def test_silence_is_reported() -> None:
     async def test() -> None:
         bench = Bench()
         bench.emulator.faults.deaf = True

@@ -76,7 +76,7 @@ def test_commands_are_read_back() -> None:
     on_bench(test)
 
 
-def test_full_drive_is_what_the_configuration_says() -> None:
+def test_full_drive_is_the_configured_power() -> None:
     async def test(bench: Bench) -> None:
         await bench.driver.set_pump(0.5)
         assert bench.emulator.registers[23] == 300.0
@@ -132,7 +132,7 @@ def test_a_setting_that_moved_is_seen(register: int, value: float) -> None:
     on_bench(test)
 
 
-def test_one_hit_answer_is_asked_again() -> None:
+def test_a_damaged_answer_is_requested_again() -> None:
     async def test(bench: Bench) -> None:
         await bench.driver.set_pump(0.5)
         spoilt = iter([600.0])

@@ -98,7 +98,7 @@ def full(*_: Any) -> None:
     raise OSError(28, "No space left on device")
 
 
-def test_on_a_full_disk_the_outcome_says_so_and_the_lock_is_stored_once_there_is_room(
+def test_on_a_full_disk_the_outcome_states_it_and_the_lock_is_stored_once_there_is_space(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Event] = []

@@ -42,7 +42,7 @@ def test_a_service_that_is_there_is_used(tmp_path: Path) -> None:
         assert link == add_key("http://127.0.0.1:9/")
 
 
-def test_without_the_library_of_the_page_one_line_says_so(
+def test_without_the_library_of_the_page_one_line_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)

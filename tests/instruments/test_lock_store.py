@@ -53,7 +53,7 @@ def test_locks_are_removed_singly(store: LockStore) -> None:
     assert found(store, BENCH) == [BOB]
 
 
-def test_equal_words_are_told_apart_again(store: LockStore) -> None:
+def test_equal_words_are_replaced_by_distinct_ones(store: LockStore) -> None:
     store.write_lock(ANN, BENCH)
     store.write_lock(ANN, BENCH)
     assert len({lock.word for lock in found(store, BENCH)}) == 2

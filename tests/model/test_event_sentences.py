@@ -24,7 +24,7 @@ FAULT = {
 }
 
 
-def test_a_fault_says_what_where_and_what_to_do() -> None:
+def test_a_fault_states_its_cause_place_and_remedy() -> None:
     assert from_dict(FAULT).sentence == (
         "Fault over_displacement: the bowl is deeper than its limit (501.0 µm). Do: check "
         "the laser against a ruler. "

@@ -43,13 +43,13 @@ def test_each_rule_of_the_safety_table_is_made_to_never_trip() -> None:
         assert not mutated[mutant.rule].broken(None, None)
 
 
-def test_there_are_enough_and_no_two_are_called_the_same() -> None:
+def test_mutants_are_enough_and_have_unique_names() -> None:
     mutants = load()[0]
     assert len(mutants) >= 80
     assert max(Counter(mutant.what for mutant in mutants).values()) == 1
 
 
-def test_every_area_has_mutations_and_what_is_asked_first() -> None:
+def test_every_area_has_mutations_and_first_tests() -> None:
     mutants, firsts = load()
     assert {mutant.area for mutant in mutants} == firsts.keys()
     assert all(first.tests for first in firsts.values())
@@ -86,5 +86,5 @@ def test_the_document_shows_the_stored_results() -> None:
     assert DOCUMENT.read_text(encoding="utf-8") == document(current_verdicts(listed), len(listed))
 
 
-def test_the_fast_tests_that_are_asked_exist() -> None:
+def test_the_named_fast_tests_exist() -> None:
     assert all(list(ROOT.glob(pattern)) for pattern in mutants.ALL_FAST)

@@ -120,7 +120,7 @@ def test_thumbnail_takes_every_step_th_pixel(writer: FrameWriter, reader: FrameR
     np.testing.assert_array_equal(thumbnail, [[0, 3, 6], [21, 24, 27]])
 
 
-def test_new_writer_goes_on_where_the_last_ended(
+def test_a_new_writer_continues_where_the_last_ended(
     address: FrameAddress, writer: FrameWriter, reader: FrameReader
 ) -> None:
     put(writer, 0)
@@ -144,7 +144,7 @@ def test_ring_for_optics_holds_a_full_cycle_and_one_more() -> None:
         owner.close()
 
 
-def test_full_shared_memory_is_told_and_nothing_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_shared_memory_is_reported_and_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     names: list[str] = []
 
     def no_room(handle: int, offset: int, size_bytes: int) -> None:
@@ -159,7 +159,7 @@ def test_full_shared_memory_is_told_and_nothing_stays(monkeypatch: pytest.Monkey
         SharedMemory(names[0])
 
 
-def test_pixels_held_too_long_are_told(address: FrameAddress) -> None:
+def test_pixels_held_too_long_are_detected(address: FrameAddress) -> None:
     writer = FrameWriter(address)
     slot = writer.begin()
     with pytest.raises(BufferError):

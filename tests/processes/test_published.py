@@ -122,7 +122,7 @@ def test_a_damaged_file_is_refused(tmp_path: Path, text: bytes) -> None:
         attach_rings(tmp_path)
 
 
-def test_a_pipe_in_place_of_the_file_hangs_nobody(tmp_path: Path) -> None:
+def test_a_pipe_in_place_of_the_file_blocks_no_reader(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "rings.json")
     with pytest.raises(OSError, match="plain file"):
         attach_rings(tmp_path)

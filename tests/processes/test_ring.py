@@ -159,7 +159,7 @@ def test_whatever_part_of_a_put_is_visible_no_message_is_torn(seen: int) -> None
             end.close()
 
 
-def test_a_slot_that_is_never_whole_costs_one_message_and_hangs_nobody() -> None:
+def test_a_slot_that_is_never_complete_costs_one_message_and_blocks_no_reader() -> None:
     with open_ring(4, 8) as address:
         writer, reader = RingWriter(address), RingReader(address)
         memory = SharedMemory(address.name)
@@ -184,7 +184,7 @@ def test_a_slot_that_is_never_whole_costs_one_message_and_hangs_nobody() -> None
         RingAddress("", 2**40, 16),
     ],
 )
-def test_a_ring_that_is_not_the_one_it_is_said_to_be_is_refused(told: RingAddress) -> None:
+def test_another_ring_than_the_named_one_is_refused(told: RingAddress) -> None:
     with open_ring(4, 16) as address, pytest.raises(RingError):
         RingReader(replace(told, name=address.name))
 

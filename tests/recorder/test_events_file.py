@@ -91,7 +91,7 @@ def test_too_many_waiting_events_are_counted_as_lost(
 
 
 @pytest.mark.parametrize("message", [b"{half", b"\xff\xfe", b"[1, 2]", b""])
-def test_a_message_that_is_no_event_becomes_one_that_says_so(message: bytes) -> None:
+def test_a_message_that_is_no_event_becomes_an_unreadable_event(message: bytes) -> None:
     assert parse_event(message)["kind"] == "unreadable_event"
 
 
@@ -119,5 +119,5 @@ def test_a_line_of_a_run_as_what_it_means(line: dict[str, object], event: Event)
     assert each.line["kind"] == event.kind
 
 
-def test_a_line_that_says_no_time_stands_at_the_start() -> None:
+def test_a_line_without_a_time_stands_at_the_start() -> None:
     assert parse_logged_line({"kind": "of tomorrow", "mono_s": None}).mono_s == 0.0

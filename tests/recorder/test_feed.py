@@ -25,7 +25,7 @@ def put(writer: RingWriter, first: int, last: int) -> None:
         writer.put(str(number).encode())
 
 
-def test_a_second_reader_goes_on_where_the_first_stopped(address: RingAddress) -> None:
+def test_a_second_reader_continues_where_the_first_stopped(address: RingAddress) -> None:
     writer = RingWriter(address)
     first = feed_of(address)
     put(writer, 0, 5)

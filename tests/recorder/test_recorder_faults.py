@@ -213,7 +213,7 @@ TAKEN_AWAY = {
 
 
 @pytest.mark.parametrize("how", TAKEN_AWAY)
-def test_a_run_folder_taken_away_is_begun_anew_and_said(tmp_path: Path, how: str) -> None:
+def test_a_removed_run_folder_is_created_again_and_reported(tmp_path: Path, how: str) -> None:
     run_dir = tmp_path / "run"
     config = Config()
     run_dir.mkdir()

@@ -274,7 +274,7 @@ def test_a_killed_control_process_leaves_a_whole_recording(tmp_path: Path) -> No
     assert (last["kind"], last["exit"]) == ("end", "killed")
 
 
-def test_a_writer_that_dies_is_reported_and_the_recording_goes_on(feed: Feed) -> None:
+def test_a_writer_that_dies_is_reported_and_the_recording_continues(feed: Feed) -> None:
     run_dir = feed.spec.run_dir
     rows = iter(rows_of(60.0))
     fed: list[float] = []
@@ -306,7 +306,7 @@ def test_a_writer_that_dies_is_reported_and_the_recording_goes_on(feed: Feed) ->
     assert time_s == pytest.approx(fed[-len(time_s) :], abs=1e-9)
 
 
-def test_a_report_nobody_takes_does_not_block() -> None:
+def test_a_report_without_a_reader_does_not_block() -> None:
     ours, theirs = SPAWN.Pipe()
     report = make_event_sender(theirs)
     for _ in range(10_000):

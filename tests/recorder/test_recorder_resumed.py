@@ -106,7 +106,7 @@ def recorded(run_dir: Path) -> np.ndarray:
     return np.concatenate([recorded_rows(path) for path in sorted(run_dir.glob("*.rrd"))])
 
 
-def test_the_next_recorder_goes_on_and_everything_is_there_once(
+def test_the_next_recorder_continues_and_everything_is_recorded_once(
     tmp_path: Path, stack: ExitStack
 ) -> None:
     run = Run(tmp_path, stack, Config())
@@ -246,7 +246,7 @@ def test_a_state_above_the_size_limit_is_refused(
     "left", [None, b"", b"no state", b"\x80\x04N.", b"[]", b"[" * 10_000, b"{}", b"null"]
 )
 @pytest.mark.parametrize(("rows_kept", "partial", "ticks"), [(3000, False, 100), (75, True, 100)])
-def test_without_what_the_first_knew_the_statistics_begin_with_what_the_ring_has_and_say_so(
+def test_without_a_handover_the_statistics_begin_with_the_ring_and_are_marked_partial(
     tmp_path: Path, stack: ExitStack, left: bytes | None, rows_kept: int, partial: bool, ticks: int
 ) -> None:
     run = Run(tmp_path, stack, Config(), rows_kept)
@@ -290,7 +290,7 @@ def test_a_fault_does_not_wait_for_its_second(tmp_path: Path, stack: ExitStack) 
     assert not recorder.urgent
 
 
-def test_on_the_last_megabytes_rerun_stops_and_goes_on_when_there_is_room(
+def test_on_the_last_megabytes_rerun_stops_and_continues_when_there_is_space(
     tmp_path: Path, stack: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left_mb = {"now": 5000.0}

@@ -17,7 +17,7 @@ from tests.support.rrd_reading import scalars, strings
 from tests.worlds.synthetic_run import shape_of
 
 
-def test_both_error_bars_of_the_sag_are_told_apart() -> None:
+def test_both_error_bars_of_the_sag_are_distinguished() -> None:
     shape = shape_of(1.0, 3)
     assert "± 0.100 µm in a change\n" in _make_legend(
         shape, shape, {}

@@ -139,7 +139,7 @@ def test_another_configuration_than_the_run_had_is_named(
     assert "config.toml: checksum mismatch" in capsys.readouterr().out
 
 
-def test_only_what_is_asked_for_is_compared(
+def test_only_the_requested_fields_are_compared(
     record: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["replay", str(record), "--from", "13s", "--to", "16s", "--json"]) == Exit.DONE

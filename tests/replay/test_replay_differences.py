@@ -47,7 +47,7 @@ def test_decisions_are_the_same_ones_within_the_slack_until_one_is_another(
     assert find_unmatched(recorded, today, 1.0) == said
 
 
-def test_each_time_that_is_off_is_told() -> None:
+def test_each_wrong_time_is_reported() -> None:
     late = [at(CHECK, 3.0), at(HOLD, 8.0)]
     assert len(find_unmatched([CHECK, HOLD], late, 1.0)) == 2
 

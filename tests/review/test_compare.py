@@ -35,7 +35,7 @@ def long_windows(values: np.ndarray, window_s: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("window_s", [1.0, 4.0, 60.0])
-def test_spreads_of_alike_series_of_different_length_seldom_differ(window_s: float) -> None:
+def test_spreads_of_equal_series_of_different_length_seldom_differ(window_s: float) -> None:
     rng = np.random.default_rng(1)
     seen = [
         spread_p(*(long_windows(series(rng, hours), window_s) for hours in (0.5, 3.0)), window_s)
@@ -53,7 +53,7 @@ def test_a_spread_half_as_large_again_is_seen(window_s: float) -> None:
 
 
 @pytest.mark.parametrize("excursions", [False, True])
-def test_alike_runs_are_seldom_called_different(excursions: bool) -> None:
+def test_equal_runs_are_seldom_called_different(excursions: bool) -> None:
     spreads, means = rates(1200, 10.0, 1.0, 60, excursions)
     assert spreads <= 0.1
     assert means <= 0.1
@@ -106,7 +106,7 @@ def analyses(tmp_path_factory: pytest.TempPathFactory) -> list[Analysis]:
     ]
 
 
-def test_every_row_is_tested_or_says_why_not(analyses: list[Analysis]) -> None:
+def test_every_row_is_tested_or_states_why_not(analyses: list[Analysis]) -> None:
     rows = {row.name: row for row in compare_analyses(*analyses)}
     assert all(
         math.isfinite(row.p_value) or row.note.startswith("no test") for row in rows.values()
@@ -119,7 +119,7 @@ def test_every_row_is_tested_or_says_why_not(analyses: list[Analysis]) -> None:
     assert not any(row.verdict_text in {"larger", "smaller"} for row in rows.values())
 
 
-def test_too_short_is_said(tmp_path: Path, analyses: list[Analysis]) -> None:
+def test_too_short_a_run_is_reported(tmp_path: Path, analyses: list[Analysis]) -> None:
     short = analyse_run(open_run(written(tmp_path, 0.05, seed=3)))
     rows = {row.name: row for row in compare_analyses(analyses[0], short)}
     assert rows["reading, std of 60 s"].note == "no test: too short"

@@ -43,7 +43,7 @@ def test_a_coarse_barometer_makes_no_steps_of_its_rounding(scenario: str) -> Non
     assert doors_in(rows) == []
 
 
-def test_a_slow_and_coarse_barometer_tells_of_a_door() -> None:
+def test_a_slow_and_coarse_barometer_shows_a_door() -> None:
     rows, _ = night(9, HOURS, "typical", [Planted(DOOR, 3000.0, 30.0)])
     repeated(rows, 5.0)
     rows[:, AMBIENT] = np.round(rows[:, AMBIENT] / 5.0) * 5.0
@@ -74,7 +74,7 @@ def test_a_door_that_is_closed_at_once_is_two_steps(open_s: float) -> None:
     assert down.time_s == pytest.approx(3000.4 + open_s, abs=1.5)
 
 
-def test_how_often_and_how_finely_a_barometer_tells() -> None:
+def test_rate_and_resolution_of_a_barometer_are_found() -> None:
     fine = np.cumsum(np.random.default_rng(12).normal(size=3000)) + 1e5
     assert update_s(fine) == 1
     assert update_s(np.repeat(fine, 7)) == 7

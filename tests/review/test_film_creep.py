@@ -38,7 +38,7 @@ def test_the_interval_of_tomorrow_holds_the_truth() -> None:
     assert sure > 8  # the bars are not merely wide
 
 
-def test_a_film_that_does_not_creep_is_not_said_to() -> None:
+def test_no_creep_is_reported_for_a_film_that_does_not_creep() -> None:
     rng = np.random.default_rng(2)
     found = [
         fit_creep(np.linspace(0, 5 * DAY_S, 50), 1e-5 * rng.normal(size=50), DAY_S)

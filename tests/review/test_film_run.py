@@ -76,7 +76,7 @@ def test_tomorrow_is_within_its_interval(
     assert (tmp_path / "film" / "creep.png").stat().st_size > 5_000
 
 
-def test_an_hour_says_nothing_of_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_hour_does_not_predict_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film_run, "open_run", lambda folder: run_of(folder, 1.0))
     with pytest.raises(RejectedError, match="say nothing of 24 h ahead"):
         film_run.film_run_command([tmp_path], PRESTRAIN, POISSON, None, False, False)

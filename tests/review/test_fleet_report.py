@@ -162,7 +162,7 @@ def test_what_no_run_can_break(lab: Path, tmp_path: Path, monkeypatch: pytest.Mo
         (["--fleet", "north", "--compare", "south"], "leave out --fleet"),
     ],
 )
-def test_what_cannot_be_asked(
+def test_impossible_options_are_refused(
     lab: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

@@ -21,6 +21,6 @@ def test_a_missing_hour_breaks_the_line_and_a_missing_second_does_not() -> None:
     assert (np.diff(broken["time_s"]) > 0).all()
 
 
-def test_cycles_that_are_minutes_apart_have_no_gap() -> None:
+def test_cycles_with_minutes_between_them_have_no_gap() -> None:
     for time_s in (np.empty(0), np.array([3.0]), np.arange(0.0, 3600.0, 60.0)):
         np.testing.assert_array_equal(broken_at_gaps({"time_s": time_s})["time_s"], time_s)

@@ -47,7 +47,7 @@ def test_ticks_that_were_missed_are_left_out(tmp_path: Path) -> None:
     assert analysis.ticks.hold_s == pytest.approx(79.8, abs=0.1)
 
 
-def test_a_setpoint_on_its_way_is_told_from_what_counts(tmp_path: Path) -> None:
+def test_a_moving_setpoint_does_not_count_as_held(tmp_path: Path) -> None:
     rows, _ = night(1, HOURS, "quiet", [])
     time_s = get_column(rows, "mono_s")
     rows[:, COLUMN["setpoint_um"]] = np.interp(time_s, [100, 190], [-90.0, 0.0])

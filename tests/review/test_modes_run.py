@@ -43,7 +43,7 @@ def test_a_set_gives_a_table_a_picture_and_a_recording(
     assert (tmp_path / "set/modes/modes.rrd").stat().st_size > 10_000
 
 
-def test_a_mode_that_moves_within_a_week_is_told(
+def test_a_mode_that_moves_within_a_week_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Eight runs, a minute of each, the last ones with a film that has lost 3 % of its tension."""
@@ -69,7 +69,9 @@ def test_a_mode_that_moves_within_a_week_is_told(
     assert said.count("mode  ") == 1
 
 
-def test_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_vibrations_is_reported_as_such(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     tracked(tmp_path / "set", seed=1, lines_hz=())
     assert command_line(["modes", str(tmp_path / "set")]) == Exit.DONE
     assert "none that stands out of the noise" in capsys.readouterr().out

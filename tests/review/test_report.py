@@ -191,7 +191,7 @@ def test_command_writes_page_and_json(
     assert not (quiet_run / "report").exists()
 
 
-def test_alike_runs_do_not_differ_and_unlike_ones_do(quiet_run: Path, tmp_path: Path) -> None:
+def test_equal_runs_do_not_differ_and_unequal_ones_do(quiet_run: Path, tmp_path: Path) -> None:
     ours = analyse_run(open_run(quiet_run))
     twin = analyse_run(open_run(written(tmp_path, HOURS, seed=7, name="20261122T180000Z-twin")))
     alike = {d.name: d.verdict_text for d in compare_analyses(ours, twin)}
@@ -226,7 +226,7 @@ def test_a_run_that_never_held(tmp_path: Path) -> None:
     assert "Not held" in render_report(analysis)
 
 
-def test_a_mark_may_say_anything(quiet_run: Path, tmp_path: Path) -> None:
+def test_a_mark_may_contain_any_text(quiet_run: Path, tmp_path: Path) -> None:
     folder = tmp_path / quiet_run.name
     shutil.copytree(quiet_run, folder)
     texts = ["$\\frac{$ <b>", "日本 $", "two\nlines", "long " * 100]

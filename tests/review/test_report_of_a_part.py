@@ -59,7 +59,7 @@ def test_faults_and_missed_ticks_of_a_part_are_its_own(folder: Path) -> None:
         ([], True, "-other: Held for 5 min 55 s"),
     ],
 )
-def test_a_part_is_set_against_the_same_part_or_says_that_it_is_not(
+def test_a_part_is_compared_with_the_same_part_or_marked_as_not_compared(
     folder: Path,
     tmp_path: Path,
     part: list[str],

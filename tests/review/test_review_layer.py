@@ -183,7 +183,7 @@ def test_overlaid_runs_have_their_names(night: Path, tmp_path: Path) -> None:
         assert f"{path}/summary" in layer
 
 
-def test_names_of_overlaid_runs_tell_them_apart() -> None:
+def test_names_of_overlaid_runs_distinguish_them() -> None:
     first, second = "20261121T180000Z-a", "20261122T180000Z-a"
     assert labels_of([first]) == [""]
     assert labels_of([first, second]) == [first, second]

@@ -68,9 +68,7 @@ def test_logs_maps_and_cursor_are_those_of_the_part(
     assert lines_s[::3] == pytest.approx([150.0, 400.0, 650.0], abs=1.5)
 
 
-def test_of_a_whole_run_everything_is_there_and_no_moment_was_asked_for(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_whole_run_is_complete_without_a_requested_moment(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "r.rrd"
     assert make_review([open_run(folder)], ReviewOptions([folder]), file) is None
     assert {50.0, 390.0, 700.0} <= {round(at_s, 3) for at_s in times_s(file, "/events")}

@@ -116,7 +116,7 @@ def test_a_lost_light_leaves_the_slow_bands() -> None:
     ).rms_um == pytest.approx(0.707, rel=0.03)
 
 
-def test_too_short_for_a_band_is_said() -> None:
+def test_too_short_for_a_band_is_reported() -> None:
     assert all(np.isnan(band.rms_um) for band in band_rms(*spectra(np.full(100, np.nan), 10)))
     found = band_rms(*spectra(np.random.default_rng(7).normal(size=600), 10))
     assert [np.isnan(band.from_hz) for band in found] == [True, True, True, False, False, False]
@@ -124,7 +124,7 @@ def test_too_short_for_a_band_is_said() -> None:
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.8])
-def test_the_interval_of_the_slope_covers_the_truth_as_often_as_it_says(memory: float) -> None:
+def test_the_interval_of_the_slope_covers_the_truth_as_often_as_stated(memory: float) -> None:
     rng = np.random.default_rng(4)
     time_s = 60.0 * np.arange(400)
     true_per_hour = 0.1
@@ -153,7 +153,7 @@ def test_the_interval_of_a_short_record_knows_that_the_line_took_up_its_wander(
     assert 0.89 <= covered / 200 <= 0.98
 
 
-def test_a_slope_is_seen_and_too_few_values_say_nothing() -> None:
+def test_a_slope_is_found_and_too_few_values_give_none() -> None:
     time_s = 60.0 * np.arange(100)
     values = 0.5 * time_s / 3600 + 0.01 * np.random.default_rng(5).normal(size=100)
     values[10] = np.nan

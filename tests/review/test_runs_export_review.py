@@ -90,7 +90,7 @@ def week(
 TWICE = '{"curve_fraction": [0.0, 1.0], "curve_um_per_s": [0.0, 12.0]}'
 
 
-def test_a_pump_that_wears_over_the_weeks_is_told(tmp_path: Path) -> None:
+def test_a_pump_that_wears_over_the_weeks_is_reported(tmp_path: Path) -> None:
     twin = "[twin]\nleak_um_per_s = 2.0\n"  # not the bench: its devices are the same
     week(tmp_path, 1, 1.0)
     week(tmp_path, 2, 0.97, devices=twin)
@@ -231,7 +231,7 @@ def test_runs_of_several_folders_are_one_list(
     assert command([*words, "--logs", str(tmp_path / "absent")]) == 2
 
 
-def test_prune_spares_what_is_kept_and_says_before_it_does(tmp_path: Path) -> None:
+def test_prune_spares_kept_runs_and_lists_before_it_deletes(tmp_path: Path) -> None:
     for day in range(1, 7):
         written(tmp_path, 0.01, name=f"202611{day:02}T180000Z-night")
     (tmp_path / "20261101T180000Z-night" / ".keep").touch()
@@ -396,7 +396,7 @@ def test_a_window_limits_the_ticks_and_runs_lie_over_each_other(tmp_path: Path) 
         ("--live", "--live follows"),
     ],
 )
-def test_what_is_not_there_is_said(
+def test_what_is_missing_is_named(
     logs: Path, tmp_path: Path, capsys: Capsys, asked: str, said: str
 ) -> None:
     folder, target = logs / "20261121T180000Z-night", tmp_path / "r.rrd"
@@ -407,7 +407,7 @@ def test_what_is_not_there_is_said(
     assert not target.exists()
 
 
-def test_a_place_that_cannot_be_written_is_said_before_the_work(
+def test_a_place_that_cannot_be_written_is_reported_before_the_work(
     logs: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
     folder = logs / "20261121T180000Z-night"

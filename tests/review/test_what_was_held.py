@@ -60,7 +60,7 @@ def folder(rows: Rows, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("batch", [1, 7, 100, 10_000])
-def test_the_parts_are_those_that_were_asked_for_in_any_blocks(rows: Rows, batch: int) -> None:
+def test_the_parts_do_not_depend_on_the_blocks(rows: Rows, batch: int) -> None:
     parts = HoldParts(2.0)
     blocks = [
         parts.classify_block(get_columns(rows[first : first + batch]))

@@ -91,7 +91,7 @@ def _content(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_a_sound_run_has_nothing_to_say(sound: Path) -> None:
+def test_a_sound_run_has_no_notes(sound: Path) -> None:
     run = open_run(sound)
     run.read_all_parts()
     assert run.notes == []
@@ -152,9 +152,7 @@ def test_no_flipped_byte_changes_a_value(sound: Path, tmp_path: Path) -> None:
         )
 
 
-def test_an_event_and_a_figure_that_were_changed_are_not_believed(
-    sound: Path, tmp_path: Path
-) -> None:
+def test_an_event_and_a_figure_that_were_changed_are_not_used(sound: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(sound, tmp_path / sound.name)
     for name, old, new in (
         ("events.jsonl", '"settle"', '"sottle"'),

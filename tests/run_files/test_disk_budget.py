@@ -85,7 +85,7 @@ def make_run(logs: Path, name: str, summary: bool = True, touched_h_ago: float =
     return folder
 
 
-def test_only_runs_that_are_over_and_nobody_keeps_may_go(tmp_path: Path) -> None:
+def test_only_finished_runs_that_are_not_kept_are_deleted(tmp_path: Path) -> None:
     present = make_run(tmp_path, "20261121T110000Z-now", summary=False)
     make_run(tmp_path, "20261101T110000Z-over")
     make_run(tmp_path, "20261120T110000Z-running", summary=False, touched_h_ago=2)
@@ -116,7 +116,7 @@ class HandClock(RunClock):
         return 0.0
 
 
-def test_the_recorder_deletes_old_runs_at_its_start_and_each_hour_and_says_which(
+def test_the_recorder_deletes_old_runs_at_its_start_and_each_hour_and_names_them(
     tmp_path: Path,
 ) -> None:
     logs = tmp_path / "logs"

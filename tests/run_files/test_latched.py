@@ -105,7 +105,7 @@ def test_a_link_to_nowhere_or_a_pipe_in_its_place_counts_as_latched(tmp_path: Pa
     assert LatchedFile(tmp_path).read() is not None
 
 
-def test_a_fault_of_many_lines_is_told_in_one(tmp_path: Path) -> None:
+def test_a_fault_of_many_lines_is_shown_in_one(tmp_path: Path) -> None:
     file = LatchedFile(tmp_path)
     file.write(replace(FAULT, seen="ValueError: first\nsecond"))
     assert str(file.read()).count("first second") == 1
@@ -157,14 +157,14 @@ def test_a_forgiven_fault_is_not_latched(tmp_path: Path) -> None:
     assert LatchedFile(tmp_path).read() is None
 
 
-def test_a_disk_that_fails_is_told(tmp_path: Path) -> None:
+def test_a_failing_disk_is_reported(tmp_path: Path) -> None:
     told: list[Event] = []
     with make(tmp_path / "nowhere", told) as fault_latch:
         fault_latch.handle_tick(outputs(*TRIP))
     assert [type(event) for event in told] == [LatchFailed]
 
 
-def test_a_disk_that_takes_files_again_is_told_once(tmp_path: Path) -> None:
+def test_a_disk_that_works_again_is_reported_once(tmp_path: Path) -> None:
     told: list[Event] = []
     with make(tmp_path / "later", told) as fault_latch:
         fault_latch.handle_tick(outputs(*TRIP))

@@ -128,7 +128,7 @@ def test_a_missing_file_of_any_table_is_named(tmp_path: Path, table: str) -> Non
     assert any(f"{table}-0000.parquet: missing" in note for note in open_run(folder).notes)
 
 
-def test_a_run_without_its_table_of_ticks_says_so(tmp_path: Path) -> None:
+def test_a_run_without_its_table_of_ticks_has_a_note(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.02)
     shutil.rmtree(folder / "ticks")
     run = open_run(folder)
@@ -193,7 +193,7 @@ def test_broken_small_files_are_named(tmp_path: Path) -> None:
     }
 
 
-def test_another_schema_is_said(tmp_path: Path) -> None:
+def test_another_schema_is_reported(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.02)
     set_summary(folder, schema="membrane-summary/0")
     assert any("membrane-summary/2" in note for note in open_run(folder).notes)

@@ -218,7 +218,7 @@ _WRITES = re.compile(
 )
 
 
-def test_nobody_writes_past_the_one_module() -> None:
+def test_only_listed_modules_write_files_themselves() -> None:
     """A new place that writes has to go through `model.files`, or say above why it need not."""
     product = ROOT / "membrane_ctrl"
     writers = {

@@ -202,7 +202,7 @@ def test_a_month_is_read_a_row_group_at_a_time(run_dir: Path) -> None:
     assert TableReader(run_dir, TABLE, []).read_newest("count").as_py() == 149
 
 
-def test_the_bits_of_nan_and_missing_values_stay_apart(tmp_path: Path) -> None:
+def test_the_bits_of_nan_and_missing_values_stay_distinct(tmp_path: Path) -> None:
     odd_nan = np.uint64(0xFFF8000000000123).view(np.float64)
     values = pa.array(
         np.array([1.0, np.nan, odd_nan, -0.0]), mask=np.array([False, False, False, False])

@@ -93,7 +93,7 @@ def test_laser_noise_and_resolution() -> None:
     assert np.array_equal(readings, np.round(readings / 0.5) * 0.5)
 
 
-def test_noise_free_sensors_tell_the_truth() -> None:
+def test_noise_free_sensors_show_the_true_values() -> None:
     quiet = {
         "laser_noise_um": 0.0,
         "laser_resolution_um": 0.0,

@@ -29,7 +29,7 @@ def bench() -> VirtualBench:
     return made
 
 
-def test_without_a_write_the_pump_stands_after_the_watchdog_period(bench: VirtualBench) -> None:
+def test_without_a_write_the_pump_stops_after_the_watchdog_period(bench: VirtualBench) -> None:
     bench.advance(0.02)
     bench.write(BenchCommand(0.5, 0.0))
     for _ in range(24):

@@ -89,7 +89,7 @@ def test_the_load_peak_is_that_of_the_real_loop() -> None:
     assert np.abs(shown.load_um).max() == pytest.approx(seen.load_peak_um, rel=0.05)
 
 
-def test_an_unstable_loop_has_no_response_and_says_so() -> None:
+def test_an_unstable_loop_has_no_response_and_is_named() -> None:
     shown = curves("yours", Gains(5.0, 1.0, 0.0, 0.0), MADE, 60.0)
     assert not shown.figures.margins.stable
     assert shown.time_s.size == shown.load_um.size == 0
@@ -164,7 +164,7 @@ def test_a_short_session_takes_the_weather_from_before_its_experiments(
     assert not opened.file_path("held.npz").exists()
 
 
-def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_path: Path) -> None:
+def test_a_hold_lost_in_the_verification_is_reported(template: Path, tmp_path: Path) -> None:
     """Not that it then takes no gains; the verification is still to be done."""
     opened = copy_of(template, tmp_path)
     session_json.write_session_file(opened.file_path("applied.json"), {})
@@ -195,7 +195,7 @@ def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_pat
         ((1.0, 1.0, 1.0, 1.3), False, 600.0),
     ],
 )
-def test_a_close_verification_goes_on_for_as_long_again(
+def test_a_close_verification_continues_for_as_long_again(
     template: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -228,7 +228,9 @@ def test_a_close_verification_goes_on_for_as_long_again(
     assert (done.kept, done.stages[-1].time_s, told) == (kept, until_s, ["keep"] * kept)
 
 
-def test_a_run_gives_its_weather_and_says_whose_plant_it_is(template: Path, tmp_path: Path) -> None:
+def test_a_run_gives_its_weather_and_names_the_source_of_its_plant(
+    template: Path, tmp_path: Path
+) -> None:
     run = review_runs.written(tmp_path, 0.2)
     assumed = of_path(run, tmp_path)
     assert "as the configuration assumes" in assumed.source

@@ -229,7 +229,7 @@ def test_a_link_leads_to_the_file_that_is_written(tmp_path: Path) -> None:
     assert load_toml(target, Config).loop.kp_per_s == 0.448
 
 
-def test_what_cannot_be_edited_says_what_to_set(
+def test_a_file_that_cannot_be_edited_gives_the_keys_to_set(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An editor that would change anything else is not trusted."""

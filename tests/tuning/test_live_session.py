@@ -100,7 +100,7 @@ def test_a_line_torn_by_a_kill_costs_no_other_line(tmp_path: Path) -> None:
     assert [step for _, step in reader.progress.begun_s] == ["observe", "verify"]
 
 
-def test_a_foreign_log_harms_nobody(tmp_path: Path) -> None:
+def test_a_foreign_log_does_no_harm(tmp_path: Path) -> None:
     (tmp_path / NAME).write_bytes(
         b'[]\n5\n{"every_s": 1e400, "displacement_um": [], "setpoint_um": [], '
         b'"flow_um_per_s": []}\n\xff\xfe\n'
@@ -112,7 +112,7 @@ def test_a_foreign_log_harms_nobody(tmp_path: Path) -> None:
     assert [len(line) for line in reader.progress.said] == [500]
 
 
-def test_a_full_disk_ends_the_log_and_says_so_once(tmp_path: Path) -> None:
+def test_a_full_disk_ends_the_log_and_is_reported_once(tmp_path: Path) -> None:
     said: list[str] = []
     (tmp_path / NAME).mkdir()
     log = LiveLog(tmp_path, RATE_HZ, said.append)
@@ -154,7 +154,7 @@ def test_a_full_disk_ends_the_log_and_says_so_once(tmp_path: Path) -> None:
         (Progressed("verify", ended="done"), 7, 0.0, "Done."),
     ],
 )
-def test_the_page_says_what_a_session_does(
+def test_the_page_shows_what_a_session_does(
     progress: Progressed, done: int, silent_s: float, words: str
 ) -> None:
     assert words in status(progress, set(folder.STEPS[:done]), silent_s, Path("logs/tuning/s"))
@@ -193,7 +193,7 @@ RUNNING = LoopConfig(kp_per_s=0.5, setpoint_um=7.0)
         (RUNNING.model_copy(update={"rate_hz": 25.0}), {}, "loop.rate_hz = 25.0"),
     ],
 )
-def test_a_session_goes_on_with_a_later_hold_of_the_same_bench(
+def test_a_session_continues_with_a_later_hold_of_the_same_bench(
     tmp_path: Path, running: LoopConfig, pump: dict[str, float], refused: str
 ) -> None:
     opened = folder.create_session(

@@ -218,7 +218,7 @@ def tuned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
     return run(["tune", *words, "--twin", "--config", str(config), "--logs", str(tmp_path)])
 
 
-def test_a_stuck_pump_is_told(
+def test_a_stuck_pump_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It goes on giving what holds the mirror, whatever it is told."""
@@ -252,7 +252,7 @@ def survey_of(
     return found
 
 
-def test_a_pump_that_starts_with_several_leaks_is_told_from_one_whose_flow_is_not_known() -> None:
+def test_a_pump_that_starts_with_several_leaks_is_distinguished_from_one_of_unknown_flow() -> None:
     said = (
         "rises from 0.1 µm/s at a command of 0.25 to 17.0 µm/s at 0.35, and the mirror loses 1.8 "
         "µm/s: throttle"
@@ -319,7 +319,7 @@ def test_visits_in_a_row_wait_for_the_gas_of_each_other(delay_s: float, known: b
     assert highest_um < 7.0
 
 
-def test_while_no_command_lifts_the_mirror_first_pulses_go_on() -> None:
+def test_while_no_command_lifts_the_mirror_first_pulses_continue() -> None:
     """With nothing known to lift it, it was to rise by 21 µm at the full command."""
     survey = survey_of([0.3, 0.6], [1.0, 1.9], 2.3, 1.5)
     assert max(step.duration_s for step in survey.steps() if step.fraction > 0) <= 2.4
@@ -336,7 +336,7 @@ def test_while_no_command_lifts_the_mirror_first_pulses_go_on() -> None:
     ("shape", "share"),
     [("root", 0.95), ("dead zone", 0.95), ("top unreachable", 0.9), ("quadratic", 0.95)],
 )
-def test_the_smoothed_flows_are_as_wrong_as_they_say(shape: str, share: float) -> None:
+def test_errors_of_the_smoothed_flows_match_their_error_bars(shape: str, share: float) -> None:
     """All flows share the leak's error, and a dead zone must not be smoothed away with it."""
     commands = np.array([0.0, 0.015, 0.03, 0.06, 0.09, 0.12, 0.18, 0.25, 0.37, 0.49, 0.6, 0.8, 1.0])
     true = np.array([ForeignPump(shape, 3.1).settled(d) for d in commands])
@@ -599,7 +599,7 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
         ([0.03, 0.22], [0.0, 4.8], "did not come back to its setpoint .* steadier weather"),
     ],
 )
-def test_a_mirror_that_does_not_come_back_is_told(
+def test_a_mirror_that_does_not_return_is_reported(
     fractions: list[float], flows: list[float], said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):
@@ -616,7 +616,7 @@ def test_a_mirror_that_does_not_come_back_is_told(
         (0.9, 1.1, 20.0, "--limit-um 20"),
     ],
 )
-def test_a_larger_limit_is_asked_for_only_where_it_would_do(
+def test_a_larger_limit_is_requested_only_where_it_helps(
     white: float, worse: float, seconds: float, said: str
 ) -> None:
     """In a random walk, or with errors far too large, it would be refused again."""
@@ -723,7 +723,7 @@ def test_a_leak_above_the_configured_flow_is_held_on_the_measured_curve(
 
 
 @pytest.mark.campaign
-def test_a_whole_session_on_a_pump_that_nobody_told_it_of(
+def test_a_whole_session_on_an_unknown_pump(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A quadratic diaphragm that starts at 0.22, 1.2 s late: from the defaults to verified gains,

@@ -148,7 +148,7 @@ def test_a_refusal_that_is_obeyed_is_not_given_again(
 @pytest.mark.campaign
 @pytest.mark.parametrize("weather", [2.0, 4.0])
 @pytest.mark.parametrize("seed", [1, 3, 5])
-def test_relays_that_noise_and_weather_stop_tell_the_gain(seed: int, weather: float) -> None:
+def test_relays_that_noise_and_weather_stop_give_the_gain(seed: int, weather: float) -> None:
     """They were discarded, and the session asked for a larger limit."""
     hold = TwinHold(
         foreign_config(rate_hz=10.0),

@@ -88,7 +88,7 @@ def test_a_pump_that_ceases_in_the_relay_is_named() -> None:
     assert "stopped at -" in finished.reason
 
 
-def test_a_mirror_too_tight_is_told_to_open_the_bleed(tmp_path: Path) -> None:
+def test_for_a_mirror_too_tight_the_advice_is_to_open_the_bleed(tmp_path: Path) -> None:
     link, rig = held(leak_time_constant_s=8e4, scenario="calm", laser_noise_um=0.3)
     folder = create_session(tmp_path, "tight", "tester", link.name, link.config, rig.loop)
     with pytest.raises(RejectedError, match="open the bleed"):
@@ -96,7 +96,7 @@ def test_a_mirror_too_tight_is_told_to_open_the_bleed(tmp_path: Path) -> None:
     assert link.rows[-1].state == State.HOLD
 
 
-def test_a_fault_in_a_session_says_what_the_hold_is_in() -> None:
+def test_a_fault_in_a_session_names_the_state_of_the_hold() -> None:
     link, rig = held()
     rig.hold(5.0)
     link.bench.wrong.gauge_offset_pa = 500.0
@@ -204,7 +204,7 @@ def time_constant_s(hold: TwinHold) -> float:
     ],
     ids=["bent", "too strong to complete a relay"],
 )
-def test_the_map_is_asked_for_by_the_first_relay_that_shows_the_need(
+def test_the_first_relay_that_shows_the_need_requests_the_map(
     pump: ForeignPump, at_most_s: float, words: str
 ) -> None:
     link = TwinHold(

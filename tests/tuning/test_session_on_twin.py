@@ -146,7 +146,7 @@ def test_a_session_killed_before_its_journal_is_complete_when_resumed(
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("step", STEPS)
-def test_a_session_killed_in_any_step_goes_on_with_it(
+def test_a_session_killed_in_any_step_continues_with_it(
     killed: Killed, tmp_path: Path, step: str
 ) -> None:
     """The steps before it are not repeated, and the end is the same."""
@@ -211,7 +211,7 @@ def test_the_report_stands_alone_and_the_recording_is_there(done: SessionFolder)
         ("candidates.png", {"candidates.png"}),
     ],
 )
-def test_a_picture_is_drawn_anew_when_what_it_shows_is(
+def test_a_picture_is_drawn_again_when_its_data_change(
     done: SessionFolder, monkeypatch: pytest.MonkeyPatch, renewed: str | None, drawn: set[str]
 ) -> None:
     names = {"experiments.png", "weather.png", "candidates.png", "verify.png"}
@@ -246,7 +246,7 @@ def test_a_step_whose_data_are_missing_names_the_step_to_run(done: SessionFolder
         design.run_design(done)
 
 
-def test_the_estimate_is_told_what_the_session_measured(
+def test_the_estimate_gets_the_values_that_the_session_measured(
     done: SessionFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The twin's own numbers; its laser rounds to 0.1 µm."""
@@ -601,7 +601,7 @@ def test_a_refused_name_applies_nothing(
     ],
 )
 @pytest.mark.parametrize("step", ["run", "apply"])
-def test_gains_that_nobody_can_choose_are_refused_before_anything_moves(
+def test_gains_that_no_person_can_choose_are_refused_before_anything_moves(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     step: str,
@@ -679,7 +679,7 @@ def test_what_cannot_be_written_ends_in_one_line(
     assert "cannot be written" in said
 
 
-def test_a_picture_replaces_a_pipe_that_nobody_reads(done: SessionFolder) -> None:
+def test_a_picture_replaces_a_pipe_without_a_reader(done: SessionFolder) -> None:
     path = done.file_path("experiments.png")
     path.unlink()
     os.mkfifo(path)

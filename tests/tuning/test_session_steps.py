@@ -350,7 +350,7 @@ def gains_file(plant: PlantModel) -> GainsFile:
     )
 
 
-def test_a_loop_in_order_suggests_nothing_and_an_aged_one_says_why() -> None:
+def test_a_loop_in_order_suggests_nothing_and_an_aged_one_states_why() -> None:
     record, _ = held(LOOP)
     about_um = np.zeros(len(record))
     fresh = judge_health(record, about_um, LOOP, gains_file(PLANT))
@@ -484,6 +484,6 @@ def test_a_folder_in_place_of_a_result_is_one_line(tmp_path: Path) -> None:
         session.begin_step("design")
 
 
-def test_nothing_to_roll_back_is_said(tmp_path: Path) -> None:
+def test_nothing_to_roll_back_is_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no kept gains"):
         journal.find_roll_back(tmp_path)

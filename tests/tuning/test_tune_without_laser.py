@@ -154,7 +154,7 @@ def test_ticks_that_no_figure_shows_are_lost_readings_and_not_a_straight_line(
     ("asked_hz", "comes_s", "expected_s"),
     [(20.0, 0.05, 0.05), (20.0, 0.11, 0.11), (5.0, 0.02, 0.2)],
 )
-def test_readings_are_as_far_apart_as_figures_are(
+def test_readings_have_the_interval_of_the_figures(
     asked_hz: float, comes_s: float, expected_s: float
 ) -> None:
     ticks = TicksByFigures(by_optics(asked_hz))

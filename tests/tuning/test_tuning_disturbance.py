@@ -29,7 +29,7 @@ def walk(rng: np.random.Generator, per_s: float) -> np.ndarray:
 W = np.geomspace(0.15, 3.0, 8)  # where it matters to a loop
 
 
-def test_both_walks_are_told_from_noise() -> None:
+def test_both_walks_are_distinguished_from_noise() -> None:
     rng = np.random.default_rng(2)
     series = walk(rng, 0.05) + lag_series(walk(rng, 1.0), 12.0, DT_S) + 0.5 * rng.standard_normal(N)
     found = fit_noise(series, DT_S, 12.0)

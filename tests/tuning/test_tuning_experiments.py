@@ -182,7 +182,7 @@ def test_a_limit_within_the_noise_is_refused() -> None:
         ExcursionGuard(Patterned(around, lambda _: 0.0, 60.0, 0.0), around, 0.0, 10.0)
 
 
-def test_a_mirror_that_is_too_tight_is_told_to_open_the_bleed() -> None:
+def test_for_a_mirror_that_is_too_tight_the_advice_is_to_open_the_bleed() -> None:
     case = Case("calm", laser_noise_um=0.3, leak=0.2)
     rig = Rig(TwinBench(case, 1), case.loop(), PumpConfig(), case.holding_flow_um_per_s)
     around = rig.around(rig.hold(60.0).part(20.0, 60.0))

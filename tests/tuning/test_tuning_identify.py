@@ -126,7 +126,7 @@ def test_too_little_excitation_is_refused_with_the_experiment_that_helps() -> No
     )
 
 
-def test_a_pump_that_saturates_is_told_from_a_straight_one() -> None:
+def test_a_pump_that_saturates_is_distinguished_from_a_straight_one() -> None:
     """Above 2.2 µm/s nothing more comes out, although the record says 4."""
     dt_s, rng = 0.02, np.random.default_rng(3)
     flow = np.repeat(rng.choice([0.4, 1.2, 2.2, 4.0], 120), 30)

@@ -52,7 +52,7 @@ def test_proportional_control_of_an_integrator_with_delay() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])
-def test_stability_is_told_on_both_sides_of_the_gain_margin(factor: float) -> None:
+def test_stability_is_right_on_both_sides_of_the_gain_margin(factor: float) -> None:
     gains = Gains(2.0, 5.0)
     edge = compute_margins(gains, PUMP, 0.02).gain_margin
     scaled = Gains(2.0 * edge * factor, 5.0)

@@ -74,7 +74,7 @@ def test_brightness_wanders_in_space_and_within_minutes(film: FilmShape) -> None
 
 
 @pytest.mark.parametrize("length_mm", [75.0, 400.0])
-def test_waves_are_as_long_as_asked_and_forget_themselves(length_mm: float) -> None:
+def test_waves_have_the_configured_length_and_lose_correlation(length_mm: float) -> None:
     field = RandomField(length_mm, 10.0, 500.0, np.random.default_rng(1))
     x = np.linspace(-490.0, 490.0, 400)
     lines = np.array(
@@ -164,7 +164,7 @@ def test_a_stand_that_grows_takes_the_camera_along(film: FilmShape) -> None:
     assert np.abs(seen - there)[on].max() < 0.05 * np.abs(here - there)[on].max()
 
 
-def test_warm_air_bends_the_rays_as_far_as_asked(film: FilmShape) -> None:
+def test_warm_air_bends_the_rays_by_the_configured_amount(film: FilmShape) -> None:
     renderer = bench(film, seeing_um=100.0)
     assert renderer._disturber is not None
     moved_mm = np.array([renderer._disturber.ray_disturbance(30.0 * k)[:2] for k in range(40)])
@@ -202,7 +202,7 @@ def test_equal_seeds_and_times_give_equal_pictures_and_others_do_not(film: FilmS
     assert not np.array_equal(renderer.render_picture(crossed(), 0.0, time_s=3.0), first[0])
 
 
-def test_simulate_disturbs_a_tracking_set_and_tells_its_vibrations(tmp_path: Path) -> None:
+def test_simulate_disturbs_a_tracking_set_and_lists_its_vibrations(tmp_path: Path) -> None:
     config = tmp_path / "bench.toml"
     config.write_text(
         "[twin]\ndrum_nm = 5.0\n[twin.disturbances]\nbrightness_fraction = 0.005\ndust = 3\n"

@@ -97,7 +97,7 @@ def test_without_a_pattern_there_is_no_frame(small_optics: OpticsConfig) -> None
         twin.camera.grab()
 
 
-def test_a_closed_camera_says_so(small_optics: OpticsConfig) -> None:
+def test_a_closed_camera_raises(small_optics: OpticsConfig) -> None:
     twin = _optics(small_optics, Bench())
     twin.screen.show(Pattern("white"))
     twin.camera.close()

@@ -38,7 +38,7 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
-def test_sinusoids_are_as_bright_as_the_interfaces_say(
+def test_sinusoids_have_the_brightness_of_the_interfaces(
     clean_optics: OpticsConfig, film: FilmShape, axis: str
 ) -> None:
     renderer = OpticsRenderer(clean_optics, film, LINEAR, exact=True)
