@@ -116,7 +116,7 @@ def alarm_process_main(spec: AlarmProcessSpec, line: Connection) -> None:
     """
     child.leave_at_stop()
     heartbeat = make_heartbeat(spec.heartbeat)
-    report = event_pipe.event_sender(line)
+    report = event_pipe.make_event_sender(line)
     folders = [FolderAlarms(logs) for logs in spec.folders]
     with limited_memory():
         for each in folders:
