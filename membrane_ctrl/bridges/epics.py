@@ -19,7 +19,7 @@ from membrane_ctrl.bridges.names import TABLE, Bridge, Published, Value
 from membrane_ctrl.config.bridges import EpicsConfig
 from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.service.access import Action
+from membrane_ctrl.service.access import ActionButton
 
 # Clients may write the value of a command (level 0) only. EPICS by itself lets them write
 # everything, and the other fields (FLNK, SCAN, ASG) would send commands in chains, again and again,
@@ -118,7 +118,7 @@ def _record(builder: Any, published: Published) -> Any:
     return builder.aIn(published.name, EGU=published.unit, PREC=_DIGITS, DESC=description)
 
 
-def _command(builder: Any, bridge: Bridge, do: str, action: Action, answer: Any) -> None:
+def _command(builder: Any, bridge: Bridge, do: str, action: ActionButton, answer: Any) -> None:
     """The record `do:COMMAND`: a number, a text, or any write at all; a put ends once the answer is
     there.
     """

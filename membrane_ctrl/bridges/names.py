@@ -15,14 +15,21 @@ from membrane_ctrl.bridges.hold_link import SendLimits, send_command
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.outcome import Outcome
-from membrane_ctrl.control_port.protocol import TEXT_BYTES
+from membrane_ctrl.control_port.protocol import TEXT_BYTES, role_includes
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.status import fault_line, lock_lines, notice_lines
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model.columns import PUBLISHED, unit_of
 from membrane_ctrl.model.notices import Topic
 from membrane_ctrl.model.numbers import parse_number
-from membrane_ctrl.service.access import ACTIONS, STOP, Action, WebUser, may, outranks, request
+from membrane_ctrl.service.access import (
+    ACTIONS,
+    STOP,
+    ActionButton,
+    WebUser,
+    is_action_allowed,
+    request,
+)
 from membrane_ctrl.service.feed import HoldFeed, HoldSeen
 
 Value = float | str | None  # None: not known
@@ -156,10 +163,14 @@ class Bridge:
         return not self.feed.seen.silent
 
     @property
-    def commands(self) -> dict[str, Action]:
+    def commands(self) -> dict[str, ActionButton]:
         """The commands that the settings allow; the hold may still refuse them."""
         user = WebUser("", self.settings.role)
-        return {name: action for name, action in COMMANDS.items() if may(user, "tune", action)}
+        return {
+            name: action
+            for name, action in COMMANDS.items()
+            if is_action_allowed(user, "tune", action)
+        }
 
     async def ask(
         self, by: str, name: str, given: Any = "", role: Role | None = None, who: str = ""
@@ -241,9 +252,9 @@ class Bridge:
         # The role at the port is known only after the first contact: it must not refuse a safety
         # command.
         port_role = "tune" if is_safety_command(name) else self.feed.seen.role
-        allowed = may(WebUser(by, self.settings.role), port_role, action) and outranks(
-            role, action.role
-        )
+        allowed = is_action_allowed(
+            WebUser(by, self.settings.role), port_role, action
+        ) and role_includes(role, action.role)
         if not allowed:
             raise ValueError(f"{name} refused: needs the role {action.role}")
         why = f"bridge: {by}, {who}" if who else f"bridge: {by}"
@@ -251,7 +262,7 @@ class Bridge:
         asked["on_behalf"] = {"via": "bridge", "name": by, "role": role}
         return asked
 
-    def _text(self, action: Action, name: str, given: Any) -> str:
+    def _text(self, action: ActionButton, name: str, given: Any) -> str:
         """The number or text of a command as `request` accepts it. Raises ValueError."""
         if action.asks == "number":
             return _number_text(action, given)
@@ -269,7 +280,7 @@ class Bridge:
         return text
 
 
-def _number_text(action: Action, given: Any) -> str:
+def _number_text(action: ActionButton, given: Any) -> str:
     """A number in the notation of `request`. Raises ValueError for whatever is not exactly one
     finite number.
     """

@@ -19,7 +19,7 @@ from membrane_ctrl.bridges.names import TABLE, Bridge, Value
 from membrane_ctrl.bridges.opcua_server import AnonymousClients, BridgeServer, NamedClients, caller
 from membrane_ctrl.config.bridges import OpcuaConfig
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.service.access import Action
+from membrane_ctrl.service.access import ActionButton
 from membrane_ctrl.service.accounts import KnownUser, known_users
 
 _UNITS = "http://www.opcfoundation.org/UA/units/un/cefact"
@@ -151,7 +151,7 @@ async def _nodes(
     return found
 
 
-def _argument(action: Action) -> ua.Argument:
+def _argument(action: ActionButton) -> ua.Argument:
     number = action.asks == "number"
     kind = ua.ObjectIds.Double if number else ua.ObjectIds.String
     return ua.Argument(

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from membrane_ctrl.control_port.protocol import TEXT_BYTES, WHY_BYTES, Action
+from membrane_ctrl.control_port.protocol import TEXT_BYTES, WHY_BYTES, RequestName
 from membrane_ctrl.controller.commands import Role
 
 _Line = Annotated[str, Field(max_length=2000)]
@@ -118,7 +118,7 @@ class CommandBody(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    do: Action
+    do: RequestName
     value: float | None = None
     text: Annotated[str, Field(max_length=TEXT_BYTES)] = ""
     loop: dict[str, bool | float] | None = None

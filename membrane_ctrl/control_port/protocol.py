@@ -31,7 +31,7 @@ MESSAGE_BYTES = 8192
 WHO_BYTES, WHY_BYTES, TEXT_BYTES = 64, 300, 500
 
 Errand = Literal["status", "watch", "release", "quiet", "claim"]
-Action = Literal[Kind, Errand]
+RequestName = Literal[Kind, Errand]
 
 
 class RequestError(ValueError):
@@ -79,7 +79,7 @@ class Request(Section):
     number: Annotated[int, Field(ge=0, lt=2**53)] = 0
     # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `claim` (command
     # for a session, this connection), `release` (give up command), `quiet` (acknowledge the alarms)
-    do: Action
+    do: RequestName
     why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
     value: float | None = None  # `setpoint`: µm. `manual`: µm/s. `gains`: trial time, s
     # `mark`: the remark. `latch`: why the mirror is locked. `unlock`: the lock's word, which a
@@ -242,7 +242,7 @@ class Wire:
         self._writer.transport.abort()
 
 
-_RANK: dict[Role, int] = {"read": 0, "operate": 1, "tune": 2}
+_RANK: dict[str, int] = {"read": 0, "operate": 1, "tune": 2}
 _ERRANDS: dict[str, Role] = {
     "status": "read",
     "watch": "read",
@@ -310,9 +310,14 @@ def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
     return Sender(who, role, account, on_behalf.session, from_person)
 
 
-def may_not(sender: Peer | Sender, do: Action) -> str:
+def role_includes(role: str, needed: Role) -> bool:
+    """Whether a role includes the needed one; an unknown role is `read`."""
+    return _RANK.get(role, 0) >= _RANK[needed]
+
+
+def explain_missing_role(sender: Peer | Sender, do: RequestName) -> str:
     """Why the sender's role forbids this request; empty if it does not."""
     needed = TABLE[do].role if do in TABLE else _ERRANDS[do]
-    if _RANK[sender.role] >= _RANK[needed]:
+    if role_includes(sender.role, needed):
         return ""
     return f"{do} needs the role {needed}; {sender.who} has {sender.role}"

@@ -21,7 +21,7 @@ from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.commander import Commander, CommandSession
 from membrane_ctrl.control_port.endpoint import Endpoint, Refusals
-from membrane_ctrl.control_port.protocol import FREE, Peer, Sender, may_not
+from membrane_ctrl.control_port.protocol import FREE, Peer, Sender, explain_missing_role
 from membrane_ctrl.control_port.request_intake import ReadingTurns
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.session import PortSession
@@ -192,7 +192,7 @@ class Port:
         peer = session.peer
         sender = protocol.sender_of(peer, request.on_behalf)
         refusal = (
-            may_not(sender, request.do)
+            explain_missing_role(sender, request.do)
             or self._expired(request)
             or self._claim_command(session, request)
         )

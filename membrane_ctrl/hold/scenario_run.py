@@ -25,7 +25,7 @@ _EVENTS: dict[str, Callable[[ScenarioStep], bench_events.BenchEvent]] = {
     "pressure_weather": lambda at: bench_events.PressureWeather(at.value),
 }
 
-Action = Command | Callable[[virtual_bench.VirtualBench], None]
+ScheduledAction = Command | Callable[[virtual_bench.VirtualBench], None]
 Ticks = Iterable[VirtualTick | None]  # None: the control process misses one
 
 
@@ -55,7 +55,7 @@ class ScenarioRun:
             (0.0, Command("hold", "scenario")),
             (scenario.duration_s, Command("stop", "duration")),
         )
-        agenda: list[tuple[float, Action]] = [
+        agenda: list[tuple[float, ScheduledAction]] = [
             begin,
             *_list_actions(steps, scenario.duration_s),
             end,
@@ -85,7 +85,9 @@ class ScenarioRun:
         self._agenda = deque([(0.0, Command("stop", who))])
 
 
-def _list_actions(steps: list[ScenarioStep], end_s: float) -> Iterator[tuple[float, Action]]:
+def _list_actions(
+    steps: list[ScenarioStep], end_s: float
+) -> Iterator[tuple[float, ScheduledAction]]:
     """What is to be done when; a switch returns to its default when its time is over."""
     for at in steps:
         if at.command is not None:

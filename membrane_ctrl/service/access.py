@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, cast
 
+from membrane_ctrl.control_port.protocol import role_includes
 from membrane_ctrl.controller.commands import ANY, TABLE, Kind, Role
 from membrane_ctrl.model.columns import unit_of
 from membrane_ctrl.model.numbers import parse_number
@@ -22,14 +23,9 @@ class WebUser:
     via: Literal["page", "token"] = "page"
 
 
-# What a viewer may ask: the commands of `ctl` that take one number or one text at most.
-
-_RANK: dict[str, int] = {"read": 0, "operate": 1, "tune": 2}
-
-
 @dataclass(frozen=True, slots=True)
-class Action:
-    """A button.
+class ActionButton:
+    """A button: a command of `ctl` that takes at most one number or one text.
 
     `asks` is what the viewer types: a number in the given unit, a text, or nothing but yes.
     """
@@ -65,37 +61,32 @@ def _states(do: str) -> frozenset[str]:
     )
 
 
-STOP = Action("stop", "STOP", "stop_circle")
-UNLOCK = Action(
+STOP = ActionButton("stop", "STOP", "stop_circle")
+UNLOCK = ActionButton(
     "unlock", "Unlock", "lock_open", "text"
 )  # none of `ACTIONS`, which the bridges offer as well
 ACTIONS = (
-    Action("hold", "Hold", "play_arrow"),
-    Action("pause", "Pause", "pause"),
-    Action("resume", "Resume", "play_circle"),
-    Action("setpoint", "Setpoint", "straighten", "number", unit_of("setpoint_um")),
-    Action("manual", "Manual flow", "tune", "number", unit_of("flow_um_per_s")),
-    Action("shape_on", "Shape loop on", "toggle_on"),
-    Action("shape_off", "Shape loop off", "toggle_off"),
-    Action("mark", "Mark", "bookmark", "text"),
-    Action("capture", "Capture set", "photo_camera"),
-    Action("keep", "Keep gains", "done_all"),
-    Action("ack", "Clear fault", "check_circle"),
-    Action("quiet", "Quiet alarms", "notifications_off"),
-    Action("lower", "Lower", "south"),
-    Action("vent", "Vent", "air"),
-    Action("latch", "Lock", "lock", "text"),
+    ActionButton("hold", "Hold", "play_arrow"),
+    ActionButton("pause", "Pause", "pause"),
+    ActionButton("resume", "Resume", "play_circle"),
+    ActionButton("setpoint", "Setpoint", "straighten", "number", unit_of("setpoint_um")),
+    ActionButton("manual", "Manual flow", "tune", "number", unit_of("flow_um_per_s")),
+    ActionButton("shape_on", "Shape loop on", "toggle_on"),
+    ActionButton("shape_off", "Shape loop off", "toggle_off"),
+    ActionButton("mark", "Mark", "bookmark", "text"),
+    ActionButton("capture", "Capture set", "photo_camera"),
+    ActionButton("keep", "Keep gains", "done_all"),
+    ActionButton("ack", "Clear fault", "check_circle"),
+    ActionButton("quiet", "Quiet alarms", "notifications_off"),
+    ActionButton("lower", "Lower", "south"),
+    ActionButton("vent", "Vent", "air"),
+    ActionButton("latch", "Lock", "lock", "text"),
 )
 
 
-def outranks(role: str, needed: Role) -> bool:
-    """Whether a role includes the needed one; an unknown role is `read`."""
-    return _RANK.get(role, 0) >= _RANK[needed]
-
-
-def may(user: WebUser, port_role: str, action: Action) -> bool:
+def is_action_allowed(user: WebUser, port_role: str, action: ActionButton) -> bool:
     """Whether the viewer's role and that of this process at the port both allow it."""
-    return outranks(user.role, action.role) and outranks(port_role, action.role)
+    return role_includes(user.role, action.role) and role_includes(port_role, action.role)
 
 
 def on_behalf(user: WebUser, session: str) -> dict[str, str]:
@@ -121,7 +112,7 @@ def on_behalf(user: WebUser, session: str) -> dict[str, str]:
     }
 
 
-def request(action: Action, why: str, given: str, take_over: bool = False) -> dict[str, Any]:
+def request(action: ActionButton, why: str, given: str, take_over: bool = False) -> dict[str, Any]:
     """The request to send, for the reason `why`. Raises ValueError with what is wrong with the
     input.
     """

@@ -31,13 +31,13 @@ from membrane_ctrl.control_port.api_models import (
     UserAnswer,
 )
 from membrane_ctrl.control_port.outcome import Outcome
-from membrane_ctrl.control_port.protocol import Peer, may_not
+from membrane_ctrl.control_port.protocol import Peer, explain_missing_role, role_includes
 from membrane_ctrl.control_port.status import alarm_lines, lock_lines
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
 from membrane_ctrl.model.program import program_identity
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.service.access import WebUser, on_behalf, outranks
+from membrane_ctrl.service.access import WebUser, on_behalf
 from membrane_ctrl.service.ended_run import REPORT_NAME, EndedRun
 from membrane_ctrl.service.feed import SIGNALS, HoldFeed, HoldSeen, history
 from membrane_ctrl.service.hold_starter import HoldStarter, StartOptions
@@ -304,7 +304,7 @@ async def _send(
         return CommandAnswer(done=False, text=f"{do}: not sent: {seen.problem}")
     for role in (user.role, seen.role):
         # the hold judges it, too
-        if refusal := may_not(Peer(user.name, role), do):  # type: ignore[arg-type]
+        if refusal := explain_missing_role(Peer(user.name, role), do):  # type: ignore[arg-type]
             raise HTTPException(HTTPStatus.FORBIDDEN, refusal)
     request.setdefault("why", f"{user.via}: {user.name}")
     request["on_behalf"] = on_behalf(user, user.via)
@@ -358,7 +358,7 @@ def _event_message(kind: str, value: object) -> str:
 
 
 def _require_role(user: WebUser, needed: Literal["operate"], what: str) -> None:
-    if not outranks(user.role, needed):
+    if not role_includes(user.role, needed):
         raise HTTPException(
             HTTPStatus.FORBIDDEN, f"{what} needs the role {needed}; {user.name} has {user.role}"
         )

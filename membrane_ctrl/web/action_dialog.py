@@ -11,7 +11,7 @@ from nicegui import ui
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.status import lock_lines
 from membrane_ctrl.model.numbers import parse_number
-from membrane_ctrl.service.access import STOP, UNLOCK, Action
+from membrane_ctrl.service.access import STOP, UNLOCK, ActionButton
 from membrane_ctrl.web.consequences import (
     AllowedRange,
     Consequence,
@@ -29,7 +29,7 @@ class GivenAnswer:
     take_over: bool
 
 
-def explain_input(action: Action, text: str, allowed: AllowedRange | None) -> str:
+def explain_input(action: ActionButton, text: str, allowed: AllowedRange | None) -> str:
     """Why an input is refused before it is sent; empty if it is not."""
     if action.asks != "number":
         return "enter a text" if action.do == "mark" and not text.strip() else ""
@@ -41,7 +41,7 @@ def explain_input(action: Action, text: str, allowed: AllowedRange | None) -> st
 
 
 async def ask_for_confirmation(
-    action: Action, status: Mapping[str, Any], config: Config | None
+    action: ActionButton, status: Mapping[str, Any], config: Config | None
 ) -> GivenAnswer | None:
     """Show the dialog; returns None if the viewer cancels.
 

@@ -12,7 +12,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control.filling_time import find_fall_s, find_filling_s
 from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.review.formatting import format_span
-from membrane_ctrl.service.access import Action
+from membrane_ctrl.service.access import ActionButton
 
 
 class Consequence(Enum):
@@ -29,7 +29,7 @@ _MOVES_GAS = frozenset(
 _COSTS_HOURS = frozenset({"lower", "vent", "latch", "stop"})
 
 
-def find_consequence(action: Action) -> Consequence:
+def find_consequence(action: ActionButton) -> Consequence:
     """The consequence of a command."""
     if action.do in _COSTS_HOURS:
         return Consequence.COSTS_HOURS
@@ -67,7 +67,7 @@ class AllowedRange:
 
 
 def find_range(
-    action: Action, row: Mapping[str, Any], config: Config | None
+    action: ActionButton, row: Mapping[str, Any], config: Config | None
 ) -> AllowedRange | None:
     """The present value and the allowed range of a command with a number; None if its hold's
     configuration is not known here.
@@ -85,7 +85,7 @@ def find_range(
     return AllowedRange(0.0, most, shown, column.unit)
 
 
-def describe_price(action: Action, row: Mapping[str, Any], config: Config | None) -> str:
+def describe_price(action: ActionButton, row: Mapping[str, Any], config: Config | None) -> str:
     """What it costs to return from a command, in a sentence; empty if it costs nothing.
 
     The leak is the present estimate of the hold; without one, that of the configuration's mirror is

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from nicegui import ui
 
+from membrane_ctrl.control_port.protocol import role_includes
 from membrane_ctrl.model import errors
-from membrane_ctrl.service.access import WebUser, outranks
+from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_starter import Configuration, HoldStarter, StartOptions
 from membrane_ctrl.service.work_pools import RUN_LISTS
@@ -52,7 +53,7 @@ class NoHoldPanel:
             self._standby = ui.checkbox("wait in standby")
             self._clear = ui.checkbox("clear latched faults")
             self._start = ui.button("Start a hold", icon="play_arrow", on_click=self._confirm)
-            self._start.props("no-caps").set_enabled(outranks(self._user.role, "operate"))
+            self._start.props("no-caps").set_enabled(role_includes(self._user.role, "operate"))
         self._failure = ui.label().classes("text-negative").props('role="alert"')
         ui.timer(0.1, self._list_configurations, once=True)
 
@@ -104,7 +105,7 @@ class NoHoldPanel:
         is_sure = await dialog
         if not dialog.is_deleted:  # with the viewer
             dialog.delete()
-        if not is_sure or not outranks(self._user.role, "operate"):
+        if not is_sure or not role_includes(self._user.role, "operate"):
             return
         options = StartOptions(bool(self._standby.value), bool(self._clear.value))
         try:

@@ -12,17 +12,17 @@ from urllib.parse import urlencode
 from nicegui import ui
 
 from membrane_ctrl.control_port.outcome import Outcome
+from membrane_ctrl.control_port.protocol import role_includes
 from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.model.columns import MISSING, PUBLISHED, TelemetryColumn
 from membrane_ctrl.service.access import (
     ACTIONS,
     STOP,
     UNLOCK,
-    Action,
+    ActionButton,
     WebUser,
-    may,
+    is_action_allowed,
     on_behalf,
-    outranks,
     request,
 )
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed
@@ -99,7 +99,7 @@ class WebPage:
         self._charted_s = -1e9
         self._drawn: tuple[object, ...] = ()
         self._coloured = ""
-        self._buttons: list[tuple[ui.button, Action]] = []
+        self._buttons: list[tuple[ui.button, ActionButton]] = []
         self._asking = False
         self._clicked_s: float | None = None  # UTC of the last click on the chart
         # of this viewer, in records
@@ -176,7 +176,9 @@ class WebPage:
         tabs.on_value_change(load)
 
     def _may_choose(self) -> bool:
-        return outranks(self._user.role, CHOOSES) and outranks(self._feed.seen.role, CHOOSES)
+        return role_includes(self._user.role, CHOOSES) and role_includes(
+            self._feed.seen.role, CHOOSES
+        )
 
     def _build_now(self) -> None:
         self._why = ui.label().classes("text-subtitle1").props('role="status"')
@@ -309,7 +311,7 @@ class WebPage:
         self._clicked_s = shown_s - (offset.total_seconds() if offset else 0.0)
         mark = next(action for action in ACTIONS if action.do == "mark")
         self._mark_here.set_text(f"Mark {moment:%H:%M:%S}")
-        self._mark_here.set_visibility(may(self._user, self._user.role, mark))
+        self._mark_here.set_visibility(is_action_allowed(self._user, self._user.role, mark))
 
     async def _mark_moment(self) -> None:
         """Mark the chosen moment: a present one by the hold, a past one beside its recording."""
@@ -320,7 +322,7 @@ class WebPage:
             await self._confirm(mark)
             return
         given = await self._ask(mark)
-        if given is None or not outranks(self._user.role, mark.role):
+        if given is None or not role_includes(self._user.role, mark.role):
             return
         who = f"web: {self._user.name}"
         try:
@@ -410,7 +412,11 @@ class WebPage:
             label.set_text(format_number(column, None if silent else value))
             card.set_visibility(value is not None)
         for button, action in self._buttons:
-            allowed = not silent and may(self._user, seen.role, action) and state in action.states
+            allowed = (
+                not silent
+                and is_action_allowed(self._user, seen.role, action)
+                and state in action.states
+            )
             allowed = allowed and changes_something(action, status)
             if button.enabled != allowed:
                 button.set_enabled(allowed)
@@ -431,7 +437,7 @@ class WebPage:
         if wanted == "pause" and self._feed.seen.status.get("paused"):
             wanted = "resume"
         action = next((each for each in (*ACTIONS, STOP) if each.do == wanted), None)
-        if action is not None and may(self._user, self._feed.seen.role, action):
+        if action is not None and is_action_allowed(self._user, self._feed.seen.role, action):
             await self._confirm(action)
 
     async def _show_keys(self) -> None:
@@ -454,7 +460,7 @@ class WebPage:
         if not dialog.is_deleted:
             dialog.delete()
 
-    async def _ask(self, action: Action) -> Any:
+    async def _ask(self, action: ActionButton) -> Any:
         """Show the dialog of a command, one at a time: a key may be pressed beside it."""
         self._asking = True
         try:
@@ -464,14 +470,14 @@ class WebPage:
         finally:
             self._asking = False
 
-    async def _confirm(self, action: Action) -> None:
+    async def _confirm(self, action: ActionButton) -> None:
         """Ask for the input and for a confirmation, send, and show what became of it."""
         if self._asking:
             return
         given = await self._ask(action)
         if given is None:
             return
-        if not may(
+        if not is_action_allowed(
             self._user, self._feed.seen.role, action
         ):  # the role may have changed while the dialog was open
             show_message(f"{action.label}: needs the role {action.role}", good=False)
@@ -496,7 +502,7 @@ def format_number(column: TelemetryColumn, value: float | None) -> str:
     return column.format_value(value)
 
 
-def changes_something(action: Action, status: Mapping[str, Any]) -> bool:
+def changes_something(action: ActionButton, status: Mapping[str, Any]) -> bool:
     """Whether a command would change anything, as far as the status shows."""
     match action.do:
         case "shape_on":

@@ -12,10 +12,11 @@ from urllib.parse import quote
 
 from nicegui import ui
 
+from membrane_ctrl.control_port.protocol import role_includes
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.run_files.run import open_run
-from membrane_ctrl.service.access import WebUser, outranks
+from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.service.work_pools import REPORTS, RUN_LISTS, PoolFullError
 from membrane_ctrl.web.messages import show_message
@@ -69,7 +70,7 @@ def report_problem(folder: Path, user: WebUser) -> str:
     """Write the run's report if there is none; returns why there is none, or an empty text."""
     if (folder / REPORT_NAME).exists():
         return ""
-    if not outranks(user.role, "operate"):
+    if not role_includes(user.role, "operate"):
         return f"{folder.name}: no report yet; writing one needs the role operate"
     return _command("report", str(folder))
 

@@ -100,9 +100,9 @@ class TuningPanel:
         self,
         look: Callable[[], Awaitable[SessionSeen | None]],
         user: WebUser,
-        may: Callable[[], bool],
+        is_action_allowed: Callable[[], bool],
     ) -> None:
-        self._look, self._user, self._may = look, user, may
+        self._look, self._user, self._may = look, user, is_action_allowed
         self._head = (
             ui.label("No tuning session in this folder.")
             .classes("text-subtitle1")

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from membrane_ctrl.control_port.commander import Commander
 from membrane_ctrl.control_port.endpoint import Refusals
-from membrane_ctrl.control_port.protocol import Peer, may_not
+from membrane_ctrl.control_port.protocol import Peer, explain_missing_role
 from membrane_ctrl.model.events import Event
 
 
@@ -37,12 +37,12 @@ def test_each_command_keeps_it_from_lapsing() -> None:
 
 
 def test_roles_are_steps() -> None:
-    assert "needs the role tune; unix:ann has operate" in may_not(
+    assert "needs the role tune; unix:ann has operate" in explain_missing_role(
         Peer("unix:ann", "operate"), "gains"
     )
-    assert may_not(Peer("unix:ann", "operate"), "stop") == ""
-    assert may_not(Peer("unix:ann", "tune"), "stop") == ""
-    assert "needs the role operate" in may_not(Peer("unix:eve", "read"), "stop")
+    assert explain_missing_role(Peer("unix:ann", "operate"), "stop") == ""
+    assert explain_missing_role(Peer("unix:ann", "tune"), "stop") == ""
+    assert "needs the role operate" in explain_missing_role(Peer("unix:eve", "read"), "stop")
 
 
 def test_a_flood_of_refusals_is_counted_and_not_written() -> None:

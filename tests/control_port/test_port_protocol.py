@@ -18,7 +18,7 @@ from membrane_ctrl.control_port.protocol import (
     Request,
     RequestError,
     encode,
-    may_not,
+    explain_missing_role,
     parse,
 )
 from membrane_ctrl.controller.commands import TABLE, Kind
@@ -158,6 +158,6 @@ def test_any_bytes_are_a_request_or_a_refusal(data: bytes) -> None:
 
 def test_every_action_takes_a_role() -> None:
     reader, tuner = Peer("unix:r", "read"), Peer("unix:t", "tune")
-    readable = {action for action in ACTIONS if not may_not(reader, action)}  # type: ignore[arg-type]
+    readable = {action for action in ACTIONS if not explain_missing_role(reader, action)}  # type: ignore[arg-type]
     assert readable == {"status", "watch"}
-    assert not any(may_not(tuner, action) for action in ACTIONS)  # type: ignore[arg-type]
+    assert not any(explain_missing_role(tuner, action) for action in ACTIONS)  # type: ignore[arg-type]

@@ -17,7 +17,15 @@ from membrane_ctrl.control_port.protocol import encode, parse
 from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model.run_events import Mark
-from membrane_ctrl.service.access import ACTIONS, STOP, UNLOCK, WebUser, may, on_behalf, request
+from membrane_ctrl.service.access import (
+    ACTIONS,
+    STOP,
+    UNLOCK,
+    WebUser,
+    is_action_allowed,
+    on_behalf,
+    request,
+)
 from membrane_ctrl.service.feed import HoldFeed
 from tests.worlds.port_run import ROW, port_run
 
@@ -53,7 +61,9 @@ async def test_a_hold_is_followed_asked_and_found_again(tmp_path: Path) -> None:
             await until(lambda: any("door" in line for line in feed.seen.events))
             assert [text for _, text in feed.marks] == ["door <b>opened</b>"]
         await until(lambda: feed.seen.silent)
-        assert not may(WebUser("anna", "tune"), feed.seen.role, STOP), "no role without a port"
+        assert not is_action_allowed(WebUser("anna", "tune"), feed.seen.role, STOP), (
+            "no role without a port"
+        )
         async with port_run(tmp_path):
             await until(lambda: not feed.seen.silent)
     finally:
@@ -137,9 +147,9 @@ def test_locks_come_first_among_the_alarms() -> None:
     ],
 )
 def test_the_lesser_of_both_roles_counts(user: str, port: str, allowed: bool) -> None:
-    assert may(WebUser("anna", user), port, STOP) is allowed  # type: ignore[arg-type]
+    assert is_action_allowed(WebUser("anna", user), port, STOP) is allowed  # type: ignore[arg-type]
     keep = next(action for action in ACTIONS if action.do == "keep")
-    assert may(WebUser("anna", "operate"), "tune", keep) is False
+    assert is_action_allowed(WebUser("anna", "operate"), "tune", keep) is False
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.service.access import ACTIONS, STOP, UNLOCK, Action
+from membrane_ctrl.service.access import ACTIONS, STOP, UNLOCK, ActionButton
 from membrane_ctrl.web.action_dialog import explain_input
 from membrane_ctrl.web.consequences import (
     Consequence,
@@ -20,7 +20,7 @@ from membrane_ctrl.web.page import changes_something
 ROW = {"leak_um_per_s": 1.24, "target_um": 12.0, "flow_um_per_s": 1.2345678}
 
 
-def action(name: str) -> Action:
+def action(name: str) -> ActionButton:
     return next(each for each in (*ACTIONS, STOP, UNLOCK) if each.do == name)
 
 
