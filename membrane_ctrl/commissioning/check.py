@@ -27,6 +27,7 @@ from membrane_ctrl.config.port import SOCKET_NAME, PortConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
+from membrane_ctrl.controller.sample_rate import FRESH_SHARE_LEAST
 from membrane_ctrl.geometry.run_geometry import read_configured_geometry
 from membrane_ctrl.instruments import (
     bench,
@@ -43,6 +44,7 @@ from membrane_ctrl.model.optional import describe_missing, is_installed
 
 _READS = 100
 _LONGEST_S = 2.0  # slow devices get fewer reads
+_SAMPLES_S = 0.5  # so long is read at least, to measure the rate of samples
 _BACK_OFF_S = 0.2  # pause on a bus after a device that could not be opened
 _GRABS = 10
 
@@ -57,6 +59,7 @@ class DeviceProbe:
     reading: str = ""  # one value, with its unit
     latency_p50_ms: float = math.nan  # of a read; NaN without one
     latency_p99_ms: float = math.nan
+    samples_hz: float = math.nan  # new samples of the displacement a second; NaN if not measured
     problem: str = ""  # what is wrong and what to do; empty if nothing
     notes: str = ""  # information that is not a problem
     facts: roles.BenchIdentity | None = None  # limits of the device that answered
@@ -77,6 +80,8 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
     missing = list_missing_packages(config)
     would = _describe_hold(config)
+    if samples := _describe_samples(config, probes):
+        would["samples"] = samples
     if config.interlocks:
         would["interlocks"] = interlock_check.describe_effect(circuits)
     if as_json:
@@ -268,6 +273,32 @@ def _describe_geometry(config: Config) -> str:
     return f"{origin.file} (hash {origin.hash}{made})"
 
 
+def _describe_samples(config: Config, probes: list[DeviceProbe]) -> str:
+    """How many new samples of the displacement a tick has; empty if that was not measured."""
+    measured = [probe.samples_hz for probe in probes if math.isfinite(probe.samples_hz)]
+    if not measured or config.by_optics:
+        return ""
+    samples_hz, rate_hz = measured[0], config.loop.rate_hz
+    found = f"{samples_hz:.0f} of the displacement a second, for {rate_hz:g} ticks"
+    if samples_hz >= FRESH_SHARE_LEAST * rate_hz:
+        return found
+    return (
+        f"{found}: the loop acts on new samples only, {samples_hz / rate_hz:.0%} of its ticks. "
+        f"Lower loop.rate_hz to {samples_hz:.0f}, or raise the rate of the sensor"
+    )
+
+
+def _measure_samples_hz(
+    first: roles.BenchReading | roles.DisplacementSample,
+    last: roles.BenchReading | roles.DisplacementSample,
+) -> float:
+    """New samples a second between two reads, by the device's own counter and time; NaN if these
+    do not advance.
+    """
+    duration_s = last.device_time_s - first.device_time_s
+    return (last.sample_counter - first.sample_counter) / duration_s if duration_s > 0 else math.nan
+
+
 async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> DeviceProbe:
     """Probe the board without writing, also while another program controls it.
 
@@ -277,15 +308,27 @@ async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> Device
     """
     try:
         identity = await board.identify()
-        reading, p50_ms, p99_ms = await _time_reads(board.read)
+        timed = await _time_reads(board.read)
     except roles.LinkError as error:
         return DeviceProbe("board", name, problem=str(error))
     finally:
         await board.close()
+    reading = timed.last
     who = f"{identity.kind} {identity.firmware}, map {identity.map_version}"
     said, problem = _describe_board_reading(reading), _find_board_problem(reading, laser)
     notes = NO_CLAIM if identity.map_version == 1 else ""
-    return DeviceProbe("board", name, who, said, p50_ms, p99_ms, problem, notes, identity)
+    return DeviceProbe(
+        role="board",
+        device=name,
+        identity=who,
+        reading=said,
+        latency_p50_ms=timed.p50_ms,
+        latency_p99_ms=timed.p99_ms,
+        samples_hz=_measure_samples_hz(timed.first, reading),
+        problem=problem,
+        notes=notes,
+        facts=identity,
+    )
 
 
 def _describe_board_reading(reading: roles.BenchReading) -> str:
@@ -328,7 +371,7 @@ async def _probe_role(
     name, notes = where.get("port", ""), where.get("watchdog", "")
     try:
         found = await role_bench.answer(role, device.open())
-        value, p50_ms, p99_ms = await _time_reads(lambda: role_bench.answer(role, read()))
+        timed = await _time_reads(lambda: role_bench.answer(role, read()))
     except roles.LinkError as error:
         return DeviceProbe(role, name, problem=str(error), notes=notes)
     finally:
@@ -338,12 +381,15 @@ async def _probe_role(
         part for part in (found.kind, found.serial, found.firmware, found.detail) if part
     )
     problem = ""
+    samples_hz = math.nan
+    value = timed.last
     if isinstance(value, roles.DisplacementSample):
         problem = (
             ""
             if value.quality == 0
             else f"no reading, error code {value.quality}; check aim and manual"
         )
+        samples_hz = _measure_samples_hz(timed.first, value)
         value = value.displacement_um
     if not problem and not math.isfinite(value):
         problem = "answers without a reading"
@@ -353,20 +399,45 @@ async def _probe_role(
     elif role == "gauge_pressure":
         facts = replace(facts, gauge_range_pa=found.shows)
     return DeviceProbe(
-        role, name, identity, f"{value:.6g} {unit}", p50_ms, p99_ms, problem, notes, facts
+        role=role,
+        device=name,
+        identity=identity,
+        reading=f"{value:.6g} {unit}",
+        latency_p50_ms=timed.p50_ms,
+        latency_p99_ms=timed.p99_ms,
+        samples_hz=samples_hz,
+        problem=problem,
+        notes=notes,
+        facts=facts,
     )
 
 
-async def _time_reads(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]:
-    """Last value of many reads, and their duration (p50, p99) in ms."""
+@dataclass(frozen=True, slots=True)
+class TimedReads:
+    """First and last value of many reads, and percentiles of their duration."""
+
+    first: Any
+    last: Any
+    p50_ms: float
+    p99_ms: float
+
+
+async def _time_reads(read: Callable[[], Awaitable[Any]]) -> TimedReads:
+    """Read many times, and long enough to measure the rate of samples."""
     took_ms: list[float] = []
-    give_up_s = time.monotonic() + _LONGEST_S
-    while len(took_ms) < _READS and time.monotonic() < give_up_s:
+    values: list[Any] = []
+    started_s = time.monotonic()
+    while True:
         begin_s = time.monotonic()
-        value = await read()
+        values = [*values[:1], await read()]
         took_ms.append(1e3 * (time.monotonic() - begin_s))
         await asyncio.sleep(0)
-    return value, float(np.percentile(took_ms, 50)), float(np.percentile(took_ms, 99))
+        since_s = time.monotonic() - started_s
+        enough = len(took_ms) >= _READS and since_s >= _SAMPLES_S
+        if enough or since_s >= _LONGEST_S:
+            break
+    p50_ms, p99_ms = (float(np.percentile(took_ms, share)) for share in (50, 99))
+    return TimedReads(values[0], values[-1], p50_ms, p99_ms)
 
 
 def probe_optics(config: Config) -> list[DeviceProbe]:

@@ -86,13 +86,16 @@ class InnerLoopState(StateNode):
     drift: pump_drift.PumpDriftState = field(default_factory=pump_drift.PumpDriftState)
     leak: leak_estimate.LeakEstimate = field(default_factory=leak_estimate.LeakEstimate)
     learned: bool = False  # the last tick has ended a segment of the probe
+    # Of the last automatic tick, and since when it is kept; None after any other tick
+    kept_output: LoopOutput | None = None
+    kept_s: float = 0.0
 
 
 class InnerLoop:
     """Two-degree-of-freedom PI(D) with feed-forward, on flow as a speed of the mirror's centre.
 
-    Call exactly one of `step`, `step_without_reading`, `follow_flow` and `resume_at_mean` per tick;
-    the first three may follow each other without a bump.
+    Call exactly one of `step`, `keep_output`, `step_without_reading`, `follow_flow` and
+    `resume_at_mean` per tick; the first four may follow each other without a bump.
     """
 
     def __init__(
@@ -160,6 +163,7 @@ class InnerLoop:
 
         The flow is the pump's present flow, or the mean it is known to need.
         """
+        self._forget_output()
         self.memory.measured.reset(displacement_um)
         self._hold_setpoint_at(displacement_um)
         self._ramp.place(math.nan)  # placed by the first step, which knows the trim
@@ -176,6 +180,7 @@ class InnerLoop:
         self.memory.learned = False
         if given.estimate is None and not math.isfinite(given.displacement_um):
             return self.step_without_reading(given, dt_s)
+        dt_s += self.memory.kept_s
         # 1. The wanted flow: the terms of the controller, the known disturbances, the ramp's speed
         weather_um_per_s = self._feedforward.update(
             given.ambient_pressure_pa, given.air_temperature_c, dt_s
@@ -216,9 +221,27 @@ class InnerLoop:
             )
         else:
             self.memory.leak.add_loss(given.estimate.leak_um_per_s, filtered_um, dt_s)
-        return self._make_output(
+        output = self._make_output(
             terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um
         )
+        self.memory.kept_output, self.memory.kept_s = output, 0.0
+        return output
+
+    def keep_output(self, given: LoopInput, dt_s: float) -> LoopOutput:
+        """Run one tick whose reading is that of an earlier one: the output stays.
+
+        A sensor slower than the loop gives such readings. The next `step` covers the time since the
+        last one, so the loop runs at the sensor's rate.
+        """
+        memory = self.memory
+        if memory.kept_output is None:
+            return self.step_without_reading(given, dt_s)
+        memory.learned = False
+        memory.kept_s += dt_s
+        return memory.kept_output
+
+    def _forget_output(self) -> None:
+        self.memory.kept_output, self.memory.kept_s = None, 0.0
 
     def _step_on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
         """PI(D) on the filtered reading: its terms, and the ramp's own speed."""
@@ -258,6 +281,7 @@ class InnerLoop:
         (docs/explanation/physics.md). A reading that is there (a pause) is filtered all the same,
         so that the error is the present one.
         """
+        self._forget_output()
         seen = math.isfinite(given.displacement_um)
         filtered_um = self._filter_reading(given.displacement_um, dt_s) if seen else math.nan
         if not math.isnan(self._ramp.value_um):
@@ -278,6 +302,7 @@ class InnerLoop:
         The setpoint stands at the last finite reading and the integrator at the flow, so that
         `step` continues from there; the target is not used.
         """
+        self._forget_output()
         seen = math.isfinite(given.displacement_um)
         if seen:
             self._filter_reading(given.displacement_um, dt_s)

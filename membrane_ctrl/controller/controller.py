@@ -33,6 +33,7 @@ from membrane_ctrl.controller import (
     states,
 )
 from membrane_ctrl.controller.observer import Observer
+from membrane_ctrl.controller.sample_rate import SampleRate
 from membrane_ctrl.controller.state import ControllerState, ReportedShape, make_first_state
 from membrane_ctrl.controller.telemetry_row import make_telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
@@ -108,6 +109,7 @@ class Controller:
         )
         self._estimation.set_gains(present.loop)
         self._consistency.set_gains(present.loop, present.pump)
+        self._sample_rate = SampleRate(memory.sample_rate)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
 
@@ -184,6 +186,13 @@ class Controller:
             interlock_level=context.interlocks.safe_level,
             interlock_words=context.interlocks.describe_open(context.interlocks.judged_mask),
         )
+        if not self._config.by_optics:
+            advances = observation.advance_age_s <= self._config.limits.stale_s
+            events += self._sample_rate.step(
+                inputs.now_s,
+                answered=inputs.reading is not None and advances,
+                fresh=observation.advance_age_s == 0.0,
+            )
         verdict = self._safety.judge(self.state, observation)
         self._apply_verdict(verdict, events)
         self._consider_resuming(observation)

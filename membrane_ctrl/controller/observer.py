@@ -68,6 +68,9 @@ class Observer:
         loop may follow the optics.
     gauge_pressure_pa : float
         The gauge reading; NaN without one or for a jump. The limits judge jumps too.
+    repeats_sample : bool
+        The answer is good, but it has the sample of an earlier tick: the sensor is slower than the
+        loop.
     optics_replace_laser : bool
         Those two are by figures: the laser is missing or stuck, or not used.
     figures : FigureGate
@@ -89,6 +92,7 @@ class Observer:
         self.reading: BenchReading | None = None
         self.laser_um = self.displacement_um = self.guard_um = self.gauge_pressure_pa = math.nan
         self.optics_guard_um = math.nan
+        self.repeats_sample = False
         self.optics_replace_laser = False
         self.link = NO_LINK_TROUBLE
 
@@ -122,9 +126,9 @@ class Observer:
                 memory.last_advance_s = now_s
                 memory.stamp = stamp
         uses_laser = not self._by_optics
-        self.laser_um = self._gate_displacement(
-            reading, fresh=memory.last_advance_s == now_s and uses_laser
-        )
+        fresh = memory.last_advance_s == now_s
+        self.repeats_sample = uses_laser and not fresh and math.isfinite(_good_quality_um(reading))
+        self.laser_um = self._gate_displacement(reading, fresh=fresh and uses_laser)
         same_s = memory.laser_repeats.same_s(self.laser_um, now_s)
         self._laser_same_s = same_s if math.isfinite(self.laser_um) else 0.0
         self.figures.judge_figure(now_s, inputs.estimate, self.moving_laser_um)

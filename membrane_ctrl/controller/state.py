@@ -17,6 +17,7 @@ from membrane_ctrl.controller.observer import ObserverState
 from membrane_ctrl.controller.resume_rule import ResumeState
 from membrane_ctrl.controller.safe_levels import SafeLevelsState
 from membrane_ctrl.controller.safety import SafetyState
+from membrane_ctrl.controller.sample_rate import SampleRateState
 from membrane_ctrl.controller.sensor_consistency import SensorConsistencyState
 from membrane_ctrl.controller.standstill import StandstillState
 from membrane_ctrl.controller.tick_context import TickContextState
@@ -56,6 +57,7 @@ class ControllerState(StateNode):
     observer: ObserverState = field(default_factory=ObserverState)
     standstill: StandstillState = field(default_factory=StandstillState)
     interlocks: InterlocksState = field(default_factory=InterlocksState)
+    sample_rate: SampleRateState = field(default_factory=SampleRateState)
     loop: InnerLoopState = field(default_factory=InnerLoopState)
     shape: ShapeLoopMemory = field(default_factory=ShapeLoopMemory)
     holders: CentreEstimationState = field(default_factory=CentreEstimationState)

@@ -424,10 +424,14 @@ def _begin_loop(context: TickContext, leak_um_per_s: float) -> State:
 
 
 def _drive_pump(context: TickContext, target_um: float) -> inner_loop.LoopOutput:
-    """Let the loop drive the pump: automatic with a valid reading, held mean flow without one."""
-    drive = context.loop.step_without_reading
-    if context.levels.safe_level == SafeLevel.NONE:
-        drive = context.loop.step
+    """Let the loop drive the pump: automatic with a new reading, the last output with one that
+    repeats, held mean flow without one.
+    """
+    drive = context.loop.step
+    if context.levels.safe_level != SafeLevel.NONE:
+        drive = context.loop.step_without_reading
+    elif context.observer.repeats_sample and context.estimate is None:
+        drive = context.loop.keep_output
     output = drive(_make_loop_input(context, target_um), context.dt_s)
     context.drive_by(output)
     return output
