@@ -59,10 +59,10 @@ class DeviceProbe:
     reading: str = ""  # one value, with its unit
     latency_p50_ms: float = math.nan  # of a read; NaN without one
     latency_p99_ms: float = math.nan
-    samples_hz: float = math.nan  # new samples of the displacement a second; NaN if not measured
     problem: str = ""  # what is wrong and what to do; empty if nothing
     notes: str = ""  # information that is not a problem
     facts: roles.BenchIdentity | None = None  # limits of the device that answered
+    samples_hz: float = math.nan  # new samples of the displacement a second; NaN if not measured
 
 
 def check_config(config: Config, source: str, as_json: bool) -> int:
