@@ -245,6 +245,8 @@ class Controller:
         measures with the laser.
         """
         context, observer = self._context, self._context.observer
+        if observer.repeats_sample and not self._estimation.blind:
+            return True  # rule `displacement_frozen` limits for how long
         if self.state == State.TUNE and not self._config.by_optics:
             return math.isfinite(observer.laser_um) or self._estimation.held_by_optics
         if self.state == State.MANUAL or context.paused:

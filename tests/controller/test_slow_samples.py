@@ -96,6 +96,13 @@ def test_a_board_at_half_the_rate_holds_as_well_as_a_loop_at_its_rate() -> None:
     assert "Lower loop.rate_hz to 100" in notice.message
 
 
+def test_a_board_at_a_quarter_of_the_rate_holds_without_a_fault() -> None:
+    ticks = run_hold(0.02, 40.0)
+    assert not any(isinstance(event, Fault) for tick in ticks for event in tick.events)
+    assert held_um(ticks, 25.0).std() < 0.15
+    assert "50 new samples a second in 200 answers" in str(notices(ticks)[0])
+
+
 def test_between_samples_the_output_stays() -> None:
     ticks = [tick.row for tick in run_hold(0.01, 22.0) if tick.row.state == State.HOLD]
     fractions = np.array([row.pump_fraction for row in ticks])
