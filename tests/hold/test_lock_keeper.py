@@ -152,7 +152,7 @@ def test_a_removal_that_fails_is_tried_again_at_the_end(
 def test_a_lock_that_another_program_stores_becomes_a_command_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lock_keeper, "_LOOK_S", 0.0)
+    monkeypatch.setattr(lock_keeper, "_CHECK_S", 0.0)
     asked: list[Command] = []
     other = LockStore([tmp_path])
     other.write_lock(Lock("tarep", "of an earlier run", "unix:ann"), DEVICES)
