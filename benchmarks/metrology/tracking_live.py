@@ -134,7 +134,7 @@ def _measured(screen: Panel) -> list[Figure]:
         begin_s, busy_s = clock.now(), time.process_time()
         for _ in range(FRAMES):
             clock.sleep(max(due_s - clock.now(), 0.0))
-            due_s = max(due_s + tracker.slower / RATE_HZ, clock.now())
+            due_s = max(due_s + tracker.interval_factor / RATE_HZ, clock.now())
             one = cycle.run_cycle()
             assert isinstance(one, CycleDone)
             verdicts.append(one.estimate.verdict)

@@ -133,7 +133,7 @@ def _make_reconstructor(
     return (
         tracker,
         replace(plan, standing=lambda: tracker.pattern),
-        lambda: tracker.slower / shape.track_rate_hz,
+        lambda: tracker.interval_factor / shape.track_rate_hz,
     )
 
 

@@ -267,7 +267,7 @@ class Film:
             time_s, um = at_s + 13.0 + since_s, float(self.moved_um[round(50 * since_s)])
             picture = renderer.render_picture(self.tracker.pattern, um, time_s=time_s)
             hold.take(self.tracker.fringes([picture], np.array([time_s]), np.array([np.nan])))
-            since_s += self.tracker.slower / 20
+            since_s += self.tracker.interval_factor / 20
         hold.settle(HandClock.moment_s + 0.1)
 
 

@@ -30,18 +30,29 @@ from membrane_ctrl.metrology.uncertainty.motion_evidence import (
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 _RENEWED_EVERY_S = 0.4
-# variance of a frame's saddle since the first frames, over that of a frame: their mean has errors
+# Variance of a frame's saddle since the first frames over that of a frame's saddle: the mean of the
+# first frames has errors.
 _SADDLE_VARIANCE = 1.5
 _BLOCKS = 14  # squares along the diameter whose errors count as independent, as in `FrameFitter`
 
 
 @dataclass(frozen=True)
 class _Scores:
-    """Products with the slopes that no surface has."""
+    """Products of phase errors with the slopes of motions that no surface has.
 
-    left: FloatArray  # q (components,)
-    covariance: FloatArray  # (components, components): from the scatter of squares of the mirror
-    gram: FloatArray  # G (components, components)
+    Attributes
+    ----------
+    left : (components,) array
+        q.
+    covariance : (components, components) array
+        Covariance of q, from the scatter of squares of the mirror.
+    gram : (components, components) array
+        G.
+    """
+
+    left: FloatArray
+    covariance: FloatArray
+    gram: FloatArray
 
 
 @dataclass
@@ -49,11 +60,20 @@ class _FirstSaddle:
     """Saddle of the ring in the first frames.
 
     An error of the reference is a saddle of all frames: they are compared with the first ones.
+
+    Attributes
+    ----------
+    mean_mm : (2,) array
+        Mean saddle of the first frames since the reference.
+    count : int
+        Frames in the mean.
+    is_settled : bool
+        Whether the first five steps have given the bins their phases.
     """
 
-    mean_mm: FloatArray = field(default_factory=lambda: np.zeros(2))  # since the reference
-    count: int = 0  # frames in it
-    is_settled: bool = False  # the first five steps have given the bins their phases
+    mean_mm: FloatArray = field(default_factory=lambda: np.zeros(2))
+    count: int = 0
+    is_settled: bool = False
 
     def compare(self, saddle_mm: FloatArray) -> FloatArray:
         """Change (2,) since the first frames of a saddle since the reference (2,)."""
@@ -82,12 +102,15 @@ class BenchWatch:
     fitter: FrameFitter
     _effects: MotionEffects = field(init=False)
     _reference: CrossedScene = field(init=False)
-    _anchor: _Scores = field(init=False)  # what the bins' own phases took
+    _anchor: _Scores = field(init=False)  # the part that the bins' own phases contain
 
     def __post_init__(self) -> None:
-        scene = self._reference = self.fitter.scene
+        scene = self.fitter.scene
         cells = scene.cells
-        # Motions vary slowly over the mirror: one ray in the middle of each cell is enough.
+        self._reference = scene
+
+        # Signatures of the motions. They vary slowly over the mirror: one ray in the middle of each
+        # cell is enough.
         rays = cells.planes(scene.points.rays)[:, 0].astype(float)
         rays /= np.linalg.norm(rays, axis=0)
         points = ray_tracing.Points.of(rays, np.zeros((2, rays.shape[1])))
@@ -103,15 +126,20 @@ class BenchWatch:
         jacobian = self.fitter.jacobian[:, :, 0].astype(float)
         weights = cells.sums(self._bin_weights(scene)).astype(float)
         self._effects = MotionEffects.of(scene.rad_per_mm * changes_mm, jacobian, weights)
+
+        # The square of the mirror that each cell is in.
         place = (scene.position_mm / scene.surface.radius_mm + 1) / 2 * _BLOCKS
         column, row = np.floor(cells.planes(place)[:, 0]).astype(int)
         self._square = (row + 1) * (_BLOCKS + 2) + column + 1
+
+        # What is known of the frames so far: nothing.
+        none = np.zeros(bench_motions.COMPONENTS)
+        no_scatter = np.zeros((none.size, none.size))
         self._saddle = _FirstSaddle()
         self._test: MotionTest | None = None
         self._tested_s = math.nan
-        self._before = none = np.zeros(bench_motions.COMPONENTS)
-        square = np.zeros((none.size, none.size))
-        self._anchor = _Scores(none, square, self._effects.gram(weights))
+        self._anchor_left = none
+        self._anchor = _Scores(none, no_scatter, self._effects.gram(weights))
 
     @staticmethod
     def _bin_weights(scene: CrossedScene) -> FloatArray:
@@ -119,9 +147,14 @@ class BenchWatch:
         return np.asarray(scene.light_adu[1:] ** 2 * scene.edge / 2)
 
     def take_scene(self, scene: CrossedScene, moved_mm: FloatArray) -> None:
-        """Keep what the bins' own phases of a new scene have taken since the reference.
+        """Keep the evidence that the bins' own phases of a new scene contain.
 
-        `moved_mm` (parameters,) is by how much the figures of its steps move with it.
+        Parameters
+        ----------
+        scene : CrossedScene
+            The new scene.
+        moved_mm : (parameters,) array
+            Change of the figures of its steps.
         """
         self._saddle.settle(ring_saddle() @ moved_mm)
         weights = self._bin_weights(scene)
@@ -130,11 +163,10 @@ class BenchWatch:
         self._test = None
 
     def _scores(self, values: AnyArray, weights: AnyArray) -> _Scores:
-        """Of weighted phase errors (2, n) of the bins and their weights (2, n)."""
+        """Scores of weighted phase errors (2, n) of the bins, with their weights (2, n)."""
         cells = self._reference.cells
         sums = cells.sums(values).astype(float)
-        left = self._effects.left
-        parts = np.einsum("kan,an->kn", left, sums)
+        parts = np.einsum("kan,an->kn", self._effects.left, sums)
         squares = sums_by(self._square, parts, (_BLOCKS + 2) ** 2)
         gram = self._effects.gram(cells.sums(weights).astype(float))
         return _Scores(parts.sum(axis=1), squares @ squares.T, gram)
@@ -147,33 +179,55 @@ class BenchWatch:
         covariance_mm2: FloatArray,
         time_s: float,
     ) -> MotionFinding:
-        """The motions that explain a frame.
+        """Find the motions that explain a frame.
 
-        `fitter` is that of the frame, `covariance_mm2` (parameters, parameters) that of its fit.
-        How well all is known is renewed twice a second: it costs a fifth of a fit.
+        The covariances of the test are renewed twice a second: they cost a fifth of a fit.
+
+        Parameters
+        ----------
+        fit : FrameFit
+            The frame's solution.
+        shifts_rad : (float, float)
+            Its phase steps.
+        fitter : FrameFitter
+            Which made the fit.
+        covariance_mm2 : (parameters, parameters) array
+            Covariance of the fit.
+        time_s : float
+            Time of the frame.
         """
         errors, weights = fitter.phase_errors(fit, shifts_rad)
         if self._test is None or not abs(time_s - self._tested_s) < _RENEWED_EVERY_S:
             self._tested_s = time_s
             self._renew_test(self._scores(errors, weights), covariance_mm2)
         assert self._test is not None
+
+        # Evidence of the slopes that no surface has: of this frame, and of the bins' own phases.
         sums = self._reference.cells.sums(errors).astype(float)
-        signatures = self._effects.left.reshape(len(self._before), -1)
-        left = signatures @ sums.ravel() + self._before
+        signatures = self._effects.left.reshape(len(self._anchor_left), -1)
+        left = signatures @ sums.ravel() + self._anchor_left
+
+        # Evidence of the ring: its tilt since the reference, its saddle since the first frames.
         moved_mm = fit.surface.parameters - self._reference.surface.parameters
         saddle_mm = self._saddle.compare(ring_saddle() @ moved_mm)
         return self._test.find(ring_tilt() @ moved_mm, saddle_mm, left)
 
-    def _renew_test(self, now: _Scores, covariance_mm2: FloatArray) -> None:
-        """Take from a frame how well ring and slopes are known."""
-        before, ring, saddle = self._anchor, ring_tilt(), ring_saddle()
-        # A frame shows less than five steps where a hand covers it: both in the frame's weights.
-        share = float(np.trace(now.gram) / np.trace(before.gram))
-        self._before = share * before.left
+    def _renew_test(self, of_frame: _Scores, covariance_mm2: FloatArray) -> None:
+        """Renew the covariances of ring and slopes from a frame.
+
+        `covariance_mm2` (parameters, parameters) is that of its fit.
+        """
+        tilt = ring_tilt()
+        saddle = ring_saddle()
+        # A hand may cover bins of this frame that the five steps saw: both count with the frame's
+        # weights.
+        share = float(np.trace(of_frame.gram) / np.trace(self._anchor.gram))
+        self._anchor_left = share * self._anchor.left
+        slopes_covariance = of_frame.covariance + share**2 * self._anchor.covariance
         self._test = MotionTest(
             self._effects,
-            ring @ covariance_mm2 @ ring.T,
-            SlopeEvidence(now.covariance + share**2 * before.covariance, now.gram),
+            tilt @ covariance_mm2 @ tilt.T,
+            SlopeEvidence(slopes_covariance, of_frame.gram),
             _SADDLE_VARIANCE * (saddle @ covariance_mm2 @ saddle.T),
         )
 

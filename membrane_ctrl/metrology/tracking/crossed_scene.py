@@ -14,9 +14,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
-from membrane_ctrl.metrology.tracking.bin_cells import (
-    Cells,
-)
+from membrane_ctrl.metrology.tracking.bin_cells import Cells
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
@@ -25,31 +23,66 @@ RESPONSE_POWERS = (2, 3, 4, 5)
 
 @dataclass(frozen=True)
 class CrossedScene:
-    """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius, cell by
-    cell.
+    """The bench as a frame of crossed fringes sees it.
+
+    It has n bins inside the analysis radius, in the order of their cells.
+
+    Attributes
+    ----------
+    tracer : Tracer
+        The bench, with the vertex of the reference.
+    surface : Surface
+        The reference's surface.
+    bin_px : int
+        Side of a bin.
+    index : (n,) int array
+        Numbers of the bins, row by row.
+    row : (n,) int array
+        Row of bins that each is in.
+    cells : Cells
+        Squares of bins over which slow changes are planes.
+    points : Points
+        The bins' rays; `t_mm` follows the surface that was traced last.
+    beyond_mm : (2, n) array
+        Screen points of the reference less the traced ones.
+    light_adu : (3, n) array
+        Mean level and swings of x and y.
+    basis : (terms, n) array
+        Zernike terms at the bins, for what changes smoothly.
+    taper : (n,) array
+        Weight, which fades to 0 where the bins end.
+    edge : (n,) array
+        The same, 0 for bins that changed between the last five steps.
+    position_mm : (2, n) array
+        The bins on the mirror.
+    response : (4,) array
+        Deviation of the panel's response from a straight line, sum c_k (v^k - v), k = 2..5; zeros
+        if it is straight.
+    rad_per_mm : float
+        Phase of the fringes on the screen.
+    half_side_mm : float
+        Half the side of the pattern.
     """
 
-    tracer: ray_tracing.Tracer  # the bench with the vertex of the reference
-    surface: Surface  # of the reference
+    tracer: ray_tracing.Tracer
+    surface: Surface
     bin_px: int
-    index: IntArray  # (n,): bins, counted row by row
-    row: IntArray  # (n,): of the picture, that each is in
+    index: IntArray
+    row: IntArray
     cells: Cells
-    points: ray_tracing.Points  # their rays; `t_mm` moves with the surface that was traced last
-    beyond_mm: FloatArray  # (2, n): screen points of the reference less the traced ones
-    light_adu: FloatArray  # (3, n): mean level and swings of x and y
-    basis: Singles  # (terms, n): Noll's order at the bins, for what changes smoothly
-    taper: Singles  # (n,): weight, which fades to 0 where the bins end
-    edge: Singles  # (n,): the same, 0 for bins that changed between the last five steps
-    position_mm: FloatArray  # (2, n): on the mirror
-    # (4,): deviation of the panel's response from a straight line, sum c_k (v^k - v), k = 2..5;
-    # zeros if straight
+    points: ray_tracing.Points
+    beyond_mm: FloatArray
+    light_adu: FloatArray
+    basis: Singles
+    taper: Singles
+    edge: Singles
+    position_mm: FloatArray
     response: FloatArray
     rad_per_mm: float
-    half_side_mm: float  # of the pattern
+    half_side_mm: float
 
     def phase_rad(self, shape: Surface) -> FloatArray:
-        """Phases (2, n) of x and y that a surface shows, counted from the low edge's -pi.
+        """Phases (2, n) of x and y that a surface shows; the pattern's low edge is at -pi.
 
         The ring does not move: a deeper bowl has its vertex lower.
         """
@@ -63,15 +96,14 @@ class CrossedScene:
 
     def jacobian(self, shape: Surface) -> Singles:
         """Change (2, parameters, n) of the phases per mm of each parameter of the surface."""
+        # Central differences.
         out = np.empty((2, PARAMETERS, self.index.size), np.float32)
+        parameters = shape.parameters
         for k, change_mm in enumerate(np.eye(PARAMETERS) * _STEP_MM):
-            above, below = (
-                self.phase_rad(
-                    Surface.from_parameters(shape.parameters + sign * change_mm, shape.radius_mm)
-                )
-                for sign in (1, -1)
-            )
-            out[:, k] = (above - below) / (2 * _STEP_MM)
+            above = Surface.from_parameters(parameters + change_mm, shape.radius_mm)
+            below = Surface.from_parameters(parameters - change_mm, shape.radius_mm)
+            difference_rad = self.phase_rad(above) - self.phase_rad(below)
+            out[:, k] = difference_rad / (2 * _STEP_MM)
         return out
 
     def harmonics_adu(self, phase_rad: FloatArray) -> FloatArray:

@@ -38,14 +38,18 @@ _ASTRAY_MM = 2.0  # steps beyond this are too far from linear
 # 0.3 nm off at most.
 _LINEAR_MM = 1e-3
 _SLOW = 0.3  # a step that is longer than this share of the last one requires a new matrix
-Shifts = tuple[float, float]  # phase steps of x and y
 _UNKNOWNS = PARAMETERS + 3 * ZERNIKE_TERMS
 # First unknown of each wave: phi_x, phi_y (both the surface's), A, B_x and B_y.
 _STARTS = 0, 0, PARAMETERS, PARAMETERS + ZERNIKE_TERMS, PARAMETERS + 2 * ZERNIKE_TERMS
 # Squares along the mirror's diameter whose errors count as independent: 2.3 fringes each. In
 # smaller ones slow changes of light leave more than they do in all.
 _BLOCKS = 14
+# Overlapping squares: mean of the sum of squares of the four shares of a bin, along x and y.
+_OVERLAP = 0.75
 _EVERY = 3  # residuals between those of which the median is taken
+_SIGMA_OVER_MAD = 1.4826  # of normal numbers
+
+Shifts = tuple[float, float]  # phase steps of x and y
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,7 @@ class FrameFit:
     @cached_property
     def scale_adu(self) -> float:
         """Robust sigma of the residual."""
-        return 1.4826 * float(np.median(np.abs(self.residual_adu[::_EVERY])))
+        return _SIGMA_OVER_MAD * float(np.median(np.abs(self.residual_adu[::_EVERY])))
 
 
 class FrameFitter:
@@ -131,7 +135,7 @@ class FrameFitter:
         -------
         FrameFit
         """
-        if self._inverse is not None and len(self._inverse) != _UNKNOWNS + len(self.bands.waves):
+        if self._inverse is not None and len(self._inverse) != self._count_unknowns():
             self._inverse = None
         inherited = self._inverse is not None
         found = self._descend(seen_adu, shifts_rad, start, reach_adu, patient=False)
@@ -233,7 +237,7 @@ class FrameFitter:
         )
 
     def _right(self) -> FloatArray:
-        """J^T W r (144 + 2 k,) of the last evaluation."""
+        """J^T W r of the last evaluation: (parameters + 3 terms + 2 bands,)."""
         of_bands = np.zeros(0)
         if len(self.bands.waves):
             of_bands = self.bands.waves @ self.rows()[0]
@@ -278,73 +282,128 @@ class FrameFitter:
         return np.asarray(matrix * np.outer(scale, scale))
 
     def covariance_mm2(self, fit: FrameFit, shifts_rad: Shifts, noise_adu: float) -> FloatArray:
-        """Covariance (parameters, parameters) of the parameters from what the fit leaves, or from
-        the noise where that is larger.
+        """Covariance of the surface's parameters, from what the fit leaves, or from the noise where
+        that is larger.
 
-        Errors of neighbouring bins belong together (light that wanders): what a square contributes
-        to the solution counts as one error, and the squares as independent. Maps of light are
-        refitted with the surface, so that their errors are in it.
+        Errors of neighbouring bins are correlated, because light changes slowly over the mirror:
+        what a square of bins contributes to the solution counts as one error, and the squares as
+        independent. The maps of light are fitted with the surface, so that their errors are
+        included.
+
+        Parameters
+        ----------
+        fit : FrameFit
+            A solution of this scene.
+        shifts_rad : (float, float)
+            Phase steps of its frame.
+        noise_adu : float
+            Noise of a bin.
+
+        Returns
+        -------
+        (parameters, parameters) array
+            In mm^2; NaN if the bins do not determine the unknowns.
         """
-        if self._inverse is None or len(self._inverse) != _UNKNOWNS + len(
-            self.bands.waves
-        ):  # the last was refused
+        is_usable = self._inverse is not None and len(self._inverse) == self._count_unknowns()
+        if not is_usable:
             self._inverse = self._inverted(shifts_rad, fit.surface, fit.light, fit.weights)
         if self._inverse is None:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
+
+        # Effect of each bin's residual on the parameters: the inverse times what changes slowly,
+        # times the fringes. Bands are left out: they change the errors by a thousandth.
         gain = self._inverse[:PARAMETERS].astype(np.float32)
-        parts = zip(_STARTS, (*self.jacobian, *[self._basis] * 3), strict=True)
+        slow_planes = (*self.jacobian, *[self._basis] * 3)
         slow = np.stack(
-            [np.tensordot(gain[:, at : at + PARAMETERS], planes, 1) for at, planes in parts], axis=1
+            [
+                np.tensordot(gain[:, first : first + PARAMETERS], planes, 1)
+                for first, planes in zip(_STARTS, slow_planes, strict=True)
+            ],
+            axis=1,
         )
-        waves = self._waves(shifts_rad, fit.surface, fit.light)[
-            :5
-        ]  # what bands pull changes errors by a thousandth
-        sums = self.in_squares(slow, waves * (self.scene.edge * fit.weights * fit.residual_adu))
+        waves = self._waves(shifts_rad, fit.surface, fit.light)[:5]
+        weighted_residual = self.scene.edge * fit.weights * fit.residual_adu
+        sums = self.in_squares(slow, waves * weighted_residual)
+
+        # Scatter of the squares' effects, enlarged for the fitted degrees of freedom.
         used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
-        seen = sums @ sums.T * (used / max(used - PARAMETERS, 1))
-        grown = np.sqrt(
-            np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen))
-        )
-        return np.asarray(seen * np.outer(grown, grown))
+        scatter = sums @ sums.T * (used / max(used - PARAMETERS, 1))
+
+        # Not less than the noise of the pixels.
+        noise_over_scatter = noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(scatter)
+        factor = np.sqrt(np.maximum(1.0, noise_over_scatter))
+        return np.asarray(scatter * np.outer(factor, factor))
+
+    def _count_unknowns(self) -> int:
+        """Unknowns of a fit with the present bands."""
+        return _UNKNOWNS + len(self.bands.waves)
 
     def phase_errors(self, fit: FrameFit, shifts_rad: Shifts) -> tuple[Singles, Singles]:
-        """Products (2, n) of a frame's residual with the light's derivatives by both phases, and
-        the squares of these derivatives (2, n), both weighted as the fit does.
+        """Errors of the phases that a frame's residual shows, and their weights.
+
+        Parameters
+        ----------
+        fit : FrameFit
+            A solution of this scene.
+        shifts_rad : (float, float)
+            Phase steps of its frame.
+
+        Returns
+        -------
+        errors : (2, n) array
+            Residual times the light's derivatives by the phases of x and y, weighted as in the fit.
+        weights : (2, n) array
+            Squares of these derivatives, weighted likewise.
         """
         waves = self._waves(shifts_rad, fit.surface, fit.light)[:2]
         weights = self.scene.edge * fit.weights
         return waves * (weights * fit.residual_adu), waves**2 * weights
 
     def in_squares(self, slow: Singles, values: AnyArray) -> FloatArray:
-        """Sums (rows, squares) over squares of the mirror whose errors count as independent.
+        """Sums over squares of the mirror whose errors count as independent.
 
-        `slow` (rows, k, 3, N) are what values (k, n) are multiplied by. Squares of 2.3 fringes fade
-        into their
-        neighbours: what cancels over whole fringes cancels in each. Their sums are as large as
-        those of squares that do not overlap.
+        Squares of 2.3 fringes fade into their neighbours: what cancels over whole fringes cancels
+        in each. Their sums are as large as those of squares that do not overlap.
+
+        Parameters
+        ----------
+        slow : (rows, k, 3, N) array
+            Planes over the cells, by which the values are multiplied.
+        values : (k, n) array
+            Values of the bins.
+
+        Returns
+        -------
+        (rows, squares) array
         """
+        # Place of the bins in units of a square; each is shared by the four nearest squares.
         place = (self.scene.position_mm / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
         low = np.floor(self._cells.planes(place)[:, 0]).astype(int)
         upper = np.sin(np.pi / 2 * np.clip(place - self._cells.each(low), 0, 1)) ** 2
         (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
         side = _BLOCKS + 2
-        number, total = low[1] * side + low[0], np.zeros((len(slow), side**2))
-        for share, on in (
+        low_square = low[1] * side + low[0]
+        shares_of_squares = (
             (left * below, 0),
             (right * below, 1),
             (left * above, side),
             (right * above, side + 1),
-        ):
+        )
+        total = np.zeros((len(slow), side**2))
+        for share, offset in shares_of_squares:
             pull = np.einsum("pkiq,kiq->pq", slow, self._cells.moments(share * values))
-            total += sums_by(number + on, pull, side**2)
-        return np.asarray(total / 0.75)  # mean of the squares of the four shares: 0.75^2
+            total += sums_by(low_square + offset, pull, side**2)
+        return np.asarray(total / _OVERLAP)
 
     def period_um(self) -> FloatArray:
-        """Change (2, parameters) of the parameters that looks like one period along x, along y, in
-        all of the mirror."""
+        """Change (2, parameters) of the parameters, µm, that looks most like one period along x,
+        and one along y, all over the mirror.
+        """
+        # Least squares for a change of 2 pi of the phases of one axis, and none of the other.
         means = self.jacobian[:, :, 0].astype(float)
         matrix = sum(j @ j.T for j in means)
-        return np.stack([1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1)) for j in means])
+        changes_mm = [np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1)) for j in means]
+        return np.stack([1e3 * change_mm for change_mm in changes_mm])
 
 
 def _reduce_phase(phase_rad: FloatArray) -> Singles:

@@ -1,5 +1,5 @@
-"""Tracking in a hold: a full cycle anchors it, then every frame of the crossed pattern is a
-figure.
+"""Tracking in a hold: a full cycle is the reference, then every frame of the crossed pattern gives
+a figure.
 
 The controller's inputs are recorded exactly, twenty figures a second of them: numbers are rounded
 to what their noise leaves of them, and the covariance stays the same for many frames.
@@ -26,16 +26,21 @@ from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
-# A gust may lose the order of a few frames, which the next ones have again.
+# A full cycle is needed after frames without fringe orders for this long: a gust may lose the order
+# of a few frames, and the next ones have it again.
 LOST_S = 1.0
-# A new covariance is 100 times a figure in the record: one for each step of the pattern.
-COVARIANCE_S = 10.0
-# A hand or a lamp goes away by itself, and meanwhile a full cycle would be rejected too.
+# A full cycle is needed after rejected frames for this long: a hand or a lamp goes away by itself,
+# and meanwhile a full cycle would be rejected too.
 REJECTED_S = 10.0
-# The interval between frames is longer in two of three steps: vibrations faster than half the frame
-# rate then have different aliases (`modes`).
-_SLOWER = (1.0, 1.09, 1.17)
-_UM, _SHARE, _TIME_S = 3, 4, 6  # decimals: a nanometre, a hundredth of a per cent, a microsecond
+# Interval between new covariances: in the record, one takes as much space as 100 figures.
+COVARIANCE_S = 10.0
+# Factors of the interval between frames: with three rates, vibrations faster than half the frame
+# rate have different aliases (`vibrations.mode_search`).
+_INTERVAL_FACTORS = (1.0, 1.09, 1.17)
+# Decimals of recorded numbers.
+_UM_DECIMALS = 3  # a nanometre
+_SHARE_DECIMALS = 4  # a hundredth of a per cent
+_TIME_DECIMALS = 6  # a microsecond
 
 
 class LiveTracker:
@@ -65,14 +70,23 @@ class LiveTracker:
         step_s: float,
         exposure_s: float = 0.0,
     ) -> None:
-        self._optics, self._cycles = optics, cycles
+        self._optics = optics
+        self._cycles = cycles
         self.patterns = crossed_patterns(periods)
-        self._step_s, self._exposure_s = step_s, exposure_s
+        self._step_s = step_s
+        self._exposure_s = exposure_s
         self._tracker: Tracker | None = None
-        self._urad_per_rad = math.nan
-        self._step, self._stepped_s = 0, -math.inf
-        self._covariance_um2, self._covariance_until_s = np.empty((0, 0)), -math.inf
-        self._lost_since_s = self._rejected_since_s = math.inf
+        self._urad_per_rad = math.nan  # slope that turns the phases by 1 rad
+        self._covariance_um2 = np.empty((0, 0))
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin with the first step of the pattern, and with frames that are not lost."""
+        self._step = 0
+        self._stepped_s = -math.inf
+        self._covariance_until_s = -math.inf
+        self._lost_since_s = math.inf
+        self._rejected_since_s = math.inf
 
     @property
     def pattern(self) -> Pattern:
@@ -80,80 +94,92 @@ class LiveTracker:
         return self.patterns[self._step % ENOUGH_STEPS]
 
     @property
-    def slower(self) -> float:
-        """How much longer than usual the interval to the next frame is."""
-        return _SLOWER[self._step % len(_SLOWER)]
+    def interval_factor(self) -> float:
+        """Interval to the next frame over the shortest one."""
+        return _INTERVAL_FACTORS[self._step % len(_INTERVAL_FACTORS)]
 
     def full(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
     ) -> ShapeEstimate:
-        """The figure of a full cycle, which anchors the frames after it. As
-        `LiveReconstructor.full`.
+        """Measure the figure of a full cycle, which becomes the reference of the frames after it.
+
+        Parameters and result as those of `LiveReconstructor.full`.
         """
         estimate = self._cycles.full(frames, time_s, displacement_um)
         self._tracker = None
         if estimate.verdict == "rejected":
             return estimate
         try:
-            self._tracker = self._anchored(frames, np.asarray(displacement_um, float))
+            self._tracker = self._make_tracker(frames, np.asarray(displacement_um, float))
         except (bin_view.NoFigureError, ValueError) as error:
-            times, readings = np.asarray(time_s, float), np.asarray(displacement_um, float)
             return live_reconstructor.make_rejected_cycle(
-                "full", times, readings, f"no anchor for tracking: {error}"
+                "full",
+                np.asarray(time_s, float),
+                np.asarray(displacement_um, float),
+                f"no anchor for tracking: {error}",
             )
-        self._step, self._stepped_s, self._covariance_until_s = 0, -math.inf, -math.inf
-        self._lost_since_s = self._rejected_since_s = math.inf
+        self._begin()
         return estimate
 
     def fringes(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
     ) -> ShapeEstimate:
-        """The figure of one frame of `pattern`. An estimate with `tracking_lost` asks for a full
-        cycle.
+        """Measure the figure of one frame of `pattern`.
+
+        An estimate with `tracking_lost` requests a full cycle.
         """
-        at_s = round(float(np.asarray(time_s)[0]) + self._exposure_s / 2, _TIME_S)
-        reading_um = round(float(np.asarray(displacement_um)[0]), _UM)
+        at_s = round(float(np.asarray(time_s)[0]) + self._exposure_s / 2, _TIME_DECIMALS)
+        reading_um = round(float(np.asarray(displacement_um)[0]), _UM_DECIMALS)
         if self._tracker is None:
-            none = np.array([at_s]), np.array([reading_um])
             return live_reconstructor.make_rejected_cycle(
-                "track", *none, live_reconstructor.NOTHING_TO_FOLLOW, tracking_lost=True
+                "track",
+                np.array([at_s]),
+                np.array([reading_um]),
+                live_reconstructor.NOTHING_TO_FOLLOW,
+                tracking_lost=True,
             )
         shown = self.pattern
         found = self._tracker.follow(
             frames[0], (shown.shift_rad, shown.shift_y_rad), at_s, reading_um
         )
         if found.verdict != "rejected":
-            self._next_step(at_s)
+            self._advance_pattern(at_s)
             if at_s >= self._covariance_until_s:
-                self._covariance_um2, self._covariance_until_s = (
-                    found.covariance_um2,
-                    at_s + COVARIANCE_S,
-                )
+                self._covariance_um2 = found.covariance_um2
+                self._covariance_until_s = at_s + COVARIANCE_S
             found = replace(found, covariance_um2=self._covariance_um2)
-        return _make_estimate(found, reading_um, self._astray(found), self._urad_per_rad)
+        needs_full_cycle = self._update_losses(found)
+        return _make_estimate(found, reading_um, needs_full_cycle, self._urad_per_rad)
 
     def prepare(self) -> None:
-        """Do ahead what the next frame needs, while its pattern settles."""
+        """Compute in advance what the next frame needs, while its pattern settles."""
         if self._tracker is not None:
             self._tracker.prepare((self.pattern.shift_rad, self.pattern.shift_y_rad))
 
-    def _anchored(self, frames: Sequence[Image], displacement_um: FloatArray) -> Tracker:
-        """A tracker that begins with the figure of a full cycle. Raises NoFigureError,
-        ValueError.
+    def _make_tracker(self, frames: Sequence[Image], displacement_um: FloatArray) -> Tracker:
+        """A tracker whose reference is a full cycle.
+
+        Raises NoFigureError or ValueError if the cycle gives no scene for the crossed pattern.
         """
+        # A geometry without a reference belongs to the first laser reading of the hold.
         optics = self._optics
         known = displacement_um[np.isfinite(displacement_um)]
         if optics.geometry.reference_displacement_um is None and known.size:
             geometry = optics.geometry.model_copy(
                 update={"reference_displacement_um": float(known[0])}
             )
-            optics = self._optics = optics.model_copy(update={"geometry": geometry})
+            optics = optics.model_copy(update={"geometry": geometry})
+            self._optics = optics
+
+        # The cycle as a capture set: checked, measured, and turned into a scene.
         patterns = tuple(pattern_sequence.full_sequence(optics.pattern))
         pictures: Any = np.asarray(frames)  # of one kind, as the frames are
         stack = frame_stack.FrameStack(pictures, patterns, displacement_um, {})
-        seen = set_check.check_set(stack, optics)
+        checked = set_check.check_set(stack, optics)
+        figure = bin_figure.bin_figure(optics, checked)
         period_mm = optics.pattern.periods * optics.pattern.period_mm / self.pattern.index
-        scene = make_scene(optics, seen, bin_figure.bin_figure(optics, seen), period_mm)
+        scene = make_scene(optics, checked, figure, period_mm)
+
         gain = slope_noise.slope_per_screen(
             scene.tracer.geometry, scene.surface.radius_mm, scene.surface.sag_mm
         )
@@ -162,57 +188,64 @@ class LiveTracker:
         size_px = camera.height_px, camera.width_px
         return Tracker(scene, size_px, 2**camera.bits - 1, camera.noise_adu, stack.mean_reading_um)
 
-    def _next_step(self, now_s: float) -> None:
-        """Step the pattern if it is time."""
+    def _advance_pattern(self, now_s: float) -> None:
+        """Go to the next step of the pattern if it is time; the first five follow each other."""
         if self._step < ENOUGH_STEPS or now_s - self._stepped_s >= self._step_s:
-            self._step, self._stepped_s = self._step + 1, now_s
+            self._step += 1
+            self._stepped_s = now_s
 
-    def _astray(self, found: TrackedFrame) -> bool:
-        """Whether the mirror must be found again by a full cycle."""
-        if found.verdict != "rejected":
+    def _update_losses(self, found: TrackedFrame) -> bool:
+        """Update since when frames are lost or rejected; return whether a full cycle is needed."""
+        is_rejected = found.verdict == "rejected"
+        if not is_rejected:
             self._rejected_since_s = math.inf
         self._rejected_since_s = min(self._rejected_since_s, found.time_s)
-        self._lost_since_s = min(self._lost_since_s, found.time_s) if found.lost else math.inf
-        return found.time_s - self._lost_since_s >= LOST_S or (
-            found.verdict == "rejected" and found.time_s - self._rejected_since_s >= REJECTED_S
-        )
+        if found.lost:
+            self._lost_since_s = min(self._lost_since_s, found.time_s)
+        else:
+            self._lost_since_s = math.inf
+        lost_for_long = found.time_s - self._lost_since_s >= LOST_S
+        rejected_for_long = is_rejected and found.time_s - self._rejected_since_s >= REJECTED_S
+        return lost_for_long or rejected_for_long
 
 
 def crossed_patterns(periods: int) -> tuple[Pattern, ...]:
-    """The steps of the crossed pattern: 72 degrees in x and 144 in y separate the axes."""
+    """Return the five steps of the crossed pattern, `periods` fringes over the screen's pattern.
+
+    72 degrees in x and 144 degrees in y from step to step separate the axes.
+    """
     turn = 2 * math.pi
-    return tuple(
-        Pattern(
-            "crossed",
-            "",
-            periods,
-            turn * k / ENOUGH_STEPS,
-            shift_y_rad=turn * (2 * k % ENOUGH_STEPS) / ENOUGH_STEPS,
-        )
-        for k in range(ENOUGH_STEPS)
-    )
+    patterns = []
+    for k in range(ENOUGH_STEPS):
+        shift_x_rad = turn * k / ENOUGH_STEPS
+        shift_y_rad = turn * (2 * k % ENOUGH_STEPS) / ENOUGH_STEPS
+        patterns.append(Pattern("crossed", "", periods, shift_x_rad, shift_y_rad=shift_y_rad))
+    return tuple(patterns)
 
 
 def _make_estimate(
-    found: TrackedFrame, reading_um: float, tracking_lost: bool, urad: float
+    found: TrackedFrame, reading_um: float, tracking_lost: bool, urad_per_rad: float
 ) -> ShapeEstimate:
-    """The figure of a frame as control and recorder take it; `urad` of slope turn the phases by 1
-    rad.
+    """The figure of a frame for control and recorder, rounded to what its noise leaves of it.
+
+    `urad_per_rad` is the slope that turns the phases by 1 rad.
     """
+    # Adding 0 turns a minus zero into a zero, which is a whole number to the recorder.
+    coeffs_um = np.round(found.coeffs_um, _UM_DECIMALS) + 0.0
     return ShapeEstimate(
         time_s=found.time_s,
         kind="track",
-        coeffs_um=np.round(found.coeffs_um, _UM)
-        + 0.0,  # a minus zero is no whole number to the recorder
-        hencky_um=round(found.hencky_um, _UM),
+        coeffs_um=coeffs_um,
+        hencky_um=round(found.hencky_um, _UM_DECIMALS),
         covariance_um2=found.covariance_um2,
-        sag_um=round(found.sag_um, _UM + 1),  # a camera that repeats itself is known by equal sags
-        sag_sigma_um=round(found.steady_sag_sigma_um, _UM + 1),
+        # One digit more: equal sags show a camera that repeats a frame.
+        sag_um=round(found.sag_um, _UM_DECIMALS + 1),
+        sag_sigma_um=round(found.steady_sag_sigma_um, _UM_DECIMALS + 1),
         displacement_um=reading_um,
-        slope_residual_urad=round(found.rest_share * urad, 2),
-        valid_fraction=round(found.used_share, _SHARE),
+        slope_residual_urad=round(found.rest_share * urad_per_rad, 2),
+        valid_fraction=round(found.used_share, _SHARE_DECIMALS),
         modulation_median_adu=round(found.swing_adu, 1),
-        saturated_fraction=round(found.saturated_share, _SHARE),
+        saturated_fraction=round(found.saturated_share, _SHARE_DECIMALS),
         verdict=found.verdict,
         reason=found.reason,
         tracking_lost=tracking_lost,

@@ -15,35 +15,66 @@ _NO_COVARIANCE = np.full((_NONE.size, _NONE.size), math.nan)
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """Figure of one frame; NaN where it is rejected."""
+    """Figure of one frame; NaN where it is rejected.
 
-    time_s: float  # middle of the exposure
-    coeffs_um: FloatArray  # (terms,) in Noll's order, the vertex at 0
-    covariance_um2: FloatArray  # (terms, terms): of the error against the reference's figure
+    Attributes
+    ----------
+    time_s : float
+        Middle of the exposure.
+    coeffs_um : (terms,) array
+        Zernike terms in Noll's order; the vertex is at 0.
+    covariance_um2 : (terms, terms) array
+        Covariance of their error against the reference's figure.
+    hencky_um : float
+        Amplitude of the Hencky excess, as sag.
+    sag_um : float
+        Height of the rim above the vertex.
+    sag_sigma_um : float
+        Its standard deviation against the reference's figure.
+    verdict : Verdict
+    reason : str
+        Why it is not `ok`.
+    rest_share : float
+        What the fit leaves, over the swing of the fringes.
+    used_share : float
+        Share of the bins with weight.
+    swing_adu : float
+        Swing of the fringes, median over the bins.
+    saturated_share : float
+        Share of the bins with a saturated pixel.
+    lost : bool
+        The mirror may be elsewhere than in the last good frame: a new reference is needed.
+    steady_sag_sigma_um : float
+        Standard deviation of the sag without motions of the bench that frames do not show: that of
+        changes from frame to frame.
+    steady_sigma_um : (terms,) array
+        The same of the terms.
+    """
+
+    time_s: float
+    coeffs_um: FloatArray
+    covariance_um2: FloatArray
     hencky_um: float
     sag_um: float
     sag_sigma_um: float
     verdict: shape_estimate.Verdict
     reason: str
-    rest_share: float  # what the fit leaves, over the swing of the fringes
-    used_share: float = 0.0  # of the bins, those with weight
-    swing_adu: float = math.nan  # of the fringes, median
-    saturated_share: float = 0.0  # of the bins
-    # the mirror may not be where the last good frame left it: a new reference is needed
+    rest_share: float
+    used_share: float = 0.0
+    swing_adu: float = math.nan
+    saturated_share: float = 0.0
     lost: bool = False
-    # standard deviations of sag and terms without motions of the bench that frames do not show:
-    # those of changes from frame to frame
     steady_sag_sigma_um: float = math.nan
     steady_sigma_um: FloatArray = field(default_factory=_NONE.copy)
 
     @property
     def sigma_um(self) -> FloatArray:
-        """(terms,): 1 sigma against the reference's figure."""
+        """Standard deviations (terms,) of the terms against the reference's figure."""
         return np.sqrt(np.diag(self.covariance_um2))
 
 
 def moved_frame(frame: TrackedFrame, by_mm: FloatArray, radius_mm: float) -> TrackedFrame:
-    """The frame with a change of the surface's parameters."""
+    """Return the frame with the surface's parameters changed by `by_mm` (parameters,)."""
     change = surface.Surface.from_parameters(by_mm, radius_mm)
     return replace(
         frame,
@@ -56,6 +87,7 @@ def moved_frame(frame: TrackedFrame, by_mm: FloatArray, radius_mm: float) -> Tra
 def rejected_frame(
     time_s: float, reason: str, rest: float = math.nan, lost: bool = False
 ) -> TrackedFrame:
+    """Return a frame without a figure."""
     nan = math.nan
     return TrackedFrame(
         time_s, _NONE, _NO_COVARIANCE, nan, nan, nan, "rejected", reason, rest, lost=lost

@@ -15,6 +15,7 @@ from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.lost_orders import LostOrders
+from membrane_ctrl.metrology.tracking.outlier_rejection import RobustFitter
 from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
 from membrane_ctrl.metrology.tracking.step_jumps import Jumps
 from membrane_ctrl.metrology.tracking.step_means import estimate_step_places
@@ -214,7 +215,9 @@ def test_jumps_at_steps_of_the_pattern_are_distinguished_from_noise_and_motion()
     for k in range(60):
         step, now = divmod(k, 10)[0], np.zeros(ZERNIKE_TERMS)
         now[:2] = 0.3 * math.sin(0.2 * k), 0.05 * (-1) ** step
-        expected.append(jumps.add((float(step), 0.0), now + random.normal(0, 0.001, ZERNIKE_TERMS)))
+        expected.append(
+            jumps.add_frame((float(step), 0.0), now + random.normal(0, 0.001, ZERNIKE_TERMS))
+        )
     assert np.flatnonzero(expected).tolist() == [10, 20, 30, 40, 50]
     sigma = np.sqrt(jumps.variance_mm2(np.zeros(ZERNIKE_TERMS)))
     assert sigma[1] == pytest.approx(0.1, rel=0.05)
@@ -226,7 +229,7 @@ def test_jumps_at_steps_of_the_pattern_are_distinguished_from_noise_and_motion()
     assert known[1] == pytest.approx(0.0998, rel=0.05)
     assert (known[2:] < sigma[2:].clip(1e-9)).all()
     jumps.begin()  # what was before is no jump
-    assert not jumps.add((9.0, 0.0), np.ones(ZERNIKE_TERMS))
+    assert not jumps.add_frame((9.0, 0.0), np.ones(ZERNIKE_TERMS))
 
 
 def test_what_the_next_frame_needs_may_be_made_ahead(bench: Bench) -> None:
@@ -283,7 +286,7 @@ def test_a_fit_that_stays_lost_has_no_removed_bands(
     tracker, rows = bench.tracker(), np.arange(SIZE[0])[:, None]
     assert tracker.follow(bench.frame(), STILL, 0.0).verdict == "ok"
     banded = (bench.frame() * (1 + 0.1 * np.cos(0.9 * rows))).astype(np.uint8)
-    monkeypatch.setattr(Tracker, "_lost", lambda self, fit: True)
+    monkeypatch.setattr(RobustFitter, "has_failed", lambda self, fit: True)
     tracker.follow(banded, STILL, 0.1)
     assert not len(tracker._bands.waves)
 
@@ -362,10 +365,10 @@ def test_a_faulty_frame_is_reported_and_does_not_change_others(
 
 def test_fringes_of_which_a_lost_period_looks_like_a_film_are_refused(bench: Bench) -> None:
     orders = LostOrders(bench.prepared._fitter)
-    orders.require_telling()
+    orders.require_distinguishable()
     orders._lost_um = 0.02 * orders._lost_um  # as much finer
     with pytest.raises(ValueError, match="use a longer period"):
-        orders.require_telling()
+        orders.require_distinguishable()
 
 
 def jumps(bench: Bench, count: int, seed: int) -> list[str]:

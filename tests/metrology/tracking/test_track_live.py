@@ -255,7 +255,7 @@ def test_a_hold_finds_the_films_vibrations_and_no_others() -> None:
         told += listener.add_estimate(
             tracker.fringes([picture], np.array([time_s]), np.array([math.nan]))
         )
-        time_s += tracker.slower / 20
+        time_s += tracker.interval_factor / 20
     assert len(told) == 2
     for heard in told:
         assert isinstance(heard, Vibrations)
