@@ -297,7 +297,7 @@ class LiveReconstructor:
         # The surface, without the effect of what the frames show of their own light and motion.
         fit = self._fit(state, usable, readings)
         cycle = cycle_errors.Cycle(self._make_tracer(readings), state, fit, self._sums(), readings)
-        errors = self._watch.look(cycle)
+        errors = self._watch.estimate_errors(cycle)
         corrected = fit.surface.parameters - errors.correction_mm
         corrected_surface = surface.Surface.from_parameters(corrected, fit.surface.radius_mm)
         fit = replace(fit, surface=corrected_surface)
@@ -448,7 +448,7 @@ class LiveReconstructor:
         # Phases that changed by more than noise since the reference: an independent error of each
         # of the points that were asked.
         changed_rad2 = np.maximum(errors.changed_rad2 - _SURELY * 2 * noise_rad2, 0.0)
-        changed_rad2 *= fit.weight_sum / max(errors.asked, 1)
+        changed_rad2 *= fit.weight_sum / max(errors.known_points, 1)
 
         # Both as slopes, and as a covariance of the parameters; with the cycle's other errors.
         gain = slope_noise.slope_per_screen(

@@ -14,35 +14,49 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.metrology.rays import disc_heights
-from membrane_ctrl.metrology.rays.surface import (
-    PARAMETERS,
-    parameter_to_coeffs,
-    sag_gradient,
-)
+from membrane_ctrl.metrology.rays.surface import PARAMETERS, parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
 from membrane_ctrl.model.arrays import FloatArray
 
+_TINY = 1e-300  # instead of a division by zero
+
 
 @dataclass(frozen=True)
 class Source:
-    """One input, or inputs that are correlated."""
+    """One input, or inputs that are correlated: a row of the budget.
 
-    name: str  # ends in the unit of `sigma`
+    Attributes
+    ----------
+    name : str
+        Name, which ends in the unit of `sigma`.
+    says : str
+        Description for people.
+    sigma : float
+        Standard uncertainty of the input; NaN for several at once.
+    effects_mm : (parameters, k) array
+        Independent changes of the parameters, of 1 sigma each, from this input.
+    common : bool
+        Whether all sets of a bench share it.
+    paired : bool
+        Whether two sets have the same error in the same column: it cancels in a change.
+    noise_mm2 : float
+        Sum of squares of noise in effects that the set shows: the noise has a row of its own.
+    """
+
+    name: str
     says: str
-    sigma: float  # standard uncertainty of the input; NaN for several at once
-    # (parameters, k): independent changes of the parameters, of 1 sigma each, from this input
+    sigma: float
     effects_mm: FloatArray
-    common: bool = True  # whether all sets of a bench share it
-    # whether two sets have the same error in the same column: it cancels in a change
+    common: bool = True
     paired: bool = True
-    # sum of squares of noise in effects that the set shows: the noise has a row of its own
     noise_mm2: float = 0.0
 
     @property
     def known_mm(self) -> FloatArray:
-        """The effects beyond that noise."""
-        share = 1 - self.noise_mm2 / max(float(np.sum(self.effects_mm**2)), 1e-300)
+        """The effects (parameters, k) beyond that noise."""
+        power_mm2 = max(float(np.sum(self.effects_mm**2)), _TINY)
+        share = 1 - self.noise_mm2 / power_mm2
         return np.asarray(math.sqrt(max(share, 0.0)) * self.effects_mm)
 
     @property
@@ -51,41 +65,53 @@ class Source:
         return np.asarray(self.known_mm @ self.known_mm.T)
 
     def change(self, earlier: "Source | None") -> list[FloatArray]:
-        """Effects on the change since an earlier set."""
+        """Effects on the change since an earlier set, arrays of (parameters, k) each."""
         if earlier is None:
             return [self.known_mm]
         if not (self.paired and earlier.paired):
             return [self.known_mm, earlier.known_mm]
-        noise_mm2 = self.noise_mm2 + earlier.noise_mm2
-        return [
-            replace(
-                self, effects_mm=self.effects_mm - earlier.effects_mm, noise_mm2=noise_mm2
-            ).known_mm
-        ]
+        difference = replace(
+            self,
+            effects_mm=self.effects_mm - earlier.effects_mm,
+            noise_mm2=self.noise_mm2 + earlier.noise_mm2,
+        )
+        return [difference.known_mm]
 
 
 @dataclass(frozen=True)
 class Budget:
-    """All inputs of one figure."""
+    """All inputs of one figure.
+
+    Attributes
+    ----------
+    sources : tuple of Source
+        The rows.
+    disc : float
+        Analysis radius over the radius of the terms.
+    motion : PairMotion, optional
+        Effects of motions of the bench after this set on the next figure; None: not known.
+    """
 
     sources: tuple[Source, ...]
-    disc: float  # analysis radius over the radius of the terms
-    # what motions of the bench after this set would do to the next figure; None: not known
+    disc: float
     motion: PairMotion | None = None
 
     def covariance(self, common: bool) -> FloatArray:
-        """(parameters, parameters) in mm^2 of the parameters, from what all sets of the bench share
-        or from this set's own."""
+        """Covariance (parameters, parameters), mm^2, from what all sets of the bench share, or from
+        what belongs to this set alone.
+        """
         parts = [source.covariance_mm2 for source in self.sources if source.common == common]
         return np.asarray(np.sum([np.zeros((PARAMETERS, PARAMETERS)), *parts], axis=0))
 
     def change_covariance(self, earlier: "Budget") -> FloatArray:
-        """(parameters, parameters) in mm^2 of the parameters' change since another set of the same
+        """Covariance (parameters, parameters), mm^2, of the change since another set of the same
         bench, which may have moved in between.
         """
-        steady = self.steady_change_covariance(earlier)
-        found = self.find_motion(earlier)
-        return steady if found is None else steady + found.covariance_mm2
+        steady_mm2 = self.steady_change_covariance(earlier)
+        motion = self.find_motion(earlier)
+        if motion is None:
+            return steady_mm2
+        return steady_mm2 + motion.covariance_mm2
 
     def find_motion(self, earlier: "Budget") -> MotionFinding | None:
         """Motions of the bench since another set; None if a budget does not know their effects."""
@@ -94,7 +120,7 @@ class Budget:
         return self.motion.find(earlier.motion, self.steady_change_covariance(earlier))
 
     def steady_change_covariance(self, earlier: "Budget") -> FloatArray:
-        """(parameters, parameters) in mm^2 of the parameters' change since another set of the same
+        """Covariance (parameters, parameters), mm^2, of the change since another set of the same
         bench, at rest.
 
         What both share cancels but for the difference of its effects on the two.
@@ -103,18 +129,23 @@ class Budget:
         parts = [np.zeros((PARAMETERS, 1))]
         for own in self.sources:
             parts += own.change(before.pop(own.name, None))
-        effects = np.concatenate([*parts, *(left.known_mm for left in before.values())], axis=1)
+        only_earlier = [source.known_mm for source in before.values()]
+        effects = np.concatenate([*parts, *only_earlier], axis=1)
         return np.asarray(effects @ effects.T)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Per input, the largest contribution first: its own uncertainty, 1 sigma of sag, height
-        and figure.
+        """One row for each input, the largest contribution first: its own uncertainty, 1 sigma of
+        sag, height and figure.
         """
         rows: list[dict[str, Any]] = []
-        for one in self.sources:
-            sigma = one.sigma if math.isfinite(one.sigma) else None
-            about = {"name": one.name, "says": one.says, "sigma": sigma, "common": one.common}
-            rows.append(about | self.sizes(one.covariance_mm2))
+        for source in self.sources:
+            about: dict[str, Any] = {
+                "name": source.name,
+                "says": source.says,
+                "sigma": source.sigma if math.isfinite(source.sigma) else None,
+                "common": source.common,
+            }
+            rows.append(about | self.sizes(source.covariance_mm2))
         return sorted(rows, key=lambda row: -float(row["height_rms_um"]))
 
     def total(self) -> dict[str, Any]:
@@ -128,23 +159,22 @@ class Budget:
         """1 sigma of the sag, and over the disc of the height and of the figure (the height without
         its plane).
         """
-        squares = {
-            name: np.sum(means * covariance_mm2)
-            for name, means in _mean_products(self.disc).items()
-        }
-        return {name: 1e3 * math.sqrt(max(float(square), 0.0)) for name, square in squares.items()}
+        sizes_um = {}
+        for name, means in _mean_products(self.disc).items():
+            square_mm2 = float(np.sum(means * covariance_mm2))
+            sizes_um[name] = 1e3 * math.sqrt(max(square_mm2, 0.0))
+        return sizes_um
 
 
 @lru_cache
 def _mean_products(disc: float) -> dict[str, FloatArray]:
-    """Means (parameters, parameters) over a disc of products of what two parameters do to sag,
-    height and figure.
+    """Means over a disc of products of the effects of two parameters, (parameters, parameters) each,
+    on sag, height and figure (the height without its plane).
     """
     heights, plane = disc_heights.heights_over_disc(disc)
-    basis = {
-        "height_rms_um": heights,
-        "figure_rms_um": disc_heights.remove_plane(heights, plane),
-    }
-    return {"sag_um": np.outer(sag_gradient(), sag_gradient())} | {
-        n: b.T @ b / len(b) for n, b in basis.items()
+    figures = disc_heights.remove_plane(heights, plane)
+    return {
+        "sag_um": np.outer(sag_gradient(), sag_gradient()),
+        "height_rms_um": heights.T @ heights / len(heights),
+        "figure_rms_um": figures.T @ figures / len(figures),
     }

@@ -1,11 +1,11 @@
 """Errors of live cycles beyond the noise of the pixels: what the frames show of them, and what
-that leaves.
+remains.
 
 The sensitivities are those of the budget of `measure`, computed once, with the first full cycle.
-Each cycle then asks some of its points what light each frame had and where the film was (see
-`frame_checks.frame_evidence`), takes the effect out, and states what is left. Errors that all
-cycles share count for one figure, not for a change since the reference cycle: the first one near
-the film's present displacement.
+In each cycle, some of its points show what light each frame had and where the film was
+(`cycle_frames`); the effect on the figure is removed, and a share of it remains as an error. Errors
+that all cycles share count for one figure, but not for a change since the reference cycle: the
+first one near the film's present displacement.
 """
 
 import math
@@ -39,42 +39,54 @@ from membrane_ctrl.metrology.uncertainty.cycle_frames import FrameErrors, estima
 from membrane_ctrl.metrology.uncertainty.held_light_error import held_light_of_cycles
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray
 
-# Some points determine light and place of a frame to 1e-4 and 20 nm, a tenth of what they leave
+# So many points determine light and place of a frame to 1e-4 and 20 nm, a tenth of what remains
+# after the correction.
 POINTS = 1500
-# Share of what the frames show that is left when it has been taken out: higher orders, and light
-# that is not even
-_LEFT = 0.03
-# Waves of uneven light nearly cancel over the mirror: the few points that show them would not show
-# what is left
+# Share of what the frames show that remains after the correction: higher orders, and light that is
+# not even.
+_REMAINING = 0.03
+# Points for the sensitivities to light. Waves of uneven light nearly cancel over the mirror: fewer
+# points would not show what remains of them.
 _WAVE_POINTS = 20_000
-_SECOND_ORDER = 0.01
+_SECOND_ORDER = 0.01  # share of the laser's motion that the linear correction leaves
 _FAR_UM = 300.0  # displacement over which the sensitivities are compared
 # A film this far from the reference cycle makes a new one: changes are stated within a hold, not
-# across setpoints
+# across setpoints.
 _REFERENCE_UM = 100.0
 
 
 @dataclass(frozen=True)
 class LiveErrors:
-    """Sensitivities of the surface's parameters, in mm."""
+    """Sensitivities of the surface's parameters to the errors of a cycle.
+
+    Attributes
+    ----------
+    frames : FrameEffects
+        Effects of light and film of single frames.
+    vertex : (parameters,) array
+        Effect of the vertex' place, mm per µm.
+    common_mm2 : (parameters, parameters) array
+        Covariance of what all cycles share; NaN if the spread of the geometry is unknown or too
+        wide.
+    per_um2 : (parameters, parameters) array
+        Covariance of what remains of that in a change, mm^2 per µm^2 of the film's displacement
+        between the cycles.
+    corrected_um2 : (parameters, parameters) array
+        Covariance of the geometry's effect on the correction for the film's motion: mm^2 per µm^2
+        that the film was deeper in x than in y.
+    """
 
     frames: frame_effects.FrameEffects
-    vertex: FloatArray  # (parameters,): per µm of the vertex' place
-    # (parameters, parameters): covariance of what all cycles share; NaN if the spread is unknown or
-    # too wide
+    vertex: FloatArray
     common_mm2: FloatArray
-    # (parameters, parameters): covariance of what is left of that in a change, per µm^2 of the
-    # film's displacement between the cycles
     per_um2: FloatArray
-    # (parameters, parameters): covariance of what the geometry makes of a film that was told to be
-    # 1 µm deeper in x than in y
-    told_um2: FloatArray
+    corrected_um2: FloatArray
 
     @classmethod
     def of(
         cls,
         bench: trial_bench.TrialBench,
-        waves: trial_bench.TrialBench,
+        wave_bench: trial_bench.TrialBench,
         shifts_rad: FloatArray,
         light: FloatArray,
         seen: FrameErrors,
@@ -82,35 +94,63 @@ class LiveErrors:
         blur_px: float,
         left: FloatArray,
     ) -> "LiveErrors":
-        """Of some points of a cycle, and of the many more that the waves of uneven light need.
+        """Compute the sensitivities.
 
-        `light` (2, n) is that of the latter over the amplitude of their fringes, and `left`
-        (parameters, k) the effects of the slopes that the fit leaves.
+        Parameters
+        ----------
+        bench : TrialBench
+            Some points of a cycle.
+        wave_bench : TrialBench
+            The many more points, n, that waves of uneven light need.
+        shifts_rad : (2, N) array
+            Phase steps of x and y.
+        light : (2, n) array
+            Light over the amplitude of the fringes at the points of `wave_bench`.
+        seen : FrameErrors
+            What the frames show.
+        spread : GeometrySpread or None
+            Covariance of the geometry, if known.
+        blur_px : float
+            Width of the image's blur.
+        left : (parameters, k) array
+            Effects of the slopes that the fit leaves, mm.
         """
-        frames = frame_effects.frame_effects(waves, bench.optics, shifts_rad, light, seen.harmonics)
+        frames = frame_effects.frame_effects(
+            wave_bench, wave_bench.optics, shifts_rad, light, seen.harmonics
+        )
         vertex = bench_sources.vertex_source(bench, 1.0, "").effects_mm[:, 0]
-        none = np.zeros((vertex.size, vertex.size))
+        zero = np.zeros((vertex.size, vertex.size))
+        unknown = zero + np.nan
         if spread is None:
-            return cls(frames, vertex, none + np.nan, none, none)
+            return cls(frames, vertex, unknown, zero, zero)
         try:
-            here = _shared_effects(bench, spread, blur_px)
-            per_um = (
-                _shared_effects(trial_bench.moved_film(bench, _FAR_UM), spread, blur_px) - here
-            ) / _FAR_UM
-            x_mm, y_mm = (
-                trial_bench.moved_film(bench, sign * _FAR_UM / 2).screen_mm for sign in (1, -1)
-            )
-            told = _of_geometry(replace(bench, screen_mm=np.stack([x_mm[0], y_mm[1]])), spread)
-            told = (told - here[:, : told.shape[1]]) / _FAR_UM
+            shared = _shared_effects(bench, spread, blur_px)
+
+            # The same at another displacement.
+            far = trial_bench.moved_film(bench, _FAR_UM)
+            per_um = (_shared_effects(far, spread, blur_px) - shared) / _FAR_UM
+
+            # And with a film that is deeper in the x frames than in the y frames.
+            x_mm = trial_bench.moved_film(bench, _FAR_UM / 2).screen_mm
+            y_mm = trial_bench.moved_film(bench, -_FAR_UM / 2).screen_mm
+            moving = replace(bench, screen_mm=np.stack([x_mm[0], y_mm[1]]))
+            geometry = _geometry_effects(moving, spread)
+            per_corrected_um = (geometry - shared[:, : geometry.shape[1]]) / _FAR_UM
         except ArithmeticError:  # a fit at the spread's end fails
-            return cls(frames, vertex, none + np.nan, none, none)
-        return cls(frames, vertex, here @ here.T + left @ left.T, per_um @ per_um.T, told @ told.T)
+            return cls(frames, vertex, unknown, zero, zero)
+        return cls(
+            frames,
+            vertex,
+            common_mm2=shared @ shared.T + left @ left.T,
+            per_um2=per_um @ per_um.T,
+            corrected_um2=per_corrected_um @ per_corrected_um.T,
+        )
 
     def correction_mm(self, seen: FrameErrors) -> FloatArray:
-        """(parameters,) that the errors of the frames added to the parameters."""
+        """Change (parameters,) that the errors of the frames have made in the parameters."""
         effects = self.frames
-        # the phases were corrected for the told motion as if the fringes were pure sinusoids
-        display = effects.display @ (seen.told_um + seen.moved_um)
+        # The phases were corrected for the laser's motion as if the fringes were pure sinusoids.
+        display = effects.display @ (seen.corrected_um + seen.moved_um)
         return np.asarray(
             effects.level @ seen.level
             + effects.swing @ seen.swing
@@ -121,21 +161,38 @@ class LiveErrors:
     def own_mm2(
         self, seen: FrameErrors, readings_um: FloatArray, laser_noise_um: float, moved_um: float
     ) -> FloatArray:
-        """Covariance (parameters, parameters) in mm^2 of what the reference cycle does not share,
-        without slopes and pixels.
+        """Covariance of what the reference cycle does not share, without slopes and pixels.
 
-        It is from light and film as `seen` and taken out, from the laser's readings (2 N,) of the
-        frames, and from the film's displacement since the reference.
+        Parameters
+        ----------
+        seen : FrameErrors
+            Light and film of the frames, whose effect was removed.
+        readings_um : (2 N,) array
+            The laser's readings at the frames; NaN without.
+        laser_noise_um : float
+            Their noise.
+        moved_um : float
+            The film's displacement since the reference cycle.
+
+        Returns
+        -------
+        (parameters, parameters) array
+            In mm^2.
         """
-        light, film_um = _LEFT * _make_rms(seen.level, seen.swing), _LEFT * _make_rms(seen.moved_um)
-        if np.isfinite(readings_um).all():  # motion is taken out to first order
+        # What remains of light and film after the correction, which is linear in the motion.
+        light = _REMAINING * _rms(seen.level, seen.swing)
+        film_um = _REMAINING * _rms(seen.moved_um)
+        has_laser = np.isfinite(readings_um).all()
+        if has_laser:
             film_um += _SECOND_ORDER * float(np.std(readings_um))
-        x_to_y_um = laser_errors.left_by_laser_um(
-            readings_um, _make_rms(seen.moved_um), laser_noise_um
-        )
+
+        # What the laser leaves unknown: motion from x to y, and the vertex. Without it, half of
+        # that motion is in the mean of the frames.
+        x_to_y_um = laser_errors.left_by_laser_um(readings_um, _rms(seen.moved_um), laser_noise_um)
         vertex_um = laser_errors.vertex_um(readings_um, laser_noise_um)
-        if not np.isfinite(readings_um).all():  # half of that motion is in the frames' mean
+        if not has_laser:
             vertex_um = math.hypot(vertex_um, x_to_y_um / 2)
+
         effects = [
             light * self.frames.level,
             light * self.frames.swing,
@@ -143,60 +200,92 @@ class LiveErrors:
             x_to_y_um * self.frames.x_to_y[:, None],
             vertex_um * self.vertex[:, None],
         ]
-        told_um = float(np.subtract(*(part.mean() for part in np.split(seen.told_um, 2))))
-        shared_mm2 = moved_um**2 * self.per_um2 + told_um**2 * self.told_um2
+
+        # Errors that cycles share cancel but for the film's displacement between them.
+        x_um, y_um = (part.mean() for part in np.split(seen.corrected_um, 2))
+        corrected_um = float(np.subtract(x_um, y_um))
+        shared_mm2 = moved_um**2 * self.per_um2 + corrected_um**2 * self.corrected_um2
         return np.asarray(sum(effect @ effect.T for effect in effects) + shared_mm2)
 
 
 def _shared_effects(
     bench: trial_bench.TrialBench, spread: geometry_spread.GeometrySpread, blur_px: float
 ) -> FloatArray:
-    """Effects (parameters, k) of what all cycles share. Raises ArithmeticError if a fit at the
-    spread's end fails.
+    """Effects (parameters, k), mm, of what all cycles share; those of the geometry are first.
+
+    Raises ArithmeticError if a fit at the spread's end fails.
     """
+    sigmas = bench.optics.geometry.sigmas or SigmasConfig()
     sources = [
-        *bench_sources.bench_sources(bench, bench.optics.geometry.sigmas or SigmasConfig()),
+        *bench_sources.bench_sources(bench, sigmas),
         image_blur.blur_source(bench, blur_px),
     ]
-    return np.concatenate(
-        [_of_geometry(bench, spread), *(source.effects_mm for source in sources)], axis=1
-    )
+    geometry = _geometry_effects(bench, spread)
+    return np.concatenate([geometry, *(source.effects_mm for source in sources)], axis=1)
 
 
-def _of_geometry(
+def _geometry_effects(
     bench: trial_bench.TrialBench, spread: geometry_spread.GeometrySpread
 ) -> FloatArray:
-    return np.concatenate(
-        [source.effects_mm for source in bench_sources.geometry_sources(bench, spread)], axis=1
-    )
+    """Effects (parameters, k), mm, of the geometry's spread."""
+    sources = bench_sources.geometry_sources(bench, spread)
+    return np.concatenate([source.effects_mm for source in sources], axis=1)
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """The fitted points of one cycle."""
+    """The fitted points of one cycle.
+
+    Attributes
+    ----------
+    tracer : Tracer
+        The bench.
+    state : TrackedPoints
+        The points with their newest phases.
+    fit : Fit
+        The surface through them.
+    sums : two (N, bins) arrays
+        Bin sums of the sinusoids of x and of y.
+    readings_um : (2 N,) array
+        Laser readings; NaN without.
+    """
 
     tracer: ray_tracing.Tracer
-    state: tracked_points.TrackedPoints  # with the fresh phases
+    state: tracked_points.TrackedPoints
     fit: surface_fit.Fit
-    sums: Sequence[AnyArray]  # two (N, bins): bin sums of the sinusoids
-    readings_um: FloatArray  # (2 N,)
+    sums: Sequence[AnyArray]
+    readings_um: FloatArray
 
 
 @dataclass(frozen=True)
 class CycleErrors:
-    """What is known of the errors of one cycle."""
+    """What is known of the errors of one cycle.
 
-    correction_mm: FloatArray  # (parameters,): to be subtracted from the parameters
-    # (parameters, parameters): covariance of what the reference cycle does not share, without
-    # slopes and pixels
+    Attributes
+    ----------
+    correction_mm : (parameters,) array
+        To be subtracted from the parameters.
+    own_mm2 : (parameters, parameters) array
+        Covariance of what the reference cycle does not share, without slopes and pixels.
+    changed_rad2 : (2,) array
+        Variance of the phases' change since the reference that no surface explains.
+    known_points : int
+        Number of points at which that change is known.
+    points : (n,) int array
+        Those of the tracked points that were examined.
+    changed_rad : (2, n) array
+        Their phases less the surface's, less those of the reference cycle; NaN where unknown.
+    is_reference : bool
+        Whether later cycles are compared with this one.
+    """
+
+    correction_mm: FloatArray
     own_mm2: FloatArray
-    # (2,): variance of the phases' change since the reference that no surface explains
     changed_rad2: FloatArray
-    asked: int  # points it is known at
-    points: IntArray  # (n,): of the tracked points, those that were asked
-    # (2, n): their phases less the surface's, less those of the reference cycle; NaN where unknown
+    known_points: int
+    points: IntArray
     changed_rad: FloatArray
-    is_reference: bool  # whether later cycles are compared with this one
+    is_reference: bool
 
 
 class ErrorWatch:
@@ -204,12 +293,20 @@ class ErrorWatch:
 
     Parameters
     ----------
-    optics, grid, shifts_rad, laser_noise_um, spread
-        Those of the reconstructor.
+    optics : OpticsConfig
+        The bench.
+    grid : BinGrid
+        Its bins.
     shape : (rows, columns)
-        Of the bins.
+        Number of the bins.
     bin_px : int
         Their side.
+    shifts_rad : (2, N) array
+        Phase steps of x and y.
+    laser_noise_um : float
+        Noise of the laser's readings.
+    spread : GeometrySpread or None
+        Covariance of the geometry, if known.
     """
 
     def __init__(
@@ -222,15 +319,20 @@ class ErrorWatch:
         laser_noise_um: float,
         spread: geometry_spread.GeometrySpread | None,
     ) -> None:
-        self._optics, self._shape, self._bin_px = optics, shape, bin_px
+        self._optics = optics
+        self._shape = shape
+        self._bin_px = bin_px
         self._places_px = np.stack([grid.column_px, grid.row_px])
-        self._shifts_rad, self._laser_noise_um, self._spread = shifts_rad, laser_noise_um, spread
+        self._shifts_rad = shifts_rad
         self._weights = np.stack([phase_steps.step_weights(shifts) for shifts in shifts_rad])
+        self._laser_noise_um = laser_noise_um
+        self._spread = spread
+        self._mm_per_rad = screen_scale.mm_per_rad(optics.pattern)
         self._errors: LiveErrors | None = None
         self._held = UNKNOWN
-        self._asked: IntArray = np.empty(0, int)  # of the tracked points
+        self._examined: IntArray = np.empty(0, int)  # numbers of tracked points
         self._reference_um = math.nan  # displacement of the reference cycle
-        # of the bins asked then: phases less those of the surface
+        # Phases of all bins less those of the surface, in the reference cycle; NaN where unknown.
         self._reference_rad: FloatArray = np.full((2, self._places_px.shape[1]), np.nan)
 
     @property
@@ -238,58 +340,67 @@ class ErrorWatch:
         """Covariance (parameters, parameters) that all cycles share; NaN before the first, and
         without a spread.
         """
-        return (
-            np.full((PARAMETERS, PARAMETERS), np.nan)
-            if self._errors is None
-            else self._errors.common_mm2
-        )
+        if self._errors is None:
+            return np.full((PARAMETERS, PARAMETERS), np.nan)
+        return self._errors.common_mm2
 
     def begin(self, state: tracked_points.TrackedPoints, held: HeldLight = UNKNOWN) -> None:
-        """Choose from the points of a full cycle those that are asked.
+        """Choose the points that are examined from those of a full cycle.
 
-        `held` is what its frames showed of the previous ones.
+        `held` is the share of the previous frames that its frames show.
         """
         self._held = held
         places_px = self._places_px[:, state.index]
-        self._asked = np.flatnonzero(
-            trial_bench.spread_evenly(places_px, self._optics.camera.width_px, POINTS)
-        )
+        chosen = trial_bench.spread_evenly(places_px, self._optics.camera.width_px, POINTS)
+        self._examined = np.flatnonzero(chosen)
 
-    def look(self, cycle: Cycle) -> CycleErrors:
-        """The errors of a cycle; the first one's determine the sensitivities."""
-        state, asked = cycle.state, self._asked[cycle.state.points.weights[self._asked] > 0]
-        scale = screen_scale.mm_per_rad(self._optics.pattern)
-        predicted_mm = cycle.tracer.predict_screen(state.points.subset(asked), cycle.fit.surface)
-        phase_rad, index = (predicted_mm + state.offset_mm[:, asked]) / scale, state.index[asked]
-        told_um = np.zeros(self._shifts_rad.shape)
+    def estimate_errors(self, cycle: Cycle) -> CycleErrors:
+        """Estimate the errors of a cycle; the first one determines the sensitivities."""
+        state = cycle.state
+        points = self._examined[state.points.weights[self._examined] > 0]
+        bins = state.index[points]
+
+        # Phases of the points by the fitted surface.
+        predicted_mm = cycle.tracer.predict_screen(state.points.subset(points), cycle.fit.surface)
+        phase_rad = (predicted_mm + state.offset_mm[:, points]) / self._mm_per_rad
+
+        # Light and film of each frame, at these phases.
+        corrected_um = np.zeros(self._shifts_rad.shape)
         if film_motion.worth_correcting(cycle.readings_um, self._laser_noise_um):
-            told_um = np.reshape(cycle.readings_um - np.mean(cycle.readings_um), told_um.shape)
-        means = np.stack([sums[:, index] for sums in cycle.sums]) / self._bin_px**2
-        sensitivity = state.sensitivity_rad_per_um[:, asked]
+            about_mean_um = cycle.readings_um - np.mean(cycle.readings_um)
+            corrected_um = np.reshape(about_mean_um, corrected_um.shape)
+        means = np.stack([sums[:, bins] for sums in cycle.sums]) / self._bin_px**2
         seen = estimate_frame_errors(
-            means, self._shifts_rad, self._weights, phase_rad, told_um, sensitivity
+            means,
+            self._shifts_rad,
+            self._weights,
+            phase_rad,
+            corrected_um,
+            state.sensitivity_rad_per_um[:, points],
         )
         if self._errors is None:
-            self._errors = self._sensitivities(cycle, asked, seen)
+            self._errors = self._compute_sensitivities(cycle, points, seen)
+
+        # Change of the phases since the reference cycle beyond surface, light and film.
         moved_um = self._moved_um(cycle.readings_um)
-        left_rad = state.fresh[:, 0, asked] - phase_rad - seen.waves_rad
+        left_rad = state.fresh[:, 0, points] - phase_rad - seen.waves_rad
         is_reference = math.isnan(moved_um)
         if is_reference:
-            self._reference_rad[:, index], moved_um = left_rad, 0.0
-        changed_rad = left_rad - self._reference_rad[:, index]
+            self._reference_rad[:, bins] = left_rad
+            moved_um = 0.0
+        changed_rad = left_rad - self._reference_rad[:, bins]
         known = np.isfinite(changed_rad[0])
-        changed_rad2 = (
-            np.mean(np.square(changed_rad[:, known]), axis=1) if known.any() else np.zeros(2)
-        )
-        own_mm2 = self._errors.own_mm2(seen, cycle.readings_um, self._laser_noise_um, moved_um)
+        changed_rad2 = np.zeros(2)
+        if known.any():
+            changed_rad2 = np.mean(np.square(changed_rad[:, known]), axis=1)
         return CycleErrors(
-            self._errors.correction_mm(seen),
-            own_mm2,
-            changed_rad2,
-            int(np.count_nonzero(known)),
-            asked,
-            changed_rad,
-            is_reference,
+            correction_mm=self._errors.correction_mm(seen),
+            own_mm2=self._errors.own_mm2(seen, cycle.readings_um, self._laser_noise_um, moved_um),
+            changed_rad2=changed_rad2,
+            known_points=int(np.count_nonzero(known)),
+            points=points,
+            changed_rad=changed_rad,
+            is_reference=is_reference,
         )
 
     def renew_reference(self) -> None:
@@ -305,37 +416,56 @@ class ErrorWatch:
         self._reference_um = mean_um
         return math.nan
 
-    def _sensitivities(self, cycle: Cycle, asked: IntArray, seen: FrameErrors) -> LiveErrors:
-        tracer, state, fit = cycle.tracer, cycle.state, cycle.fit
+    def _compute_sensitivities(
+        self, cycle: Cycle, points: IntArray, seen: FrameErrors
+    ) -> LiveErrors:
+        """The sensitivities at a cycle.
+
+        Parameters
+        ----------
+        cycle : Cycle
+            Its points.
+        points : (n,) int array
+            Numbers of those that are examined.
+        seen : FrameErrors
+            What its frames show.
+        """
+        tracer = cycle.tracer
+        state = cycle.state
+        fit = cycle.fit
+        swings = state.fresh[:, 4]
+        places_px = self._places_px[:, state.index]
+
+        # Slopes that the fit leaves, as patches, and as a film that is not Hencky's.
         field = tracer.slope_field(state.points, fit.surface)
-        reach_mm, slopes = self._optics.mirror.analysis_radius_mm, field[2:4] - field[4:6]
-        patches = residual_patches.Patches.of(field[:2], state.points.weights, slopes, reach_mm)
+        residual_slopes = field[2:4] - field[4:6]
+        reach_mm = self._optics.mirror.analysis_radius_mm
+        patches = residual_patches.Patches.of(
+            field[:2], state.points.weights, residual_slopes, reach_mm
+        )
         law, _ = film_shape_error.law_effect(patches, tracer.radius_mm, fit.normal.inverse)
         left = np.column_stack([patches.effects(tracer.radius_mm, fit.normal.inverse), law])
+
+        # Light over the amplitude of the fringes, and blur of the image.
         levels = [
-            w[0] @ sums[:, state.index] for w, sums in zip(self._weights, cycle.sums, strict=True)
+            weights[0] @ sums[:, state.index]
+            for weights, sums in zip(self._weights, cycle.sums, strict=True)
         ]
-        light = np.stack(levels) / self._bin_px**2 / state.fresh[:, 4]
-        scale = screen_scale.mm_per_rad(self._optics.pattern)
-        predicted_rad = tracer.predict_screen(state.points, fit.surface) / scale
-        swings = state.fresh[:, 4]
+        light = np.stack(levels) / self._bin_px**2 / swings
+        predicted_rad = tracer.predict_screen(state.points, fit.surface) / self._mm_per_rad
         blur_px = image_blur.estimate_blur_px(
             predicted_rad, swings, state.index, self._shape, self._bin_px
         )
-        places_px, width_px = self._places_px[:, state.index], self._optics.camera.width_px
+
+        # The bench with the examined points, and with as many as waves of light need.
+        width_px = self._optics.camera.width_px
         many = np.flatnonzero(trial_bench.spread_evenly(places_px, width_px, _WAVE_POINTS))
-
-        def bench(at: IntArray) -> trial_bench.TrialBench:
-            some, exact = state.points.subset(at), np.zeros((2, at.size))
-            return trial_bench.TrialBench.of_points(
-                self._optics, tracer, fit.surface, some, places_px[:, at], exact, at.size
-            )
-
-        few = bench(asked)
-        left = np.column_stack([left, held_light_of_cycles(few, self._shifts_rad, self._held)])
+        bench = self._make_bench(cycle, places_px, points)
+        wave_bench = self._make_bench(cycle, places_px, many)
+        left = np.column_stack([left, held_light_of_cycles(bench, self._shifts_rad, self._held)])
         return LiveErrors.of(
-            few,
-            bench(many),
+            bench,
+            wave_bench,
             self._shifts_rad,
             light[:, many],
             seen,
@@ -344,6 +474,25 @@ class ErrorWatch:
             left,
         )
 
+    def _make_bench(
+        self, cycle: Cycle, places_px: FloatArray, points: IntArray
+    ) -> trial_bench.TrialBench:
+        """A trial bench of n points of a cycle, without noise.
 
-def _make_rms(*parts: FloatArray) -> float:
+        `places_px` (2, tracked points) are the places of all tracked points in the picture,
+        `points` (n,) the numbers of those to use.
+        """
+        return trial_bench.TrialBench.of_points(
+            self._optics,
+            cycle.tracer,
+            cycle.fit.surface,
+            cycle.state.points.subset(points),
+            places_px[:, points],
+            np.zeros((2, points.size)),
+            points.size,
+        )
+
+
+def _rms(*parts: FloatArray) -> float:
+    """Root mean square of all values."""
     return math.sqrt(float(np.mean(np.square(parts))))

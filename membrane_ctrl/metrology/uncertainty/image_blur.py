@@ -9,22 +9,30 @@ from membrane_ctrl.metrology.uncertainty.budget import Source
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, predicted_mm
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
+_TINY = 1e-300  # instead of a division by zero
+
 
 def blur_source(bench: TrialBench, sigma_px: float) -> Source:
-    """A picture blurred by a Gauss of this width: the phase is its mean over the blur.
+    """The row for a picture that is blurred by a Gaussian of this width: a phase is its mean over
+    the blur.
 
-    The mean of the four values at a distance of sqrt(2) sigma, less the value at the centre
-    (`bins.BinGrid`).
+    The mean over the Gaussian is that of the four values at a distance of sqrt(2) sigma (as in
+    `bin_grid.BinGrid.averaging_bias_mm`).
     """
-    nominal, far = bench.geometry(), math.sqrt(2) * sigma_px
-    mean = np.zeros_like(bench.screen_mm)
-    for right, down in ((far, 0.0), (-far, 0.0), (0.0, far), (0.0, -far)):
-        beside = replace(bench, column_px=bench.column_px + right, row_px=bench.row_px + down)
-        mean += predicted_mm(beside, nominal, bench.surface) / 4
-    effect = (
-        bench.solve(bench.geometry(), mean - bench.screen_mm, linear=True)
-        - bench.surface.parameters
+    nominal = bench.geometry()
+    distance_px = math.sqrt(2) * sigma_px
+    offsets_px = (
+        (distance_px, 0.0),
+        (-distance_px, 0.0),
+        (0.0, distance_px),
+        (0.0, -distance_px),
     )
+    mean_mm = np.zeros_like(bench.screen_mm)
+    for right, down in offsets_px:
+        moved = replace(bench, column_px=bench.column_px + right, row_px=bench.row_px + down)
+        mean_mm += predicted_mm(moved, nominal, bench.surface) / 4
+    solved = bench.solve(nominal, mean_mm - bench.screen_mm, linear=True)
+    effect = solved - bench.surface.parameters
     return Source("blur_px", "blur of the picture", sigma_px, effect[:, None])
 
 
@@ -35,7 +43,7 @@ def estimate_blur_px(
     shape: tuple[int, int],
     bin_px: int,
 ) -> float:
-    """Width of the blur, a Gauss's sigma in pixels: the contrast falls with the fringes' frequency.
+    """Estimate the blur from the contrast, which falls with the fringes' frequency.
 
     A blur divides the swing of fringes by exp(sigma^2 |grad phase|^2 / 2), so that
 
@@ -58,20 +66,29 @@ def estimate_blur_px(
         Rows and columns of the bins.
     bin_px : int
         Side of a bin.
+
+    Returns
+    -------
+    float
+        Sigma of the Gaussian, pixels.
     """
-    steep = []
+    # |grad phase|^2 of x and of y, per pixel.
+    squares = []
     for phase in predicted_rad:
         grid = np.full(shape, np.nan)
         grid.reshape(-1)[index] = phase
         square = np.sum(np.square(np.gradient(grid)), axis=0)
-        steep.append(square.reshape(-1)[index] / bin_px**2)
-    steeper = steep[0] - steep[1]
+        squares.append(square.reshape(-1)[index] / bin_px**2)
+    difference = squares[0] - squares[1]
     with np.errstate(divide="ignore", invalid="ignore"):
         contrast = np.log(swings[0]) - np.log(swings[1])
-    known = np.isfinite(steeper) & np.isfinite(contrast)
+    known = np.isfinite(difference) & np.isfinite(contrast)
     if not known.any():
         return 0.0
-    steeper = steeper[known] - steeper[known].mean()
+
+    # Regression of the contrast on the difference; its slope is -sigma^2 / 2.
+    difference = difference[known] - difference[known].mean()
     contrast = contrast[known] - contrast[known].mean()
-    slope = float(steeper @ contrast) / max(float(steeper @ steeper), 1e-300)
-    return math.sqrt(max(-2 * slope - (bin_px**2 - 1) / 12, 0.0))
+    slope = float(difference @ contrast) / max(float(difference @ difference), _TINY)
+    of_bin = (bin_px**2 - 1) / 12
+    return math.sqrt(max(-2 * slope - of_bin, 0.0))

@@ -18,37 +18,69 @@ _PATCHES = 40  # across the mirror: slopes that the fit leaves are independent f
 def pixel_sources(
     full: FullResult, slope_variance: FloatArray, noise_adu: float
 ) -> Iterator[Source]:
-    """White noise of the pixels; and what the slopes show beyond it, taken as one error per patch
-    of the mirror.
+    """Rows of the budget for the noise of the pixels, and for what the slopes show beyond it.
+
+    Parameters
+    ----------
+    full : FullResult
+        The figure of a set.
+    slope_variance : (2,) array
+        Variance of an x and of a y slope from the noise.
+    noise_adu : float
+        Noise of a pixel.
     """
-    inverse = full.fit.normal.inverse
-    middle = slope_variance[0] * full.fit.normal.x + slope_variance[1] * full.fit.normal.y
+    # White noise: the covariance inverse M inverse, with M the matrix of the slopes' variances.
+    fit = full.fit
+    inverse = fit.normal.inverse
+    middle = slope_variance[0] * fit.normal.x + slope_variance[1] * fit.normal.y
     noise = inverse @ np.linalg.cholesky(middle)
     yield Source("noise_adu", "noise of the pixels", noise_adu, noise, False, False)
+
+    # Residual slopes, as one error for each patch of the mirror.
     left = Patches.of_grid(full.fit_grid).effects(full.surface.radius_mm, inverse)
-    left_urad = 1e6 * math.hypot(full.fit.residual_x, full.fit.residual_y)
+    left_urad = 1e6 * math.hypot(fit.residual_x, fit.residual_y)
+    noise_mm2 = float(np.sum(noise**2))
     says = "slopes that the fit leaves: gamma, light, dust, ripple"
-    yield Source(
-        "slope_urad", says, left_urad, left, common=False, noise_mm2=float(np.sum(noise**2))
-    )
+    yield Source("slope_urad", says, left_urad, left, common=False, noise_mm2=noise_mm2)
 
 
 @dataclass(frozen=True)
 class Patches:
-    """Means of residual slopes over patches of the mirror."""
+    """Means of residual slopes over patches of the mirror.
 
-    places_mm: FloatArray  # (2, patches)
-    count: FloatArray  # (patches,): points in each
-    slopes: FloatArray  # (2, patches)
+    Attributes
+    ----------
+    places_mm : (2, patches) array
+        Mean place of the points of a patch.
+    count : (patches,) array
+        Number of its points.
+    slopes : (2, patches) array
+        Mean residual slopes along x and y.
+    """
+
+    places_mm: FloatArray
+    count: FloatArray
+    slopes: FloatArray
 
     @classmethod
     def of(
         cls, places_mm: FloatArray, count: FloatArray, slopes: FloatArray, reach_mm: float
     ) -> "Patches":
-        """Of points that stand for `count` (n,) each, over a square of half the side `reach_mm`."""
-        column, row = np.clip(
-            ((places_mm / reach_mm + 1) / 2 * _PATCHES).astype(int), 0, _PATCHES - 1
-        )
+        """Average points over patches.
+
+        Parameters
+        ----------
+        places_mm : (2, n) array
+            The points on the mirror.
+        count : (n,) array
+            Weight of each.
+        slopes : (2, n) array
+            Residual slopes along x and y.
+        reach_mm : float
+            Half the side of the square that the patches cover.
+        """
+        in_patches = (places_mm / reach_mm + 1) / 2 * _PATCHES
+        column, row = np.clip(in_patches.astype(int), 0, _PATCHES - 1)
         patch = row * _PATCHES + column
         sums = [
             np.bincount(patch, count * part, _PATCHES**2)
@@ -59,23 +91,35 @@ class Patches:
 
     @classmethod
     def of_grid(cls, grid: ResidualGrid) -> "Patches":
-        """Of a measured set; in the grid each pixel has its weight in the fit.
+        """Average the cells of a grid, in which each pixel has its weight in the fit.
 
         The fit's matrix is made with the same weights. Slopes that the fit left out, of wrinkles at
         the rim, would seem to move it by millimetres.
         """
-        seen, (x, y) = grid.count > 0, np.meshgrid(grid.axis_mm, grid.axis_mm)
+        seen = grid.count > 0
+        x_mm, y_mm = np.meshgrid(grid.axis_mm, grid.axis_mm)
+        places_mm = np.stack([x_mm[seen], y_mm[seen]])
         slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
-        return cls.of(
-            np.stack([x[seen], y[seen]]), grid.count[seen], slopes, float(grid.axis_mm[-1])
-        )
+        return cls.of(places_mm, grid.count[seen], slopes, float(grid.axis_mm[-1]))
 
     def effects(self, radius_mm: float, inverse: FloatArray) -> FloatArray:
-        """(parameters, patches) on the parameters if the residual slopes are independent from patch
-        to patch only.
+        """Effects of the residual slopes on the parameters, if only those of different patches are
+        independent.
 
         The patches are those of the mirror, whatever was seen: two sets of a bench have the same
-        ones. `inverse` is that of the fit's normal matrix.
+        ones.
+
+        Parameters
+        ----------
+        radius_mm : float
+            Radius of the Zernike disc.
+        inverse : (parameters, parameters) array
+            Inverse of the fit's normal matrix.
+
+        Returns
+        -------
+        (parameters, patches) array
+            In mm.
         """
         _, of_x, of_y = surface_basis.evaluate_basis(*self.places_mm / radius_mm)
         x, y = self.count * self.slopes

@@ -26,25 +26,47 @@ from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
 from membrane_ctrl.metrology.uncertainty.geometry_spread import moved_bench
 from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray
 
-# 170 a parameter: errors of a geometry are smooth and need fewer; a trial then takes about a
-# millisecond
+# 170 for each parameter: the errors of a geometry are smooth, and a trial takes about a
+# millisecond.
 TRIAL_POINTS = 6000
+_GOLDEN_RATIO = (np.sqrt(5) - 1) / 2
 
 
 @dataclass(frozen=True)
 class TrialBench:
     """All that the trials of one set need; half a megabyte, so that it can be sent to where they
     run.
+
+    Attributes
+    ----------
+    optics : OpticsConfig
+        The bench, with the nominal geometry.
+    vertex_z_mm : float
+        Height of the vertex.
+    column_px, row_px : (n,) arrays
+        The points in the picture.
+    screen_mm : (2, n) array
+        Where the fitted surface sends them on the screen.
+    residual_mm : (2, n) array
+        Where they were seen, less that.
+    sigma_mm : (2, n) array
+        Standard uncertainty of where they were seen, from noise.
+    t_mm : (n,) array
+        Lengths of their rays.
+    surface : Surface
+        The fitted surface.
+    normal : NormalMatrix
+        Matrix of its least squares.
     """
 
-    optics: OpticsConfig  # with the nominal geometry
-    vertex_z_mm: float  # position of the vertex
-    column_px: FloatArray  # (n,): the points in the picture
-    row_px: FloatArray  # (n,)
-    screen_mm: FloatArray  # (2, n): where the fitted surface sends them
-    residual_mm: FloatArray  # (2, n): where they were seen, less that
-    sigma_mm: FloatArray  # (2, n): 1 sigma of noise there
-    t_mm: FloatArray  # (n,): lengths of their rays
+    optics: OpticsConfig
+    vertex_z_mm: float
+    column_px: FloatArray
+    row_px: FloatArray
+    screen_mm: FloatArray
+    residual_mm: FloatArray
+    sigma_mm: FloatArray
+    t_mm: FloatArray
     surface: Surface
     normal: normal_matrix.NormalMatrix
 
@@ -56,7 +78,7 @@ class TrialBench:
         figure: bin_figure.BinFigure,
         count: int = TRIAL_POINTS,
     ) -> "TrialBench":
-        """Of a set's figure, its points thinned to about `count`."""
+        """The trial bench of a set and its figure, with about `count` of the bins."""
         places_px = checked.places_px(figure.index)
         return cls.of_points(
             optics,
@@ -79,10 +101,27 @@ class TrialBench:
         sigma_mm: FloatArray,
         count: int,
     ) -> "TrialBench":
-        """Of points that stand on a surface, seen at `place_px` (2, n),
-        thinned to about `count`.
+        """The trial bench of points on a surface.
+
+        Parameters
+        ----------
+        optics : OpticsConfig
+            The bench.
+        tracer : Tracer
+            Its rays.
+        surface : Surface
+            The fitted surface.
+        points : Points
+            n rays, traced to it.
+        place_px : (2, n) array
+            Columns and rows at which they are seen.
+        sigma_mm : (2, n) array
+            Standard uncertainty of their screen points.
+        count : int
+            About how many of them to use.
         """
         chosen = spread_evenly(place_px, optics.camera.width_px, count)
+        # Fewer points are as certain together as all of them.
         thinning = points.t_mm.size / np.count_nonzero(chosen)
         points = points.subset(chosen)
         column_px, row_px = place_px[:, chosen]
@@ -103,30 +142,44 @@ class TrialBench:
     def solve(
         self, there: BenchGeometry, disturbance_mm: FloatArray | float = 0.0, linear: bool = False
     ) -> FloatArray:
-        """Parameters (parameters,) in mm of the surface that `fit` finds."""
+        """Parameters (parameters,), mm, of the surface that `fit` finds."""
         return self.fit(there, disturbance_mm, linear).surface.parameters
 
     def fit(
         self, there: BenchGeometry, disturbance_mm: FloatArray | float = 0.0, linear: bool = False
     ) -> surface_fit.Fit:
-        """Fit the surface on another bench, the screen points (2, n) off by a disturbance.
+        """Fit the surface on another bench.
 
-        One step suffices for a `linear` answer: the next would change it by 1/300.
+        Parameters
+        ----------
+        there : BenchGeometry
+            The bench.
+        disturbance_mm : (2, n) array or float
+            Error of the screen points.
+        linear : bool
+            One step of the fit suffices: the next would change its answer by 1/300.
 
-        Raises ArithmeticError if the fit does not converge: the geometry is not near the nominal
-        one.
+        Returns
+        -------
+        Fit
+
+        Raises
+        ------
+        ArithmeticError
+            If the fit does not converge: the geometry is not near the nominal one.
         """
-        geometry, screen_mm = there.geometry, there.pitch * (self.screen_mm + disturbance_mm)
+        # The points on that bench.
+        geometry = there.geometry
+        screen_mm = there.pitch * (self.screen_mm + disturbance_mm)
         tracer = ray_tracing.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
         points = ray_tracing.Points.of(geometry.rays(self.column_px, self.row_px), screen_mm)
         points.t_mm[:] = self.t_mm
         tracer.intersect(points, self.surface, newton=3)
+
+        # The fit with a matrix of its own: a turn of the camera moves the points by centimetres. A
+        # fit that diverges is reported below.
         steps = 1 if linear else surface_fit.MAX_ITERATIONS
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # of a fit that diverges, which is reported below
-            # the nominal points' matrix would not do: a turn of the camera moves them by
-            # centimetres
+        with np.errstate(over="ignore", invalid="ignore"):
             try:
                 normal = NormalMatrix.from_points(tracer, points)
                 fit = surface_fit.fit_surface(
@@ -134,16 +187,18 @@ class TrialBench:
                 )
             except ValueError:
                 fit = None
-        if fit is None or not (fit.converged or (linear and np.isfinite(fit.changes_mm[-1]))):
-            raise ArithmeticError("a trial did not converge: the geometry's spread is too wide")
-        return fit
+        if fit is not None:
+            is_linear_answer = linear and np.isfinite(fit.changes_mm[-1])
+            if fit.converged or is_linear_answer:
+                return fit
+        raise ArithmeticError("a trial did not converge: the geometry's spread is too wide")
 
     def geometry(self, names: tuple[str, ...] = (), change: ArrayLike = ()) -> BenchGeometry:
-        """The nominal bench, or changed."""
+        """The nominal bench, with its named numbers changed by (k,) amounts."""
         return moved_bench(self.optics, names, change)
 
     def slope_variance(self) -> FloatArray:
-        """(2,) variance of an x and of a y slope from the noise."""
+        """Variance (2,) of an x and of a y slope from the noise."""
         gain = slope_noise.slope_per_screen(
             Geometry.from_config(self.optics), self.surface.radius_mm, self.surface.sag_mm
         )
@@ -151,21 +206,35 @@ class TrialBench:
 
 
 def spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
-    """About `count` of the points at `place_px` (2, n) by a golden-ratio sequence: even along rows
-    and columns alike.
+    """Choose points by a golden-ratio sequence, evenly along rows and columns.
 
     A place is chosen in every set or in none, so that sets of one bench can be compared.
+
+    Parameters
+    ----------
+    place_px : (2, n) array
+        Columns and rows of the points.
+    width_px : int
+        Width of the picture.
+    count : int
+        About how many points to choose.
+
+    Returns
+    -------
+    (n,) bool array
     """
     size = place_px.shape[1]
     if size <= count:
         return np.ones(size, bool)
-    turn = ((np.rint(place_px[1]) * width_px + np.rint(place_px[0])) * ((np.sqrt(5) - 1) / 2)) % 1
+    column, row = np.rint(place_px)
+    turn = ((row * width_px + column) * _GOLDEN_RATIO) % 1
     return np.asarray(turn < count / size)
 
 
 def moved_film(bench: TrialBench, displacement_um: float) -> TrialBench:
-    """The bench with the film's bowl deeper by a displacement, and the ring in its place."""
-    deeper_mm, surface = displacement_um * 1e-3, bench.surface
+    """Return the bench with a bowl that is deeper by a displacement; the ring stays."""
+    deeper_mm = displacement_um * 1e-3
+    surface = bench.surface
     bowl = Surface.hencky_bowl(deeper_mm, surface.radius_mm)
     surface = Surface.from_parameters(surface.parameters + bowl.parameters, surface.radius_mm)
     there = replace(bench, surface=surface, vertex_z_mm=bench.vertex_z_mm - deeper_mm)
@@ -190,6 +259,10 @@ def predicted_mm(
 def traced_points(
     bench: TrialBench, geometry: Geometry, bent: FloatArray | float = 0.0
 ) -> tuple[Tracer, Points]:
+    """The points of a bench with another geometry, near the surface.
+
+    `bent` (3, n) is added to the directions of their rays.
+    """
     points = Points.of(geometry.rays(bench.column_px, bench.row_px) + bent, bench.screen_mm)
     points.t_mm[:] = bench.t_mm
     return Tracer(geometry, bench.surface.radius_mm, bench.vertex_z_mm), points
