@@ -168,8 +168,8 @@ class Budget:
 
 @lru_cache
 def _mean_products(disc: float) -> dict[str, FloatArray]:
-    """Means over a disc of products of the effects of two parameters, (parameters, parameters) each,
-    on sag, height and figure (the height without its plane).
+    """Means (parameters, parameters) over a disc of products of the effects of two parameters, on
+    sag, height and figure (the height without its plane).
     """
     heights, plane = disc_heights.heights_over_disc(disc)
     figures = disc_heights.remove_plane(heights, plane)

@@ -41,20 +41,24 @@ from membrane_ctrl.metrology.rays.bench_motions import GROUPS, group_columns
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_DEGREE
 
-# K is at least some times what the mirror would have tilted: a camera that turns tilts the ring by
-# a fourth, a screen that shifts by a fifth of it
+# Least K over the tilt that a motion of the mirror alone would explain: a camera that turns tilts
+# the ring by a fourth of its turn, a screen that shifts by a fifth.
 _KNOCK_PER_TILT = 5.0
-_CHANCE_GAIN = 4.0  # of each component of a group: below it there is no motion beyond the allowance
-_SURE_GAIN = 25.0  # decrease of chi-square: 5 sigma
+# Decreases of chi-square.
+_CHANCE_GAIN = 4.0  # for each component of a group: a smaller one is no motion beyond the allowance
+_SURE_GAIN = 25.0  # 5 sigma
 _PLAUSIBLE_GAIN = 9.0  # below the best: 3 sigma
-# Effects on the figure (RMS without tilt): beyond the first, a proven motion degrades it; beyond
-# the second, one that camera, screen or mirror may have made
-_PROVEN_UM, _POSSIBLE_UM = 0.03, 0.1
+# Effects on the figure (RMS without tilt) beyond which it is degraded: by a proven motion, and by
+# one that camera, screen or mirror may have made.
+_PROVEN_UM = 0.03
+_POSSIBLE_UM = 0.1
+_TINY = 1e-12  # instead of a division by zero
 _FIGURE = slice(FIRST_FIGURE_INDEX - 2, None)  # of the parameters: without tilt
 
 
 @cache
 def _ring_harmonic(order: int) -> FloatArray:
+    """Matrix (2, parameters): cosine and sine of one harmonic of the rim's height."""
     return rim_harmonics.rim_harmonics()[[order, order + ZERNIKE_DEGREE]]
 
 
@@ -70,17 +74,33 @@ def ring_saddle() -> FloatArray:
 
 @dataclass(frozen=True)
 class MotionEffects:
-    """What each component of the motions does to figure, ring and slopes."""
+    """What each component of the motions does to figure, ring and slopes.
 
-    figure_mm: FloatArray  # S (parameters, components): per µm or µrad
-    # R (components, 2, n): screen points that no surface explains, in the unit of the observation
+    Attributes
+    ----------
+    figure_mm : (parameters, components) array
+        S, mm per µm or µrad.
+    left : (components, 2, n) array
+        R: screen points that no surface explains, in the unit of the observation.
+    """
+
+    figure_mm: FloatArray
     left: FloatArray
 
     @classmethod
     def of(cls, changes: FloatArray, jacobian: FloatArray, weights: FloatArray) -> "MotionEffects":
-        """Of changes E (components, 2, n), derivatives J (2, parameters, n) in the same unit, and
-        weights (2, n).
+        """Split the effects of the motions into a change of the figure and the rest.
+
+        Parameters
+        ----------
+        changes : (components, 2, n) array
+            E: changes of the screen points, or of the phases.
+        jacobian : (2, parameters, n) array
+            J: derivatives by the surface's parameters, in the same unit.
+        weights : (2, n) array
+            W.
         """
+        # S = (J^T W J)^-1 J^T W E, R = E - J S.
         weighted = jacobian * weights[:, None]
         normal = np.einsum("apn,aqn->pq", weighted, jacobian)
         right = np.einsum("apn,kan->pk", weighted, changes)
@@ -88,42 +108,66 @@ class MotionEffects:
         return cls(figure, changes - np.einsum("apn,pk->kan", jacobian, figure))
 
     def gram(self, weights: FloatArray) -> FloatArray:
-        """G (components, components)."""
+        """G = R^T W R (components, components), with weights (2, n)."""
         flat = self.left.reshape(len(self.left), -1)
         return np.asarray((flat * weights.ravel()) @ flat.T)
 
 
 @dataclass(frozen=True)
 class GroupFit:
-    """A group of motions as the only cause."""
+    """A group of motions as the only cause.
 
-    group: int  # of `GROUPS`
-    amount: FloatArray  # (1,) or (2,): µm or µrad
-    gain: float  # decrease of chi-square
+    Attributes
+    ----------
+    group : int
+        Number of the group in `GROUPS`.
+    amount : (1,) or (2,) array
+        Estimated motion, µm or µrad.
+    gain : float
+        Decrease of chi-square.
+    """
+
+    group: int
+    amount: FloatArray
+    gain: float
 
     def describe(self) -> str:
-        """What moved, for a person."""
+        """What moved, and how far, for people."""
+        group = GROUPS[self.group]
         size = float(np.linalg.norm(self.amount))
-        return f"{GROUPS[self.group].name} by {size:.2g} {GROUPS[self.group].unit}"
+        return f"{group.name} by {size:.2g} {group.unit}"
 
 
 @dataclass(frozen=True)
 class MotionFinding:
-    """The motions that explain an observation."""
+    """The motions that explain an observation.
 
-    tilted: tuple[GroupFit, ...]  # what is not hidden, by the ring's tilt; most likely first
-    bent: tuple[GroupFit, ...]  # all but the mirror's tilt, by the ring's saddle; empty without it
-    # (parameters, parameters): what motions beyond chance may have done to the figure, and what
-    # motions may have done that are hidden or too small to be found; the latter is common to all
-    # frames
+    Attributes
+    ----------
+    tilted : tuple of GroupFit
+        Motions that are not hidden, by the ring's tilt; the most likely first.
+    bent : tuple of GroupFit
+        All motions but the mirror's tilt, by the ring's saddle; empty if saddles are not compared.
+    found_mm2 : (parameters, parameters) array
+        Covariance of what motions beyond chance may have done to the figure.
+    allowed_mm2 : (parameters, parameters) array
+        The same of motions that are hidden or too small to be found; common to all frames.
+    figure_um : float
+        RMS of the worst plausible effect of motions that tilt the ring, without the tilt.
+    hidden_um : float
+        The same of hidden motions.
+    """
+
+    tilted: tuple[GroupFit, ...]
+    bent: tuple[GroupFit, ...]
     found_mm2: FloatArray
     allowed_mm2: FloatArray
-    figure_um: float  # RMS of the worst plausible effect, without tilt, of motions that tilt
-    hidden_um: float  # the same, of hidden motions
+    figure_um: float
+    hidden_um: float
 
     @property
     def covariance_mm2(self) -> FloatArray:
-        """What motions may have done to the figure, (parameters, parameters)."""
+        """Covariance (parameters, parameters) of what motions may have done to the figure."""
         return self.found_mm2 + self.allowed_mm2
 
     @property
@@ -148,8 +192,11 @@ class MotionFinding:
         )
 
     def describe(self) -> str:
-        """The most likely motion, with the runner-up unless it is excluded."""
-        best, second = (self.tilted if self.is_tilt_sure or not self.bent else self.bent)[:2]
+        """The most likely motion, with the second one unless it is excluded."""
+        candidates = self.bent
+        if self.is_tilt_sure or not self.bent:
+            candidates = self.tilted
+        best, second = candidates[:2]
         if best.gain - second.gain > _PLAUSIBLE_GAIN:
             return best.describe()
         return f"it looks like {best.describe()}, or {second.describe()}"
@@ -161,10 +208,11 @@ def find_motion_doubt(motion: MotionFinding, own_mm2: FloatArray, tilt_urad: flo
     Parameters
     ----------
     motion : MotionFinding
+        The motions that explain it.
     own_mm2 : (parameters, parameters) array
         Covariance of the figure on a bench that has not moved.
     tilt_urad : float
-        Of the ring since the reference.
+        Tilt of the ring since the reference.
     """
     if motion.is_sure:
         return f"knocked: {motion.describe()}; check camera and screen"
@@ -179,21 +227,35 @@ def find_motion_doubt(motion: MotionFinding, own_mm2: FloatArray, tilt_urad: flo
 
 @dataclass(frozen=True)
 class _GroupTest:
-    """How a group of k components is estimated."""
+    """How a group of k components is estimated.
+
+    Attributes
+    ----------
+    columns : slice
+        Its columns among all components.
+    by_ring : (k, 2) array
+        h^T C_c^-1.
+    by_left : (k, k) array
+        G C_q^-1.
+    information : (k, k) array
+        A.
+    spread : (k, k) array
+        (A + 1 / K^2)^-1, with K of the group.
+    """
 
     columns: slice
-    by_ring: FloatArray  # h^T C_c^-1 (k, 2)
-    by_left: FloatArray  # G C_q^-1 (k, k)
-    information: FloatArray  # A (k, k)
-    spread: FloatArray  # (A + 1 / K^2)^-1 (k, k), with K of the group
+    by_ring: FloatArray
+    by_left: FloatArray
+    information: FloatArray
+    spread: FloatArray
 
     def weigh(self, ring_mm: FloatArray, left: FloatArray) -> FloatArray:
-        """b (k,)."""
+        """b (k,) of the ring's tilt or saddle (2,) and of the products q (components,)."""
         return np.asarray(self.by_ring @ ring_mm + self.by_left @ left[self.columns])
 
 
 def _spread(information: FloatArray, size: float) -> FloatArray:
-    """Covariance (k, k) of a group whose components are of this size unless seen otherwise."""
+    """(A + 1 / size^2)^-1 (k, k): covariance of a group whose components have a prior of this size."""
     return np.asarray(np.linalg.inv(information + np.eye(len(information)) / size**2))
 
 
@@ -217,6 +279,7 @@ class MotionTest:
     Parameters
     ----------
     effects : MotionEffects
+        Effects of each motion.
     tilt_mm2 : (2, 2) array
         Covariance C_c of the ring's tilt.
     slopes : SlopeEvidence or None
@@ -239,6 +302,8 @@ class MotionTest:
         self._by_saddle: dict[int, _GroupTest] = {}
         if saddle_mm2 is not None:
             self._by_saddle = self._tests(ring_saddle(), saddle_mm2)
+
+        # What motions may have done that are too small to be found, within their allowances.
         self._undetected_mm2 = np.zeros((len(effects.figure_mm),) * 2)
         for number, group in enumerate(GROUPS):
             if group.allowance == 0:
@@ -254,7 +319,11 @@ class MotionTest:
             self._undetected_mm2 += effect @ allowed @ effect.T
 
     def _tests(self, harmonic: FloatArray, ring_mm2: FloatArray) -> dict[int, _GroupTest]:
-        """Of each group, by a harmonic of the ring and by the slopes."""
+        """The test of each group, by a harmonic of the ring and by the slopes.
+
+        `harmonic` (2, parameters) is `ring_tilt` or `ring_saddle`, `ring_mm2` (2, 2) its
+        covariance.
+        """
         tests = {}
         ring_weight = np.linalg.inv(ring_mm2)
         for number, (group, columns) in enumerate(zip(GROUPS, group_columns(), strict=True)):
@@ -274,8 +343,12 @@ class MotionTest:
     def find(self, tilt_mm: FloatArray, saddle_mm: FloatArray, left: FloatArray) -> MotionFinding:
         """Estimate every group.
 
-        From the ring's tilt and saddle c (2,) each, and the products q (components,). What is not
-        compared counts for nothing.
+        Parameters
+        ----------
+        tilt_mm, saddle_mm : (2,) arrays
+            c of the ring; the saddle has no effect if saddles are not compared.
+        left : (components,) array
+            q of the slopes; no effect if slopes are not compared.
         """
         tilted = [fit for fit in self._fit_tilt(tilt_mm, left) if not GROUPS[fit.group].is_hidden]
         bent = self._fit(self._by_saddle, saddle_mm, left)
@@ -292,22 +365,21 @@ class MotionTest:
         )
 
     def _fit_tilt(self, tilt_mm: FloatArray, left: FloatArray) -> list[GroupFit]:
-        """By the ring's tilt: knocks are at least some times what the mirror would have tilted."""
+        """Estimate every group by the ring's tilt, the most likely first."""
+        # Tilt of the mirror if only it had moved; K of every group is at least a multiple of it.
         mirror = next(number for number, group in enumerate(GROUPS) if group.is_of_mirror)
         test = self._by_tilt[mirror]
         tilt = np.linalg.solve(test.information, test.weigh(tilt_mm, left))
         tilt_knock = _KNOCK_PER_TILT * float(np.linalg.norm(tilt))
-        tests = {
-            number: replace(test, spread=_spread(test.information, tilt_knock))
-            if tilt_knock > GROUPS[number].knock
-            else test
-            for number, test in self._by_tilt.items()
-        }
+        tests = dict(self._by_tilt)
+        for number, test in self._by_tilt.items():
+            if tilt_knock > GROUPS[number].knock:
+                tests[number] = replace(test, spread=_spread(test.information, tilt_knock))
         return self._fit(tests, tilt_mm, left)
 
     @staticmethod
     def _fit(tests: dict[int, _GroupTest], ring_mm: FloatArray, left: FloatArray) -> list[GroupFit]:
-        """The groups, the most likely first."""
+        """Estimate every group, the most likely first."""
         fits = []
         for number, test in tests.items():
             right = test.weigh(ring_mm, left)
@@ -319,11 +391,26 @@ class MotionTest:
 def _worst_effect(
     effects: MotionEffects, fits: list[GroupFit], is_hidden: bool
 ) -> tuple[FloatArray, float]:
-    """Change (parameters,) of the figure by the worst plausible motion, and its RMS without tilt.
+    """Worst effect of a plausible motion; amounts count as far as they are beyond chance.
 
-    Of the hidden motions or of the others. Amounts count as far as they are beyond chance.
+    Parameters
+    ----------
+    effects : MotionEffects
+        Effects of each motion.
+    fits : list of GroupFit
+        Estimates of the groups, the most likely first.
+    is_hidden : bool
+        Whether hidden motions or the others are considered.
+
+    Returns
+    -------
+    worst_mm : (parameters,) array
+        Change of the figure.
+    figure_um : float
+        Its RMS without tilt.
     """
-    worst, figure_um = np.zeros(len(effects.figure_mm)), 0.0
+    worst_mm = np.zeros(len(effects.figure_mm))
+    figure_um = 0.0
     for fit in fits:
         group = GROUPS[fit.group]
         if group.is_of_mirror or group.is_hidden != is_hidden:
@@ -332,9 +419,10 @@ def _worst_effect(
             continue
         columns = group_columns()[fit.group]
         chance = _CHANCE_GAIN * group.components
-        share = math.sqrt(max(0.0, 1 - chance / max(fit.gain, 1e-12)))
-        effect = share * (effects.figure_mm[:, columns] @ fit.amount)
-        size_um = 1e3 * float(np.linalg.norm(effect[_FIGURE]))
+        share = math.sqrt(max(0.0, 1 - chance / max(fit.gain, _TINY)))
+        effect_mm = share * (effects.figure_mm[:, columns] @ fit.amount)
+        size_um = 1e3 * float(np.linalg.norm(effect_mm[_FIGURE]))
         if size_um > figure_um:
-            worst, figure_um = effect, size_um
-    return worst, figure_um
+            worst_mm = effect_mm
+            figure_um = size_um
+    return worst_mm, figure_um
