@@ -8,6 +8,7 @@ standard deviation over the trials' heights: the paper's RMSE map.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.numerics import zernike
@@ -19,13 +20,21 @@ MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what the terms ca
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Points of a square grid inside a radius, and the matrix that makes heights of parameters
-    there.
+    """Points of a square grid inside a radius, and the matrix from parameters to heights there.
+
+    Attributes
+    ----------
+    axis_mm : (n,) array
+        Coordinates of x and of y.
+    inside : (n, n) bool array
+        Points inside the radius; rows are along y.
+    matrix : (points, parameters) array
+        Heights of the points inside, 0 at the vertex.
     """
 
-    axis_mm: FloatArray  # (n,): of x and of y
-    inside: BoolArray  # (n, n): rows along y
-    matrix: FloatArray  # (points, parameters): heights, 0 at the vertex, of the points inside
+    axis_mm: FloatArray
+    inside: BoolArray
+    matrix: FloatArray
 
     @classmethod
     def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> "HeightMap":
@@ -36,14 +45,14 @@ class HeightMap:
         return cls(axis, inside, height_matrix(x[inside], y[inside], radius_mm))
 
     def picture(self, heights: FloatArray) -> FloatArray:
-        """(n, n) of values at the points inside; NaN outside."""
+        """A map (n, n) of values (points,) at the points inside; NaN outside."""
         out = np.full(self.inside.shape, np.nan)
         out[self.inside] = heights
         return out
 
     def sigma(self, covariance: FloatArray) -> FloatArray:
-        """(points,) standard deviation for a covariance (parameters, parameters) of the parameters,
-        in its unit.
+        """Standard deviation (points,) of the height, for a covariance (parameters, parameters) of
+        the parameters.
         """
         variance = np.einsum("pi,pi->p", self.matrix @ covariance, self.matrix)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -51,10 +60,10 @@ class HeightMap:
 
 def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
     """Matrix (points, parameters) from parameters to heights, 0 at the vertex."""
-    x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
+    x = np.asarray(x_mm) / radius_mm
+    y = np.asarray(y_mm) / radius_mm
     out = np.asarray(zernike.evaluate_terms(x, y).T @ parameter_to_coeffs())
-    out[:, -1] += (
-        np.polynomial.polynomial.polyval(x * x + y * y, hencky_bowl.excess_series())
-        / hencky_bowl.excess_rms()
-    )
+    # The last parameter also has the excess of Hencky's bowl.
+    excess = series.polyval(x * x + y * y, hencky_bowl.excess_series())
+    out[:, -1] += excess / hencky_bowl.excess_rms()
     return out

@@ -1,8 +1,8 @@
-"""The linear covariance of the parameters, beside the Monte Carlo: C = J S J^T + C_noise.
+"""The linear covariance of the parameters, to compare with the Monte Carlo: C = J S J^T + C_noise.
 
 S is the covariance of the geometry and J the change of the parameters with it, from two solutions
-a number (some ms each). J hardly changes while the film moves by micrometres, so the live cycle
-computes it once a full cycle.
+for each number (some ms each). J hardly changes while the film moves by micrometres, so the live
+cycle computes it once.
 """
 
 from collections.abc import Sequence
@@ -30,12 +30,12 @@ def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
             continue
         step = np.zeros(len(spread.names))
         step[k] = sigma
-        ends = [
-            bench.solve(bench.geometry(spread.names, sign * step), linear=True)
-            for sign in (1.0, -1.0)
-        ]
-        columns.append((ends[0] - ends[1]) / (2 * sigma))
-    return np.stack(columns, axis=1) if columns else np.zeros((PARAMETERS, 0))
+        above = bench.solve(bench.geometry(spread.names, step), linear=True)
+        below = bench.solve(bench.geometry(spread.names, -step), linear=True)
+        columns.append((above - below) / (2 * sigma))
+    if not columns:
+        return np.zeros((PARAMETERS, 0))
+    return np.stack(columns, axis=1)
 
 
 def noise_covariance(bench: TrialBench) -> FloatArray:
@@ -44,17 +44,17 @@ def noise_covariance(bench: TrialBench) -> FloatArray:
 
 
 def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:
-    """Covariance (parameters, parameters) in mm^2 from the geometry; the live cycle reports it
-    beside its own.
+    """Covariance (parameters, parameters), mm^2, from the geometry.
+
+    `jacobian` (parameters, k) is that of `geometry_jacobian`.
     """
     return np.asarray(jacobian @ spread.covariance @ jacobian.T)
 
 
 def linear_covariance(benches: Sequence[TrialBench], spread: GeometrySpread) -> FloatArray:
-    """What the Monte Carlo finds, without it: (parameters, parameters) in mm^2.
+    """Covariance (parameters, parameters), mm^2, that the Monte Carlo approximates.
 
-    With two benches the covariance is that of the change between them: they share the geometry, not
-    the noise.
+    With two benches it is that of the change between them: they share the geometry, not the noise.
     """
     jacobian = geometry_jacobian(benches[0], spread)
     if len(benches) > 1:

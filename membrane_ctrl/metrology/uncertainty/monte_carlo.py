@@ -1,6 +1,6 @@
 """Monte Carlo over geometry and pixel noise (the paper's section 3.1), on a few thousand bins.
 
-A trial of the paper disturbs the frames of every pixel and reconstructs them anew. The disturbance
+A trial of the paper disturbs the frames of every pixel and reconstructs them again. The disturbance
 of a bin's phase by white noise of the pixels is known: sigma sqrt(2 / N) / (B m) for bins of m x m
 pixels. A few thousand of the bins determine the terms: one in k, each with a k-th of the variance,
 gives the fit the same covariance as all of them. A trial therefore draws a geometry, disturbs the
@@ -29,20 +29,33 @@ def run_trials(
     trials: Sequence[int],
     first_set: int = 0,
 ) -> FloatArray:
-    """Parameters (trials, sets, parameters) in mm of the trials with these numbers; all sets share
-    the geometry of a trial.
+    """Run trials; all sets share the geometry of a trial.
 
-    The benches, one a set, have the same nominal geometry. `first_set` is the number of the first
-    set in its run: noise differs from set to set.
+    Parameters
+    ----------
+    benches : sequence of TrialBench
+        One for each set, all with the same nominal geometry.
+    spread : GeometrySpread
+        From which the geometries are drawn.
+    seed : int
+        Seed of the run.
+    trials : sequence of int
+        Numbers of the trials to run.
+    first_set : int
+        Number of the first set in its run: noise differs from set to set.
+
+    Returns
+    -------
+    (trials, sets, parameters) array
+        Parameters of the surfaces, mm.
     """
     out = np.empty((len(trials), len(benches), PARAMETERS))
     for row, trial in enumerate(trials):
         change = spread.draw(np.random.default_rng((seed, 0, trial)))
         for k, bench in enumerate(benches):
-            noise = np.random.default_rng((seed, 1 + first_set + k, trial)).standard_normal(
-                bench.sigma_mm.shape
-            )
-            out[row, k] = bench.solve(bench.geometry(spread.names, change), noise * bench.sigma_mm)
+            random = np.random.default_rng((seed, 1 + first_set + k, trial))
+            noise_mm = random.standard_normal(bench.sigma_mm.shape) * bench.sigma_mm
+            out[row, k] = bench.solve(bench.geometry(spread.names, change), noise_mm)
     return out
 
 

@@ -255,7 +255,7 @@ class _GroupTest:
 
 
 def _spread(information: FloatArray, size: float) -> FloatArray:
-    """(A + 1 / size^2)^-1 (k, k): covariance of a group whose components have a prior of this size."""
+    """(A + 1 / size^2)^-1 (k, k): covariance of a group, its components with a prior of `size`."""
     return np.asarray(np.linalg.inv(information + np.eye(len(information)) / size**2))
 
 

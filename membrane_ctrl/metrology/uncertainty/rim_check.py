@@ -13,11 +13,11 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.model.arrays import FloatArray
 
-# A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); rings are round
-# to about 1 mm. Of that, 1 sigma:
-_RING_SIGMA_MM, _RING_SIZE_SIGMA = 1.0, 0.0017
-# Twice what the sigmas allow is nothing to wonder at: sigmas are then widened until they allow half
-# of the misfit.
+# 1 sigma of place and relative size of a real ring, which is round to about 1 mm. A good pose
+# leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels).
+_RING_SIGMA_MM = 1.0
+_RING_SIZE_SIGMA = 0.0017
+# Misfit that is usual. Beyond it the geometry's sigmas are widened until the misfit is usual.
 _USUAL_SIGMAS = 2.0
 # Correlations between the inputs are left out, so sigmas are somewhat too large: beyond this a
 # sound bench is rarer than 1 in 10,000.
@@ -62,7 +62,17 @@ class RimMisfit:
 
 
 def measure_rim_misfit(bench: TrialBench, spread: GeometrySpread, outline: Outline) -> RimMisfit:
-    """Compare the rim in the picture with the prediction and its uncertainty."""
+    """Compare the rim in the picture with the geometry's prediction.
+
+    Parameters
+    ----------
+    bench : TrialBench
+        The set's bench and surface.
+    spread : GeometrySpread
+        Covariance of the geometry.
+    outline : Outline
+        The rim as it is seen.
+    """
     theta = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     radius_mm = bench.surface.radius_mm
     rim_z_mm = np.full(theta.size, bench.vertex_z_mm + bench.surface.sag_mm)
@@ -80,16 +90,15 @@ def measure_rim_misfit(bench: TrialBench, spread: GeometrySpread, outline: Outli
         predict_px((name,), np.array([sigma])) - nominal_px
         for name, sigma in zip(spread.names, spread.sigmas, strict=True)
     ]
-    # correlations are left out: they make the rim better known than its parts, and the scale then
-    # too small
-    sigmas_px = np.sqrt(np.sum(np.square(changes_px), axis=0)) if changes_px else np.zeros(3)
+    # 1 sigma of the prediction. Correlations are left out: with them the rim is better known than
+    # its parts, and the limit would be too strict.
+    sigmas_px = np.zeros(3)
+    if changes_px:
+        sigmas_px = np.sqrt(np.sum(np.square(changes_px), axis=0))
     place_sigma_mm = float(np.hypot(sigmas_px[0], sigmas_px[1])) * radius_mm / nominal_px[2]
     size_sigma = float(sigmas_px[2] / nominal_px[2])
-    return RimMisfit(
-        outline.offset_mm,
-        outline.size_ratio,
-        max(
-            abs(outline.offset_mm) / math.hypot(place_sigma_mm, _RING_SIGMA_MM),
-            abs(outline.size_ratio - 1) / math.hypot(size_sigma, _RING_SIZE_SIGMA),
-        ),
-    )
+
+    # Both misfits in units of the prediction's sigma and that of the ring.
+    place_misfit = abs(outline.offset_mm) / math.hypot(place_sigma_mm, _RING_SIGMA_MM)
+    size_misfit = abs(outline.size_ratio - 1) / math.hypot(size_sigma, _RING_SIZE_SIGMA)
+    return RimMisfit(outline.offset_mm, outline.size_ratio, max(place_misfit, size_misfit))

@@ -11,22 +11,19 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import FloatArray
 
-# Where the film is watched, as (radius in analysis radii, azimuth in degrees): a third of a turn
-# apart and inside, halfway and near the rim, so that a tilt, a bend and a wave of the rim look
-# different in the
-# three.
-_WATCHED = {"A": (0.45, 90.0), "B": (0.70, 210.0), "C": (0.95, 330.0)}
+# Points of the film whose height is followed, as (radius in analysis radii, azimuth in degrees). A
+# tilt, a bend and a wave of the rim look different in the three.
+_POINTS = {"A": (0.45, 90.0), "B": (0.70, 210.0), "C": (0.95, 330.0)}
 
 
 def default_points_mm(analysis_radius_mm: float) -> dict[str, tuple[float, float]]:
-    """A, B and C: name to (x, y) in mm."""
-    turns = {
-        name: (analysis_radius_mm * r, math.radians(azimuth))
-        for name, (r, azimuth) in _WATCHED.items()
-    }
-    return {
-        name: (r_mm * math.cos(turn), r_mm * math.sin(turn)) for name, (r_mm, turn) in turns.items()
-    }
+    """Places (x, y) of the points A, B and C by name, mm."""
+    places_mm = {}
+    for name, (radius, azimuth_deg) in _POINTS.items():
+        radius_mm = analysis_radius_mm * radius
+        azimuth_rad = math.radians(azimuth_deg)
+        places_mm[name] = (radius_mm * math.cos(azimuth_rad), radius_mm * math.sin(azimuth_rad))
+    return places_mm
 
 
 class RunningCovariance:
@@ -35,9 +32,9 @@ class RunningCovariance:
     Attributes
     ----------
     count : int
-        Vectors seen.
+        Number of vectors.
     mean : (k,) array
-        Of them.
+        Their mean.
     """
 
     def __init__(self, size: int) -> None:
@@ -46,7 +43,7 @@ class RunningCovariance:
         self._squares: FloatArray = np.zeros((size, size))
 
     def add(self, vector: FloatArray) -> None:
-        """Count one more."""
+        """Add a vector (k,)."""
         self.count += 1
         before = vector - self.mean
         self.mean = self.mean + before / self.count
@@ -54,7 +51,7 @@ class RunningCovariance:
 
     @property
     def covariance(self) -> FloatArray:
-        """(k, k), unbiased; zeros before the second vector."""
+        """Unbiased covariance (k, k); zeros before the second vector."""
         return self._squares / max(self.count - 1, 1)
 
 
@@ -68,7 +65,11 @@ class Tally:
     high: float = math.nan
 
     def add(self, value: float) -> None:
-        """Count one more."""
+        """Add a number."""
         self.count += 1
-        self.mean = value if self.count == 1 else self.mean + (value - self.mean) / self.count
-        self.low, self.high = float(np.fmin(self.low, value)), float(np.fmax(self.high, value))
+        if self.count == 1:
+            self.mean = value
+        else:
+            self.mean += (value - self.mean) / self.count
+        self.low = float(np.fmin(self.low, value))
+        self.high = float(np.fmax(self.high, value))

@@ -7,10 +7,7 @@ import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
-from membrane_ctrl.metrology.figure.set_motion import (
-    LASER_NOISE_UM,
-    FilmMotion,
-)
+from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM, FilmMotion
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.phase import screen_scale
 from membrane_ctrl.metrology.rays.rim_outline import Outline
@@ -33,29 +30,29 @@ from membrane_ctrl.metrology.uncertainty.second_reflection_error import second_r
 from membrane_ctrl.metrology.uncertainty.set_moment import moment_source
 from membrane_ctrl.metrology.uncertainty.slope_misfit import SlopeMisfit, measure_slope_misfit
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
-from membrane_ctrl.metrology.uncertainty.unseen_motion import (
-    UnseenMotion,
-    estimate_unseen_motion,
-)
+from membrane_ctrl.metrology.uncertainty.unseen_motion import UnseenMotion, estimate_unseen_motion
 
-_BLUR_UM = 0.5  # RMS of the height: a picture is out of focus, not only seen through a lens
-# the fringes' error in the film's place at a frame, the share of a motion within an axis that its
-# correction leaves, and that of a motion from x to y: a lens of a data sheet is 1 % off
-_SEEN_UM, _SEEN_SHARE, _TOLD_SHARE = 0.1, 0.05, 0.02
+_BLUR_UM = 0.5  # RMS of the height beyond which a picture is out of focus
+# What the correction for the film's motion leaves: the fringes' error in the film's place at a
+# frame, a share of the motion within an axis, and a share of that from x to y (a lens of a data
+# sheet is 1 % off).
+_FRINGES_UM = 0.1
+_WITHIN_SHARE = 0.05
+_X_TO_Y_SHARE = 0.02
 
 
 @dataclass(frozen=True)
 class SetBudget:
-    """Budget of a figure, and what makes it doubtful.
+    """Budget of a figure, and the results of its consistency checks.
 
     Attributes
     ----------
     budget : Budget
         The rows.
     doubts : tuple of str
-        What the frames say against the figure, and what to do.
+        Why the figure is degraded, and what to do, for people.
     rim : RimMisfit or None
-        What the rim says of the geometry; None if the picture does not show it.
+        The rim against the geometry's prediction; None if the picture does not show it.
     slopes : SlopeMisfit
         Slopes that belong to no surface.
     """
@@ -74,51 +71,74 @@ def assemble_budget(
     noise_adu: float,
     outline: Outline | None,
 ) -> SetBudget:
-    """The budget, widened by what the set says of itself. Raises ArithmeticError if the spread is
-    too wide.
+    """Assemble the error budget of a measured set.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench.
+    checked : Checked
+        The set.
+    full : FullResult
+        Its figure.
+    spread : GeometrySpread
+        Covariance of the geometry; the budget is widened if the rim contradicts it.
+    noise_adu : float
+        Noise of a pixel.
+    outline : Outline or None
+        The rim in the picture, if it is visible.
+
+    Returns
+    -------
+    SetBudget
+
+    Raises
+    ------
+    ArithmeticError
+        If the spread is so wide that a fit does not converge.
     """
-    state, shifts = checked.state, [checked.stack.shifts_rad(used) for used in checked.view.used]
-    exact, places_px = np.zeros((2, state.index.size)), checked.places_px(state.index)
-    bench = TrialBench.of_points(
-        optics,
-        checked.tracer,
-        state.surface,
-        state.points,
-        places_px,
-        exact,
-        trial_bench.TRIAL_POINTS,
-    )
+    shifts = [checked.stack.shifts_rad(used) for used in checked.view.used]
+    bench = _make_bench(optics, checked)
     sigmas = optics.geometry.sigmas or SigmasConfig()
-    moved = FilmMotion.of(checked)
-    unseen = None
-    if not math.isfinite(moved.x_to_y_sigma_um):
-        unseen = estimate_unseen_motion(bench, spread)
-    film, doubts = _film_source(bench, moved, unseen)
-    blur = image_blur.blur_source(bench, _blur_px(optics, checked))
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
-    rim = None if outline is None else measure_rim_misfit(bench, spread, outline)
+
+    # Motion of the film from x to y: by the laser, or by the fringes.
+    motion = FilmMotion.of(checked)
+    unseen = None
+    if not math.isfinite(motion.x_to_y_sigma_um):
+        unseen = estimate_unseen_motion(bench, spread)
+    film_rows, doubts = _film_rows(bench, motion, unseen)
+    moment = moment_source(checked, motion, unseen, optics.mirror.radius_mm)
+    moment_rows = [] if moment is None else [moment]
+
+    # The geometry against the rim in the picture, and against slopes that no surface has.
+    rim = None
+    widening = 1.0
+    if outline is not None:
+        rim = measure_rim_misfit(bench, spread, outline)
+        widening = rim.widening
     slopes = measure_slope_misfit(bench, spread, full.grid, full.residual_mm)
-    # Contrast is compared with the slopes of the fitted surface: where these are not those of a
-    # surface, it shows no blur.
+
+    # Blur. It follows from the contrast and the slopes of the fitted surface: if these are not
+    # those of a surface, the contrast shows no blur.
+    blur = image_blur.blur_source(bench, _estimate_blur_px(optics, checked))
     is_blurred = budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM
     if is_blurred and not slopes.contradicts:
         doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
+
+    # One row for each input.
     slope_variance = full.slope_variance(optics, shifts, noise_adu)
+    light = math.hypot(frame_effects.LIGHT, checked.light_left)
+    film_um = _left_film_um(motion)
     sources = [
-        *bench_sources.geometry_sources(bench, spread, 1.0 if rim is None else rim.widening),
+        *bench_sources.geometry_sources(bench, spread, widening),
         *bench_sources.bench_sources(bench, sigmas),
-        *film,
-        *filter(None, [moment_source(checked, moved, unseen, optics.mirror.radius_mm)]),
-        _vertex_source(bench, sigmas, checked, film[0].sigma),
+        *film_rows,
+        *moment_rows,
+        _vertex_source(bench, sigmas, checked, film_rows[0].sigma),
         *film_shape_sources(full, slope_variance),
         blur,
-        *frame_effects.frame_sources(
-            bench,
-            optics,
-            shifts,
-            _film_um(moved),
-            math.hypot(frame_effects.LIGHT, checked.light_left),
-        ),
+        *frame_effects.frame_sources(bench, optics, shifts, film_um, light),
         second_reflection_source(bench, checked.second),
         held_light_source(bench, checked.stack, checked.view.used, checked.held),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
@@ -127,60 +147,89 @@ def assemble_budget(
     return SetBudget(whole, tuple(doubts), rim, slopes)
 
 
-def _blur_px(optics: OpticsConfig, checked: Checked) -> float:
-    state, shape = checked.state, checked.phase_rad.shape[1:]
+def _make_bench(optics: OpticsConfig, checked: Checked) -> TrialBench:
+    """A trial bench of some of the set's bins, without noise, which has a separate row."""
+    state = checked.state
+    return TrialBench.of_points(
+        optics,
+        checked.tracer,
+        state.surface,
+        state.points,
+        checked.places_px(state.index),
+        np.zeros((2, state.index.size)),
+        trial_bench.TRIAL_POINTS,
+    )
+
+
+def _estimate_blur_px(optics: OpticsConfig, checked: Checked) -> float:
+    """Sigma of the image's blur, from the contrast of the set's bins."""
+    state = checked.state
+    _, rows, columns = checked.phase_rad.shape
     screen_mm = checked.tracer.predict_screen(state.points, state.surface)
     predicted_rad = screen_mm / screen_scale.mm_per_rad(optics.pattern)
     swings = checked.view.swing_adu.reshape(2, -1)[:, state.index]
-    return estimate_blur_px(
-        predicted_rad, swings, state.index, (shape[0], shape[1]), checked.binned.bin_px
-    )
+    bin_px = checked.binned.bin_px
+    return estimate_blur_px(predicted_rad, swings, state.index, (rows, columns), bin_px)
 
 
 def _vertex_source(
     bench: TrialBench, sigmas: SigmasConfig, checked: Checked, moved_um: float
 ) -> budget.Source:
-    """Where the vertex is: by the laser, or nobody knows; half a motion from x to y is in the
-    frames' mean.
+    """The row for the place of the vertex.
+
+    Without a laser, half a motion `moved_um` from x to y is in the frames' mean.
     """
-    readings = checked.stack.readings_um
-    noise_um = vertex_um(readings, LASER_NOISE_UM)
-    if not np.isfinite(readings).all():
-        return bench_sources.vertex_source(
-            bench, math.hypot(noise_um, moved_um / 2), "place of the vertex, without a laser"
-        )
+    readings_um = checked.stack.readings_um
+    noise_um = vertex_um(readings_um, LASER_NOISE_UM)
+    if not np.isfinite(readings_um).all():
+        says = "place of the vertex, without a laser"
+        return bench_sources.vertex_source(bench, math.hypot(noise_um, moved_um / 2), says)
     scale_um = 1e3 * sigmas.laser_relative * abs(bench.vertex_z_mm)
     says = "place of the vertex, by the laser's noise and scale"
     return bench_sources.vertex_source(bench, math.hypot(noise_um, scale_um), says)
 
 
-def _film_um(film: FilmMotion) -> float:
-    """RMS motion of the film left in the phases of the frames."""
-    left = (_SEEN_UM, _SEEN_SHARE * film.moved_um) if film.worth_correcting else (film.moved_um,)
-    return math.hypot(*left, film.noise_um)
+def _left_film_um(motion: FilmMotion) -> float:
+    """1 sigma of the film's motion that is left in the phases of the frames."""
+    if motion.worth_correcting:
+        return math.hypot(_FRINGES_UM, _WITHIN_SHARE * motion.moved_um, motion.noise_um)
+    return math.hypot(motion.moved_um, motion.noise_um)
 
 
-def _film_source(
-    bench: TrialBench, film: FilmMotion, moved: UnseenMotion | None
+def _film_rows(
+    bench: TrialBench, motion: FilmMotion, unseen: UnseenMotion | None
 ) -> tuple[list[budget.Source], list[str]]:
-    """The film's motion from x to y: by the laser, else by the fringes."""
-    if moved is None:
-        left = _TOLD_SHARE if film.worth_correcting else 1.0
-        sigma_um = math.hypot(
-            film.x_to_y_sigma_um, left * float(film.told_um[0].mean() - film.told_um[1].mean())
-        )
+    """Rows for the film's motion from x to y, and the doubts that it raises.
+
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the set.
+    motion : FilmMotion
+        Motion by laser and fringes.
+    unseen : UnseenMotion or None
+        Motion by the fringes alone, of a set without a laser.
+    """
+    if unseen is None:
+        x_um, y_um = motion.told_um
+        share_left = _X_TO_Y_SHARE if motion.worth_correcting else 1.0
+        left_um = share_left * float(x_um.mean() - y_um.mean())
+        sigma_um = math.hypot(motion.x_to_y_sigma_um, left_um)
         says = "motion of the film from x to y, by the laser"
         return [bench_sources.film_source(bench, (sigma_um,), says, paired=False)], []
+
+    # Without a laser: the motion and the geometry's part of its error, which sets share; the noise
+    # of the fringes, which they do not.
     says = "motion of the film from x to y, without a laser"
-    source = bench_sources.film_source(bench, (moved.moved_um, moved.shared_um), says, paired=True)
+    sigmas_um = (unseen.moved_um, unseen.shared_um)
+    source = bench_sources.film_source(bench, sigmas_um, says, paired=True)
     says = "noise of the fringes that show the film's motion from x to y"
-    noise = replace(
-        bench_sources.film_source(bench, (moved.noise_um,), says, paired=False), name="film_seen_um"
+    noise = bench_sources.film_source(bench, (unseen.noise_um,), says, paired=False)
+    rows = [source, replace(noise, name="film_seen_um")]
+    if not unseen.is_sure:
+        return rows, []
+    doubt = (
+        f"the film moved by {unseen.moved_um:+.0f} +- {unseen.sigma_um:.0f} µm from the x to the y "
+        "frames, seen in the fringes: record the laser's readings"
     )
-    if not moved.sure:
-        return [source, noise], []
-    says = (
-        f"the film moved by {moved.moved_um:+.0f} +- {moved.sigma_um:.0f} µm from the x to the y "
-        "frames"
-    )
-    return [source, noise], [f"{says}, seen in the fringes: record the laser's readings"]
+    return rows, [doubt]

@@ -16,10 +16,10 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
-# patches a side over which slopes are averaged: the pixels' noise falls below a microradian
+# Patches along a side, over which slopes are averaged: the pixels' noise falls below a microradian.
 _PATCHES = 40
 _LEAST_SEEN = 1 / 3  # of the fullest patch's cells; patches at the edge are left out
-# slopes without a surface that light and gamma leave on a sound bench (1 to 3 measured)
+# Slopes without a surface that light and gamma leave on a sound bench (1 to 3 measured).
 _LIGHT_URAD = 5.0
 _CONTRADICTING_SIGMAS = 4.0
 # Beyond this, light no longer explains them: gamma, flicker, blur and 5 % of ambient light leave
@@ -86,7 +86,7 @@ def measure_slope_misfit(
         step = np.zeros(len(spread.names))
         step[k] = sigma
         fit = bench.fit(bench.geometry(spread.names, step), linear=True)
-        # what the fit leaves is nearly all without a surface: the terms take up the rest
+        # What the fit leaves belongs to no surface: the terms represent nearly all of the rest.
         squares_urad2.append(1e12 * (fit.residual_x**2 + fit.residual_y**2) / 2)
     return SlopeMisfit(_measure_curl_urad(grid, height_mm), math.sqrt(sum(squares_urad2)))
 
@@ -94,18 +94,17 @@ def measure_slope_misfit(
 def _measure_curl_urad(grid: ResidualGrid, height_mm: FloatArray) -> float:
     """RMS, µrad, of the slopes less the gradient of the height, averaged over patches."""
     seen = grid.count > 0
-    # the slope between two neighbouring cells: measured as the mean of theirs, and by the height
+    # The slope between two neighbouring cells: measured as the mean of theirs, and by the height.
     measured_x = (grid.slope_x[:, :-1] + grid.slope_x[:, 1:]) / 2
     measured_y = (grid.slope_y[:-1] + grid.slope_y[1:]) / 2
     off_x = measured_x - np.diff(height_mm, axis=1) / grid.step_mm
     off_y = measured_y - np.diff(height_mm, axis=0) / grid.step_mm
-    patches = np.concatenate(
-        [
-            _average_patches(off_x, seen[:, :-1] & seen[:, 1:]),
-            _average_patches(off_y, seen[:-1] & seen[1:]),
-        ]
-    )
-    return 1e6 * float(np.sqrt(np.mean(np.square(patches)))) if patches.size else 0.0
+    patches_x = _average_patches(off_x, seen[:, :-1] & seen[:, 1:])
+    patches_y = _average_patches(off_y, seen[:-1] & seen[1:])
+    patches = np.concatenate([patches_x, patches_y])
+    if not patches.size:
+        return 0.0
+    return 1e6 * float(np.sqrt(np.mean(np.square(patches))))
 
 
 def _average_patches(values: FloatArray, valid: BoolArray) -> FloatArray:
