@@ -13,38 +13,64 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
-COMMON = len(bench_parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
-# What the round terms beyond the fit's are. They are a micrometre of a 37 mm bowl, and a nanometre
-# of them is 10 µm of sag, so that the film checks the geometry. "free": unknown. "prestressed": by
-# the law, for whatever slackness the set's own excess shows. "hencky": by the excess of a film
-# without pre-strain and with nu = 0.3.
+COMMON = len(bench_parameters.NAMES) + RING  # unknowns: parameters of `NAMES`, then the ring
+# What determines the film's round terms beyond the fit's. They are a micrometre of a 37 mm bowl,
+# and a nanometre of them is 10 µm of sag, so that the film checks the geometry. "free": nothing.
+# "prestressed": the law, for the slackness that the set's own excess shows. "hencky": the excess,
+# of a film without pre-strain and with nu = 0.3.
 FilmModel = Literal["free", "hencky", "prestressed"]
 
 
 @dataclass(frozen=True)
 class SetState:
-    """Values of a set's own unknowns."""
+    """Values of the unknowns of one set.
+
+    Attributes
+    ----------
+    surface : Surface
+        The film, or the artefact.
+    vertex_z_mm : float
+        Height of its vertex.
+    motion_mm : float
+        By how much the film was deeper in the x frames than in the y frames.
+    elsewhere : tuple of (MOVED,) arrays
+        Unknowns of each further place of the screen.
+    """
 
     surface: Surface
-    vertex_z_mm: float  # height of its vertex
-    motion_mm: float = 0.0  # by how much the film was deeper in the x frames than in the y frames
-    elsewhere: tuple[FloatArray, ...] = ()  # (MOVED,) of each screen elsewhere
+    vertex_z_mm: float
+    motion_mm: float = 0.0
+    elsewhere: tuple[FloatArray, ...] = ()
 
 
 @dataclass(frozen=True)
 class References:
-    """Knowledge besides the fringes."""
+    """Knowledge besides the fringes.
 
-    reference_um: float  # laser reading at which the vertex is at z = 0
-    laser_sigma_um: float = 1.0  # of a set's mean reading
-    # the clamp creeps by less than a micrometre in the minutes that a calibration takes
-    ring_sigma_um: float = 1.0  # how far the ring's harmonics may differ from set to set
-    film: FilmModel = "free"  # what the film's round terms beyond the fit's are
-    waves: bool = False  # whether the film has waves beyond the fit's terms (`film_waves`)
+    Attributes
+    ----------
+    reference_um : float
+        Laser reading at which the vertex is at z = 0.
+    laser_sigma_um : float
+        Standard uncertainty of a set's mean reading.
+    ring_sigma_um : float
+        How far the ring's harmonics may differ from set to set: the clamp creeps by less than a
+        micrometre in the minutes that a calibration takes.
+    film : FilmModel
+        What determines the film's round terms beyond the fit's.
+    waves : bool
+        Whether the film has waves beyond the fit's terms (`film_waves`).
+    """
+
+    reference_um: float
+    laser_sigma_um: float = 1.0
+    ring_sigma_um: float = 1.0
+    film: FilmModel = "free"
+    waves: bool = False
 
 
 def rim_of(state: SetState) -> FloatArray:
-    """Harmonics (RING,) of the rim's height in world."""
+    """Harmonics (RING,) of the rim's height in world, mm."""
     out = rim_harmonics() @ state.surface.parameters
     out[0] += state.vertex_z_mm
     if state.surface.beyond_mm:

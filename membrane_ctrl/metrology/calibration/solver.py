@@ -1,5 +1,16 @@
-"""The one least-squares problem: Gauss-Newton on the common unknowns, surfaces eliminated
-(`normal_equations`).
+"""The least-squares problem of a calibration, solved by Gauss-Newton.
+
+The unknowns are the common ones of all sets (parameters of the bench, harmonics of the ring) and
+those of each set (surface, vertex, motion). The latter are eliminated set by set
+(`normal_equations`), so that each step solves for the common ones alone. The weights of the points
+have three stages:
+
+1. equal weights, until the steps have nearly converged;
+2. robust weights of each set (`RobustWeights.seen`), renewed after each further step;
+3. once these steps have converged: weights of whole sets that contradict the others are reduced
+   (`reduce_weights`), and stay until the end.
+
+Equations: section 2 of docs/explanation/calibration.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,57 +41,99 @@ from membrane_ctrl.metrology.reconstruction import surface_fit
 from membrane_ctrl.model.arrays import FloatArray
 
 MAX_ITERATIONS = 40
-_SETTLED = 1e-2  # of each parameter's own standard deviation: less is invisible in the result
-_NEARLY = 0.1  # likewise: the next step is far below the noise
+# Largest step, in the parameters' own standard deviations, that is invisible in the result; and
+# that after which the next one is far below the noise.
+_SETTLED = 1e-2
+_NEARLY = 0.1
 _FEW = 4000  # points of a set: a hundred times its unknowns
-# in sigmas of the hand measurements; sets that contradict each other would lead out of the room
+# Largest step in sigmas of the hand measurements: sets that contradict each other would lead to a
+# bench that cannot exist.
 _FURTHEST = 4.0
 _START_SAG_MM = 40.0
-_FREE_RING_MM = 1e3  # the ring's form is not known beforehand
+_FREE_RING_MM = 1e3  # 1 sigma of the ring's form, which is not known beforehand
+_PARAMETERS = len(bench_parameters.NAMES)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """The problem to solve."""
+    """The problem to solve.
 
-    stated: Geometry  # as measured by hand
-    sets: tuple[set_phases.SetPhases, ...]  # at different sags
-    sigmas: FloatArray  # (len(NAMES),): of the hand's measurements; 0 holds a parameter
-    references: set_state.References  # laser and ring
-    radius_mm: float  # of the ring
-    rim: Rim | None = None  # the light's edge, where it is seen
+    Attributes
+    ----------
+    stated : Geometry
+        The bench as measured by hand.
+    sets : tuple of SetPhases
+        Capture sets at different sags, of the film or of artefacts.
+    sigmas : (len(NAMES),) array
+        Standard uncertainties of the hand measurements; 0 holds a parameter.
+    references : References
+        Knowledge of laser and ring.
+    radius_mm : float
+        Radius of the ring.
+    rim : Rim, optional
+        Edge of the light, where it is visible.
+    """
+
+    stated: Geometry
+    sets: tuple[set_phases.SetPhases, ...]
+    sigmas: FloatArray
+    references: set_state.References
+    radius_mm: float
+    rim: Rim | None = None
 
     @property
     def films(self) -> list[int]:
-        """Which sets show the film; the others show artefacts."""
+        """Numbers of the sets that show the film; the others show artefacts."""
         return [k for k, phases in enumerate(self.sets) if phases.artefact is None]
 
     @property
     def with_artefact(self) -> bool:
-        """Whether a known surface stood in the mirror's place."""
-        return any(isinstance(each.artefact, Artefact) for each in self.sets)
+        """Whether a set shows a known surface in the mirror's place."""
+        return any(isinstance(phases.artefact, Artefact) for phases in self.sets)
 
     @property
     def middle(self) -> int:
-        """The set of the film in the middle of their order: results are stated for a figure like
-        its.
+        """Number of the film's set in the middle of their order: results are stated for a figure
+        like that one.
         """
         return self.films[len(self.films) // 2]
 
 
 @dataclass(frozen=True)
 class Solution:
-    """The unknowns at the solution, and the equations there."""
+    """The unknowns at the solution, and the equations there.
 
-    problem: Problem  # as given, many bins averaged
-    values: FloatArray  # (len(NAMES),): parameters, 0 for the stated bench
-    common: FloatArray  # (COMMON,): parameters and ring
-    states: tuple[set_state.SetState, ...]  # surface and vertex of each set
-    equations: tuple[normal_equations.Equations, ...]  # of each set, at the end
-    at_rim: FloatArray  # (COMMON + 1, squared): the rim's equations
-    covariance: FloatArray  # (COMMON, COMMON): of the common unknowns; zeros for what was held
-    changes: tuple[float, ...]  # largest change of each step, in standard deviations
-    converged: bool  # whether the last step was too small to matter
+    Attributes
+    ----------
+    problem : Problem
+        The problem; sets of very many bins are averaged.
+    values : (len(NAMES),) array
+        Parameters; 0 for the stated bench.
+    common : (COMMON,) array
+        Parameters and harmonics of the ring.
+    states : tuple of SetState
+        Surface and vertex of each set.
+    equations : tuple of Equations
+        Equations of each set, at the end.
+    at_rim : (COMMON + 1, COMMON + 1) array
+        Equations of the rim.
+    covariance : (COMMON, COMMON) array
+        Covariance of the common unknowns; zeros for held ones.
+    changes : tuple of float
+        Largest change of each step, in standard deviations.
+    converged : bool
+        Whether the last step was small enough.
+    """
+
+    problem: Problem
+    values: FloatArray
+    common: FloatArray
+    states: tuple[set_state.SetState, ...]
+    equations: tuple[normal_equations.Equations, ...]
+    at_rim: FloatArray
+    covariance: FloatArray
+    changes: tuple[float, ...]
+    converged: bool
 
     @property
     def bench(self) -> bench_poses.BenchGeometry:
@@ -88,29 +141,39 @@ class Solution:
         return bench_poses.bench_at(self.problem.stated, self.values)
 
     def known(self, sigmas: FloatArray) -> FloatArray:
-        """What is known besides the sets, as sums (COMMON + 1, squared), with these sigmas of the
-        hand.
+        """Knowledge besides the sets, as sums (COMMON + 1, COMMON + 1), with these sigmas
+        (len(NAMES),) of the hand measurements.
         """
         return make_prior(sigmas, self.common) + self.at_rim
 
     @property
     def free(self) -> list[str]:
         """Names of the parameters that were free."""
-        return [
-            name
-            for name, sigma in zip(bench_parameters.NAMES, self.problem.sigmas, strict=True)
-            if sigma > 0
-        ]
+        pairs = zip(bench_parameters.NAMES, self.problem.sigmas, strict=True)
+        return [name for name, sigma in pairs if sigma > 0]
 
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviations of the parameters, in the order of `NAMES`."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)[: len(bench_parameters.NAMES)]))
+        return np.asarray(np.sqrt(np.diag(self.covariance)[:_PARAMETERS]))
 
 
 def make_prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
-    """The knowledge without the sets, as sums (COMMON + 1, squared) about the present unknowns."""
-    wide = np.append(sigmas, np.full(set_state.COMMON - len(bench_parameters.NAMES), _FREE_RING_MM))
+    """Knowledge without the sets, as sums about the present unknowns.
+
+    Parameters
+    ----------
+    sigmas : (len(NAMES),) array
+        Prior standard deviations of the parameters; 0 holds one.
+    common : (COMMON,) array
+        Present values of the common unknowns.
+
+    Returns
+    -------
+    (COMMON + 1, COMMON + 1) array
+        Normal matrix, with the right-hand side as last column and row.
+    """
+    wide = np.append(sigmas, np.full(set_state.COMMON - _PARAMETERS, _FREE_RING_MM))
     weight = np.divide(1, wide**2, out=np.zeros(set_state.COMMON), where=wide > 0)
     rows = np.hstack([np.diag(np.sqrt(weight)), -(np.sqrt(weight) * common)[:, None]])
     return np.asarray(rows.T @ rows)
@@ -118,7 +181,17 @@ def make_prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class SolverStep:
-    """Step (COMMON,) of the common unknowns, their covariance, and the sum of squares after it."""
+    """One step of the common unknowns.
+
+    Attributes
+    ----------
+    delta : (COMMON,) array
+        The step.
+    covariance : (COMMON, COMMON) array
+        Covariance of the unknowns.
+    squares : float
+        Sum of squares after the step.
+    """
 
     delta: FloatArray
     covariance: FloatArray
@@ -126,20 +199,27 @@ class SolverStep:
 
 
 def solve_step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
-    """Solve for the free unknowns. `sums` (COMMON + 1, squared) hold the sets and the prior."""
-    free = np.flatnonzero(
-        np.append(sigmas > 0, np.ones(set_state.COMMON - len(bench_parameters.NAMES), bool))
-    )
-    matrix, right = sums[np.ix_(free, free)], sums[free, -1]
-    scale = 1 / np.sqrt(
-        np.diag(matrix)
-    )  # parameters have units of their own: the scaled matrix loses fewer digits
-    inverse = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-    delta, covariance = (
-        np.zeros(set_state.COMMON),
-        np.zeros((set_state.COMMON, set_state.COMMON)),
-    )
+    """Solve for the free unknowns.
+
+    Parameters
+    ----------
+    sums : (COMMON + 1, COMMON + 1) array
+        Sums of the sets and of the prior.
+    sigmas : (len(NAMES),) array
+        Prior standard deviations; parameters with 0 are held.
+    """
+    is_free = np.append(sigmas > 0, np.ones(set_state.COMMON - _PARAMETERS, bool))
+    free = np.flatnonzero(is_free)
+    matrix = sums[np.ix_(free, free)]
+    right = sums[free, -1]
+
+    # Parameters differ in their units: the scaled matrix loses fewer digits.
+    scale = 1 / np.sqrt(np.diag(matrix))
+    scales = np.outer(scale, scale)
+    inverse = np.linalg.inv(matrix * scales) * scales
+    delta = np.zeros(set_state.COMMON)
     delta[free] = inverse @ right
+    covariance = np.zeros((set_state.COMMON, set_state.COMMON))
     covariance[np.ix_(free, free)] = inverse
     return SolverStep(delta, covariance, float(sums[-1, -1] - right @ delta[free]))
 
@@ -149,168 +229,212 @@ def solve_calibration(
     progress: Callable[[int, float], None] | None = None,
     start: Solution | None = None,
 ) -> Solution:
-    """Calibrate. Sets of very many bins are solved with some of them first, and then with means of
-    them all.
+    """Calibrate.
 
-    Raises ValueError if there is no set of the film, or if a set's points do not determine a
-    surface. `progress` gets the number of the step and its largest change in standard deviations;
-    `start` is a solution of the same sets.
+    Sets of very many bins are solved with some of the bins first, and then with means of all.
+
+    Parameters
+    ----------
+    problem : Problem
+        What to solve.
+    progress : callable, optional
+        Gets the number of each step, and its largest change in standard deviations.
+    start : Solution, optional
+        A solution of the same sets to start from.
+
+    Returns
+    -------
+    Solution
+        The solution; it may not have converged.
+
+    Raises
+    ------
+    ValueError
+        If there is no set of the film, if a set's points do not determine a surface, or if the
+        steps diverge.
     """
     if not problem.films:
         raise ValueError("no capture set of the film to calibrate with")
-    with np.errstate(over="ignore", invalid="ignore"):  # the numbers show a divergence, below
+    with np.errstate(over="ignore", invalid="ignore"):  # a divergence is reported below
         return _solve_sets(problem, progress, start)
 
 
 def _solve_sets(
     problem: Problem, progress: Callable[[int, float], None] | None, start: Solution | None
 ) -> Solution:
-    if start is None and max(phases.sigma_mm.size for phases in problem.sets) > 2 * _FEW:
+    """Solve with some of the bins first where there are very many."""
+    largest = max(phases.sigma_mm.size for phases in problem.sets)
+    if start is None and largest > 2 * _FEW:
         some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
         start = _solve_sets(some, progress, None)
         if not start.converged:
             return start  # means about a diverged bench would be meaningless
         clean = fringe_waves.remove_fringe_waves(start.bench, problem.sets, start.states)
-        pairs = zip(clean, start.states, strict=True)
-        problem = replace(
-            problem,
-            sets=tuple(point_averages.average_points(start.bench, *pair, _FEW) for pair in pairs),
+        averaged = tuple(
+            point_averages.average_points(start.bench, phases, state, _FEW)
+            for phases, state in zip(clean, start.states, strict=True)
         )
-    states = start.states if start is not None else first_states(problem)
-    # the parameters as stated, and the ring as the first surfaces have it
+        problem = replace(problem, sets=averaged)
+    if start is not None:
+        return _iterate(problem, progress, start.states, start.common)
+
+    # The parameters as stated, and the ring as the first surfaces show it.
+    states = first_states(problem)
     ring = np.mean([set_state.rim_of(states[k]) for k in problem.films], axis=0)
-    common = (
-        start.common
-        if start is not None
-        else np.append(np.zeros(len(bench_parameters.NAMES)), ring)
-    )
-    trust = tuple(robust_weights.RobustWeights.full(phases) for phases in problem.sets)
-    free = problem.sigmas > 0
+    return _iterate(problem, progress, states, np.append(np.zeros(_PARAMETERS), ring))
+
+
+def _iterate(
+    problem: Problem,
+    progress: Callable[[int, float], None] | None,
+    states: tuple[set_state.SetState, ...],
+    common: FloatArray,
+) -> Solution:
+    """Gauss-Newton steps from states of the sets and values of the common unknowns (COMMON,)."""
+    weights = tuple(robust_weights.RobustWeights.full(phases) for phases in problem.sets)
     changes: list[float] = []
-    # the step before was the first with new weights; they stay; a solution was near
-    weighed = final = near = False
+    has_new_weights = False  # since the step before
+    has_final_weights = False
+    was_near = False  # to a solution
     while True:
-        linear = _linearise_sets(problem, states, common, trust)
-        at_rim = (
-            np.zeros((common.size + 1,) * 2)
-            if problem.rim is None
-            else problem.rim.sums(problem.stated, common)
-        )
-        sums = (
-            np.sum([each.reduced() for each in linear], axis=0)
-            + make_prior(problem.sigmas, common)
-            + at_rim
-        )
-        moved = solve_step(sums, problem.sigmas)
-        sigmas = np.sqrt(np.diag(moved.covariance))
-        if not (np.isfinite(moved.delta).all() and np.isfinite(sigmas).all()):
+        # The equations about the present unknowns, and their solution.
+        linear = _linearise_sets(problem, states, common, weights)
+        at_rim = np.zeros((common.size + 1, common.size + 1))
+        if problem.rim is not None:
+            at_rim = problem.rim.sums(problem.stated, common)
+        of_sets = np.sum([equations.reduced() for equations in linear], axis=0)
+        sums = of_sets + make_prior(problem.sigmas, common) + at_rim
+        step = solve_step(sums, problem.sigmas)
+        sigmas = np.sqrt(np.diag(step.covariance))
+        if not (np.isfinite(step.delta).all() and np.isfinite(sigmas).all()):
             raise ValueError("the calibration diverges: the sets do not show the stated bench")
-        changes.append(
-            float(np.max(np.abs(moved.delta[sigmas > 0]) / sigmas[sigmas > 0], initial=0.0))
-        )
+        is_free = sigmas > 0
+        relative = np.abs(step.delta[is_free]) / sigmas[is_free]
+        change = float(np.max(relative, initial=0.0))
+        changes.append(change)
         if progress is not None:
-            progress(len(changes), changes[-1])
-        settled = (weighed or final) and changes[-1] < _SETTLED
-        left = [each.residual_mm for each in linear]
-        if settled and not final and len(changes) < MAX_ITERATIONS:
-            # not before: far from the solution a wrong bench looks like a film, and both would be
-            # believed in turn
-            trust, final, settled = (
-                robust_weights.reduce_weights(problem.sets, left, trust),
-                True,
-                False,
-            )
+            progress(len(changes), change)
+
+        # Converged with robust weights: reduce those of contradicting sets, once. Far from the
+        # solution a wrong bench looks like another film, and weights would alternate between both.
+        is_last = len(changes) == MAX_ITERATIONS
+        is_settled = (has_new_weights or has_final_weights) and change < _SETTLED
+        left_mm = [equations.residual_mm for equations in linear]
+        if is_settled and not has_final_weights and not is_last:
+            weights = robust_weights.reduce_weights(problem.sets, left_mm, weights)
+            has_final_weights = True
             continue
-        if settled or len(changes) == MAX_ITERATIONS:
-            values = common[: len(bench_parameters.NAMES)].copy()
+        if is_settled or is_last:
             return Solution(
-                problem,
-                values,
-                common,
-                states,
-                linear,
-                at_rim,
-                moved.covariance,
-                tuple(changes),
-                settled,
+                problem=problem,
+                values=common[:_PARAMETERS].copy(),
+                common=common,
+                states=states,
+                equations=linear,
+                at_rim=at_rim,
+                covariance=step.covariance,
+                changes=tuple(changes),
+                converged=is_settled,
             )
-        far = float(
-            np.max(
-                np.abs(moved.delta[: len(bench_parameters.NAMES)][free]) / problem.sigmas[free],
-                initial=0.0,
-            )
+
+        # Take the step, or a part of it that stays within a few sigmas of the hand measurements.
+        far = _step_length(step.delta, problem.sigmas)
+        delta = step.delta
+        if far > 0:
+            delta = step.delta * min(1.0, _FURTHEST / far)
+        states = tuple(
+            _move_state(state, equations, delta)
+            for state, equations in zip(states, linear, strict=True)
         )
-        delta = moved.delta * min(1.0, _FURTHEST / far) if far > 0 else moved.delta
-        states = tuple(_move_state(s, each, delta) for s, each in zip(states, linear, strict=True))
         common = common + delta
-        # Weights are renewed where the steps have nearly converged (at every step, the two may
-        # chase each other), and where points with too much weight lead astray before a solution was
-        # near
-        near |= changes[-1] < _NEARLY
-        weighed = not final and (changes[-1] < _NEARLY or (far > _FURTHEST and not near))
-        if weighed:
-            trust = tuple(
-                robust_weights.RobustWeights.seen(*pair)
-                for pair in zip(problem.sets, left, strict=True)
+
+        # Renew the weights if the steps have nearly converged (at every step, steps and weights may
+        # never settle), or if points with too much weight lead far away before any solution was
+        # near.
+        was_near |= change < _NEARLY
+        leads_away = far > _FURTHEST and not was_near
+        has_new_weights = not has_final_weights and (change < _NEARLY or leads_away)
+        if has_new_weights:
+            weights = tuple(
+                robust_weights.RobustWeights.seen(phases, residual_mm)
+                for phases, residual_mm in zip(problem.sets, left_mm, strict=True)
             )
+
+
+def _step_length(delta: FloatArray, sigmas: FloatArray) -> float:
+    """Largest change of a free parameter by a step (COMMON,), in its sigma (len(NAMES),) of the
+    hand measurement.
+    """
+    is_free = sigmas > 0
+    relative = np.abs(delta[:_PARAMETERS][is_free]) / sigmas[is_free]
+    return float(np.max(relative, initial=0.0))
 
 
 def _linearise_sets(
     problem: Problem,
     states: Sequence[set_state.SetState],
     common: FloatArray,
-    trust: Sequence[robust_weights.RobustWeights],
+    weights: Sequence[robust_weights.RobustWeights],
 ) -> tuple[normal_equations.Equations, ...]:
-    values = common[: len(bench_parameters.NAMES)]
-    bench, turns = (
-        bench_poses.bench_at(problem.stated, values),
-        bench_poses.pose_derivatives(problem.stated, values),
-    )
+    """Equations of each set about the present unknowns."""
+    values = common[:_PARAMETERS]
+    bench = bench_poses.bench_at(problem.stated, values)
+    turns = bench_poses.pose_derivatives(problem.stated, values)
     return tuple(
         normal_equations.linearise_set(
-            bench, turns, phases, state, common, problem.references, believed
+            bench, turns, phases, state, common, problem.references, weights_of_set
         )
-        for phases, state, believed in zip(problem.sets, states, trust, strict=True)
+        for phases, state, weights_of_set in zip(problem.sets, states, weights, strict=True)
     )
 
 
 def _move_state(
     state: set_state.SetState, linear: normal_equations.Equations, common_step: FloatArray
 ) -> set_state.SetState:
+    """The unknowns of a set after a step (COMMON,) of the common ones."""
     own = linear.local_step(common_step)
-    surface = Surface.from_parameters(
-        state.surface.parameters + own[:PARAMETERS], state.surface.radius_mm
-    )
-    beyond_mm = (
-        np.array(state.surface.beyond_mm or [0.0] * terms_beyond_fit.BEYOND_TERMS)
-        + own[forward_model.BEYOND]
-    )
+
+    # Its surface, with the terms beyond the fit's.
+    before = state.surface
+    surface = Surface.from_parameters(before.parameters + own[:PARAMETERS], before.radius_mm)
+    beyond_before_mm = np.array(before.beyond_mm or [0.0] * terms_beyond_fit.BEYOND_TERMS)
+    beyond_mm = beyond_before_mm + own[forward_model.BEYOND]
     surface = replace(surface, beyond_mm=tuple(beyond_mm.tolist()))
-    vertex_z_mm, motion_mm = (
-        state.vertex_z_mm + own[PARAMETERS],
-        state.motion_mm + own[forward_model.MOTION],
-    )
+
+    # Vertex, motion from y to x, and the places of the screen.
+    vertex_z_mm = state.vertex_z_mm + own[PARAMETERS]
+    motion_mm = state.motion_mm + own[forward_model.MOTION]
     steps = linear.moved(own, common_step)
     elsewhere = tuple(move + step for move, step in zip(state.elsewhere, steps, strict=True))
     return set_state.SetState(surface, float(vertex_z_mm), float(motion_mm), elsewhere)
 
 
 def first_states(problem: Problem) -> tuple[set_state.SetState, ...]:
-    """The sets' surfaces with the stated geometry. Raises ValueError if there is none."""
-    return tuple(_make_first_states(problem, phases) for phases in problem.sets)
+    """Unknowns of the sets with the stated geometry.
+
+    Raises ValueError if a set's points determine no surface.
+    """
+    return tuple(_make_first_state(problem, phases) for phases in problem.sets)
 
 
-def _make_first_states(problem: Problem, phases: set_phases.SetPhases) -> set_state.SetState:
-    moved_um, artefact = phases.displacement_um - problem.references.reference_um, phases.artefact
-    vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
+def _make_first_state(problem: Problem, phases: set_phases.SetPhases) -> set_state.SetState:
+    """Unknowns of one set with the stated geometry, as `first_states`."""
+    artefact = phases.artefact
     radius_mm = problem.radius_mm
-    elsewhere = tuple(each.known(problem.references.laser_sigma_um)[0] for each in phases.elsewhere)
+    laser_sigma_um = problem.references.laser_sigma_um
+    elsewhere = tuple(each.known(laser_sigma_um)[0] for each in phases.elsewhere)
     if isinstance(artefact, SeenScreen):
-        return set_state.SetState(
-            Surface.from_parameters(np.zeros(PARAMETERS), radius_mm), 0.0, elsewhere=elsewhere
-        )
+        flat = Surface.from_parameters(np.zeros(PARAMETERS), radius_mm)
+        return set_state.SetState(flat, 0.0, elsewhere=elsewhere)
+
+    # The vertex is where the laser, or the artefact, has it.
+    vertex_z_mm = 0.0
+    moved_um = phases.displacement_um - problem.references.reference_um
+    if np.isfinite(moved_um):
+        vertex_z_mm = -moved_um * 1e-3
     if artefact is not None:
-        vertex_z_mm, radius_mm = artefact.vertex_mm, artefact.radius_mm
+        vertex_z_mm = artefact.vertex_mm
+        radius_mm = artefact.radius_mm
     fit = fit_on(bench_poses.BenchGeometry(problem.stated), phases, radius_mm, vertex_z_mm)
     return set_state.SetState(fit.surface, vertex_z_mm, elsewhere=elsewhere)
 
@@ -321,14 +445,13 @@ def fit_on(
     radius_mm: float,
     vertex_z_mm: float,
 ) -> surface_fit.Fit:
-    """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is
-    none.
+    """Fit one set's surface on a bench without bow, as `measure` does.
+
+    Raises ValueError if its points determine no surface.
     """
     phases = phases.subset(phases.seen_with(0))
     tracer = ray_tracing.Tracer(bench.geometry, radius_mm, vertex_z_mm)
-    points = ray_tracing.Points.of(
-        forward_model.camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch
-    )
-    return surface_fit.fit_surface(
-        tracer, points, ray_tracing.make_parabola(_START_SAG_MM, radius_mm)
-    )
+    rays = forward_model.camera_rays(bench.geometry, phases)
+    points = ray_tracing.Points.of(rays, phases.screen_mm * bench.pitch)
+    start = ray_tracing.make_parabola(_START_SAG_MM, radius_mm)
+    return surface_fit.fit_surface(tracer, points, start)

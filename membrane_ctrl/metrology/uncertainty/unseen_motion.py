@@ -119,4 +119,4 @@ def _assign_patches(bench: TrialBench) -> IntArray:
         np.int64((_PATCHES - 1e-6) * (place_px - place_px.min()) / np.ptp(place_px))
         for place_px in (bench.row_px, bench.column_px)
     ]
-    return np.ravel_multi_index(rows_and_columns, (_PATCHES, _PATCHES))
+    return np.asarray(np.ravel_multi_index(rows_and_columns, (_PATCHES, _PATCHES)))
