@@ -13,13 +13,13 @@ from membrane_ctrl.metrology.calibration.set_state import SetState
 from membrane_ctrl.metrology.rays import bench_poses, forward_model, set_phases
 from membrane_ctrl.model.arrays import FloatArray
 
-_WAVES = range(
-    1, 5
-)  # per fringe: light that differs between frames makes one and two, gamma in four steps four
-_WAVES_SEEN, _OUTSTANDING = (
-    0.5,
-    2.0,
-)  # of a point's noise, and of the usual set's: smaller ones are part of the scatter
+# Waves per fringe: light that differs between frames makes one and two, gamma with four steps four.
+_WAVES = range(1, 5)
+# Least size of waves that are removed, over a point's noise and over the usual set's waves: smaller
+# ones are part of the scatter.
+_LEAST_SIZE = 0.5
+_LEAST_RATIO = 2.0
+_SMOOTH_ORDER = 3  # of the polynomials in the picture that are fitted with the waves
 
 
 def remove_fringe_waves(
@@ -27,54 +27,74 @@ def remove_fringe_waves(
     sets: Sequence[set_phases.SetPhases],
     states: Sequence[SetState],
 ) -> tuple[set_phases.SetPhases, ...]:
-    """The sets, those with outstanding errors that repeat with the fringes without these.
+    """Remove errors that repeat with the fringes from sets in which they are outstanding.
 
-    Light that differs between frames makes them: errors of a phase that depend on the phase alone.
-    They show in the residuals, beside what is smooth there. Such a set would count as one of
-    another bench.
+    With them, a set would look like one of another bench.
+
+    Parameters
+    ----------
+    bench : BenchGeometry
+        The calibrated bench.
+    sets : sequence of SetPhases
+        All sets.
+    states : sequence of SetState
+        Their unknowns at the solution.
+
+    Returns
+    -------
+    tuple of SetPhases
     """
-    waves = [_waves_mm(bench, *pair) for pair in zip(sets, states, strict=True)]
+    waves_mm = [
+        _fit_waves_mm(bench, phases, state) for phases, state in zip(sets, states, strict=True)
+    ]
     sizes = np.array(
-        [np.std(of_set) / np.mean(each.sigma_mm) for of_set, each in zip(waves, sets, strict=True)]
+        [
+            np.std(of_set) / np.mean(phases.sigma_mm)
+            for of_set, phases in zip(waves_mm, sets, strict=True)
+        ]
     )
-    strong = sizes > np.maximum(_WAVES_SEEN, _OUTSTANDING * np.median(sizes))
-    return tuple(
-        replace(each, screen_mm=each.screen_mm - of_set) if bad else each
-        for each, of_set, bad in zip(sets, waves, strong, strict=True)
-    )
+    is_strong = sizes > np.maximum(_LEAST_SIZE, _LEAST_RATIO * np.median(sizes))
+    cleaned = list(sets)
+    for k in np.flatnonzero(is_strong):
+        cleaned[k] = replace(sets[k], screen_mm=sets[k].screen_mm - waves_mm[k])
+    return tuple(cleaned)
 
 
-def _waves_mm(
+def _fit_waves_mm(
     bench: bench_poses.BenchGeometry, phases: set_phases.SetPhases, state: SetState
 ) -> FloatArray:
-    """What of a set's residuals (2, n) repeats with its fringes; 0 if their period is unknown."""
+    """The part of a set's residuals (2, n) that repeats with its fringes; 0 if their period is
+    unknown.
+    """
     out = np.zeros_like(phases.screen_mm)
     if not phases.period_mm:
         return out
-    left = forward_model.residual_mm(
+    left_mm = forward_model.residual_mm(
         bench, phases, state.surface, state.vertex_z_mm, state.elsewhere
     )
-    root, turn = (
-        np.sqrt(RobustWeights.seen(phases, left).weights) / phases.sigma_mm,
-        2 * np.pi / phases.period_mm,
-    )
-    for there in range(1 if phases.screen is None else len(phases.elsewhere) + 1):
-        some = phases.seen_with(there)
-        column, row = (
-            place[some] / across_px(phases) for place in (phases.column_px, phases.row_px)
-        )
-        smooth = [column**p * row**q for p in range(4) for q in range(4 - p)]
-        for axis in range(2 if some.any() else 0):
-            phase_rad = turn * phases.screen_mm[axis, some]
-            waves = [
-                wave(k * phase_rad) * by
-                for k in _WAVES
-                for wave in (np.cos, np.sin)
-                for by in (1.0, column, row)
-            ]
+    root = np.sqrt(RobustWeights.seen(phases, left_mm).weights) / phases.sigma_mm
+    rad_per_mm = 2 * np.pi / phases.period_mm
+
+    # For each place of the screen and each axis, waves of the fringes, whose amplitudes change
+    # linearly over the picture, are fitted together with smooth changes.
+    places = 1 if phases.screen is None else len(phases.elsewhere) + 1
+    for place in range(places):
+        some = phases.seen_with(place)
+        if not some.any():
+            continue
+        column = phases.column_px[some] / across_px(phases)
+        row = phases.row_px[some] / across_px(phases)
+        orders = range(_SMOOTH_ORDER + 1)
+        powers = [(p, q) for p in orders for q in range(_SMOOTH_ORDER + 1 - p)]
+        smooth = [column**p * row**q for p, q in powers]
+        for axis in range(2):
+            phase_rad = rad_per_mm * phases.screen_mm[axis, some]
+            waves = []
+            for k in _WAVES:
+                for wave in (np.cos(k * phase_rad), np.sin(k * phase_rad)):
+                    waves += [wave * 1.0, wave * column, wave * row]
             design = np.stack([*waves, *smooth], axis=1) * root[some, None]
-            found = np.linalg.lstsq(design, left[axis, some] * root[some], rcond=None)[0][
-                : len(waves)
-            ]
-            out[axis, some] = found @ np.stack(waves)
+            right = left_mm[axis, some] * root[some]
+            amplitudes = np.linalg.lstsq(design, right, rcond=None)[0]
+            out[axis, some] = amplitudes[: len(waves)] @ np.stack(waves)
     return out

@@ -27,25 +27,53 @@ from membrane_ctrl.metrology.rays.rim_harmonics import RING, rim_harmonics
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 from membrane_ctrl.model.arrays import FloatArray
 
-_FREE_MM, _LAW_MM = 1e-3, 1e-7
-_HELD_MM = 1e-10  # the fringes of a full set know a wave to 1e-7
-_TILT_STEP = 1e-4
+# 1 sigma of the film's round terms: free, and by the law.
+_FREE_MM = 1e-3
+_LAW_MM = 1e-7
+# 1 sigma of a wave that is held at 0: the fringes of a full set determine it to 1e-7.
+_HELD_MM = 1e-10
+_EXCESS_STEP_MM = 1e-5  # for the derivative of the law
+_TILT_STEP = 1e-4  # for the derivative of an artefact's form
 
 
 def reference_rows(
     phases: set_phases.SetPhases, state: SetState, common: FloatArray, references: References
 ) -> FloatArray:
-    """What is known of the set besides its fringes, as weighted rows [derivatives, miss].
+    """Equations for what is known of a set besides its fringes.
 
     Of a film: ring, laser, motion and law. Of an artefact: its form.
+
+    Parameters
+    ----------
+    phases : SetPhases
+        The set.
+    state : SetState
+        Values of its own unknowns.
+    common : (COMMON,) array
+        Values of the common unknowns.
+    references : References
+        What is known.
+
+    Returns
+    -------
+    (rows, LOCAL + COMMON + 1) array
+        Derivatives by the unknowns, and the known value less the present one as last column; each
+        row is divided by its standard uncertainty.
     """
     if isinstance(phases.artefact, SeenScreen):
-        return np.eye(forward_model.LOCAL, forward_model.LOCAL + COMMON + 1)  # there is no surface
+        # There is no surface: its unknowns are held.
+        return np.eye(forward_model.LOCAL, forward_model.LOCAL + COMMON + 1)
     if phases.artefact is not None:
         return _artefact_rows(phases.artefact, state)
     rows = np.zeros((RING + 2, forward_model.LOCAL + COMMON + 1))
-    rows[-1, forward_model.MOTION], rows[-1, -1] = 1.0, 1e-3 * phases.motion_um - state.motion_mm
-    rows[-1] /= max(phases.motion_sigma_um, set_phases.STILL_UM) * 1e-3
+
+    # The motion from the x to the y frames.
+    motion = rows[-1]
+    motion[forward_model.MOTION] = 1.0
+    motion[-1] = 1e-3 * phases.motion_um - state.motion_mm
+    motion /= max(phases.motion_sigma_um, set_phases.STILL_UM) * 1e-3
+
+    # The ring: the harmonics of the rim's height are those of all sets.
     ring = rows[:RING]
     ring[:, :PARAMETERS] = rim_harmonics()
     ring[0, PARAMETERS] = 1.0
@@ -53,6 +81,8 @@ def reference_rows(
     ring[:, forward_model.LOCAL + len(bench_parameters.NAMES) : -1] = -np.eye(RING)
     ring[:, -1] = common[len(bench_parameters.NAMES) :] - rim_of(state)
     ring /= references.ring_sigma_um * 1e-3
+
+    # The laser: the vertex is at -(1 + scale) (d - reference).
     if np.isfinite(phases.displacement_um):
         moved_mm = (phases.displacement_um - references.reference_um) * 1e-3
         laser = rows[RING]
@@ -65,28 +95,30 @@ def reference_rows(
 
 
 def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
-    """What the film says of the round terms beyond the fit's, as weighted rows [derivatives,
-    miss].
-    """
+    """Equations of the round terms beyond the fit's by the film's law, as `reference_rows`."""
     rows = _beyond_rows(surface)[terms_beyond_fit.ROUND]
     if film == "prestressed":
-        excess_mm, step_mm = surface.parameters[-1], 1e-5
-        here, there = (round_of(excess_mm + d, surface.sag_mm) for d in (0.0, step_mm))
-        rows[:, PARAMETERS - 1] = (here - there) / step_mm
+        # The law gives them for the surface's own excess.
+        excess_mm = surface.parameters[-1]
+        here = round_of(excess_mm, surface.sag_mm)
+        there = round_of(excess_mm + _EXCESS_STEP_MM, surface.sag_mm)
+        rows[:, PARAMETERS - 1] = (here - there) / _EXCESS_STEP_MM
         rows[:, -1] += here
-    return rows / (_FREE_MM if film == "free" else _LAW_MM)
+    sigma_mm = _FREE_MM if film == "free" else _LAW_MM
+    return rows / sigma_mm
 
 
 def wave_rows(surface: Surface, free: bool) -> FloatArray:
-    """The waves beyond the fit's as weighted rows [derivatives, miss]: of a film that may be
-    orthotropic, or 0.
+    """Equations of the waves beyond the fit's, as `reference_rows`: 0, with the uncertainty of a
+    film that may be orthotropic if they are `free`.
     """
     sigmas_mm = [wave.sigma_mm if free else _HELD_MM for wave in terms_beyond_fit.WAVES]
-    return np.asarray(_beyond_rows(surface)[terms_beyond_fit.WAVE] / np.array(sigmas_mm)[:, None])
+    rows = _beyond_rows(surface)[terms_beyond_fit.WAVE]
+    return np.asarray(rows / np.array(sigmas_mm)[:, None])
 
 
 def _beyond_rows(surface: Surface) -> FloatArray:
-    """Each term beyond the fit's is 0: rows [derivatives, miss] without weights."""
+    """Equations that each term beyond the fit's is 0, as `reference_rows`, not yet divided."""
     count = terms_beyond_fit.BEYOND_TERMS
     rows = np.zeros((count, forward_model.LOCAL + COMMON + 1))
     rows[:, forward_model.BEYOND] = np.eye(count)
@@ -95,33 +127,35 @@ def _beyond_rows(surface: Surface) -> FloatArray:
 
 
 def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
-    """Form and place of an artefact as weighted rows; its tilt, the first two terms,
-    is not known.
+    """Equations of an artefact's form and place, as `reference_rows`.
+
+    Its tilt, the first two terms, is not known.
     """
     terms = [*range(PARAMETERS), *range(forward_model.BEYOND.start, forward_model.BEYOND.stop)]
     rows = np.zeros((len(terms), forward_model.LOCAL + COMMON + 1))
-    form, (vertex, still) = rows[2:], rows[:2]
-    surface, origin = state.surface, np.zeros(1)
+    vertex = rows[0]
+    motion = rows[1]
+    form = rows[2:]
+    surface = state.surface
+
+    # The tilt at the vertex is the surface's own, and the form follows: 5 µm of coma for a
+    # milliradian.
+    origin = np.zeros(1)
+    _, by_x, by_y = surface_basis.evaluate_basis(origin, origin)
+    tilt_by_parameters = np.stack([by_x[:, 0], by_y[:, 0]]) / surface.radius_mm
+    tilt = tilt_by_parameters @ surface.parameters
+    expected_mm = artefact.terms_mm(*tilt)
+    beyond_mm = surface.beyond_mm or [0.0] * terms_beyond_fit.BEYOND_TERMS
+    present_mm = np.append(surface.parameters, beyond_mm)
     form[:, terms] = np.eye(len(terms))[2:]
-    # the tilt at the vertex is the surface's own, and its form follows: 5 µm of coma for a
-    # milliradian
-    leans = (
-        np.stack([part[:, 0] for part in surface_basis.evaluate_basis(origin, origin)[1:]])
-        / surface.radius_mm
-    )
-    tilt = leans @ surface.parameters
-    here = artefact.terms_mm(*tilt)
-    form[:, -1] = (
-        here
-        - np.append(surface.parameters, surface.beyond_mm or [0.0] * terms_beyond_fit.BEYOND_TERMS)
-    )[2:]
-    for step, lean in zip(_TILT_STEP * np.eye(2), leans, strict=True):
-        form[:, :PARAMETERS] -= np.outer(
-            (artefact.terms_mm(*(tilt + step)) - here)[2:] / _TILT_STEP, lean
-        )
+    form[:, -1] = (expected_mm - present_mm)[2:]
+    for step, by_parameters in zip(_TILT_STEP * np.eye(2), tilt_by_parameters, strict=True):
+        change_mm = artefact.terms_mm(*(tilt + step)) - expected_mm
+        form[:, :PARAMETERS] -= np.outer(change_mm[2:] / _TILT_STEP, by_parameters)
     form[:] = np.linalg.solve(np.linalg.cholesky(artefact.covariance_mm2()[2:, 2:]), form)
-    vertex[[PARAMETERS, -1]] = (
-        np.array([1.0, artefact.vertex_mm - state.vertex_z_mm]) / artefact.vertex_sigma_mm
-    )
-    still[forward_model.MOTION] = 1.0 / (1e-3 * set_phases.STILL_UM)
+
+    # Its vertex, and that it does not move.
+    vertex[PARAMETERS] = 1.0 / artefact.vertex_sigma_mm
+    vertex[-1] = (artefact.vertex_mm - state.vertex_z_mm) / artefact.vertex_sigma_mm
+    motion[forward_model.MOTION] = 1.0 / (1e-3 * set_phases.STILL_UM)
     return rows

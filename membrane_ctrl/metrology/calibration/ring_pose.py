@@ -26,19 +26,31 @@ from membrane_ctrl.model.arrays import FloatArray
 
 POSE_NAMES = ("a_mm", "alpha_deg", "camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg")
 _PLACES = [NAMES.index(name) for name in POSE_NAMES]
-_UNITS = np.array(
-    [usual_sigma(name) for name in POSE_NAMES]
-)  # so that the solver's steps are of one size
+# Units of the solver's unknowns, so that its steps are of one size.
+_UNITS = np.array([usual_sigma(name) for name in POSE_NAMES])
+_SOFT_PX = 0.3  # distance beyond which an edge counts linearly
 
 
 @dataclass(frozen=True)
 class RingPose:
-    """The pose that the rim gives."""
+    """The pose that the rim gives.
 
-    values: FloatArray  # (5,): of `POSE_NAMES`, 0 for the stated bench
-    sigmas: FloatArray  # (5,)
-    rms_px: float  # residual of an edge
-    points: int  # edges that were used
+    Attributes
+    ----------
+    values : (5,) array
+        Values of `POSE_NAMES`; 0 for the stated bench.
+    sigmas : (5,) array
+        Their standard deviations.
+    rms_px : float
+        Residual of an edge.
+    points : int
+        Number of edges that were used.
+    """
+
+    values: FloatArray
+    sigmas: FloatArray
+    rms_px: float
+    points: int
 
     def bench(self, stated: Geometry) -> Geometry:
         """The stated bench with the camera at the rim's pose and the screen moved with alpha."""
@@ -53,20 +65,31 @@ def ring_pose(
     rim_z: HeightFunction,
     radius_sigma_mm: float,
 ) -> RingPose:
-    """Fit the pose, weighted with the hand measurements (`parameters.POSE`).
-
-    Raises ValueError if half of the rim or more is not visible.
+    """Fit the pose, weighted with the hand measurements (`bench_parameters.POSE`).
 
     Parameters
     ----------
     light : (H, W) array
         White minus black.
+    stated : Geometry
+        The stated bench.
     rough_px : (2, n) array
-        The rim as `geometry.find_outline` sees it, to within `_REACH_PX`.
+        The rim as `rim_outline.find_outline` sees it, to within a few pixels.
+    radius_mm : float
+        Radius of the ring.
     rim_z : height function
         Height of the rim in world; a ring is flat, the rim of a mounted film nearly.
     radius_sigma_mm : float
-        How well the radius is known, which enters `a_mm`.
+        Standard uncertainty of the radius, which enters `a_mm`.
+
+    Returns
+    -------
+    RingPose
+
+    Raises
+    ------
+    ValueError
+        If half of the rim or more is not visible.
     """
     edges = rim_edges(light, rough_px)
     if edges.shape[1] < LEAST_FOUND * RIM_POINTS:
@@ -76,40 +99,49 @@ def ring_pose(
     mm_per_px = radius_mm / float(np.mean(np.hypot(*from_middle(edges))))
 
     def miss_px(x: FloatArray) -> FloatArray:
-        return np.asarray(
-            (_radii_mm(_make_bench(stated, x * _UNITS), edges, rim_z) - radius_mm) / mm_per_px
-        )
+        """Distances (n,) of the edges from the ring, with the pose x (5,) in units of `_UNITS`."""
+        radii_mm = _radii_mm(_make_bench(stated, x * _UNITS), edges, rim_z)
+        return np.asarray((radii_mm - radius_mm) / mm_per_px)
 
     from scipy.optimize import least_squares  # calibrations without a pose start sooner
 
-    fit = least_squares(miss_px, np.zeros(len(POSE_NAMES)), loss="soft_l1", f_scale=0.3)
-    slopes, found = np.asarray(fit.jac, float), np.asarray(fit.x, float)
+    fit = least_squares(miss_px, np.zeros(len(POSE_NAMES)), loss="soft_l1", f_scale=_SOFT_PX)
+    found = np.asarray(fit.x, float)
+    slopes = np.asarray(fit.jac, float)
+
+    # Information of the edges: their scatter, and what they have in common.
     rms_px = float(np.sqrt(np.mean(miss_px(found) ** 2)))
     inverse = np.linalg.inv(slopes.T @ slopes)
     shared = inverse @ slopes.T @ _shared_misses(edges, radius_sigma_mm / mm_per_px)
-    seen = np.linalg.inv(inverse * rms_px**2 + shared @ shared.T)
-    both = np.linalg.inv(seen + np.eye(len(POSE_NAMES)))  # in units of the hand's sigmas
-    return RingPose(
-        both @ seen @ found * _UNITS, np.sqrt(np.diag(both)) * _UNITS, rms_px, edges.shape[1]
-    )
+    information = np.linalg.inv(inverse * rms_px**2 + shared @ shared.T)
+
+    # Together with the hand measurements, whose information is 1 in these units.
+    covariance = np.linalg.inv(information + np.eye(len(POSE_NAMES)))
+    values = covariance @ information @ found * _UNITS
+    sigmas = np.sqrt(np.diag(covariance)) * _UNITS
+    return RingPose(values, sigmas, rms_px, edges.shape[1])
 
 
-def _make_bench(stated: Geometry, own: FloatArray) -> Geometry:
+def _make_bench(stated: Geometry, pose: FloatArray) -> Geometry:
+    """The stated bench with the values (5,) of `POSE_NAMES`."""
     values = np.zeros(len(NAMES))
-    values[_PLACES] = own
+    values[_PLACES] = pose
     return bench_at(stated, values).geometry
 
 
 def _radii_mm(geometry: Geometry, edges: FloatArray, rim_z: HeightFunction) -> FloatArray:
+    """Distances (n,) from the axis at which the rays of edges (2, n) meet the rim's height."""
     return np.asarray(np.hypot(*on_rim(geometry, edges, rim_z)))
 
 
 def _shared_misses(edges: FloatArray, radius_sigma_px: float) -> FloatArray:
-    """Misses that the edges have in common, one sigma each, (n, 3).
+    """Errors (n, 3) that the edges have in common, one sigma each.
 
     The radius; and the edge's own error as a rim that is larger, longer across, or longer along a
     diagonal.
     """
     x, y = from_middle(edges) / np.hypot(*from_middle(edges))
-    alike = np.full(x.size, np.hypot(radius_sigma_px, EDGE_SIGMA_PX))
-    return np.stack([alike, EDGE_SIGMA_PX * (x * x - y * y), EDGE_SIGMA_PX * 2 * x * y], axis=1)
+    larger = np.full(x.size, np.hypot(radius_sigma_px, EDGE_SIGMA_PX))
+    across = EDGE_SIGMA_PX * (x * x - y * y)
+    diagonal = EDGE_SIGMA_PX * 2 * x * y
+    return np.stack([larger, across, diagonal], axis=1)

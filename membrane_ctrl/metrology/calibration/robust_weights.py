@@ -8,21 +8,35 @@ import numpy as np
 from membrane_ctrl.metrology.rays import forward_model, set_phases
 from membrane_ctrl.model.arrays import FloatArray
 
-# across the mirror's picture: finer than the geometry's patterns, coarser than a film's ripple
+# Patches across the mirror's picture: finer than the geometry's patterns, coarser than a film's
+# ripple.
 _PATCHES = 12
-_FEW_IN_PATCH = 4
-_CHANCE = 0.5  # by which patches' variance exceeds single points' without a cause
-# of the length of two normal components: keeps 95 % of the efficiency of least squares
+_FEWEST_IN_PATCH = 4
+# By how much the variance of patches may exceed that of single points by chance.
+_CHANCE = 0.5
+# Huber's limit for the length of two normal components: it keeps 95 % of the efficiency of least
+# squares.
 _HUBER = 1.9
+_RAYLEIGH_MEDIAN = 1.1774  # in sigmas
 
 
 @dataclass(frozen=True)
 class RobustWeights:
-    """Robust weights (n,) of points, 1 for a good one, and their variance over the expected one."""
+    """Robust weights of the points of a set.
+
+    Attributes
+    ----------
+    weights : (n,) array
+        Weight of each point over that of its noise; 1 for a good one.
+    variance : float
+        Variance of the points over the expected one.
+    alike : float
+        Factor of the variance from residuals that neighbours share: a pattern.
+    """
 
     weights: FloatArray
     variance: float
-    alike: float = 1.0  # part of the variance from residuals that neighbours share: a pattern
+    alike: float = 1.0
 
     @classmethod
     def full(cls, phases: set_phases.SetPhases) -> "RobustWeights":
@@ -31,11 +45,12 @@ class RobustWeights:
 
     @classmethod
     def seen(cls, phases: set_phases.SetPhases, residual_mm: FloatArray) -> "RobustWeights":
-        """From residuals (2, n): Huber's weights against their own scatter."""
+        """Huber's weights of residuals (2, n), against their own scatter.
+
+        The scatter is not less than the camera's noise.
+        """
         length = np.hypot(*residual_mm) / phases.sigma_mm
-        # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have
-        # is not accepted
-        variance = max(float(np.median(length) / 1.1774) ** 2, 1.0)
+        variance = max(float(np.median(length) / _RAYLEIGH_MEDIAN) ** 2, 1.0)
         return cls(_HUBER / np.maximum(length / np.sqrt(variance), _HUBER), variance)
 
 
@@ -44,32 +59,45 @@ def reduce_weights(
     left_mm: Sequence[FloatArray],
     trust: Sequence[RobustWeights],
 ) -> tuple[RobustWeights, ...]:
-    """Robust weights of the points of all sets, from their residuals (2, n) at a solution.
+    """Reduce the weights of sets whose residuals show a pattern.
 
-    What a film has beyond the model is alike in neighbouring points, and in all sets: it does not
-    average out as noise does. So the means over patches of the picture are compared with what
-    single points let expect, set by set and as sums over the sets; where they scatter more, all
-    points weigh less.
+    The shape that a film has beyond the model is the same in neighbouring points, and in all sets:
+    it does not average out as noise does. The means over patches of the picture are compared with
+    the scatter that single points predict, set by set and as sums over the sets; if they scatter
+    more, all points of the set have less weight.
+
+    Parameters
+    ----------
+    sets : sequence of SetPhases
+        All sets.
+    left_mm : sequence of (2, n) arrays
+        Their residuals at a solution.
+    trust : sequence of RobustWeights
+        Their present weights.
+
+    Returns
+    -------
+    tuple of RobustWeights
     """
-    films = [
-        k for k, phases in enumerate(sets) if phases.artefact is None
-    ]  # an artefact is seen smaller
-    side_px = max(across_px(sets[k]) for k in films) / _PATCHES
-    sides_px = [
-        side_px if phases.artefact is None else across_px(phases) / _PATCHES for phases in sets
-    ]
-    patches = [_patch_means(*each) for each in zip(sets, left_mm, trust, sides_px, strict=True)]
-    together = _reduced_chi_square(
-        np.sum([patches[k] for k in films], axis=0) / np.sqrt(len(films))
-    )
-    alike = [together if phases.artefact is None else 0.0 for phases in sets]
-    factors = [
-        max(1.0, _reduced_chi_square(m) - _CHANCE, all_ - _CHANCE)
-        for m, all_ in zip(patches, alike, strict=True)
-    ]
-    return tuple(
-        replace(t, variance=t.variance * f, alike=f) for t, f in zip(trust, factors, strict=True)
-    )
+    # Patches of one size for all films; an artefact is smaller in the picture.
+    films = [k for k, phases in enumerate(sets) if phases.artefact is None]
+    film_side_px = max(across_px(sets[k]) for k in films) / _PATCHES
+    patches = []
+    for phases, residual_mm, weights in zip(sets, left_mm, trust, strict=True):
+        side_px = film_side_px
+        if phases.artefact is not None:
+            side_px = across_px(phases) / _PATCHES
+        patches.append(_patch_means(phases, residual_mm, weights, side_px))
+
+    # A pattern of all films shows in their sum.
+    of_films = np.sum([patches[k] for k in films], axis=0) / np.sqrt(len(films))
+    chi_square_of_films = _reduced_chi_square(of_films)
+    reduced = []
+    for phases, means, weights in zip(sets, patches, trust, strict=True):
+        common = chi_square_of_films if phases.artefact is None else 0.0
+        factor = max(1.0, _reduced_chi_square(means) - _CHANCE, common - _CHANCE)
+        reduced.append(replace(weights, variance=weights.variance * factor, alike=factor))
+    return tuple(reduced)
 
 
 def across_px(phases: set_phases.SetPhases) -> float:
@@ -80,24 +108,31 @@ def across_px(phases: set_phases.SetPhases) -> float:
 def _patch_means(
     phases: set_phases.SetPhases, left_mm: FloatArray, trust: RobustWeights, side_px: float
 ) -> FloatArray:
-    """Residuals' means over patches in units of their noise, (2, patches, patches); NaN with few
+    """Means of residuals (2, n) over patches in units of their noise, (2, patches); NaN with few
     points.
     """
-    column, row = (
-        np.floor(place / side_px).astype(int) for place in (phases.column_px, phases.row_px)
-    )
+    # The patch of each point; the same place has the same patch in all sets.
+    column = np.floor(phases.column_px / side_px).astype(int)
+    row = np.floor(phases.row_px / side_px).astype(int)
     count = _PATCHES + 2
-    patch = row % count * count + column % count  # the same in all sets
+    patch = row % count * count + column % count
+
+    # Weighted means over their standard errors.
     weights = trust.weights / (trust.variance * phases.sigma_mm**2)
     total = np.bincount(patch, weights, count**2)
     sums = np.stack([np.bincount(patch, weights * part, count**2) for part in left_mm])
-    full = np.bincount(patch, minlength=count**2) >= _FEW_IN_PATCH
-    return np.where(full, sums / np.sqrt(np.where(full, total, 1.0)), np.nan)
+    is_full = np.bincount(patch, minlength=count**2) >= _FEWEST_IN_PATCH
+    return np.where(is_full, sums / np.sqrt(np.where(is_full, total, 1.0)), np.nan)
 
 
 def _reduced_chi_square(means: FloatArray) -> float:
-    """Their variance, as if they were alone: those that the fit has taken are as good as gone."""
+    """Reduced chi-square of patch means, without the degrees of freedom that the fit used.
+
+    Waves count as unused: they are small, and mostly held.
+    """
     known = means[np.isfinite(means)]
-    taken = forward_model.LOCAL_EVEN  # waves are small, and mostly held: they take little
-    free = known.size - taken
-    return float(np.sum(known**2) / free) if free > taken else 1.0
+    fitted = forward_model.LOCAL_EVEN
+    freedom = known.size - fitted
+    if freedom <= fitted:
+        return 1.0
+    return float(np.sum(known**2) / freedom)
