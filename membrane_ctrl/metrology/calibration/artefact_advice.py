@@ -15,69 +15,112 @@ from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 
 # A sphere that a telescope maker can deliver: radius of curvature by interferometer and scale,
-# place by a dial gauge
-_SPHERE_MM, _SPHERE_USED = 200.0, 0.95
-_SPHERE_KNOWN, _FORM_MM, _VERTEX_MM = 1e-4, 5e-5, 0.05
+# place by a dial gauge.
+_SPHERE_MM = 200.0  # radius of its edge
+_SPHERE_USED = 0.95  # share of that radius that is used
+_CURVATURE_SIGMA = 1e-4  # relative
+_FORM_SIGMA_MM = 5e-5
+_VERTEX_SIGMA_MM = 0.05
 
 
 @dataclass(frozen=True)
 class ArtefactAdvice:
-    """A sphere in the mirror's place, where lengths of the bench cannot be told apart."""
+    """A sphere in the mirror's place, where lengths of the bench are ambiguous.
 
-    together: tuple[str, ...]  # parameters that move together
+    Attributes
+    ----------
+    together : tuple of str
+        Parameters that are ambiguous together.
+    curvature_radius_mm, curvature_radius_sigma_mm : float
+        Radius of curvature of the sphere, and its standard uncertainty.
+    vertex_sigma_mm : float
+        Standard uncertainty of the height of its vertex.
+    radius_mm : float
+        Radius of its edge.
+    sag_um : float
+        1 sigma of the film's sag with a set of it.
+    """
+
+    together: tuple[str, ...]
     curvature_radius_mm: float
     curvature_radius_sigma_mm: float
     vertex_sigma_mm: float
-    radius_mm: float  # of the sphere's edge
-    sag_um: float  # 1 sigma then
+    radius_mm: float
+    sag_um: float
 
 
 def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
-    """What a sphere in the mirror's place would give; None if it is not worth it, or if an artefact
-    stood there.
+    """The sphere that would reduce the sag's sigma most.
 
-    Its set is foreseen from the bench found: rays of the film's set that meet the sphere, with
+    Its set is foreseen from the calibrated bench: rays of the film's set that meet the sphere, with
     their noise.
+
+    Parameters
+    ----------
+    solution : Solution
+        The calibration.
+    index : int
+        Number of the set whose sag is considered.
+
+    Returns
+    -------
+    ArtefactAdvice or None
+        None if it is not worth it, or if there is a set of an artefact.
     """
     if solution.problem.with_artefact:
         return None
-    phases, surface = solution.problem.sets[index], solution.states[index].surface
+    phases = solution.problem.sets[index]
     phases = replace(phases.subset(phases.seen_with(0)), elsewhere=())
-    # as deep as the film, so that the fringes fall on the same places of the screen
+    surface = solution.states[index].surface
+
+    # As deep as the film, so that the fringes fall on the same places of the screen.
     curvature_mm = (surface.radius_mm**2 + surface.sag_mm**2) / (2 * surface.sag_mm)
-    spread = _SPHERE_KNOWN / curvature_mm
     sphere = Artefact(
-        1 / curvature_mm, spread, _FORM_MM, 0.0, _VERTEX_MM, min(_SPHERE_MM, surface.radius_mm)
+        1 / curvature_mm,
+        _CURVATURE_SIGMA / curvature_mm,
+        _FORM_SIGMA_MM,
+        0.0,
+        _VERTEX_SIGMA_MM,
+        min(_SPHERE_MM, surface.radius_mm),
     )
-    terms = sphere.terms_mm()
+    terms_mm = sphere.terms_mm()
     shape = replace(
-        Surface.from_parameters(terms[:PARAMETERS], sphere.radius_mm),
-        beyond_mm=tuple(terms[PARAMETERS:].tolist()),
+        Surface.from_parameters(terms_mm[:PARAMETERS], sphere.radius_mm),
+        beyond_mm=tuple(terms_mm[PARAMETERS:].tolist()),
     )
+
+    # Bins that meet the sphere, without residuals.
     bench = solution.bench
     points = forward_model.place_rays(bench, phases, shape, 0.0)
     x_mm, y_mm, _z = bench.geometry.pinhole_mm[:, None] + points.t_mm * points.rays
-    seen = replace(phases, displacement_um=np.nan, artefact=sphere).subset(
-        np.hypot(x_mm, y_mm) < _SPHERE_USED * sphere.radius_mm
-    )
+    on_sphere = np.hypot(x_mm, y_mm) < _SPHERE_USED * sphere.radius_mm
+    seen = replace(phases, displacement_um=np.nan, artefact=sphere).subset(on_sphere)
     if seen.sigma_mm.size < 2 * forward_model.LOCAL_EVEN:
         return None
-    seen = replace(
-        seen, screen_mm=seen.screen_mm - forward_model.residual_mm(bench, seen, shape, 0.0)
-    )
-    more = foreseen_equations(
-        solution, seen, set_state.SetState(shape, 0.0), robust_weights.RobustWeights.full(seen)
-    )
+    residual_mm = forward_model.residual_mm(bench, seen, shape, 0.0)
+    seen = replace(seen, screen_mm=seen.screen_mm - residual_mm)
+
+    # The solution with that set in addition.
+    state = set_state.SetState(shape, 0.0)
+    weights = robust_weights.RobustWeights.full(seen)
+    more = foreseen_equations(solution, seen, state, weights)
     then = with_equations(solution, (*solution.equations, more))
-    then_um, now_um = (sag_um(surface_covariance(each, index)) for each in (then, solution))
-    if not then_um < WORTHWHILE_SHARE * now_um:
+    then_um = sag_um(surface_covariance(then, index))
+    present_um = sag_um(surface_covariance(solution, index))
+    if not then_um < WORTHWHILE_SHARE * present_um:
         return None
-    worst = max(
-        weak_combinations(solution, index, surface.radius_mm),
-        key=lambda each: each.figure_um,
-        default=None,
-    )
-    together = () if worst is None else tuple(name for name, _ in worst.parts)
+
+    # The parameters that it determines: those of the worst ambiguity.
+    combinations = weak_combinations(solution, index, surface.radius_mm)
+    worst = max(combinations, key=lambda combination: combination.figure_um, default=None)
+    together: tuple[str, ...] = ()
+    if worst is not None:
+        together = tuple(name for name, _ in worst.parts)
     return ArtefactAdvice(
-        together, curvature_mm, _SPHERE_KNOWN * curvature_mm, _VERTEX_MM, sphere.radius_mm, then_um
+        together=together,
+        curvature_radius_mm=curvature_mm,
+        curvature_radius_sigma_mm=_CURVATURE_SIGMA * curvature_mm,
+        vertex_sigma_mm=_VERTEX_SIGMA_MM,
+        radius_mm=sphere.radius_mm,
+        sag_um=then_um,
     )

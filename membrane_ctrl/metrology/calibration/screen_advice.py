@@ -19,83 +19,125 @@ from membrane_ctrl.metrology.rays import forward_model, set_phases
 from membrane_ctrl.metrology.rays.artefacts import SeenScreen
 from membrane_ctrl.model.arrays import FloatArray
 
-# The screen itself before the camera, and the screen on a rail: what a pair of hands and a dial
-# gauge can do
-# of the screen itself, to two sides: one tilt leaves the focal length with the distance
+# The screen itself before the camera, tilted to two sides: with one tilt, focal length and distance
+# remain ambiguous.
 TILT_DEG = 25.0
+_FILLED = 0.9  # share of the picture that the fringes fill
+# The screen on a rail, away from the mirror: what two hands and a dial gauge can do.
 RAIL_SIGMA_MM = 0.05
-_RAIL_MM, _RAIL_TURN_DEG = -300.0, 0.5  # away from the mirror
-_FILLS = 0.9  # of the picture that the fringes fill
+_RAIL_MM = -300.0
+_RAIL_TURN_DEG = 0.5
+
+Placement = Literal["screen", "screen_moved"]
 
 
 @dataclass(frozen=True)
 class ScreenAdvice:
-    """Sets with the screen in another place, each in addition to those named before it."""
+    """Sets with the screen in another place, each in addition to those named before it.
 
-    sets: Literal[
-        "screen", "screen_moved"
-    ]  # `[artefact] form = "screen"`, or `[screen_moved]` beside a film's set
-    distance_mm: float  # of the screen from the camera; by how far it moves along its normal
-    sag_um: float  # 1 sigma then
+    Attributes
+    ----------
+    sets : "screen" or "screen_moved"
+        Sets with `[artefact] form = "screen"`, or one with `[screen_moved]` of a film's set.
+    distance_mm : float
+        Distance of the screen from the camera, or its motion along its normal.
+    sag_um : float
+        1 sigma of the sag with these sets.
+    """
+
+    sets: Placement
+    distance_mm: float
+    sag_um: float
 
 
 def screen_advice(solution: Solution, index: int) -> tuple[ScreenAdvice, ...]:
-    """Sets of the screen itself, and of the film with the screen elsewhere, the most useful first;
-    those worth it.
+    """Sets of the screen itself, and of the film with the screen elsewhere, that are worth taking.
 
     The second is judged as taken with the first.
+
+    Parameters
+    ----------
+    solution : Solution
+        The calibration.
+    index : int
+        Number of the set whose sag is considered.
+
+    Returns
+    -------
+    tuple of ScreenAdvice
+        The most useful first.
     """
-    problem, found = solution.problem, solution
+    problem = solution.problem
     half_mm = np.max([np.abs(problem.sets[k].screen_mm).max(axis=1) for k in problem.films], axis=0)
-    left: list[Literal["screen", "screen_moved"]] = []
+    candidates: list[Placement] = []
     if not any(isinstance(phases.artefact, SeenScreen) for phases in problem.sets):
-        left.append("screen")
+        candidates.append("screen")
     if not any(problem.sets[k].elsewhere for k in problem.films):
-        left.append("screen_moved")
-    out: list[ScreenAdvice] = []
-    while left:
-        tried = {name: _FORESEEN[name](found, index, half_mm) for name in left}
-        claims = {
-            name: sag_um(surface_covariance(then, index)) for name, (then, _) in tried.items()
+        candidates.append("screen_moved")
+
+    # Add the best candidate, as long as it reduces the sigma enough.
+    found = solution
+    advice: list[ScreenAdvice] = []
+    while candidates:
+        foreseen = {name: _foresee(name, found, index, half_mm) for name in candidates}
+        sigmas_um = {
+            name: sag_um(surface_covariance(then, index)) for name, (then, _) in foreseen.items()
         }
-        name = min(claims, key=lambda each: claims[each])
-        if not claims[name] < WORTHWHILE_SHARE * sag_um(surface_covariance(found, index)):
+        best = min(sigmas_um, key=lambda name: sigmas_um[name])
+        present_um = sag_um(surface_covariance(found, index))
+        if not sigmas_um[best] < WORTHWHILE_SHARE * present_um:
             break
-        found, distance_mm = tried[name]
-        out.append(ScreenAdvice(name, distance_mm, claims[name]))
-        left.remove(name)
-    return tuple(out)
+        found, distance_mm = foreseen[best]
+        advice.append(ScreenAdvice(best, distance_mm, sigmas_um[best]))
+        candidates.remove(best)
+    return tuple(advice)
+
+
+def _foresee(
+    placement: Placement, solution: Solution, index: int, half_mm: FloatArray
+) -> tuple[Solution, float]:
+    """The solution with sets of that kind, and their distance.
+
+    `half_mm` (2,) is half the size of the screen that the film's sets show.
+    """
+    if placement == "screen":
+        return _with_screens(solution, index, half_mm)
+    return _with_rail(solution, index, half_mm)
 
 
 def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Solution, float]:
     """The solution with sets of the screen itself, tilted to two sides, and its distance from the
     camera.
     """
-    film, camera = solution.problem.sets[index], solution.bench.geometry
+    # The bins of the film's set, which see the screen instead.
+    film = solution.problem.sets[index]
     film = replace(
         film.subset(film.seen_with(0)),
         displacement_um=np.nan,
         screen=None,
         elsewhere=(set_phases.ANYWHERE,),
     )
+
+    # The distance at which the fringes fill the picture.
+    camera = solution.bench.geometry
     rays = camera.rotation @ forward_model.camera_rays(camera, film)
     tangents = rays[:2] / rays[2]
-    distance_mm = float(_FILLS * 2 * np.min(half_mm) / np.ptp(tangents, axis=1).max())
+    width = np.ptp(tangents, axis=1).max()
+    distance_mm = float(_FILLED * 2 * np.min(half_mm) / width)
     middle = np.append(tangents.mean(axis=1), 1.0)
-    state = set_state.SetState(
-        solution.states[index].surface, 0.0, elsewhere=(np.zeros(set_phases.MOVED),)
-    )
+
+    # Two sets, tilted about x and about y. The screen faces the camera, and s_y goes up in the
+    # picture.
+    no_moves = (np.zeros(set_phases.MOVED),)
+    state = set_state.SetState(solution.states[index].surface, 0.0, elsewhere=no_moves)
     more = []
-    for turn in ("x", "y"):
-        # it faces the camera, and s_y goes up in the picture
-        facing = Rotation.from_euler(turn, TILT_DEG, degrees=True).as_matrix() @ np.diag(
-            [1.0, -1.0, -1.0]
-        )
+    for axis in ("x", "y"):
+        tilt = Rotation.from_euler(axis, TILT_DEG, degrees=True).as_matrix()
+        facing = tilt @ np.diag([1.0, -1.0, -1.0])
         phases = replace(film, artefact=SeenScreen(distance_mm * middle, facing.T))
         seen = foreseen_set(solution, phases, state, half_mm)
-        more.append(
-            foreseen_equations(solution, seen, state, robust_weights.RobustWeights.full(seen))
-        )
+        weights = robust_weights.RobustWeights.full(seen)
+        more.append(foreseen_equations(solution, seen, state, weights))
     return with_equations(solution, (*solution.equations, *more)), distance_mm
 
 
@@ -103,16 +145,15 @@ def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Sol
     """The solution with the film of one set seen again, the screen moved along a rail, and by how
     far.
     """
-    film, now = solution.problem.sets[index], solution.equations[index]
+    film = solution.problem.sets[index]
+    present = solution.equations[index]
     known = set_phases.Elsewhere((0.0, 0.0, _RAIL_MM), RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0)
     move = known.known(solution.problem.references.laser_sigma_um)[0]
     state = replace(solution.states[index], elsewhere=(move,))
     there = foreseen_set(solution, film.beside(film, known), state, half_mm)
     again = there.subset(there.seen_with(1))
-    trust = replace(now.trust, weights=np.append(now.trust.weights, np.ones(again.sigma_mm.size)))
+    all_weights = np.append(present.trust.weights, np.ones(again.sigma_mm.size))
+    trust = replace(present.trust, weights=all_weights)
     linear = list(solution.equations)
     linear[index] = foreseen_equations(solution, film.beside(again, known), state, trust)
     return with_equations(solution, tuple(linear)), _RAIL_MM
-
-
-_FORESEEN = {"screen": _with_screens, "screen_moved": _with_rail}
