@@ -30,7 +30,7 @@ from firmware_iface.roles import DriverClock, Pattern, SensorFormat
 from firmware_iface.settings import AravisCameraConfig, PygameScreenConfig
 from membrane_ctrl.acquisition.cycle import CycleDone, ShapeCycle
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan
-from membrane_ctrl.acquisition.optical_bench import DisplayTest
+from membrane_ctrl.acquisition.display_test import DisplayTest
 from membrane_ctrl.acquisition.waiting_clock import WaitingClock
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor

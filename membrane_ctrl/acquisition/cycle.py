@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from firmware_iface.roles import Camera, Pixels, Screen
-from membrane_ctrl.acquisition import exposures
+from membrane_ctrl.acquisition import exposures, stage_errors
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.durations import pause_s
@@ -101,7 +101,7 @@ class ShapeCycle:
         self._cycle += 1
         try:
             estimate = self._measure_shape("full" if self._full_next else "fringes")
-        except exposures.StageError as error:
+        except stage_errors.StageError as error:
             self._failed_in_a_row += 1
             return CycleFailed(self._cycle, error.stage, str(error), pause_s(self._failed_in_a_row))
         if estimate is None:
@@ -114,7 +114,7 @@ class ShapeCycle:
         """Do ahead what the next figure needs: not while it is waited for. That cycle tells of a
         failure.
         """
-        with suppress(exposures.StageError), exposures.convert_stage_errors("reconstruction"):
+        with suppress(stage_errors.StageError), stage_errors.convert_stage_errors("reconstruction"):
             self._reconstructor.prepare()
 
     def _choose_next_kind(self, estimate: ShapeEstimate) -> None:
@@ -136,7 +136,7 @@ class ShapeCycle:
         # to come
         displacement_um = np.array([self._laser.at(frame.time_s) for frame in frames])
         time_s = np.array([frame.time_s for frame in frames])
-        with exposures.convert_stage_errors("reconstruction"):
+        with stage_errors.convert_stage_errors("reconstruction"):
             reconstruct = (
                 self._reconstructor.full if kind == "full" else self._reconstructor.fringes
             )

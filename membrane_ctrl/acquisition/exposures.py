@@ -9,9 +9,8 @@ thread (aravis fills buffers outside Python), the consumer is the cycle.
     cycle    |                                                                       | reconstruct
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Literal, Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from typing import Protocol, runtime_checkable
 
 from firmware_iface.roles import (
     TRIES,
@@ -23,30 +22,8 @@ from firmware_iface.roles import (
     Pixels,
     Screen,
 )
+from membrane_ctrl.acquisition.stage_errors import StageError, convert_stage_errors
 from membrane_ctrl.processes.frames import FrameSlot, FrameWriter
-
-# Where a cycle failed: every exception of a device or the numerics becomes one error that names the
-# stage.
-
-
-Stage = Literal["screen", "camera", "reconstruction"]
-
-
-class StageError(Exception):
-    """A failure and its stage."""
-
-    def __init__(self, stage: Stage, message: str) -> None:
-        super().__init__(message)
-        self.stage = stage
-
-
-@contextmanager
-def convert_stage_errors(stage: Stage) -> Iterator[None]:
-    """Turn any exception of the block into a StageError."""
-    try:
-        yield
-    except Exception as error:
-        raise StageError(stage, f"{type(error).__name__}: {error}") from error
 
 
 class CycleClock(Protocol):
@@ -95,14 +72,17 @@ class Exposures:
         laser: Laser,
         interval_s: float,
     ) -> None:
-        self._camera: ExposingCamera = (
-            camera if isinstance(camera, ExposingCamera) else _Grabbing(camera)
-        )
-        self._screen: SettlingScreen = (
-            screen if isinstance(screen, SettlingScreen) else _Showing(screen)
-        )
-        self._looks_ahead = isinstance(screen, SettlingScreen)
-        self._frames, self._clock, self._laser = frames, clock, laser
+        self._camera: ExposingCamera = _Grabbing(camera)
+        if isinstance(camera, ExposingCamera):
+            self._camera = camera
+        self._screen: SettlingScreen = _Showing(screen)
+        if isinstance(screen, SettlingScreen):
+            self._screen = screen
+        # Only such a screen shows the next pattern while this cycle is reconstructed.
+        self._shows_ahead = isinstance(screen, SettlingScreen)
+        self._frames = frames
+        self._clock = clock
+        self._laser = laser
         self._interval_s = interval_s
         self._shown: Pattern | None = None
 
@@ -125,6 +105,7 @@ class Exposures:
     def _expose_in_order(
         self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]
     ) -> list[Frame] | None:
+        """Take the frames; the exposure before is fetched while the next pattern settles."""
         taken: list[Frame] = []
         pending: tuple[Pattern, FrameSlot] | None = None
         exposed_s = -self._interval_s
@@ -137,22 +118,22 @@ class Exposures:
                 exposed_s = taken[-1].time_s
             with convert_stage_errors("screen"):
                 self._screen.wait()
-            self._clock.sleep(max(0.0, exposed_s + self._interval_s - self._clock.now()))
+            due_s = exposed_s + self._interval_s
+            self._clock.sleep(max(0.0, due_s - self._clock.now()))
             slot = self._frames.begin()
             with convert_stage_errors("camera"):
                 self._camera.expose(slot.pixels)
             pending = pattern, slot
         if pending is not None:
-            ahead = (
-                patterns[0] if self._looks_ahead else None
-            )  # both kinds of cycle start with the same pattern
+            # Both kinds of cycle begin with the same pattern.
+            ahead = patterns[0] if self._shows_ahead else None
             if ahead is not None:
                 self._show_pattern(ahead)
             taken.append(self._store_frame(*pending, cycle, then=ahead))
         return taken
 
     def _show_pattern(self, pattern: Pattern) -> None:
-        """Send a pattern to the screen, unless it stands there."""
+        """Send a pattern to the screen, unless it is shown already."""
         if pattern != self._shown:
             with convert_stage_errors("screen"):
                 self._screen.begin(pattern)
@@ -202,8 +183,9 @@ class _Grabbing:
         self._frame = self._camera.grab(out=out)
 
     def fetch(self) -> Frame:
-        assert self._frame is not None  # after an exposure
-        frame, self._frame = self._frame, None
+        frame = self._frame
+        assert frame is not None  # after an exposure
+        self._frame = None
         return frame
 
     def discard_frame(self) -> None:

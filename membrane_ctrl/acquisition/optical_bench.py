@@ -1,23 +1,14 @@
 """Camera and screen of a run: the twin's, or the configured ones."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from firmware_iface import (
-    checkerboard_check,
-    display_patterns,
-    display_response,
-    display_settling,
-    drivers,
-    exposure_check,
-    roles,
-)
+from firmware_iface import display_patterns, drivers, roles
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.pattern_screen import PatternScreen
 from firmware_iface.settings import ExternalCameraConfig, ExternalScreenConfig, ScreenSection
+from membrane_ctrl.acquisition.display_test import DisplayTest
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.instruments import driver_loading
@@ -26,116 +17,9 @@ from membrane_ctrl.metrology.tracking.live_tracker import crossed_patterns
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sim.optics.camera import TwinOptics
 
-_CAMERA, _SCREEN = "devices.camera", "devices.screen"  # for messages
-# Longer than any suitable display takes
-LONG_S = 0.5
-# Frame after frame for this long, three times per direction, as refresh and exposure are not
-# synchronised
-_FOLLOWED_S = 0.35
-_TIMES = 3
-
-
-class DisplayTest:
-    """Measures a display with the camera that sees it, both open.
-
-    It waits `settle_s` before a still picture; `measure_settling` shortens that.
-    """
-
-    def __init__(
-        self,
-        screen: PatternScreen,
-        camera: roles.Camera,
-        clock: CycleClock,
-        width_px: int,
-        height_px: int,
-    ) -> None:
-        self._screen, self._camera, self._clock = screen, camera, clock
-        self._size = (height_px, width_px)
-        self.settle_s = LONG_S
-
-    def check_exposure(self, full_scale_adu: int, exposure_ms: float) -> str:
-        """Any problem with the camera's exposure, else empty."""
-        white, black = (
-            self._expose_still(self._make_grey(255)),
-            self._expose_still(self._make_grey(0)),
-        )
-        return exposure_check.explain_exposure(white, black, full_scale_adu, exposure_ms)
-
-    def check_checkerboard(self) -> str:
-        """Any problem with pixel-for-pixel display, else empty."""
-        white, black = (
-            self._expose_still(self._make_grey(255)),
-            self._expose_still(self._make_grey(0)),
-        )
-        return checkerboard_check.explain_checkerboard(
-            self._expose_still(display_patterns.make_checkerboard(self._size[1], self._size[0])),
-            white,
-            black,
-        )
-
-    def measure_settling(self) -> display_settling.Settling:
-        """Time from a command to the light, over steps both ways between black, white and two
-        greys.
-
-        Includes greys because panels are slowest between them. Raises ValueError if the display
-        never settles.
-        """
-        delays_s: list[float] = []
-        left: list[float] = []
-        noise = 0.0
-        for one, other in ((0, 255), (64, 160)):
-            pictures = {
-                level: _thin_pixels(self._expose_still(self._make_grey(level)))
-                for level in (one, other)
-            }
-            again = _thin_pixels(self._expose_still(self._make_grey(one)))
-            noise = max(noise, display_settling.share_left(again, pictures[other], pictures[one]))
-            for before, after in ((one, other), (other, one)) * _TIMES:
-                self._expose_still(self._make_grey(before))
-                for delay_s, pixels in list(
-                    self._expose_series(self._make_grey(after))
-                ):  # evaluated afterwards
-                    delays_s.append(delay_s)
-                    left.append(
-                        display_settling.share_left(pixels, pictures[before], pictures[after])
-                    )
-        found = display_settling.fit_settling(delays_s, left, noise)
-        self.settle_s = found.settle_s
-        return found
-
-    def measure_response(self) -> display_response.DisplayResponse:
-        """Light against level. Raises ValueError if the camera sees no ramp."""
-        frames = [
-            self._expose_still(self._make_grey(level)) for level in display_response.RAMP_LEVELS
-        ]
-        swing = frames[-1].astype(np.float64) - frames[0]
-        lit = swing > 0.5 * np.quantile(swing, 0.99)
-        return display_response.make_measured_response(
-            display_response.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames]
-        )
-
-    def _expose_still(self, levels: roles.Levels) -> roles.Pixels:
-        self._screen.show_levels(levels)
-        self._clock.sleep(self.settle_s)
-        return self._camera.grab().pixels
-
-    def _expose_series(self, levels: roles.Levels) -> Iterator[tuple[float, roles.Pixels]]:
-        """Frames one after the other, each with the time from the command to the start of its
-        exposure.
-        """
-        self._screen.show_levels(levels)
-        begun_s = self._clock.now()
-        while self._clock.now() - begun_s < _FOLLOWED_S:
-            frame = self._camera.grab()
-            yield frame.time_s - begun_s, _thin_pixels(frame.pixels)
-
-    def _make_grey(self, level: int) -> roles.Levels:
-        return np.full(self._size, level, np.uint8)
-
-
-def _thin_pixels(pixels: roles.Pixels) -> roles.Pixels:
-    """Every fourth pixel both ways (the same colour on a Bayer sensor), enough for block means."""
-    return pixels[::4, ::4].copy()
+# Tables of the configuration, for messages.
+_CAMERA = "devices.camera"
+_SCREEN = "devices.screen"
 
 
 def format_finding(name: str, measure: Callable[[], str]) -> str:

@@ -26,13 +26,14 @@ from membrane_ctrl.processes.frames import FrameHead, FrameReader
 from membrane_ctrl.processes.ring import RingAddress, RingReader
 from membrane_ctrl.run_files.detail_level import PICTURES_FROM
 
-# If the disk is slower than the cycles, sets beyond this queue are omitted
-_WAITING_SETS = 3
+_WAITING_SETS = 3  # longest queue: if the disk is slower than the cycles, further sets are omitted
 _FASTEST = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # stronger compression hardly shrinks a noisy frame
 
 
 @dataclass(frozen=True, slots=True)
 class _Set:
+    """The frames of one cycle, and their pixels."""
+
     kind: str
     heads: tuple[FrameHead, ...]
     pixels: tuple[Pixels, ...]
@@ -54,10 +55,28 @@ class _Write:
 
 
 class RawFrames:
-    """Keeps frames in the run's folder `raw`, made for the first set; sees faults in the telemetry.
+    """Keeps frames in the run's folder `raw`; finds faults in the telemetry.
 
-    `tell` gets an event of kind "raw_frames" when the disk forces sets to be omitted: once per
-    reason, until one is kept again. `left_out` counts the sets omitted for lack of time or disk.
+    Parameters
+    ----------
+    folder : Path
+        The folder, made for the first set.
+    optics : OpticsConfig
+        The bench that the sets state.
+    plan : CyclePlan
+        Patterns of the cycles.
+    recording : RecordingConfig
+        Which sets are kept.
+    frames, telemetry : FrameAddress, RingAddress
+        The rings that are read.
+    send_event : callable
+        Gets an event when the disk forces sets to be omitted: once for each reason, until a set is
+        kept again.
+
+    Attributes
+    ----------
+    left_out : int
+        Number of sets omitted for lack of time or disk space.
     """
 
     def __init__(
@@ -68,20 +87,23 @@ class RawFrames:
         recording: RecordingConfig,
         frames: FrameAddress,
         telemetry: RingAddress,
-        tell: Callable[[events.Event], None] = lambda event: None,
+        send_event: Callable[[events.Event], None] = lambda event: None,
     ) -> None:
-        self._folder, self._optics, self._plan, self._recording = folder, optics, plan, recording
+        self._folder = folder
+        self._optics = optics
+        self._plan = plan
+        self._recording = recording
         self._patterns = {pattern.name: pattern for pattern in plan.full}
         self._frames = FrameReader(frames)
         self._telemetry = RingReader(telemetry)
         self._writer = ThreadPoolExecutor(1, "raw frames")
         self._writing: list[_Write] = []
-        self._tell = tell
-        self._told = ""
+        self._send_event = send_event
+        self._reported = ""  # the reason of the last event
         self._in_fault = False
-        self._kept: dict[int, Path] = {}
-        self._reference: Path | None = None
-        self._reference_needed = False
+        self._kept: dict[int, Path] = {}  # folders by the number of the cycle
+        self._reference: Path | None = None  # the newest accepted full cycle
+        self._reference_needed = False  # a set refers to it, or a person requested it
         self.left_out = 0
 
     def keep_due_frames(self, estimate: ShapeEstimate) -> None:
@@ -92,18 +114,18 @@ class RawFrames:
             return
         if not (self._recording.raw_every_cycles or self._recording.raw_before_fault_cycles):
             return
-        due = (
-            self._recording.raw_every_cycles
-            and estimate.cycle % self._recording.raw_every_cycles == 0
-        )
-        anchors = estimate.kind == "full" and estimate.verdict != "rejected"
-        if not (due or anchors):
+        every = self._recording.raw_every_cycles
+        is_due = bool(every and estimate.cycle % every == 0)
+        is_reference = estimate.kind == "full" and estimate.verdict != "rejected"
+        if not (is_due or is_reference):
             return
         kept = self._copy_and_queue(estimate.cycle)
-        if anchors and kept is not None:
+        if is_reference and kept is not None:
+            # It replaces the former reference, which is removed unless a set refers to it.
             if self._reference is not None and not self._reference_needed:
                 self._writer.submit(shutil.rmtree, self._reference, ignore_errors=True)
-            self._reference, self._reference_needed = kept, bool(due)
+            self._reference = kept
+            self._reference_needed = is_due
 
     def write_capture(self, estimate: ShapeEstimate) -> Path:
         """Write a cycle's frames and wait; returns the set's folder. Raises OSError."""
@@ -122,14 +144,14 @@ class RawFrames:
     def look_for_fault(self) -> None:
         """Keep the last cycles if a fault has occurred since the last call."""
         message = self._telemetry.latest()
-        fault = message is not None and telemetry.TelemetryRow.unpack(message).fault > 0
-        if fault and not self._in_fault and self._recording.raw_before_fault_cycles:
-            cycles = sorted(
-                {head.cycle for head in self._frames.heads() if head.pattern in self._patterns}
-            )
-            for cycle in cycles[-self._recording.raw_before_fault_cycles :]:
+        has_fault = message is not None and telemetry.TelemetryRow.unpack(message).fault > 0
+        before_fault = self._recording.raw_before_fault_cycles
+        if has_fault and not self._in_fault and before_fault:
+            heads = self._frames.heads()
+            cycles = sorted({head.cycle for head in heads if head.pattern in self._patterns})
+            for cycle in cycles[-before_fault:]:
                 self._copy_and_queue(cycle)
-        self._in_fault = fault
+        self._in_fault = has_fault
 
     def close(self) -> None:
         """Check for a fault once more, write pending sets, detach."""
@@ -145,14 +167,19 @@ class RawFrames:
             return self._kept[cycle]
         self._collect_writes()
         found = self._copy_frames(cycle)
-        against = self._find_objection(found) if found is not None else ""
-        if found is None or against:
-            self._leave_out(against)
+        if found is None:
+            self._leave_out("")
             return None
-        path = self._kept[cycle] = self._find_free_name(cycle)
+        objection = self._find_objection(found)
+        if objection:
+            self._leave_out(objection)
+            return None
+        path = self._find_free_name(cycle)
+        self._kept[cycle] = path
         reference = None
         if found.kind == "fringes" and self._reference is not None:
-            self._reference_needed, reference = True, f"../{self._reference.name}"
+            reference = f"../{self._reference.name}"
+            self._reference_needed = True
         table = _make_set_table(found, self._optics, self._patterns, reference)
         done = self._writer.submit(_write_set, path, table, found)
         self._writing.append(_Write(cycle, path, found.size_bytes, done))
@@ -166,20 +193,21 @@ class RawFrames:
             free_bytes = shutil.disk_usage(self._folder.parent).free
         except OSError as error:
             return str(error)
-        # count queued sets too: after writing them, the disk must still have room as for thumbnails
-        left_mb = (
-            free_bytes - found.size_bytes - sum(write.size_bytes for write in self._writing)
-        ) / 1e6
+        # After this set and those in the queue, the disk must have as much space as for thumbnails.
+        queued_bytes = sum(write.size_bytes for write in self._writing)
+        left_mb = (free_bytes - found.size_bytes - queued_bytes) / 1e6
         least_mb = PICTURES_FROM * self._recording.min_free_mb
-        return "" if left_mb > least_mb else f"less than {least_mb:g} MB would stay free"
+        if left_mb > least_mb:
+            return ""
+        return f"less than {least_mb:g} MB would stay free"
 
-    def _leave_out(self, why: str) -> None:
+    def _leave_out(self, reason: str) -> None:
+        """Count an omitted set, and report a new reason; empty: there is nothing to report."""
         self.left_out += 1
-        if why and why != self._told:
-            self._told = why
-            self._tell(
-                acquisition_events.FramesLeftOut(self.left_out, f"frames are omitted: {why}")
-            )
+        if reason and reason != self._reported:
+            self._reported = reason
+            text = f"frames are omitted: {reason}"
+            self._send_event(acquisition_events.FramesLeftOut(self.left_out, text))
 
     def _collect_writes(self) -> None:
         """Collect finished writes; drop a failed set, to which no other may refer."""
@@ -188,7 +216,7 @@ class RawFrames:
         for write in done:
             error = write.done.exception()
             if error is None:
-                self._told = ""
+                self._reported = ""
                 continue
             self._kept.pop(write.cycle, None)
             if self._reference == write.folder:
@@ -197,24 +225,25 @@ class RawFrames:
 
     def _find_free_name(self, cycle: int) -> Path:
         """A free name for the set; a replacement acquisition counts its cycles from 1 again."""
-        path, again = self._folder / f"cycle-{cycle:06d}", 1
+        path = self._folder / f"cycle-{cycle:06d}"
+        number = 1
         while path.exists():
-            again += 1
-            path = path.with_name(f"cycle-{cycle:06d}-{again}")
+            number += 1
+            path = path.with_name(f"cycle-{cycle:06d}-{number}")
         return path
 
     def _copy_frames(self, cycle: int) -> _Set | None:
+        """Copy a cycle's frames from the ring; None if it was stopped or is partly overwritten."""
         heads = [head for head in self._frames.heads() if head.cycle == cycle]
         copies = [self._frames.copy(head) for head in heads]
-        names = {
-            head.pattern for head, pixels in zip(heads, copies, strict=True) if pixels is not None
-        }
+        pixels = tuple(copy for copy in copies if copy is not None)
+        pairs = zip(heads, copies, strict=True)
+        names = {head.pattern for head, copy in pairs if copy is not None}
         for kind, wanted in (("full", self._plan.full), ("fringes", self._plan.fringes)):
-            if names == {pattern.name for pattern in wanted} and len(heads) == len(wanted):
-                return _Set(
-                    kind, tuple(heads), tuple(pixels for pixels in copies if pixels is not None)
-                )
-        return None  # a stopped or partly overwritten cycle
+            is_complete = names == {pattern.name for pattern in wanted}
+            if is_complete and len(heads) == len(wanted):
+                return _Set(kind, tuple(heads), pixels)
+        return None
 
 
 def _write_set(folder: Path, table: dict[str, Any], content: _Set) -> None:
@@ -224,11 +253,10 @@ def _write_set(folder: Path, table: dict[str, Any], content: _Set) -> None:
         if "reference" in table and not (folder / table["reference"] / "capture.toml").exists():
             raise OSError(f"{folder.name}: the full cycle it refers to is missing")
         for head, pixels in zip(content.heads, content.pixels, strict=True):
+            # Written by Python, which reports a full disk; OpenCV does not.
             _, png = cv2.imencode(".png", pixels, _FASTEST)
-            (folder / f"{head.pattern}.png").write_bytes(
-                png.tobytes()
-            )  # unlike OpenCV, this reports a full disk
-        # last, as it marks a complete set
+            (folder / f"{head.pattern}.png").write_bytes(png.tobytes())
+        # Last, because it marks a complete set.
         (folder / "capture.toml").write_text(tomli_w.dumps(table), encoding="utf-8")
     except Exception:
         shutil.rmtree(folder, ignore_errors=True)
@@ -238,6 +266,7 @@ def _write_set(folder: Path, table: dict[str, Any], content: _Set) -> None:
 def _make_set_table(
     content: _Set, optics: OpticsConfig, patterns: dict[str, Pattern], reference: str | None
 ) -> dict[str, Any]:
+    """The content of the set's `capture.toml`; `reference` is the folder of its full cycle."""
     table: dict[str, Any] = {**program.file_origin("membrane-capture/1"), "kind": content.kind}
     if reference is not None:
         table["reference"] = reference
@@ -249,6 +278,7 @@ def _make_set_table(
 def _make_frame_rows(
     heads: Iterable[FrameHead], patterns: dict[str, Pattern]
 ) -> Iterable[dict[str, Any]]:
+    """The rows `[[frames]]` of `capture.toml`."""
     for head in heads:
         pattern = patterns[head.pattern]
         row: dict[str, Any] = {"file": f"{head.pattern}.png", "role": pattern.role}

@@ -32,23 +32,31 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.processes import child, frames, ring
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 
-_TRUTH_LOOK_S = 0.1
+_TRUTH_POLL_S = 0.1  # interval at which the twin's truth is read until it is there
 
 
 def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
     """Prepare, then measure until stopped.
 
-    Before the first cycle `processes.STOP` simply ends the process, as no resource needs care and a
-    compiling kernel cannot check for it; afterwards it ends the cycle at its next exposure. Raises
-    LinkError if no camera is configured, or its patterns do not fit on the screen.
+    Before the first cycle `processes.STOP` simply ends the process, because no resource needs to be
+    released and a compiling kernel cannot check for it; afterwards it ends the cycle at its next
+    exposure.
+
+    Raises
+    ------
+    LinkError
+        If no camera is configured, or its patterns do not fit on the screen.
     """
-    remote.take_commands()  # the first report, which allows silence until all this is done
+    # The first report permits silence until all this is done.
+    remote.take_commands()
     remote.report_state("preparing", "rendering the first picture, compiling")
-    config, clock = spec.config, WaitingClock(spec.clock)
+    config = spec.config
+    clock = WaitingClock(spec.clock)
     geometry = run_geometry.read_run_geometry(spec.run_dir, config)
     remote.send_event(geometry_watch.geometry_event(geometry))
     plan = _cycle_plan(config, geometry.optics)
     with ExitStack() as stack:
+        # Camera and screen, open, and compiled kernels.
         if spec.truth is None:
             bench = optical_bench.configured_bench(config, clock)
             _warm_up(config, plan, TYPICAL_FILM, clock)
@@ -59,21 +67,21 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
         _open_bench(bench, config, clock, remote)
         if remote.stop:
             return
+
+        # What makes figures, and what evaluates them.
         reconstructor, plan, period_s = _make_reconstructor(spec, geometry.optics, plan)
-        drift, hear = (
-            geometry_watch.GeometryWatch(geometry, config.shape.bin_px),
-            make_vibration_handler(config, spec.clock, spec.run_dir),
-        )
+        drift = geometry_watch.GeometryWatch(geometry, config.shape.bin_px)
+        handle_vibrations = make_vibration_handler(config, spec.clock, spec.run_dir)
+
+        # Rings. The bench closes before that of the frames: a running exposure holds the pixels of
+        # a slot.
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
-        stack.callback(
-            bench.close
-        )  # before the frame ring: a running exposure holds the pixels of a slot
-        laser = stack.enter_context(
-            closing(laser_history.LaserHistory(spec.telemetry, config.loop.rate_hz))
-        )
+        stack.callback(bench.close)
+        history = laser_history.LaserHistory(spec.telemetry, config.loop.rate_hz)
+        laser = stack.enter_context(closing(history))
         raw = _make_raw_frames(spec, geometry.optics, plan, stack, remote)
-        taking = cycle.ShapeCycle(
+        shape_cycle = cycle.ShapeCycle(
             bench.camera,
             bench.screen,
             reconstructor,
@@ -85,21 +93,23 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
         )
 
         def publish(estimate: ShapeEstimate) -> None:
+            """Send a figure to the other processes, with the events that follow from it."""
             shapes.put(pack_estimate(estimate))
-            for notice in (drift.check_estimate(estimate), *hear(estimate)):
-                if notice is not None:
-                    remote.send_event(notice)
+            for event in (drift.check_estimate(estimate), *handle_vibrations(estimate)):
+                if event is not None:
+                    remote.send_event(event)
             if raw is not None:
                 raw.keep_due_frames(estimate)
 
-        def keep(estimate: ShapeEstimate) -> Path:
+        def write_capture(estimate: ShapeEstimate) -> Path:
+            """Write a requested set. Raises OSError."""
             if raw is None:
                 raise OSError("the run has no folder")
             return raw.write_capture(estimate)
 
         remote.start_line_checks()
         remote.report_state("running", "first cycle")
-        cycle_loop.keep_cycling(taking, remote, publish, clock, period_s, keep)
+        cycle_loop.keep_cycling(shape_cycle, remote, publish, clock, period_s, write_capture)
 
 
 def _cycle_plan(config: Config, optics: OpticsConfig) -> cycle_plan.CyclePlan:
@@ -115,26 +125,29 @@ def _cycle_plan(config: Config, optics: OpticsConfig) -> cycle_plan.CyclePlan:
 def _make_reconstructor(
     spec: AcquisitionSpec, optics: OpticsConfig, plan: cycle_plan.CyclePlan
 ) -> tuple[cycle.Reconstructor, cycle_plan.CyclePlan, Callable[[], float]]:
-    """What makes figures of the frames, the patterns it needs, and the interval between its
-    figures.
+    """The reconstructor of the figures, the patterns that it needs, and the function of the
+    interval between its figures.
 
-    The figures have their covariance if the uncertainty of the geometry is stated.
+    The figures have the covariance of the geometry if its uncertainty is stated.
     """
     shape = spec.config.shape
-    kept = None if spec.run_dir is None else spec.run_dir / run_geometry.GEOMETRY_COPY
-    spread, _ = spread_file.geometry_spread(
-        optics, kept if kept is not None and kept.exists() else None
-    )
+    geometry_copy = None
+    if spec.run_dir is not None:
+        geometry_copy = spec.run_dir / run_geometry.GEOMETRY_COPY
+        if not geometry_copy.exists():
+            geometry_copy = None
+    spread, _ = spread_file.geometry_spread(optics, geometry_copy)
     cycles = live_reconstructor.LiveReconstructor(optics, shape.bin_px, spread=spread)
     if shape.mode == "cycle":
         return cycles, plan, lambda: shape.period_s
-    exposure_s = optical_bench.exposure_s(spec.config) if spec.truth is None else 0.0
+
+    # Tracking: one pattern stays on the screen, and each frame is a figure.
+    exposure_s = 0.0
+    if spec.truth is None:
+        exposure_s = optical_bench.exposure_s(spec.config)
     tracker = LiveTracker(optics, cycles, shape.track_periods, shape.track_step_s, exposure_s)
-    return (
-        tracker,
-        replace(plan, standing=lambda: tracker.pattern),
-        lambda: tracker.interval_factor / shape.track_rate_hz,
-    )
+    tracking_plan = replace(plan, standing=lambda: tracker.pattern)
+    return tracker, tracking_plan, lambda: tracker.interval_factor / shape.track_rate_hz
 
 
 def _make_twin_bench(
@@ -148,7 +161,7 @@ def _make_twin_bench(
     """Camera and screen at the twin's mirror, once its bench has published the film's position."""
     truth = stack.enter_context(closing(TwinTruth(address)))
     while not truth.known and not remote.stop:
-        remote.take_commands(_TRUTH_LOOK_S)
+        remote.take_commands(_TRUTH_POLL_S)
     optics = TwinOptics(config.optics, config.twin, truth, clock)
     if not remote.stop:
         _warm_up(config, plan, truth(), clock)

@@ -7,7 +7,7 @@ import numpy as np
 from firmware_iface.display_response import DisplayResponse
 from firmware_iface.display_settling import Settling
 from firmware_iface.roles import LinkError
-from membrane_ctrl.acquisition import exposures, optical_bench, waiting_clock
+from membrane_ctrl.acquisition import display_test, exposures, optical_bench, waiting_clock
 from membrane_ctrl.config.schema import Config, PatternConfig
 from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
 from membrane_ctrl.model import errors
@@ -49,7 +49,7 @@ def measure_display(
     """
     bench.camera.open()
     bench.screen.open()
-    test = optical_bench.DisplayTest(bench.screen, bench.camera, clock, width_px, height_px)
+    test = display_test.DisplayTest(bench.screen, bench.camera, clock, width_px, height_px)
     return test.measure_settling(), test.measure_response()
 
 

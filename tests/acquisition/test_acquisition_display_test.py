@@ -10,7 +10,8 @@ import pytest
 from acquisition_fakes import VirtualClock
 
 from firmware_iface.roles import Frame
-from membrane_ctrl.acquisition.optical_bench import DisplayTest, format_finding
+from membrane_ctrl.acquisition.display_test import DisplayTest
+from membrane_ctrl.acquisition.optical_bench import format_finding
 from tests.worlds.panel import EmulatedPanel, PanelResponse
 
 EXPOSURE_S, TRANSFER_S = 0.01, 0.005

@@ -55,8 +55,9 @@ def remove_fringe_waves(
     )
     is_strong = sizes > np.maximum(_LEAST_SIZE, _LEAST_RATIO * np.median(sizes))
     cleaned = list(sets)
-    for k in np.flatnonzero(is_strong):
-        cleaned[k] = replace(sets[k], screen_mm=sets[k].screen_mm - waves_mm[k])
+    for k, phases in enumerate(sets):
+        if is_strong[k]:
+            cleaned[k] = replace(phases, screen_mm=phases.screen_mm - waves_mm[k])
     return tuple(cleaned)
 
 
