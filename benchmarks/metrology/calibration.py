@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.calibration.sets import phases_of
+from membrane_ctrl.calibration.set_points import phases_of
 from membrane_ctrl.config.optics import (
     CameraConfig,
     CameraPoseConfig,

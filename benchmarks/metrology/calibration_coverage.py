@@ -25,14 +25,10 @@ import cv2
 import numpy as np
 
 from benchmarks.metrology.calibration import errors_um
-from membrane_ctrl.calibration.sets import (
-    Bundle,
-    CalibrateOptions,
-    join_moved_screen,
-    phases_of,
-    phases_of_screen,
-    problem_of,
-)
+from membrane_ctrl.calibration.calibrate_options import CalibrateOptions
+from membrane_ctrl.calibration.set_points import phases_of, phases_of_screen
+from membrane_ctrl.calibration.sets import Bundle, join_moved_screen
+from membrane_ctrl.calibration.stated_problem import problem_of
 from membrane_ctrl.config.optics import CameraConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.geometry.file import stated_origin
 from membrane_ctrl.geometry.set_tables import ScreenMovedTable, move_screen

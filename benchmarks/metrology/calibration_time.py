@@ -9,7 +9,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from membrane_ctrl.calibration.sets import CalibrateOptions, problem_of, read_sets
+from membrane_ctrl.calibration.calibrate_options import CalibrateOptions
+from membrane_ctrl.calibration.sets import read_sets
+from membrane_ctrl.calibration.stated_problem import problem_of
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibration.solver import solve_calibration
 from membrane_ctrl.sim.optics.film_shape import typical_film

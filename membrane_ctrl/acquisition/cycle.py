@@ -56,7 +56,7 @@ class CycleFailed:
     """A cycle without an estimate, where it failed and why; wait `pause_s` before the next."""
 
     cycle: int
-    stage: exposures.Stage
+    stage: stage_errors.Stage
     message: str
     pause_s: float
 

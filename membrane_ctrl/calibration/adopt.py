@@ -14,36 +14,39 @@ from membrane_ctrl.model import errors, files
 def compare_geometries(
     optics: schema.OpticsConfig, origin: GeometryOrigin, new: GeometryFile
 ) -> list[str]:
-    """The geometry in force (`optics`, `origin`) beside the new one, in numbers that a tape measure
-    can check.
+    """Lines that compare the geometry in use (`optics`, `origin`) with the new one, in numbers that
+    a tape measure can check.
     """
-    old = "by hand" if not origin.calibrated_utc else f"calibrated {origin.calibrated_utc}"
+    old = "by hand"
+    if origin.calibrated_utc:
+        old = f"calibrated {origin.calibrated_utc}"
     lines = [
-        f"in force: {old}, hash {origin.hash}; new: hash {new.origin.hash}",
-        f"{'':<28}{'in force':>12}{'new':>12}",
+        f"in use: {old}, hash {origin.hash}; new: hash {new.origin.hash}",
+        f"{'':<28}{'in use':>12}{'new':>12}",
     ]
-    rows = zip(
-        _tape_lengths(Geometry.from_config(optics)),
-        _tape_lengths(Geometry.from_config(new.apply_to_optics(optics))),
-        strict=True,
-    )
-    lines += [f"{name:<28}{before:>12.3f}{after:>12.3f}" for (name, before), (_, after) in rows]
+    before = _tape_lengths(Geometry.from_config(optics))
+    after = _tape_lengths(Geometry.from_config(new.apply_to_optics(optics)))
+    for name, length in before.items():
+        lines.append(f"{name:<28}{length:>12.3f}{after[name]:>12.3f}")
     return lines
 
 
-def _tape_lengths(geometry: Geometry) -> list[tuple[str, float]]:
-    pinhole, screen = geometry.pinhole_mm, geometry.screen_origin_mm
-    facing = np.cross(geometry.screen_s_x, geometry.screen_s_y)
-    leans = np.degrees(np.arccos(np.clip(abs(facing @ screen) / np.linalg.norm(screen), -1.0, 1.0)))
-    return [
-        ("a, vertex to pinhole, mm", float(np.linalg.norm(pinhole))),
-        ("b, vertex to screen, mm", float(np.linalg.norm(screen))),
-        (
-            "alpha of the camera, deg",
-            float(np.degrees(np.arctan2(pinhole[2], np.hypot(pinhole[0], pinhole[1])))),
-        ),
-        ("the screen leans by, deg", float(leans)),
-    ]
+def _tape_lengths(geometry: Geometry) -> dict[str, float]:
+    """Lengths and angles of a geometry, by what they are."""
+    pinhole_mm = geometry.pinhole_mm
+    screen_mm = geometry.screen_origin_mm
+    height_mm = pinhole_mm[2]
+    across_mm = np.hypot(pinhole_mm[0], pinhole_mm[1])
+
+    # Angle between the screen's normal and its direction from the vertex.
+    normal = np.cross(geometry.screen_s_x, geometry.screen_s_y)
+    cosine = np.clip(abs(normal @ screen_mm) / np.linalg.norm(screen_mm), -1.0, 1.0)
+    return {
+        "a, vertex to pinhole, mm": float(np.linalg.norm(pinhole_mm)),
+        "b, vertex to screen, mm": float(np.linalg.norm(screen_mm)),
+        "alpha of the camera, deg": float(np.degrees(np.arctan2(height_mm, across_mm))),
+        "the screen leans by, deg": float(np.degrees(np.arccos(cosine))),
+    }
 
 
 def adopt_geometry(new: Path, place: Path) -> Path | None:

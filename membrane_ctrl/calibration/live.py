@@ -10,15 +10,12 @@ import numpy as np
 
 from membrane_ctrl.calibration import session as sessions
 from membrane_ctrl.calibration.adopt import adopt_geometry, compare_geometries
+from membrane_ctrl.calibration.calibrate import calibrate_command
+from membrane_ctrl.calibration.calibrate_options import CalibrateOptions, parse_freed
 from membrane_ctrl.calibration.procedure import Procedure
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
 from membrane_ctrl.calibration.setpoints import HeldMirror, plan_setpoints_um, setpoint_reach
-from membrane_ctrl.calibration.sets import (
-    CalibrateOptions,
-    calibrate_command,
-    known_sigmas,
-    parse_freed,
-)
+from membrane_ctrl.calibration.stated_problem import known_sigmas
 from membrane_ctrl.calibration.sweep import CaptureLink, Sweep
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.control_port.ctl import Where

@@ -168,7 +168,8 @@ def calibrate(
     ] = False,
 ) -> int:
     """Calibrate the optics: one geometry with its covariance, from sets at several pressures."""
-    from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command
+    from membrane_ctrl.calibration.calibrate import calibrate_command
+    from membrane_ctrl.calibration.calibrate_options import CalibrateOptions
 
     solving = CalibrateOptions(
         folders or (),

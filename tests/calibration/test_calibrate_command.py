@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from membrane_ctrl.calibration import sets
+from membrane_ctrl.calibration import calibrate, sets
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig
 from membrane_ctrl.geometry.set_tables import move_screen
@@ -195,7 +195,7 @@ def test_a_rejected_calibration_leaves_the_old_geometry(
     assert run(["calibrate", *map(str, backwards), "--out", str(out)]) == 3
     printed = capsys.readouterr()
     assert "the laser counts the wrong way" in printed.out
-    assert "old geometry stays in force" in printed.err
+    assert "old geometry remains in use" in printed.err
     assert out.read_text() == "old"
 
 
@@ -287,14 +287,14 @@ def test_a_refusal_of_sets_with_different_references_names_these_first() -> None
         CalibrationFinding(False, "wide"),
     )
     bundle = sets.Bundle((), OpticsConfig(), 0.0, ("no rim",), "the sets state two references")
-    found = sets._judge_sets([crept, wide], bundle)
+    found = calibrate._judge_sets([crept, wide], bundle)
     assert [(each.fatal, each.says) for each in found] == [
         (True, "the sets state two references; if it was not: camera or screen crept"),
         (False, "wide"),
         (False, "no rim"),
     ]
     assert found[0].sets == (1,)
-    one = sets._judge_sets([crept], replace(bundle, apart=""))
+    one = calibrate._judge_sets([crept], replace(bundle, apart=""))
     assert [each.says for each in one] == ["camera or screen crept", "no rim"]
 
 

@@ -102,7 +102,7 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
         value, sigma = found[name]
         assert abs(value - true) < 4 * sigma, name
         assert sigma < known, name
-    assert "in force: by hand" in said.err
+    assert "in use: by hand" in said.err
     assert (
         f"adopted: {tmp_path / 'bench.toml'}; the previous one is {tmp_path / 'bench-'}" in said.err
     )

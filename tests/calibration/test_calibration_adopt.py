@@ -55,7 +55,7 @@ def test_a_place_that_cannot_be_written(new: Path, tmp_path: Path) -> None:
 def test_old_beside_new_as_a_tape_would_have_it(new: Path) -> None:
     optics = OpticsConfig(geometry=GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9))
     lines = compare_geometries(optics, stated_origin(optics), read_geometry(new))
-    assert lines[0].startswith("in force: by hand, hash ")
+    assert lines[0].startswith("in use: by hand, hash ")
     assert [line.split()[-2:] for line in lines[2:]] == [
         ["2672.000", "2674.000"],
         ["2871.000", "2869.000"],

@@ -197,7 +197,7 @@ _OWN = {
     "review/export.py",
     "calibration/session.py",
     "calibration/camera.py",
-    "calibration/sets.py",
+    "calibration/calibrate.py",
     "calibration/adopt.py",
     "calibration/geometry_writer.py",
     "geometry/prior_file.py",

@@ -90,7 +90,8 @@ def prior_sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
     """Prior standard deviations (len(NAMES),) in the order of `NAMES`; 0 holds a parameter.
 
     Without `free` only the poses and the laser's scale are free. The command `calibrate` passes a
-    sigma for every parameter (`calibration.sets.known_sigmas`), so that all of them are free there.
+    sigma for every parameter (`calibration.stated_problem.known_sigmas`): there all of them are
+    free.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from membrane_ctrl.calibration.sets import known_sigmas
+from membrane_ctrl.calibration.stated_problem import known_sigmas
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate_to_figure
 from membrane_ctrl.metrology.calibration.fringe_waves import remove_fringe_waves
