@@ -58,7 +58,7 @@ def _cell_means(
 ) -> FloatArray:
     """Weighted means over cells, (rows, columns); NaN in cells without points."""
     phases, linear = solution.problem.sets[index], solution.equations[index]
-    weights = linear.trust.weights / phases.sigma_mm**2
+    weights = linear.robust.weights / phases.sigma_mm**2
     bins = (edges[1], edges[0])
     total = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weights)[0]
     summed = np.histogram2d(

@@ -47,8 +47,8 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> set_phases.S
     # The motion from x to y is left to the solution: the stated lens would correct 2 % too much or
     # too little of it.
     film = FilmMotion.of(checked)
-    x_um, y_um = film.told_um
-    within_axes = replace(film, told_um=(x_um - x_um.mean(), y_um - y_um.mean()))
+    x_um, y_um = film.motion_um
+    within_axes = replace(film, motion_um=(x_um - x_um.mean(), y_um - y_um.mean()))
     figure = bin_figure(optics, checked, within_axes)
     motion_sigma_um = film.x_to_y_sigma_um
     if not math.isfinite(motion_sigma_um):

@@ -192,11 +192,11 @@ def _describe_light(checked: Checked | None) -> list[str]:
     if checked is None:
         return []
     lines = []
-    held = checked.held
+    lag = checked.lag
     response = checked.response
-    if held.corrected:
+    if lag.corrected:
         lines.append(
-            f"panel     each frame showed {held.share:.2%} +- {held.sigma:.2%} of the previous "
+            f"panel     each frame showed {lag.share:.2%} +- {lag.sigma:.2%} of the previous "
             "picture, which was taken out: wait longer before each frame"
         )
     if abs(response.exponent - 1) > _NOT_LINEAR:

@@ -219,12 +219,12 @@ def details_table(
     if measurement.checked is not None:
         clip = measurement.checked.binned.clip
         black_adu = None if clip.black_adu < 0 else clip.black_adu
-        held = measurement.checked.held
-        table["held_share"] = {
-            "rise": number_or_null(held.rise),
-            "fall": number_or_null(held.fall),
-            "sigma": number_or_null(held.sigma),
-            "taken_out": held.corrected,
+        lag = measurement.checked.lag
+        table["image_lag_share"] = {
+            "rise": number_or_null(lag.rise),
+            "fall": number_or_null(lag.fall),
+            "sigma": number_or_null(lag.sigma),
+            "taken_out": lag.corrected,
         }
         response, second = measurement.checked.response, measurement.checked.second
         table["response_exponent"] = number_or_null(response.exponent)

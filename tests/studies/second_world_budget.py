@@ -54,7 +54,7 @@ OWN_ROWS = (
     "film_um",
     "slope_urad",
     "noise_adu",
-    "held_share",
+    "image_lag_share",
     "moment_um",
     "second_image",
 )
@@ -215,12 +215,12 @@ PLANTS = (
         effects=lambda _: replace(STILL, panel=Panel(gamma=1.6, gamma_by_angle=0.3)),
     ),
     Plant(
-        ("held_share",),
+        ("image_lag_share",),
         "the previous picture is 1 % of a frame",
         effects=lambda _: replace(STILL, panel=Panel(previous_share=0.01)),
     ),
     Plant(
-        ("held_share",),
+        ("image_lag_share",),
         "the previous picture is 5 % of a frame",
         effects=lambda _: replace(STILL, panel=Panel(previous_share=0.05)),
     ),

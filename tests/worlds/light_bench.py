@@ -66,7 +66,7 @@ class LightEffects:
 
     gamma: float = 1.0  # of the panel
     gamma_slope: float = 0.0  # change of gamma from the panel's middle to its edge, along x
-    held_share: float = 0.0  # of the previous pattern's light in each frame
+    image_lag_share: float = 0.0  # of the previous pattern's light in each frame
     held_fall_share: float | None = None  # the same where the light falls; None: as where it rises
     first_order: bool = False  # the panel relaxes from its last state, not from the last pattern
     fall_off: float = 0.0  # loss of light from one side of the panel to the other, along x
@@ -121,10 +121,10 @@ def render_frames(
             state = states[k]
             seen = target
             if state is not None:
-                fall = effects.held_share
+                fall = effects.image_lag_share
                 if effects.held_fall_share is not None:
                     fall = effects.held_fall_share
-                held = np.where(target < state, fall, effects.held_share)
+                held = np.where(target < state, fall, effects.image_lag_share)
                 seen = target + held * (state - target)
             states[k] = seen if effects.first_order else target
             light += share * seen * place.lit

@@ -34,12 +34,12 @@ def foreseen_equations(
     solution: Solution,
     phases: set_phases.SetPhases,
     state: set_state.SetState,
-    trust: robust_weights.RobustWeights,
+    robust: robust_weights.RobustWeights,
 ) -> normal_equations.Equations:
     turns = bench_poses.pose_derivatives(solution.problem.stated, solution.values)
     references = solution.problem.references
     return normal_equations.linearise_set(
-        solution.bench, turns, phases, state, solution.common, references, trust
+        solution.bench, turns, phases, state, solution.common, references, robust
     )
 
 

@@ -34,7 +34,7 @@ class Equations:
         matrix, right side and sum of squares in one.
     residual_mm : (2, n) array
         Seen minus predicted screen points.
-    trust : RobustWeights
+    robust : RobustWeights
         Weights of the points.
     residual_rms_mm : float
         RMS of one component, each point counting by its weight.
@@ -45,14 +45,14 @@ class Equations:
 
     sums: FloatArray
     residual_mm: FloatArray
-    trust: RobustWeights
+    robust: RobustWeights
     residual_rms_mm: float
     elsewhere: tuple[FloatArray, ...] = ()
 
     @property
     def variance(self) -> float:
         """Assumed variance of the points over the expected one."""
-        return self.trust.variance
+        return self.robust.variance
 
     def local_step(self, common_step: FloatArray) -> FloatArray:
         """Step (LOCAL,) of the set's own unknowns that goes with one of the common ones."""
@@ -93,7 +93,7 @@ def linearise_set(
     state: SetState,
     common: FloatArray,
     references: References,
-    trust: RobustWeights,
+    robust: RobustWeights,
 ) -> Equations:
     """Linearise one set.
 
@@ -111,7 +111,7 @@ def linearise_set(
         Parameters and ring.
     references : References
         What laser and ring are known by.
-    trust : RobustWeights
+    robust : RobustWeights
         Weights of the points.
 
     Returns
@@ -123,7 +123,7 @@ def linearise_set(
     sums = rows.T @ rows
 
     # The fringes, for each place of the screen.
-    root_weights = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
+    root_weights = np.sqrt(robust.weights / robust.variance) / phases.sigma_mm
     residual_mm = np.empty_like(phases.screen_mm)
     elsewhere = []
     for k, there, poses, some in forward_model.screen_views(bench, turns, phases, state.elsewhere):
@@ -151,9 +151,9 @@ def linearise_set(
             found = eliminate_first(found, set_phases.MOVED)
         sums = sums + found
 
-    weights = trust.weights / phases.sigma_mm**2
+    weights = robust.weights / phases.sigma_mm**2
     rms_mm = float(np.sqrt(np.mean(residual_mm**2 @ weights) / np.sum(weights)))
-    return Equations(sums, residual_mm, trust, rms_mm, tuple(elsewhere))
+    return Equations(sums, residual_mm, robust, rms_mm, tuple(elsewhere))
 
 
 def _sum_fringes(

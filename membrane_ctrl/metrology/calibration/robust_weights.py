@@ -30,13 +30,13 @@ class RobustWeights:
         Weight of each point over that of its noise; 1 for a good one.
     variance : float
         Variance of the points over the expected one.
-    alike : float
+    pattern_factor : float
         Factor of the variance from residuals that neighbours share: a pattern.
     """
 
     weights: FloatArray
     variance: float
-    alike: float = 1.0
+    pattern_factor: float = 1.0
 
     @classmethod
     def full(cls, phases: set_phases.SetPhases) -> "RobustWeights":
@@ -57,7 +57,7 @@ class RobustWeights:
 def reduce_weights(
     sets: Sequence[set_phases.SetPhases],
     left_mm: Sequence[FloatArray],
-    trust: Sequence[RobustWeights],
+    robust: Sequence[RobustWeights],
 ) -> tuple[RobustWeights, ...]:
     """Reduce the weights of sets whose residuals show a pattern.
 
@@ -72,7 +72,7 @@ def reduce_weights(
         All sets.
     left_mm : sequence of (2, n) arrays
         Their residuals at a solution.
-    trust : sequence of RobustWeights
+    robust : sequence of RobustWeights
         Their present weights.
 
     Returns
@@ -83,7 +83,7 @@ def reduce_weights(
     films = [k for k, phases in enumerate(sets) if phases.artefact is None]
     film_side_px = max(across_px(sets[k]) for k in films) / _PATCHES
     patches = []
-    for phases, residual_mm, weights in zip(sets, left_mm, trust, strict=True):
+    for phases, residual_mm, weights in zip(sets, left_mm, robust, strict=True):
         side_px = film_side_px
         if phases.artefact is not None:
             side_px = across_px(phases) / _PATCHES
@@ -93,10 +93,10 @@ def reduce_weights(
     of_films = np.sum([patches[k] for k in films], axis=0) / np.sqrt(len(films))
     chi_square_of_films = _reduced_chi_square(of_films)
     reduced = []
-    for phases, means, weights in zip(sets, patches, trust, strict=True):
+    for phases, means, weights in zip(sets, patches, robust, strict=True):
         common = chi_square_of_films if phases.artefact is None else 0.0
         factor = max(1.0, _reduced_chi_square(means) - _CHANCE, common - _CHANCE)
-        reduced.append(replace(weights, variance=weights.variance * factor, alike=factor))
+        reduced.append(replace(weights, variance=weights.variance * factor, pattern_factor=factor))
     return tuple(reduced)
 
 
@@ -106,7 +106,7 @@ def across_px(phases: set_phases.SetPhases) -> float:
 
 
 def _patch_means(
-    phases: set_phases.SetPhases, left_mm: FloatArray, trust: RobustWeights, side_px: float
+    phases: set_phases.SetPhases, left_mm: FloatArray, robust: RobustWeights, side_px: float
 ) -> FloatArray:
     """Means of residuals (2, n) over patches in units of their noise, (2, patches); NaN with few
     points.
@@ -118,7 +118,7 @@ def _patch_means(
     patch = row % count * count + column % count
 
     # Weighted means over their standard errors.
-    weights = trust.weights / (trust.variance * phases.sigma_mm**2)
+    weights = robust.weights / (robust.variance * phases.sigma_mm**2)
     total = np.bincount(patch, weights, count**2)
     sums = np.stack([np.bincount(patch, weights * part, count**2) for part in left_mm])
     is_full = np.bincount(patch, minlength=count**2) >= _FEWEST_IN_PATCH

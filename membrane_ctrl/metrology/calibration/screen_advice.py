@@ -152,8 +152,8 @@ def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Sol
     state = replace(solution.states[index], elsewhere=(move,))
     there = foreseen_set(solution, film.beside(film, known), state, half_mm)
     again = there.subset(there.seen_with(1))
-    all_weights = np.append(present.trust.weights, np.ones(again.sigma_mm.size))
-    trust = replace(present.trust, weights=all_weights)
+    all_weights = np.append(present.robust.weights, np.ones(again.sigma_mm.size))
+    robust = replace(present.robust, weights=all_weights)
     linear = list(solution.equations)
-    linear[index] = foreseen_equations(solution, film.beside(again, known), state, trust)
+    linear[index] = foreseen_equations(solution, film.beside(again, known), state, robust)
     return with_equations(solution, tuple(linear)), _RAIL_MM

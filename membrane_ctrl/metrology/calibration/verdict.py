@@ -224,7 +224,9 @@ def _of_others(solution: Solution) -> list[int]:
     """Sets whose fringes show a bench of their own: they hardly count, and by a pattern, not by
     noise.
     """
-    ratios = np.array([(np.sqrt(each.variance), each.trust.alike) for each in solution.equations])
+    ratios = np.array(
+        [(np.sqrt(each.variance), each.robust.pattern_factor) for each in solution.equations]
+    )
     return [
         int(k) for k in np.flatnonzero((ratios > _SCATTER * np.median(ratios, axis=0)).all(axis=1))
     ]

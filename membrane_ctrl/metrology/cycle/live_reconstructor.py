@@ -22,7 +22,7 @@ from membrane_ctrl.metrology.cycle import cycle_motion
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.frame_checks import (
     band_removal,
-    held_light,
+    image_lag,
     picture_orientation,
 )
 from membrane_ctrl.metrology.frame_checks.clipping import ClippedShares
@@ -121,7 +121,7 @@ class LiveReconstructor:
         # What the last full cycle found of the light: frequencies of backlight bands, the share of
         # the previous picture, and why a cycle is degraded by either.
         self._bands_rad = np.zeros(0)
-        self._held = held_light.UNKNOWN
+        self._lag = image_lag.UNKNOWN
         self._doubt = ""
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
@@ -188,8 +188,8 @@ class LiveReconstructor:
             return make_rejected_cycle("full", times, readings, cause or str(error))
 
         # The figure, without light of previous pictures.
-        self._remove_held_of_full(state)
-        self._watch.begin(state, self._held)
+        self._remove_lag_of_full(state)
+        self._watch.begin(state, self._lag)
         estimate = self._follow("full", state, times, readings)
 
         # If no surface explains the slopes, pictures or pattern may be turned.
@@ -232,7 +232,7 @@ class LiveReconstructor:
         self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
         if self._bands_rad.size:
             self._take_bands(self._bands_rad)
-        self._remove_held_of_fringes()
+        self._remove_lag_of_fringes()
         return self._follow("fringes", self._tracked, times, readings)
 
     def prepare(self) -> None:
@@ -338,7 +338,7 @@ class LiveReconstructor:
         elif found.size:
             self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
 
-    def _remove_held_of_full(self, state: tracked_points.TrackedPoints) -> None:
+    def _remove_lag_of_full(self, state: tracked_points.TrackedPoints) -> None:
         """Find the share of the previous picture in the frames of a full cycle, and remove it.
 
         The first frame has no previous picture: its pattern is on the screen while the former cycle
@@ -352,20 +352,20 @@ class LiveReconstructor:
         binned = self._binned(self._binner.sums[: self._slots.count])
         # Saturated bins are known of the sinusoids; other frames do not need them.
         phase_rad = state.accepted[:, 0]
-        self._held, corrected = held_light.find_held_light(stack, binned, state.index, phase_rad)
-        if self._held.corrected:
+        self._lag, corrected = image_lag.find_image_lag(stack, binned, state.index, phase_rad)
+        if self._lag.corrected:
             slots = np.r_[self._slots.sinusoids]
             self._binner.sums[slots] = np.rint(corrected.means[slots] * self._bin_px**2)
-        self._doubt = self._doubt or held_light.describe_held_light(self._held)
+        self._doubt = self._doubt or image_lag.describe_image_lag(self._lag)
 
-    def _remove_held_of_fringes(self) -> None:
+    def _remove_lag_of_fringes(self) -> None:
         """Remove the share of the previous picture that the last full cycle found."""
-        if not self._held.corrected:
+        if not self._lag.corrected:
             return
         slots = np.r_[self._slots.sinusoids]
         stack = self._stack_without_frames(self._patterns)
         binned = self._binned(self._binner.sums[slots])
-        corrected = held_light.remove_held_light(stack, binned, self._held)
+        corrected = image_lag.remove_image_lag(stack, binned, self._lag)
         self._binner.sums[slots] = np.rint(corrected.means * self._bin_px**2)
 
     def _stack_without_frames(self, patterns: tuple[Pattern, ...]) -> FrameStack:
@@ -389,7 +389,7 @@ class LiveReconstructor:
 
     def _track_phases(self, state: tracked_points.TrackedPoints, readings: FloatArray) -> None:
         """Fresh phases from the bin sums, corrected for the film's motion between the frames."""
-        moved = film_motion.worth_correcting(readings, self._laser_noise_um)
+        moved = film_motion.is_worth_correcting(readings, self._laser_noise_um)
         motion_um = np.reshape(readings - np.mean(readings), (2, -1)) if moved else None
         combined = []
         for axis in range(2):

@@ -188,14 +188,14 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
 
     # Their phases, in the period of their bin.
     film = FilmMotion.of(checked)
-    moved = film.worth_correcting
-    told_um = film.told_um if moved else (None, None)
+    moved = film.is_worth_correcting
+    motion_um = film.motion_um if moved else (None, None)
     sensitivity_rad_per_um = np.zeros((2, index.size))
     if moved:
         sensitivity_mm_per_um = film_motion.sensitivity_mm_per_um(tracer, points, surface)
         sensitivity_rad_per_um = sensitivity_mm_per_um / screen_scale.mm_per_rad(optics.pattern)
     x_phases, y_phases = axes = [
-        _axis_phases(checked, k, index, in_bin, sensitivity_rad_per_um[k], told_um[k])
+        _axis_phases(checked, k, index, in_bin, sensitivity_rad_per_um[k], motion_um[k])
         for k in range(2)
     ]
     phase_rad = np.stack([each.phase_rad for each in axes])
@@ -231,12 +231,12 @@ def _axis_phases(
     index: IntArray,
     in_bin: IntArray,
     sensitivity_rad_per_um: FloatArray,
-    told_um: FloatArray | None,
+    motion_um: FloatArray | None,
 ) -> PixelPhases:
     """Phases of one axis at the pixels `index` (n,), which are in the bins `in_bin` (n,)."""
     stack = checked.stack
     used = checked.view.used[axis]
-    combined = combine_axis_steps(checked, axis, told_um)
+    combined = combine_axis_steps(checked, axis, motion_um)
     every = stack.sinusoids(pattern_sequence.AXES[axis])
     chosen: slice | list[int] = used
     if used == every:
@@ -254,7 +254,7 @@ def _axis_phases(
         checked.binned.clip,
         gain,
         _gather_previous(stack, used),
-        stack.held_shares,
+        stack.lag_shares,
     )
 
 
@@ -262,7 +262,7 @@ def _gather_previous(stack: FrameStack, used: list[int]) -> Image | None:
     """The frame before each of these, or itself if there is none; None if they show no light of
     it.
     """
-    if not any(stack.held_shares):
+    if not any(stack.lag_shares):
         return None
     previous = []
     for frame in used:

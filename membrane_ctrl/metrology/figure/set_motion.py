@@ -34,7 +34,7 @@ class FilmMotion:
 
     Attributes
     ----------
-    told_um : two (N,) arrays
+    motion_um : two (N,) arrays
         Displacement at the used sinusoids of x and of y, about the mean of both.
     x_to_y_sigma_um : float
         Standard uncertainty of the mean of x less that of y; NaN without a laser.
@@ -42,7 +42,7 @@ class FilmMotion:
         Standard uncertainty of the fringes' part in each of these displacements.
     """
 
-    told_um: tuple[FloatArray, FloatArray]
+    motion_um: tuple[FloatArray, FloatArray]
     x_to_y_sigma_um: float
     noise_um: float
 
@@ -84,17 +84,17 @@ class FilmMotion:
         about_um = readings_um[[*x, *y]].mean() - checked.stack.mean_reading_um
         of_axes = np.array([len(y), -len(x)]) / frames
         mean_x_um, mean_y_um = np.nan_to_num(about_um + share * x_to_y_um * of_axes)
-        told_um = (moving * seen_x + mean_x_um, moving * seen_y + mean_y_um)
+        motion_um = (moving * seen_x + mean_x_um, moving * seen_y + mean_y_um)
         sigma_um = math.hypot(math.sqrt(most) * laser_um, (most - share) * x_to_y_um)
-        return cls(told_um, sigma_um, checked.film_noise_um)
+        return cls(motion_um, sigma_um, checked.film_noise_um)
 
     @property
     def moved_um(self) -> float:
         """RMS motion."""
-        return float(np.std(np.concatenate(self.told_um)))
+        return float(np.std(np.concatenate(self.motion_um)))
 
     @property
-    def worth_correcting(self) -> bool:
+    def is_worth_correcting(self) -> bool:
         """Whether the film moved."""
         return self.moved_um > _STILL_UM
 

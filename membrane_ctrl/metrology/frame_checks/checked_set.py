@@ -10,7 +10,7 @@ from membrane_ctrl.metrology.frame_checks import (
     band_removal,
     bin_view,
     frame_faults,
-    held_light,
+    image_lag,
     light_response,
     second_reflection,
 )
@@ -67,7 +67,7 @@ class Checked:
     light_left : float
         RMS difference between the light of the used sinusoids and the light with which the phases
         were computed, relative.
-    held : HeldLight
+    lag : ImageLag
         Share of the previous picture in each frame.
     second : SecondReflection
         A second image of the screen.
@@ -86,7 +86,7 @@ class Checked:
     film_um: FloatArray
     film_noise_um: float
     light_left: float
-    held: held_light.HeldLight = held_light.UNKNOWN
+    lag: image_lag.ImageLag = image_lag.UNKNOWN
     second: second_reflection.SecondReflection = second_reflection.UNKNOWN
     response: light_response.LightResponse = light_response.UNKNOWN
 
@@ -98,7 +98,7 @@ class Checked:
             return "degraded", reason
         doubts = (
             band_removal.describe_bands(self.stack.gain),
-            held_light.describe_held_light(self.held),
+            image_lag.describe_image_lag(self.lag),
             second_reflection.describe_second_reflection(self.second),
             light_response.describe_response(self.response),
         )

@@ -23,7 +23,7 @@ from membrane_ctrl.metrology.frame_checks import (
     frame_evidence,
     frame_faults,
     frame_inspection,
-    held_light,
+    image_lag,
     light_response,
     picture_orientation,
     second_reflection,
@@ -248,7 +248,7 @@ def _check_rounds(
     for done in range(rounds + 1):
         # Fit the surface without the excluded frames.
         try:
-            stack, binned, attempt, held = _attempt_without_held(stack, taken, bench, excluded)
+            stack, binned, attempt, lag = _attempt_without_lag(stack, taken, bench, excluded)
         except (bin_view.NoFigureError, ValueError) as error:
             named = _merge_flags(_keep_believable(stack, flags), known)
             raise _explain_no_figure(stack, binned, bench, excluded, named, error) from None
@@ -282,7 +282,7 @@ def _check_rounds(
                 film_um,
                 film_noise_um,
                 light_left=float(np.sqrt(np.mean(np.square(light_error[:, used])))),
-                held=held,
+                lag=lag,
             )
             return _measure_light_path(checked, attempt.scene, excluded, optics)
 
@@ -418,32 +418,32 @@ class _Bench:
         return cls(optics, geometry, grid, near, anchor)
 
 
-def _attempt_without_held(
+def _attempt_without_lag(
     stack: frame_stack.FrameStack,
     taken: frame_stack.Binned,
     bench: _Bench,
     excluded: set[int],
-) -> tuple[frame_stack.FrameStack, frame_stack.Binned, _Attempt, held_light.HeldLight]:
+) -> tuple[frame_stack.FrameStack, frame_stack.Binned, _Attempt, image_lag.ImageLag]:
     """Fit the bins without what the frames show of the previous ones.
 
     Returns the stack that states those shares, the bins without them, the fit, and the shares.
     Raises NoFigureError or ValueError if there is no fit.
     """
-    stack = replace(stack, held_shares=(0.0, 0.0))
+    stack = replace(stack, lag_shares=(0.0, 0.0))
     binned = taken
-    held = held_light.UNKNOWN
+    lag = image_lag.UNKNOWN
     attempt = _attempt_fit(stack, binned, bench, excluded)
-    for _ in range(held_light.ROUNDS):
-        found = held_light.estimate_held_light(stack, binned, attempt.scene, excluded)
-        held = held_light.add_held_light(held, found)
-        if not held.corrected or not held_light.is_worth_another_round(found):
+    for _ in range(image_lag.ROUNDS):
+        found = image_lag.estimate_image_lag(stack, binned, attempt.scene, excluded)
+        lag = image_lag.add_image_lag(lag, found)
+        if not lag.corrected or not image_lag.is_worth_another_round(found):
             break
-        if not any(stack.held_shares):
-            stack = held_light.add_first_predecessor(stack, taken, attempt.scene, held)
-        stack = replace(stack, held_shares=(held.rise, held.fall))
-        binned = held_light.remove_held_light(stack, taken, held)
+        if not any(stack.lag_shares):
+            stack = image_lag.add_first_predecessor(stack, taken, attempt.scene, lag)
+        stack = replace(stack, lag_shares=(lag.rise, lag.fall))
+        binned = image_lag.remove_image_lag(stack, taken, lag)
         attempt = _attempt_fit(stack, binned, bench, excluded)
-    return stack, binned, attempt, held
+    return stack, binned, attempt, lag
 
 
 def _attempt_fit(

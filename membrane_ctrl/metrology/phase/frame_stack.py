@@ -37,7 +37,7 @@ class FrameStack:
     before : tuple of int, optional
         The frame that was taken before each; -1: none of the set. None: the patterns were taken in
         their order.
-    held_shares : tuple[float, float]
+    lag_shares : tuple[float, float]
         Shares of the previous frame's picture that each one still shows: where it is brighter than
         that one, and where it is darker.
     """
@@ -49,7 +49,7 @@ class FrameStack:
     light: FloatArray | None = None
     gain: FloatArray | None = None
     before: tuple[int, ...] | None = None
-    held_shares: tuple[float, float] = (0.0, 0.0)
+    lag_shares: tuple[float, float] = (0.0, 0.0)
 
     def sinusoids(self, axis: str) -> list[int]:
         """Frames that show the sinusoids of an axis."""

@@ -112,7 +112,7 @@ def pixel_phases(
     clip: ClipLevels,
     gain: FloatArray | None = None,
     previous: Image | None = None,
-    held_shares: tuple[float, float] = (0.0, 0.0),
+    lag_shares: tuple[float, float] = (0.0, 0.0),
 ) -> PixelPhases:
     """Phases of one axis at n pixels (eq. 1, by least squares).
 
@@ -136,7 +136,7 @@ def pixel_phases(
         Of the light of the rows of each frame.
     previous : (N, height, width) array, optional
         The frames taken before each.
-    held_shares : two floats
+    lag_shares : two floats
         Shares of those that the frames still show, where they are brighter and where darker.
 
     Returns
@@ -148,7 +148,7 @@ def pixel_phases(
     out = np.empty((2, index.size), np.float32)
     fade = np.ones(frames.shape[:2]) if gain is None else 1 / gain
     before = flat if previous is None else previous.reshape(flat.shape)
-    rise, fall = (share / (1 - share) for share in held_shares)
+    rise, fall = (share / (1 - share) for share in lag_shares)
     fixed = (fade, np.linalg.pinv(design), design, combined.turn, combined.mirror)
 
     def run(start: int, stop: int) -> None:

@@ -53,7 +53,7 @@ def combine_steps(
     return phase_change.StepCombination(cosine, sine, turn, mirror)
 
 
-def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:
+def is_worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:
     """Whether the readings show motion beyond the laser's noise.
 
     A swing of 1 µm standard deviation left in the frames costs 0.3 µm RMS of figure; correcting

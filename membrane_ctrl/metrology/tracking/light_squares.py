@@ -19,7 +19,7 @@ _UNEVEN = 0.1
 _LEAST_LIGHT = 1e-6  # instead of a division by zero
 
 
-class Squares:
+class LightSquares:
     """The mirror in squares, which compare the light of a frame with that of the scene.
 
     Where the film's slopes spread the fringes, a square shows parts of one, and its light depends
@@ -67,7 +67,7 @@ class Squares:
         light : float
             Light of the frame over the scene's.
         covered : (squares,) bool array
-            Squares whose light or contrast is wrong.
+            LightSquares whose light or contrast is wrong.
         """
         share, contrast = self._compare_squares(seen_adu)
         light = float(np.median(share[self._even]))

@@ -1,4 +1,4 @@
-"""Jumps of the figure at steps of the pattern: image retention of the panel."""
+"""StepJumps of the figure at steps of the pattern: image retention of the panel."""
 
 from collections import deque
 
@@ -13,7 +13,7 @@ _STILL_FRAMES = 50
 _STEP_FRAMES = 5 * ENOUGH_STEPS  # fewer scatter too much to give a variance
 
 
-class Jumps:
+class StepJumps:
     """How much more the figure changes at a step of the pattern than from frame to frame.
 
     A panel with image retention shows the former step together with the present one, which looks

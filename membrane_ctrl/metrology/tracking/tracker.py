@@ -105,7 +105,7 @@ class Tracker:
         # The scene and what is fitted to it.
         self._bands = Bands(scene.row)
         self._fitter = FrameFitter(scene, self._bands)
-        self._jumps = step_jumps.Jumps()
+        self._jumps = step_jumps.StepJumps()
         self._covariance = FitCovariance(self._noise_adu)
         self._begin_scene(scene, scene.surface, np.zeros((3, ZERNIKE_TERMS)))
 
@@ -137,7 +137,7 @@ class Tracker:
         self._light = math.nan
         self._shown_rad = (math.nan, math.nan)
         self._covariance.drop_request()
-        self._squares = light_squares.Squares(scene)
+        self._squares = light_squares.LightSquares(scene)
         self._jumps.begin()
         self._steps: list[step_means.StepMeans] = []
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
-from membrane_ctrl.metrology.frame_checks.held_light import UNKNOWN, HeldLight
+from membrane_ctrl.metrology.frame_checks.image_lag import UNKNOWN, ImageLag
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.surface import PARAMETERS
@@ -36,7 +36,7 @@ from membrane_ctrl.metrology.uncertainty import (
     trial_bench,
 )
 from membrane_ctrl.metrology.uncertainty.cycle_frames import FrameErrors, estimate_frame_errors
-from membrane_ctrl.metrology.uncertainty.held_light_error import held_light_of_cycles
+from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_of_cycles
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray
 
 # So many points determine light and place of a frame to 1e-4 and 20 nm, a tenth of what remains
@@ -329,7 +329,7 @@ class ErrorWatch:
         self._spread = spread
         self._mm_per_rad = screen_scale.mm_per_rad(optics.pattern)
         self._errors: LiveErrors | None = None
-        self._held = UNKNOWN
+        self._lag = UNKNOWN
         self._examined: IntArray = np.empty(0, int)  # numbers of tracked points
         self._reference_um = math.nan  # displacement of the reference cycle
         # Phases of all bins less those of the surface, in the reference cycle; NaN where unknown.
@@ -344,12 +344,12 @@ class ErrorWatch:
             return np.full((PARAMETERS, PARAMETERS), np.nan)
         return self._errors.common_mm2
 
-    def begin(self, state: tracked_points.TrackedPoints, held: HeldLight = UNKNOWN) -> None:
+    def begin(self, state: tracked_points.TrackedPoints, lag: ImageLag = UNKNOWN) -> None:
         """Choose the points that are examined from those of a full cycle.
 
-        `held` is the share of the previous frames that its frames show.
+        `lag` is the share of the previous frames that its frames show.
         """
-        self._held = held
+        self._lag = lag
         places_px = self._places_px[:, state.index]
         chosen = trial_bench.spread_evenly(places_px, self._optics.camera.width_px, POINTS)
         self._examined = np.flatnonzero(chosen)
@@ -366,7 +366,7 @@ class ErrorWatch:
 
         # Light and film of each frame, at these phases.
         corrected_um = np.zeros(self._shifts_rad.shape)
-        if film_motion.worth_correcting(cycle.readings_um, self._laser_noise_um):
+        if film_motion.is_worth_correcting(cycle.readings_um, self._laser_noise_um):
             about_mean_um = cycle.readings_um - np.mean(cycle.readings_um)
             corrected_um = np.reshape(about_mean_um, corrected_um.shape)
         means = np.stack([sums[:, bins] for sums in cycle.sums]) / self._bin_px**2
@@ -462,7 +462,7 @@ class ErrorWatch:
         many = np.flatnonzero(trial_bench.spread_evenly(places_px, width_px, _WAVE_POINTS))
         bench = self._make_bench(cycle, places_px, points)
         wave_bench = self._make_bench(cycle, places_px, many)
-        left = np.column_stack([left, held_light_of_cycles(bench, self._shifts_rad, self._held)])
+        left = np.column_stack([left, image_lag_of_cycles(bench, self._shifts_rad, self._lag)])
         return LiveErrors.of(
             bench,
             wave_bench,

@@ -38,7 +38,7 @@ def left_by_laser_um(readings_um: FloatArray, within_um: float, laser_noise_um: 
         Noise of a reading.
     """
     noise_um = laser_noise_um * math.sqrt(4 / readings_um.size)
-    if film_motion.worth_correcting(readings_um, laser_noise_um):
+    if film_motion.is_worth_correcting(readings_um, laser_noise_um):
         return noise_um
     if not np.isfinite(readings_um).all():
         return X_TO_Y * within_um

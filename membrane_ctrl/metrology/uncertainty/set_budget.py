@@ -21,8 +21,8 @@ from membrane_ctrl.metrology.uncertainty import (
 )
 from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_sources
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
-from membrane_ctrl.metrology.uncertainty.held_light_error import held_light_source
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
+from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_source
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
@@ -140,7 +140,7 @@ def assemble_budget(
         blur,
         *frame_effects.frame_sources(bench, optics, shifts, film_um, light),
         second_reflection_source(bench, checked.second),
-        held_light_source(bench, checked.stack, checked.view.used, checked.held),
+        image_lag_source(bench, checked.stack, checked.view.used, checked.lag),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
     whole = budget.Budget(tuple(sources), disc, PairMotion.of(bench))
@@ -191,7 +191,7 @@ def _vertex_source(
 
 def _left_film_um(motion: FilmMotion) -> float:
     """1 sigma of the film's motion that is left in the phases of the frames."""
-    if motion.worth_correcting:
+    if motion.is_worth_correcting:
         return math.hypot(_FRINGES_UM, _WITHIN_SHARE * motion.moved_um, motion.noise_um)
     return math.hypot(motion.moved_um, motion.noise_um)
 
@@ -211,8 +211,8 @@ def _film_rows(
         Motion by the fringes alone, of a set without a laser.
     """
     if unseen is None:
-        x_um, y_um = motion.told_um
-        share_left = _X_TO_Y_SHARE if motion.worth_correcting else 1.0
+        x_um, y_um = motion.motion_um
+        share_left = _X_TO_Y_SHARE if motion.is_worth_correcting else 1.0
         left_um = share_left * float(x_um.mean() - y_um.mean())
         sigma_um = math.hypot(motion.x_to_y_sigma_um, left_um)
         says = "motion of the film from x to y, by the laser"

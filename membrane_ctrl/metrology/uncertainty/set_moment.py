@@ -108,7 +108,7 @@ def moment_source(
     stack = checked.stack
     if math.isfinite(film.x_to_y_sigma_um):
         count_used = sum(frames.size for frames in used)
-        if not film.worth_correcting or count_used == stack.readings_um.size:
+        if not film.is_worth_correcting or count_used == stack.readings_um.size:
             return None
         sigma_um = left_out_sigma_um(count_used, stack.readings_um.size, LASER_NOISE_UM)
         says = "the laser's noise where a frame is left out while the film moves"

@@ -12,7 +12,7 @@ from membrane_ctrl.metrology.phase.bin_sums import FOLLOWED_ROWS, Binner
 from membrane_ctrl.metrology.phase.phase_change import update_phases
 from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, step_weights
 from membrane_ctrl.metrology.phase.phasor_kernels import branchless_arctan2
-from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps, worth_correcting
+from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps, is_worth_correcting
 
 RNG = np.random.default_rng(7)
 
@@ -140,4 +140,4 @@ def test_a_constant_displacement_is_a_plain_shift() -> None:
 def test_motion_within_the_lasers_noise_is_not_corrected(
     readings: list[float], worth: bool
 ) -> None:
-    assert worth_correcting(np.array(readings), 1.0) is worth
+    assert is_worth_correcting(np.array(readings), 1.0) is worth

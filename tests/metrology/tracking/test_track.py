@@ -17,7 +17,7 @@ from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.lost_orders import LostOrders
 from membrane_ctrl.metrology.tracking.outlier_rejection import RobustFitter
 from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
-from membrane_ctrl.metrology.tracking.step_jumps import Jumps
+from membrane_ctrl.metrology.tracking.step_jumps import StepJumps
 from membrane_ctrl.metrology.tracking.step_means import estimate_step_places
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
 from membrane_ctrl.metrology.tracking.tracker import Tracker
@@ -211,7 +211,7 @@ def test_a_hand_makes_the_error_bars_larger_while_it_is_there(bench: Bench) -> N
 
 def test_jumps_at_steps_of_the_pattern_are_distinguished_from_noise_and_motion() -> None:
     """The first parameter moves, the second jumps at steps, the others are noise."""
-    random, jumps, expected = np.random.default_rng(1), Jumps(), []
+    random, jumps, expected = np.random.default_rng(1), StepJumps(), []
     for k in range(60):
         step, now = divmod(k, 10)[0], np.zeros(ZERNIKE_TERMS)
         now[:2] = 0.3 * math.sin(0.2 * k), 0.05 * (-1) ** step

@@ -43,18 +43,21 @@ def held_row_um(checked: Checked) -> tuple[float, str, tuple[str, ...]]:
     """Height of the budget's row, the verdict and the doubts."""
     full = reconstruct_full(OPTICS, checked, measure_pixels(OPTICS, checked))
     budget = assemble_budget(OPTICS, checked, full, geometry_spread(OPTICS, None)[0], 0.4, None)
-    row = next(row for row in budget.budget.rows() if row["name"] == "held_share")
+    row = next(row for row in budget.budget.rows() if row["name"] == "image_lag_share")
     verdict = judge_quality(full.quality)[0]
     return row["height_rms_um"], checked.verdict[0] if verdict == "ok" else verdict, budget.doubts
 
 
 CASES = {
-    "1 %": (LightEffects(held_share=0.01), 0.03),
-    "3 %": (LightEffects(held_share=0.03), 0.05),
-    "10 %": (LightEffects(held_share=0.1), 0.3),
-    "relaxing": (LightEffects(held_share=0.05, first_order=True), 0.05),
-    "rising faster": (LightEffects(held_share=0.02, held_fall_share=0.04), 0.1),
-    "rising faster, gamma": (LightEffects(held_share=0.01, held_fall_share=0.03, gamma=1.8), 0.1),
+    "1 %": (LightEffects(image_lag_share=0.01), 0.03),
+    "3 %": (LightEffects(image_lag_share=0.03), 0.05),
+    "10 %": (LightEffects(image_lag_share=0.1), 0.3),
+    "relaxing": (LightEffects(image_lag_share=0.05, first_order=True), 0.05),
+    "rising faster": (LightEffects(image_lag_share=0.02, held_fall_share=0.04), 0.1),
+    "rising faster, gamma": (
+        LightEffects(image_lag_share=0.01, held_fall_share=0.03, gamma=1.8),
+        0.1,
+    ),
 }
 
 
@@ -64,16 +67,16 @@ def test_held_light_is_found_and_removed(name: str) -> None:
     effects, allowed_um = CASES[name]
     checked, found_um = coefficients_um(render_set(OPTICS, effects, seed=3))
     off_um = float(np.linalg.norm(found_um - still_um(effects.gamma)[1]))
-    fall = effects.held_share if effects.held_fall_share is None else effects.held_fall_share
-    assert checked.held.rise == pytest.approx(effects.held_share, rel=0.15)
-    assert checked.held.fall == pytest.approx(fall, rel=0.15)
+    fall = effects.image_lag_share if effects.held_fall_share is None else effects.held_fall_share
+    assert checked.lag.rise == pytest.approx(effects.image_lag_share, rel=0.15)
+    assert checked.lag.fall == pytest.approx(fall, rel=0.15)
     assert not checked.flags
     row_um, verdict, doubts = held_row_um(checked)
     assert off_um < allowed_um
     assert off_um < 2 * row_um + 0.03
     assert row_um < 2.0
     assert not doubts
-    assert verdict == ("degraded" if checked.held.share > 0.05 else "ok")
+    assert verdict == ("degraded" if checked.lag.share > 0.05 else "ok")
     if verdict == "degraded":
         assert "wait longer" in checked.verdict[1]
 
@@ -91,9 +94,9 @@ OTHER_EFFECTS = {
 @pytest.mark.parametrize("name", OTHER_EFFECTS)
 def test_other_effects_are_not_taken_for_held_light(name: str) -> None:
     checked = check_set(render_set(OPTICS, OTHER_EFFECTS[name], seed=4), OPTICS)
-    assert not checked.held.corrected
-    assert abs(checked.held.share) < 3 * checked.held.sigma
-    assert checked.held.sigma < 3e-3
+    assert not checked.lag.corrected
+    assert abs(checked.lag.share) < 3 * checked.lag.sigma
+    assert checked.lag.sigma < 3e-3
 
 
 def test_one_stale_frame_is_no_held_light() -> None:
@@ -103,7 +106,7 @@ def test_one_stale_frame_is_no_held_light() -> None:
     stack.frames[stale] = stack.frames[stale - 1]
     checked = check_set(stack, OPTICS)
     assert [flag.frame for flag in checked.flags] == [stale]
-    assert not checked.held.corrected
+    assert not checked.lag.corrected
 
 
 def test_times_state_the_order_of_the_frames() -> None:
@@ -112,11 +115,11 @@ def test_times_state_the_order_of_the_frames() -> None:
     count = len(stack.patterns)
     order = np.random.default_rng(1).permutation(count)
     shown = [stack.patterns[k] for k in order]
-    frames = render_frames(OPTICS, LightEffects(held_share=0.03), shown, seed=6)
+    frames = render_frames(OPTICS, LightEffects(image_lag_share=0.03), shown, seed=6)
     time_s = np.argsort(order).astype(float)
     mixed = replace(stack, frames=frames[np.argsort(order)], before=find_frames_before(time_s))
     checked, found_um = coefficients_um(mixed)
-    assert checked.held.share == pytest.approx(0.03, rel=0.1)
+    assert checked.lag.share == pytest.approx(0.03, rel=0.1)
     assert np.linalg.norm(found_um - still_um()[1]) < 0.3
 
 
@@ -129,10 +132,10 @@ def test_frames_before_others_by_their_times() -> None:
 def test_fringes_alone_show_it_where_y_follows_x() -> None:
     anchor = still_um()[0].anchor()
     shown = list(fringe_sequence(OPTICS.pattern))
-    frames = render_frames(OPTICS, LightEffects(held_share=0.03), shown, seed=7, before=None)
+    frames = render_frames(OPTICS, LightEffects(image_lag_share=0.03), shown, seed=7, before=None)
     stack = FrameStack(frames, tuple(shown), np.full(len(shown), math.nan), {})
     checked, found_um = coefficients_um(stack, anchor)
-    assert checked.held.share == pytest.approx(0.03, rel=0.1)
+    assert checked.lag.share == pytest.approx(0.03, rel=0.1)
     assert np.linalg.norm(found_um - still_um()[1]) < 1.0
 
 
@@ -155,7 +158,7 @@ def live_um(
 def test_live_cycles_take_it_out() -> None:
     """The full cycle finds it, the fringes-only cycles use it; the first picture is shown ahead."""
     spread = geometry_spread(OPTICS, None)[0]
-    slow = LightEffects(held_share=0.03)
+    slow = LightEffects(image_lag_share=0.03)
     first = fringe_sequence(OPTICS.pattern)[0]
     found = {}
     for name, effects in (("still", LightEffects()), ("slow", slow)):

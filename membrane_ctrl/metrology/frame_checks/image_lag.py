@@ -58,7 +58,7 @@ ShareOfFrame = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class HeldLight:
+class ImageLag:
     """Share of the previous picture in each frame.
 
     Attributes
@@ -89,12 +89,12 @@ class HeldLight:
         return self.sigma if self.corrected else math.hypot(self.share, self.sigma)
 
 
-UNKNOWN = HeldLight(0.0, 0.0, math.nan)
+UNKNOWN = ImageLag(0.0, 0.0, math.nan)
 
 
-def estimate_held_light(
+def estimate_image_lag(
     stack: FrameStack, binned: Binned, scene: SampledBins, excluded: Collection[int]
-) -> HeldLight:
+) -> ImageLag:
     """Estimate the shares from all frames that can show them.
 
     Derivation: section 10 of docs/explanation/metrology.md.
@@ -110,7 +110,7 @@ def estimate_held_light(
 
     Returns
     -------
-    HeldLight
+    ImageLag
         `UNKNOWN` if no frame shows both shares, or only with an uncertainty above 3 %.
     """
     scene = scene.thinned()
@@ -145,27 +145,27 @@ def estimate_held_light(
         sigma = math.hypot(sigma, rise - fall)
     if sigma > _UNKNOWN_SIGMA:
         return UNKNOWN
-    return HeldLight(rise, fall, math.hypot(sigma, _FLOOR_SIGMA))
+    return ImageLag(rise, fall, math.hypot(sigma, _FLOOR_SIGMA))
 
 
-def is_worth_removing(held: HeldLight) -> bool:
+def is_worth_removing(lag: ImageLag) -> bool:
     """Whether the frames show a share beyond its uncertainty."""
-    return max(abs(held.rise), abs(held.fall)) > _SURE_SIGMAS * held.sigma
+    return max(abs(lag.rise), abs(lag.fall)) > _SURE_SIGMAS * lag.sigma
 
 
-def add_held_light(removed: HeldLight, found: HeldLight) -> HeldLight:
+def add_image_lag(removed: ImageLag, found: ImageLag) -> ImageLag:
     """Return the shares in the frames, of which one part was removed before the other was found.
 
     Parameters
     ----------
-    removed : HeldLight
+    removed : ImageLag
         Sum of the shares that earlier rounds removed.
-    found : HeldLight
+    found : ImageLag
         Shares that the corrected frames still show.
 
     Returns
     -------
-    HeldLight
+    ImageLag
         `found` itself if nothing was removed and nothing is worth it; else the sum, whose sigma
         contains what no frame shows.
     """
@@ -177,27 +177,27 @@ def add_held_light(removed: HeldLight, found: HeldLight) -> HeldLight:
     model_sigma = math.hypot(
         _TRANSITIONS * share, _ASYMMETRY * (rise - fall), _SECOND_ORDER * share**2
     )
-    return HeldLight(rise, fall, math.hypot(found.sigma, model_sigma), corrected=True)
+    return ImageLag(rise, fall, math.hypot(found.sigma, model_sigma), corrected=True)
 
 
-def remove_held_light(stack: FrameStack, binned: Binned, held: HeldLight) -> Binned:
+def remove_image_lag(stack: FrameStack, binned: Binned, lag: ImageLag) -> Binned:
     """Return the bins with the previous pictures taken out."""
     means = binned.means.copy()
     for frame in range(len(stack.patterns)):
         previous = stack.before_of(frame)
         if previous >= 0:
-            means[frame] += held_change(binned.means[frame], binned.means[previous], held)
+            means[frame] += lag_correction(binned.means[frame], binned.means[previous], lag)
     return replace(binned, means=means)
 
 
-def held_change(seen: Singles, previous: Singles, held: HeldLight) -> Singles:
+def lag_correction(seen: Singles, previous: Singles, lag: ImageLag) -> Singles:
     """Return the correction f / (1 - f) (I - I_before) that a picture at rest shows in addition.
 
     Parameters
     ----------
     seen, previous : array of one shape
         The picture I, and the one before it as it was seen.
-    held : HeldLight
+    lag : ImageLag
         The shares f.
 
     Returns
@@ -206,14 +206,14 @@ def held_change(seen: Singles, previous: Singles, held: HeldLight) -> Singles:
         P - I in the units of the pictures.
     """
     more = seen - previous
-    rise = np.float32(held.rise / (1 - held.rise))
-    fall = np.float32(held.fall / (1 - held.fall))
+    rise = np.float32(lag.rise / (1 - lag.rise))
+    fall = np.float32(lag.fall / (1 - lag.fall))
     return np.asarray(np.where(more > 0, rise, fall) * more)
 
 
-def find_held_light(
+def find_image_lag(
     stack: FrameStack, binned: Binned, index: IntArray, phase_rad: FloatArray
-) -> tuple[HeldLight, Binned]:
+) -> tuple[ImageLag, Binned]:
     """Find the shares of a live cycle, whose phases are known, and take them out.
 
     Parameters
@@ -225,35 +225,35 @@ def find_held_light(
 
     Returns
     -------
-    HeldLight, Binned
+    ImageLag, Binned
         The bins are the given ones if the frames show no share.
     """
     few = slice(None, None, max(1, index.size // _LIVE_BINS))
     index, phase_rad = index[few], phase_rad[:, few]
     x_frames = stack.sinusoids(AXES[0])
     mean_of_steps = stack.weights(x_frames)[0]
-    held = UNKNOWN
+    lag = UNKNOWN
     corrected = binned
     for _ in range(ROUNDS):
         # The light is the mean of the x steps, in the frames as corrected so far.
         x_means = corrected.means[x_frames].reshape(len(x_frames), -1)[:, index]
         light = np.tensordot(mean_of_steps, x_means, axes=1)
         scene = SampledBins(index, light, phase_rad, np.zeros_like(phase_rad))
-        found = estimate_held_light(stack, corrected, scene, ())
-        held = add_held_light(held, found)
-        if not held.corrected or not is_worth_another_round(found):
+        found = estimate_image_lag(stack, corrected, scene, ())
+        lag = add_image_lag(lag, found)
+        if not lag.corrected or not is_worth_another_round(found):
             break
-        corrected = remove_held_light(stack, binned, held)
-    return held, corrected
+        corrected = remove_image_lag(stack, binned, lag)
+    return lag, corrected
 
 
-def is_worth_another_round(found: HeldLight) -> bool:
+def is_worth_another_round(found: ImageLag) -> bool:
     """Whether the shares that the last round found are worth a correction."""
     return max(abs(found.rise), abs(found.fall)) > _NEGLIGIBLE_SHARE
 
 
 def add_first_predecessor(
-    stack: FrameStack, binned: Binned, scene: SampledBins, held: HeldLight
+    stack: FrameStack, binned: Binned, scene: SampledBins, lag: ImageLag
 ) -> FrameStack:
     """Return the stack with the last frame as the first one's predecessor, if that fits better.
 
@@ -263,8 +263,8 @@ def add_first_predecessor(
     Parameters
     ----------
     stack, binned, scene
-        As in `estimate_held_light`.
-    held : HeldLight
+        As in `estimate_image_lag`.
+    lag : ImageLag
         The shares, as the other frames show them.
 
     Returns
@@ -272,7 +272,7 @@ def add_first_predecessor(
     FrameStack
         The given one, or one whose first frame has a predecessor.
     """
-    share = held.share
+    share = lag.share
     x_frames = stack.sinusoids(AXES[0])
     without_predecessor = [frame for frame in x_frames if stack.before_of(frame) < 0]
     if len(without_predecessor) != 1 or share <= 0:
@@ -289,7 +289,7 @@ def add_first_predecessor(
         solved = np.linalg.lstsq((columns * scene.light).T, seen, rcond=None)[0]
         swings[frame] = float(np.hypot(solved[1], solved[2]))
 
-    # Swing without held light: the other frames contain the share f of a step of the same fringes,
+    # Swing without image lag: the other frames contain the share f of a step of the same fringes,
     # which leaves |1 - f + f exp(-i step)| of it.
     others = float(np.median([swing for frame, swing in swings.items() if frame != first]))
     step_rad = float(np.median(np.diff(stack.shifts_rad(x_frames))))
@@ -304,12 +304,12 @@ def add_first_predecessor(
     return replace(stack, before=tuple(before))
 
 
-def describe_held_light(held: HeldLight) -> str:
+def describe_image_lag(lag: ImageLag) -> str:
     """Why a set is degraded by light of the previous pictures; empty if it is not."""
-    if not held.corrected or abs(held.share) < _GREAT_SHARE:
+    if not lag.corrected or abs(lag.share) < _GREAT_SHARE:
         return ""
     return (
-        f"each frame shows {held.share:.1%} of the previous picture: the panel is slow, or the "
+        f"each frame shows {lag.share:.1%} of the previous picture: the panel is slow, or the "
         "frames come too early after it: wait longer"
     )
 

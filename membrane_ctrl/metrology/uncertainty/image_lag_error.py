@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from membrane_ctrl.metrology.frame_checks.held_light import HeldLight
+from membrane_ctrl.metrology.frame_checks.image_lag import ImageLag
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.phase.gray_code import gray_bit
@@ -17,17 +17,19 @@ from membrane_ctrl.model.arrays import FloatArray
 _SAYS = "what each frame still shows of the previous picture"
 
 
-def held_light_source(
-    bench: TrialBench, stack: FrameStack, used: tuple[list[int], list[int]], held: HeldLight
+def image_lag_source(
+    bench: TrialBench, stack: FrameStack, used: tuple[list[int], list[int]], lag: ImageLag
 ) -> Source:
     """Return the row of the budget; without an estimate its uncertainty is 0, and so stated."""
-    sigma = held.left if math.isfinite(held.left) else 0.0
-    effect = held_light_effect(bench, stack, used)
+    sigma = lag.left if math.isfinite(lag.left) else 0.0
+    effect = image_lag_effect(bench, stack, used)
     # The panel holds the same share in all sets of a bench, but each set estimates its own
-    return Source("held_share", _SAYS, sigma, sigma * effect[:, None], common=False, paired=False)
+    return Source(
+        "image_lag_share", _SAYS, sigma, sigma * effect[:, None], common=False, paired=False
+    )
 
 
-def held_light_of_cycles(bench: TrialBench, shifts_rad: FloatArray, held: HeldLight) -> FloatArray:
+def image_lag_of_cycles(bench: TrialBench, shifts_rad: FloatArray, lag: ImageLag) -> FloatArray:
     """Return the error (parameters,), mm, that live cycles share: that of their fringes.
 
     `shifts_rad` (2, N) are the steps of x and y.
@@ -40,11 +42,11 @@ def held_light_of_cycles(bench: TrialBench, shifts_rad: FloatArray, held: HeldLi
     count = len(shifted)
     stack = FrameStack(np.empty((count, 0, 0), np.uint8), shifted, np.full(count, np.nan), {})
     used = (stack.sinusoids(AXES[0]), stack.sinusoids(AXES[1]))
-    sigma = held.left if math.isfinite(held.left) else 0.0
-    return sigma * held_light_effect(bench, stack, used)
+    sigma = lag.left if math.isfinite(lag.left) else 0.0
+    return sigma * image_lag_effect(bench, stack, used)
 
 
-def held_light_effect(
+def image_lag_effect(
     bench: TrialBench, stack: FrameStack, used: tuple[list[int], list[int]]
 ) -> FloatArray:
     """Return the change of the parameters (parameters,), mm, per unit of the share."""
