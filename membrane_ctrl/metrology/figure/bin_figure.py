@@ -71,7 +71,9 @@ def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None =
     # hence bins of one pixel in the combinations of the steps.
     means = [checked.binned.means[used].reshape(len(used), -1) for used in checked.view.used]
     motion_um = film.motion_um if film.is_worth_correcting else (None, None)
-    steps = [combine_axis_steps(checked, axis, told) for axis, told in enumerate(motion_um)]
+    steps = [
+        combine_axis_steps(checked, axis, of_axis_um) for axis, of_axis_um in enumerate(motion_um)
+    ]
     followed = np.empty_like(state.accepted)
     phase_change.update_phases(
         means, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed

@@ -35,7 +35,8 @@ class FilmMotion:
     Attributes
     ----------
     motion_um : two (N,) arrays
-        Displacement at the used sinusoids of x and of y, about the mean of both.
+        Displacement at the used sinusoids of x and of y, about the mean of both; phases are
+        corrected for it.
     x_to_y_sigma_um : float
         Standard uncertainty of the mean of x less that of y; NaN without a laser.
     noise_um : float

@@ -6,16 +6,14 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.metrology.rays.artefacts import Artefact, SeenScreen
-from membrane_ctrl.metrology.rays.bench_poses import (
-    SCREEN_MOVE,
-)
+from membrane_ctrl.metrology.rays.bench_poses import SCREEN_MOVE
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
-MOVED = (
-    SCREEN_MOVE + 2
-)  # of a screen elsewhere: its move, by how much the film was deeper, and in x than in y
-STILL_UM = 1e-3  # of a film that does not move
-_PER_POINT = ("column_px", "row_px", "screen_mm", "sigma_mm")  # the last axis: points
+# Unknowns of a screen elsewhere: its move, by how much the film was deeper then, and deeper in x
+# than in y.
+MOVED = SCREEN_MOVE + 2
+STILL_UM = 1e-3  # 1 sigma of the motion of a film that does not move
+_PER_POINT = ("column_px", "row_px", "screen_mm", "sigma_mm")  # arrays whose last axis is points
 
 
 @dataclass(frozen=True)
@@ -48,25 +46,31 @@ class Elsewhere:
     glass_sigma_mm: float = 0.0
 
     def known(self, laser_sigma_um: float) -> FloatArray:
-        """Values and sigmas (2, MOVED), in mm and degrees: the move, the film deeper, deeper in x
-        than in y.
+        """Values and sigmas (2, MOVED), mm and degrees, of the unknowns of a screen elsewhere.
+
+        `laser_sigma_um` is the standard uncertainty of a set's mean laser reading.
         """
-        deeper_mm = 1e-3 * np.array([self.deeper_um, self.motion_um])
-        told = np.concatenate([self.shift_mm, np.zeros(3), deeper_mm])
+        film_mm = 1e-3 * np.array([self.deeper_um, self.motion_um])
+        values = np.concatenate([self.shift_mm, np.zeros(3), film_mm])
+
+        # The shift: a rail is as parallel to the screen's normal as the screen is to itself after
+        # the move, so that the direction's error adds to the components across the shift.
+        squares_mm2 = np.square(self.shift_mm)
+        across_mm = np.sqrt(np.sum(squares_mm2) - squares_mm2) * np.radians(self.turn_sigma_deg)
+        shift_sigmas_mm = np.hypot(self.shift_sigma_mm, across_mm)
+
+        # The film: two laser readings, or the glass over a screen that is seen directly.
         deeper_sigma_mm = self.glass_sigma_mm or 1e-3 * np.sqrt(2) * laser_sigma_um
-        film_mm = np.array([deeper_sigma_mm, 1e-3 * max(self.motion_sigma_um, STILL_UM)])
-        # a rail is as parallel to the screen's normal as the screen is to itself after the move
-        across_mm = np.sqrt(
-            np.sum(np.square(self.shift_mm)) - np.square(self.shift_mm)
-        ) * np.radians(self.turn_sigma_deg)
-        shift_mm = np.hypot(self.shift_sigma_mm, across_mm)
+        motion_sigma_mm = 1e-3 * max(self.motion_sigma_um, STILL_UM)
+        film_sigmas_mm = np.array([deeper_sigma_mm, motion_sigma_mm])
+        turn_sigmas_deg = np.full(3, self.turn_sigma_deg)
         return np.stack(
-            [told, np.concatenate([shift_mm, np.full(3, self.turn_sigma_deg), film_mm])]
+            [values, np.concatenate([shift_sigmas_mm, turn_sigmas_deg, film_sigmas_mm])]
         )
 
 
-# of the screen seen directly: nothing is known of its place, and its pixels may lie behind some mm
-# of glass
+# A screen that is seen directly: nothing is known of its place, and its pixels may lie behind some
+# mm of glass.
 ANYWHERE = Elsewhere((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0, glass_sigma_mm=3.0)
 
 
@@ -118,7 +122,9 @@ class SetPhases:
 
     def seen_with(self, screen: int) -> BoolArray:
         """Which points (n,) were seen with the screen in that place."""
-        return np.full(self.sigma_mm.size, True) if self.screen is None else self.screen == screen
+        if self.screen is None:
+            return np.full(self.sigma_mm.size, True)
+        return self.screen == screen
 
     def thinned(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""
@@ -131,10 +137,11 @@ class SetPhases:
 
     def beside(self, again: "SetPhases", known: Elsewhere) -> "SetPhases":
         """The set with the points of the same film, seen again with the screen elsewhere."""
-        before = np.zeros(self.sigma_mm.size, int) if self.screen is None else self.screen
+        before = self.screen
+        if before is None:
+            before = np.zeros(self.sigma_mm.size, int)
         screen = np.append(before, np.full(again.sigma_mm.size, len(self.elsewhere) + 1))
-        parts: Any = {
-            name: np.concatenate([getattr(k, name) for k in (self, again)], -1)
-            for name in _PER_POINT
-        }
+        parts: Any = {}
+        for name in _PER_POINT:
+            parts[name] = np.concatenate([getattr(self, name), getattr(again, name)], -1)
         return replace(self, **parts, elsewhere=(*self.elsewhere, known), screen=screen)

@@ -22,7 +22,7 @@ _LEAST_SQUARE = np.float32(1e-3)  # of the offsets of a cell whose bins are in o
 
 @dataclass(frozen=True)
 class Cells:
-    """LightSquares of bins, N of them, over each of which what changes slowly is a plane.
+    """Squares of bins, N of them, over each of which what changes slowly is a plane.
 
     64 cells are a block: their first bins, then their second ones, and so on, so that loops over a
     block use vector units. A cell with fewer bins repeats one, as the last block repeats a cell;

@@ -40,7 +40,7 @@ class CrossedScene:
     row : (n,) int array
         Row of bins that each is in.
     cells : Cells
-        LightSquares of bins over which slow changes are planes.
+        Squares of bins over which slow changes are planes.
     points : Points
         The bins' rays; `t_mm` follows the surface that was traced last.
     beyond_mm : (2, n) array

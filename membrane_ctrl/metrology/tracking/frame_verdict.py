@@ -50,7 +50,7 @@ def light_faults(saturated: float, light: float, covered: BoolArray) -> list[Fin
     light : float
         Light over the reference's.
     covered : (squares,) bool array
-        LightSquares of the mirror with wrong light.
+        Squares of the mirror with wrong light.
     """
     share = float(np.mean(covered))
     faults = []

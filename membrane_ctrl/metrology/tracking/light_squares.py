@@ -67,7 +67,7 @@ class LightSquares:
         light : float
             Light of the frame over the scene's.
         covered : (squares,) bool array
-            LightSquares whose light or contrast is wrong.
+            Squares whose light or contrast is wrong.
         """
         share, contrast = self._compare_squares(seen_adu)
         light = float(np.median(share[self._even]))

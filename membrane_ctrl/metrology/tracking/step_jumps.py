@@ -1,4 +1,4 @@
-"""StepJumps of the figure at steps of the pattern: image retention of the panel."""
+"""Jumps of the figure at steps of the pattern: image retention of the panel."""
 
 from collections import deque
 

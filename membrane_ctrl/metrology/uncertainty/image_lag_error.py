@@ -23,7 +23,7 @@ def image_lag_source(
     """Return the row of the budget; without an estimate its uncertainty is 0, and so stated."""
     sigma = lag.left if math.isfinite(lag.left) else 0.0
     effect = image_lag_effect(bench, stack, used)
-    # The panel holds the same share in all sets of a bench, but each set estimates its own
+    # The panel has the same share in all sets of a bench, but each set estimates it.
     return Source(
         "image_lag_share", _SAYS, sigma, sigma * effect[:, None], common=False, paired=False
     )

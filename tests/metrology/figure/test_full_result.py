@@ -169,7 +169,7 @@ def test_noisy_pictures_move_no_film_and_hide_no_motion(
                 checked.stack, displacement_um=place_um + rng.standard_normal(place_um.size)
             )
             film = FilmMotion.of(replace(checked, stack=noisy))
-            motion_um = [told * film.is_worth_correcting for told in film.motion_um]
+            motion_um = [axis_um * film.is_worth_correcting for axis_um in film.motion_um]
             off = [
                 told - place_um[used]
                 for told, used in zip(motion_um, checked.view.used, strict=True)
