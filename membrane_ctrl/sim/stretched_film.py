@@ -29,37 +29,61 @@ _PROFILE_DEGREE = 18  # exact to the last bit; powers of rho^2 lose digits beyon
 def solve_stretched_film(
     depth: float, prestrain: float, poisson: float
 ) -> tuple[float, FloatArray]:
-    """Load q and profile of a film: element k of the profile multiplies rho^(2k), height for a
-    depth of 1.
+    """Solve for a film of given depth.
 
-    rho is where the film is under its load. Raises ValueError if the film would be slack at its
-    ring.
+    Parameters
+    ----------
+    depth : float
+        Depth over the radius.
+    prestrain : float
+        Strain of the flat film.
+    poisson : float
+        Poisson ratio.
+
+    Returns
+    -------
+    load : float
+        q.
+    profile : (k,) array
+        Element k multiplies rho^(2k), with rho the radius at which the film is under its load;
+        height for a depth of 1.
+
+    Raises
+    ------
+    ValueError
+        If the film would be slack at its ring.
     """
     depth = depth or 1e-9  # a flat film bends as the shallowest does
+
+    # Nodes of the integral over the area, and the shapes there.
     x, weight = legendre.leggauss(6 * _SHAPES)
     v = (x + 1) / 2
-    r, area = np.sqrt(v), weight / 4
+    r = np.sqrt(v)
+    area = weight / 4
     (wide, wide_r), (deep, deep_r) = _shape_functions(v)
     vertex = _shape_functions(np.zeros(1))[1][0][:, 0]
 
     def forces(u: FloatArray, u_r: FloatArray, w_r: FloatArray) -> tuple[FloatArray, FloatArray]:
-        along, around = (
-            prestrain + u_r + (u_r**2 + w_r**2) / 2,
-            prestrain + u / r + (u / r) ** 2 / 2,
-        )
-        return (along + poisson * around) / (1 - poisson**2), (around + poisson * along) / (
-            1 - poisson**2
-        )
+        """Radial and hoop force per length over E t, by Hooke's law of Green's strains."""
+        along = prestrain + u_r + (u_r**2 + w_r**2) / 2
+        around = prestrain + u / r + (u / r) ** 2 / 2
+        radial = (along + poisson * around) / (1 - poisson**2)
+        hoop = (around + poisson * along) / (1 - poisson**2)
+        return radial, hoop
 
-    # a film's strain is its pre-strain and the square of its depth: with these units any film is of
-    # order 1
+    # A film's strain is its pre-strain and the square of its depth: in these units any film is of
+    # order 1.
     strain = depth**2 + max(prestrain, 0.0)
     units = np.concatenate([np.full(_SHAPES, depth**2), np.full(_SHAPES, depth), [strain * depth]])
 
     def gradient(scaled: FloatArray) -> FloatArray:
+        """Derivatives of the energy by the shapes of u and w, and the depth less the wanted one."""
         u, w, push = np.split(scaled * units, [_SHAPES, 2 * _SHAPES])
         push = push * area / r
-        out, out_r, down, down_r = u @ wide, u @ wide_r, w @ deep, w @ deep_r
+        out = u @ wide
+        out_r = u @ wide_r
+        down = w @ deep
+        down_r = w @ deep_r
         pull, hoop = (area * force for force in forces(out, out_r, down_r))
         of_u = wide_r @ (pull * (1 + out_r) - push * down * (r + out)) + wide / r @ (
             hoop * (1 + out / r)
@@ -68,18 +92,20 @@ def solve_stretched_film(
         of_w = deep_r @ (pull * down_r) - deep @ (push * (r + out) * (1 + out_r))
         return np.concatenate([of_u / strain, of_w / (strain * depth), [w @ vertex / depth - 1]])
 
+    # Its zero; slow progress at the last bits is no fault.
     start = np.zeros(2 * _SHAPES + 1)
-    start[_SHAPES], start[-1] = 1.0, 4.0
-    with warnings.catch_warnings(
-        action="ignore", category=RuntimeWarning
-    ):  # of slow progress at the last bits
+    start[_SHAPES] = 1.0
+    start[-1] = 4.0
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):
         found = np.asarray(fsolve(gradient, start, xtol=1e-15, maxfev=20_000))
     u, w, load = np.split(found * units, [_SHAPES, 2 * _SHAPES])
     pull, _ = forces(u @ wide, u @ wide_r, w @ deep_r)
     if np.abs(gradient(found)).max() > 1e-11 or pull.min() < 0.2 * pull[0]:
         raise ValueError(f"prestrain = {prestrain:g}: the film would be slack at its ring")
+
+    # The height over the place under load, as a power series.
     at = (chebyshev.chebpts2(8 * _PROFILE_DEGREE) + 1) / 2
-    (out, _), (down, _) = (tables for tables in _shape_functions(at))
+    (out, _), (down, _) = _shape_functions(at)
     rho2 = (np.sqrt(at) + u @ out) ** 2
     profile = Chebyshev.fit(rho2, 1 - w @ down / depth, _PROFILE_DEGREE, domain=[0, 1])
     powers = profile.convert(domain=[-1, 1], kind=Polynomial, window=[-1, 1]).coef
@@ -90,12 +116,12 @@ def _shape_functions(
     v: FloatArray,
 ) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
     """Displacements outward, r (1 - v) P(v), and down, (1 - v) P(v), with v = r^2, and their
-    derivatives along r.
+    derivatives along r: (_SHAPES, n) each.
     """
-    r, eye = np.sqrt(v), np.eye(_SHAPES)
-    value, slope = (
-        legendre.legval(2 * v - 1, eye),
-        2 * legendre.legval(2 * v - 1, legendre.legder(eye)),
-    )
-    down, down_r = (1 - v) * value, 2 * r * ((1 - v) * slope - value)
+    r = np.sqrt(v)
+    eye = np.eye(_SHAPES)
+    value = legendre.legval(2 * v - 1, eye)
+    slope = 2 * legendre.legval(2 * v - 1, legendre.legder(eye))
+    down = (1 - v) * value
+    down_r = 2 * r * ((1 - v) * slope - value)
     return (r * down, down + r * down_r), (down, down_r)

@@ -40,20 +40,41 @@ from membrane_ctrl.metrology.film.ring_waves import (
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
-# What is known without the sets: films are stretched by some 0.1 %, and a polymer's Poisson ratio
-# is 0.25 to 0.45
-PRESTRAIN_SIGMA, POISSON, POISSON_SIGMA = 3e-3, 0.35, 0.1
-# Round terms among a figure's parameters: those of Noll's order from 2 on, then the excess
+# Prior without any set: films are stretched by some 0.1 %, and a polymer's Poisson ratio is 0.25 to
+# 0.45.
+PRESTRAIN_SIGMA = 3e-3
+POISSON = 0.35
+POISSON_SIGMA = 0.1
+_LOG_STIFFNESS = 12.0  # start and prior of the natural logarithm of E t in N/m
+_LOG_STIFFNESS_PRECISION = 1e-4  # inverse variance
+_LOG_LOAD_PRECISION = 1e-6
+# Round terms among a figure's parameters: those of Noll's order from 2 on, then the excess.
 ROUND = np.array([*(j - 2 for j in hencky_bowl.ROUND_NOLL[1:]), ZERNIKE_TERMS - 1])
-_FREEDOM = np.append(np.ones(ROUND.size - 1), 0.1)  # of a misfit: the excess has 10 % of a term's
+# Size of a misfit in each round term: the excess has 10 % of that of a term.
+_FREEDOM = np.append(np.ones(ROUND.size - 1), 0.1)
+_LEAST_MM = 2e-4  # least misfit: no film is assumed to follow the law more closely
+_NEGLECTED = 0.005  # misfit of Hooke's law over sag^3 / radius^2: 1 µm at 37 mm
 _ITERATIONS = 40
-_LEAST_MM = 2e-4  # no film is trusted to follow the law more closely
-_NEGLECTED = 0.005  # what Hooke's law misses of a film, of sag^3 / radius^2: 1 µm at 37 mm
+_NEAR_SIGMAS = 0.05  # of a step: the solution is near
+_SLOPE_STEP = 1e-6  # of the central differences
+# Largest steps of the logarithms of the loads and of the pre-strain.
+_LARGEST_LOG_STEP = 0.5
+_LARGEST_STRAIN_STEP = 2e-3
 
 
 @dataclass(frozen=True)
 class Gauge:
-    """What is known of the gauge: sigmas of a reading, of an offset, and of its scale."""
+    """Standard uncertainties of the pressure gauge.
+
+    Attributes
+    ----------
+    noise_pa : float
+        Of a reading.
+    offset_pa : float
+        Of its offset.
+    scale : float
+        Of its scale, relative.
+    """
 
     noise_pa: float = 0.3
     offset_pa: float = 1.0
@@ -62,15 +83,31 @@ class Gauge:
 
 @dataclass(frozen=True)
 class FilmFit:
-    """A film as its figures show it."""
+    """A film as its figures show it.
 
-    law: FilmLaw  # its stiffness is meaningless without pressures
-    covariance: FloatArray  # (3, 3): of pre-strain, Poisson ratio, relative stiffness
-    # (n, parameters): what it leaves; 0 where it says nothing (tilt, orders above 5)
+    Attributes
+    ----------
+    law : FilmLaw
+        The film; its stiffness has no meaning without pressures.
+    covariance : (3, 3) array
+        Covariance of pre-strain, Poisson ratio and relative stiffness.
+    left_mm : (n, parameters) array
+        What the law leaves of each figure; 0 in terms that it does not determine (tilt, azimuthal
+        orders above 5).
+    waves : tuple of RingWave
+        Waves of the ring with a cause.
+    unexplained : tuple of UnexplainedWaves
+        Waves without one.
+    misfit_um : float
+        1 sigma of a term.
+    """
+
+    law: FilmLaw
+    covariance: FloatArray
     left_mm: FloatArray
     waves: tuple[RingWave, ...]
     unexplained: tuple[UnexplainedWaves, ...]
-    misfit_um: float  # 1 sigma of a term
+    misfit_um: float
 
     @property
     def sigmas(self) -> FloatArray:
@@ -83,32 +120,57 @@ def fit_film(
 ) -> FilmFit:
     """Fit the law to the figures of one film.
 
-    Raises ValueError if there are fewer than two figures, or no film of the law is like them.
+    Parameters
+    ----------
+    figures : sequence of FilmFigure
+        Figures at different pressures.
+    radius_mm : float
+        Radius of the ring.
+    analysis_mm : float
+        Radius within which the figures were fitted.
+    gauge : Gauge
+        Uncertainties of the pressures.
+
+    Returns
+    -------
+    FilmFit
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two figures, or no film of the law fits them.
     """
     if len(figures) < 2:
         raise ValueError(
             "one set cannot tell pre-strain from Poisson ratio: two or more pressures are needed"
         )
     reach = analysis_mm / radius_mm
-    sags_mm = np.array([[one.sag_mm] for one in figures])
-    about = FilmLaw(0.0, POISSON, 1.0, radius_mm).with_sag(sags_mm)
-    seen_mm = max(unexplained_term_mm(figures, about, reach), _LEAST_MM)
+
+    # Size of the misfit, from the terms that the law does not determine.
+    sags_mm = np.array([[figure.sag_mm] for figure in figures])
+    typical_bowls = FilmLaw(0.0, POISSON, 1.0, radius_mm).with_sag(sags_mm)
+    seen_mm = max(unexplained_term_mm(figures, typical_bowls, reach), _LEAST_MM)
+
+    # The film by the round terms, then the waves of its ring.
     unknowns, covariance, size_mm = _fit_round(figures, radius_mm, reach, gauge, seen_mm)
     law = FilmLaw(float(unknowns[0]), float(unknowns[1]), float(np.exp(unknowns[2])), radius_mm)
     bowls = law.loaded(np.exp(unknowns[3:, None]))
     of_waves = fit_waves(figures, bowls, reach, seen_mm)
-    predicted = of_waves.added_mm
-    predicted[:, ROUND] = round_terms_mm(bowls, reach) + _finite_terms_mm(law, bowls, reach)
-    known = np.zeros(ZERNIKE_TERMS, bool)
-    known[ROUND] = True
+
+    # What both leave of the figures.
+    predicted_mm = of_waves.added_mm
+    predicted_mm[:, ROUND] = round_terms_mm(bowls, reach) + _finite_terms_mm(law, bowls, reach)
+    is_predicted = np.zeros(ZERNIKE_TERMS, bool)
+    is_predicted[ROUND] = True
     for order in CAUSES:
-        known[azimuthal_terms(order).ravel()] = True
-    left = np.where(known, np.array([each.parameters_mm for each in figures]) - predicted, 0.0)
-    return FilmFit(law, covariance, left, of_waves.waves, of_waves.unexplained, 1e3 * size_mm)
+        is_predicted[azimuthal_terms(order).ravel()] = True
+    seen = np.array([figure.parameters_mm for figure in figures])
+    left_mm = np.where(is_predicted, seen - predicted_mm, 0.0)
+    return FilmFit(law, covariance, left_mm, of_waves.waves, of_waves.unexplained, 1e3 * size_mm)
 
 
 def round_terms_mm(bowls: Bowl, reach: float) -> FloatArray:
-    """The round terms and the excess (n, k) that a fit of slopes inside `reach` radii finds in
+    """The round terms and the excess (n, k), mm, that a fit of slopes inside `reach` radii finds in
     bowls (n, 1).
     """
     rho, weight, onto = _round_projection(reach)
@@ -116,8 +178,8 @@ def round_terms_mm(bowls: Bowl, reach: float) -> FloatArray:
 
 
 def _finite_terms_mm(law: FilmLaw, bowls: Bowl, reach: float) -> FloatArray:
-    """What finite slopes add to `round_terms_mm`: a hundredth, which hardly changes with the law's
-    numbers.
+    """What finite slopes add to `round_terms_mm` (n, k), mm: a hundredth, which hardly changes with
+    the law's numbers.
     """
     rho, weight, onto = _round_projection(reach)
     rises = [finite_slopes.finite_rise_mm(law, float(load), rho) for load in bowls.load.ravel()]
@@ -126,79 +188,112 @@ def _finite_terms_mm(law: FilmLaw, bowls: Bowl, reach: float) -> FloatArray:
 
 @cache
 def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Radii, weights, and the least squares of slopes there onto these terms."""
+    """Radii (m,), their weights (m,), and the matrix (k, m) from weighted slopes there to the round
+    terms and the excess, by least squares.
+    """
     rho, weight = slope_radii(reach)
+
+    # Slopes of the round terms, sqrt(2 k + 1) P_k(2 rho^2 - 1), and of the excess.
     x = 2 * rho**2 - 1
-    round_degrees = [*enumerate(np.eye(hencky_bowl.EXCESS_DEGREE))][1:]
-    slopes = [
-        np.sqrt(2 * k + 1) * 4 * rho * legendre.legval(x, legendre.legder(unit))
-        for k, unit in round_degrees
-    ]
-    excess = (
-        2
-        * rho
-        * polynomial.polyval(rho**2, polynomial.polyder(hencky_bowl.excess_series()))
-        / hencky_bowl.excess_rms()
-    )
-    return rho, weight, np.asarray(np.linalg.pinv((np.stack([*slopes, excess]) * weight).T))
+    slopes = []
+    for k, unit in enumerate(np.eye(hencky_bowl.EXCESS_DEGREE)):
+        if k == 0:
+            continue  # piston
+        slope = legendre.legval(x, legendre.legder(unit))
+        slopes.append(np.sqrt(2 * k + 1) * 4 * rho * slope)
+    excess_slope = polynomial.polyval(rho**2, polynomial.polyder(hencky_bowl.excess_series()))
+    slopes.append(2 * rho * excess_slope / hencky_bowl.excess_rms())
+    return rho, weight, np.asarray(np.linalg.pinv((np.stack(slopes) * weight).T))
 
 
 def _fit_round(
     figures: Sequence[FilmFigure], radius_mm: float, reach: float, gauge: Gauge, seen_mm: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Unknowns (pre-strain, Poisson ratio, log stiffness, log loads), covariance (3, 3), misfit."""
-    count = len(figures)
-    pressure = np.array([each.pressure_pa for each in figures])
-    sag_mm = float(np.mean([each.sag_mm for each in figures]))
-    seen_mm = max(seen_mm, _NEGLECTED * sag_mm**3 / radius_mm**2)
-    gauged = np.isfinite(pressure)
-    log_q = np.log(pressure[gauged] * radius_mm * 1e-3)
-    data = np.array([each.parameters_mm[ROUND] for each in figures]).ravel()
-    finite = np.zeros((count, len(ROUND)))
+    """Fit the law to the round terms of n figures, by Gauss-Newton.
 
-    def bent(x: FloatArray) -> tuple[FilmLaw, Bowl]:
+    Data are the round terms and the excess of each figure, and the logarithm of each gauged load.
+
+    Parameters
+    ----------
+    figures, radius_mm, gauge
+        As those of `fit_film`.
+    reach : float
+        Radius of the fitted area over that of the ring.
+    seen_mm : float
+        Size of the misfit in other terms.
+
+    Returns
+    -------
+    unknowns : (3 + n,) array
+        Pre-strain, Poisson ratio, logarithm of the stiffness, logarithms of the loads.
+    covariance : (3, 3) array
+        Of the first three.
+    size_mm : float
+        Size of the misfit.
+    """
+    count = len(figures)
+    sags_mm = np.array([figure.sag_mm for figure in figures])
+    sag_mm = float(np.mean(sags_mm))
+    seen_mm = max(seen_mm, _NEGLECTED * sag_mm**3 / radius_mm**2)
+
+    # The data. The gauge's pressure times the radius is the load times the stiffness.
+    pressure_pa = np.array([figure.pressure_pa for figure in figures])
+    is_gauged = np.isfinite(pressure_pa)
+    log_q = np.log(pressure_pa[is_gauged] * radius_mm * 1e-3)
+    terms = np.array([figure.parameters_mm[ROUND] for figure in figures]).ravel()
+    target = np.append(terms, log_q)
+    finite_mm = np.zeros((count, len(ROUND)))
+
+    def make_bowls(x: FloatArray) -> tuple[FilmLaw, Bowl]:
+        """The film and its bowls for the unknowns (3 + n,)."""
         law = FilmLaw(float(x[0]), float(x[1]), 1.0, radius_mm)
         return law, law.loaded(np.exp(x[3:, None]))
 
     def predict(x: FloatArray) -> FloatArray:
-        return np.append((round_terms_mm(bent(x)[1], reach) + finite).ravel(), x[3:][gauged] + x[2])
+        """The data for the unknowns (3 + n,)."""
+        _, bowls = make_bowls(x)
+        predicted_mm = round_terms_mm(bowls, reach) + finite_mm
+        return np.append(predicted_mm.ravel(), x[3:][is_gauged] + x[2])
 
-    offset = gauge.offset_pa / pressure[gauged]
-    of_gauge = (
-        np.outer(offset, offset)
-        + gauge.scale**2
-        + np.diag((gauge.noise_pa / pressure[gauged]) ** 2)
-    )
-    shared = shared_covariance(figures, ROUND)
-    noise = np.zeros((len(data) + len(log_q),) * 2)
-    noise[: len(data), : len(data)], noise[len(data) :, len(data) :] = shared, of_gauge
+    # Their covariances: of noise and geometry, of the gauge, and of a misfit of size 1.
+    offset = gauge.offset_pa / pressure_pa[is_gauged]
+    reading_noise = (gauge.noise_pa / pressure_pa[is_gauged]) ** 2
+    of_gauge = np.outer(offset, offset) + gauge.scale**2 + np.diag(reading_noise)
+    split = len(terms)
+    noise = np.zeros((target.size, target.size))
+    noise[:split, :split] = shared_covariance(figures, ROUND)
+    noise[split:, split:] = of_gauge
     misfits = np.zeros((GROWTHS.size, *noise.shape))
-    misfits[:, : len(data), : len(data)] = [
-        np.kron(part, np.diag(_FREEDOM**2)) for part in misfit_covariances(figures)
-    ]
-    known = np.append([0.0, POISSON, 12.0], np.zeros(count))
-    precision = np.append([PRESTRAIN_SIGMA**-2, POISSON_SIGMA**-2, 1e-4], np.full(count, 1e-6))
-    start = FilmLaw(0.0, POISSON, 1.0, radius_mm).with_sag(
-        np.array([each.sag_mm for each in figures])
-    )
-    x = np.append([0.0, POISSON, 12.0], np.log(start.load))
-    x[2], target = (
-        float(np.mean(log_q - x[3:][gauged])) if gauged.any() else x[2],
-        np.append(data, log_q),
-    )
-    far = True
+    of_terms = np.diag(_FREEDOM**2)
+    misfits[:, :split, :split] = [np.kron(part, of_terms) for part in misfit_covariances(figures)]
+
+    # The prior, and the start: Hencky's film at each sag.
+    known = np.append([0.0, POISSON, _LOG_STIFFNESS], np.zeros(count))
+    precisions = [PRESTRAIN_SIGMA**-2, POISSON_SIGMA**-2, _LOG_STIFFNESS_PRECISION]
+    precision = np.append(precisions, np.full(count, _LOG_LOAD_PRECISION))
+    start = FilmLaw(0.0, POISSON, 1.0, radius_mm).with_sag(sags_mm)
+    x = np.append([0.0, POISSON, _LOG_STIFFNESS], np.log(start.load))
+    if is_gauged.any():
+        x[2] = float(np.mean(log_q - x[3:][is_gauged]))
+
+    # Gauss-Newton. Far from the solution, the misfit that grows fastest is enough; near it, all are
+    # averaged.
+    is_far = True
     for _ in range(_ITERATIONS):
-        finite[:] = _finite_terms_mm(*bent(x), reach)
-        slopes, rest = _numerical_slopes(predict, x), target - predict(x)
-        tried = average_over_misfits(
-            slopes, rest, noise, misfits[-far:], known - x, precision, seen_mm
-        )  # far: one will do
-        step = tried.mean * _limit_step(x, tried.mean)
+        finite_mm[:] = _finite_terms_mm(*make_bowls(x), reach)
+        slopes = _numerical_slopes(predict, x)
+        rest = target - predict(x)
+        tried_misfits = misfits[-1:] if is_far else misfits
+        solved = average_over_misfits(
+            slopes, rest, noise, tried_misfits, known - x, precision, seen_mm
+        )
+        step = solved.mean * _limit_step(x, solved.mean)
         x = x + step
-        near = np.all(np.abs(step[:3]) < 0.05 * np.sqrt(np.diag(tried.covariance)[:3]))
-        if near and not far:
-            return x, tried.covariance[:3, :3], tried.size_mm
-        far = far and not near
+        sigmas = np.sqrt(np.diag(solved.covariance)[:3])
+        is_near = np.all(np.abs(step[:3]) < _NEAR_SIGMAS * sigmas)
+        if is_near and not is_far:
+            return x, solved.covariance[:3, :3], solved.size_mm
+        is_far = is_far and not is_near
     raise ValueError(
         "no film of the law is like these figures: they are of different films, or of a "
         "wrong geometry"
@@ -206,12 +301,15 @@ def _fit_round(
 
 
 def _limit_step(x: FloatArray, step: FloatArray) -> float:
-    """The part of a step that stays among films: Poisson ratio in 0 .. 0.5, loads by less than a
+    """Share of a step that stays among films: Poisson ratio in 0 .. 0.5, loads by less than a
     factor of two.
+
+    `x` and `step` (3 + n,) are the unknowns and their step. Raises ValueError if no part of it
+    stays there.
     """
-    scale = min(
-        1.0, 0.5 / max(float(np.max(np.abs(step[3:]))), 1e-9), 2e-3 / max(abs(float(step[0])), 1e-9)
-    )
+    log_step = max(float(np.max(np.abs(step[3:]))), 1e-9)
+    strain_step = max(abs(float(step[0])), 1e-9)
+    scale = min(1.0, _LARGEST_LOG_STEP / log_step, _LARGEST_STRAIN_STEP / strain_step)
     while not 0 <= x[1] + scale * step[1] <= 0.5:
         scale /= 2
         if scale < 1e-4:
@@ -223,9 +321,10 @@ def _limit_step(x: FloatArray, step: FloatArray) -> float:
 
 
 def _numerical_slopes(predict: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
+    """Derivatives (m, k) of a prediction (m,) by its unknowns x (k,), by central differences."""
     columns = []
     for k in range(x.size):
         step = np.zeros(x.size)
-        step[k] = 1e-6
-        columns.append((predict(x + step) - predict(x - step)) / 2e-6)
+        step[k] = _SLOPE_STEP
+        columns.append((predict(x + step) - predict(x - step)) / (2 * _SLOPE_STEP))
     return np.stack(columns, axis=1)

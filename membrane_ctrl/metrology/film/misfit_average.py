@@ -12,22 +12,23 @@ import numpy as np
 from membrane_ctrl.metrology.film.film_figure import FilmFigure
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
-# Of the misfit that differs between the sets: what does not follow the sag, and what does but is
-# another figure
-_DIFFERS, _UNRELATED = 0.1, 0.5
-_TIMES_SEEN = np.logspace(
-    0, 2.5, 12
-)  # sizes of the common misfit: never below that of the terms without a law
+# Parts of the misfit that differ between the sets, over the common one: a part that does not follow
+# the sag, and one that does but is another figure.
+_DIFFERS = 0.1
+_UNRELATED = 0.5
+# Sizes of the common misfit that are tried, over that of the terms that the law does not determine:
+# it is not smaller than that.
+_SIZES = np.logspace(0, 2.5, 12)
 # Powers of the sag with which a misfit grows: a ring's figure stays, what a law leaves of large
-# strains grows by 3
+# strains grows with the third power.
 GROWTHS = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0])
-# misfit over that of the terms without a law: natural logarithm, of a Cauchy distribution
-_UNLIKE = 1.0
+# Width of the prior of the size, a Cauchy distribution of its natural logarithm.
+_LOG_WIDTH = 1.0
 
 
 def shared_covariance(figures: Sequence[FilmFigure], terms: IntArray) -> FloatArray:
-    """Covariance of some terms of all sets: each its noise,
-    the geometry's error the same for all.
+    """Covariance (n k, n k), mm^2, of k terms of n sets: each has its noise, and all share the
+    geometry's error.
     """
     errors = np.vstack([each.geometry_mm[terms] for each in figures])
     out = errors @ errors.T
@@ -38,21 +39,34 @@ def shared_covariance(figures: Sequence[FilmFigure], terms: IntArray) -> FloatAr
 
 
 def misfit_covariances(figures: Sequence[FilmFigure]) -> FloatArray:
-    """Covariance (growths, n, n) over the sets of a misfit of size 1 that grows with these powers
-    of the sag.
+    """Covariance (growths, n, n) over n sets of a misfit of size 1 that grows with the powers
+    `GROWTHS` of the sag.
     """
     sags = np.array([each.sag_mm for each in figures])
-    deeper = sags / sags.mean()
-    grows, off = deeper[:, None] ** GROWTHS, deeper - 1
-    differs = _UNRELATED**2 * np.outer(off, off) + _DIFFERS**2 * np.var(deeper) * np.eye(sags.size)
-    return np.asarray(
-        np.einsum("ig,jg->gij", grows, grows) + np.multiply.outer(GROWTHS**2, differs)
-    )
+    relative = sags / sags.mean()
+    grown = relative[:, None] ** GROWTHS
+    off = relative - 1
+    follows_sag = _UNRELATED**2 * np.outer(off, off)
+    of_each_set = _DIFFERS**2 * np.var(relative) * np.eye(sags.size)
+    common = np.einsum("ig,jg->gij", grown, grown)
+    return np.asarray(common + np.multiply.outer(GROWTHS**2, follows_sag + of_each_set))
 
 
 @dataclass(frozen=True)
 class Solved:
-    """A linear model's unknowns."""
+    """The unknowns of a linear model.
+
+    Attributes
+    ----------
+    mean : (k,) array
+        Their values.
+    covariance : (k, k) array
+        Their covariance.
+    log_evidence : float
+        Natural logarithm of the model's evidence, up to a constant.
+    size_mm : float
+        Size of the misfit, RMS over those that were averaged.
+    """
 
     mean: FloatArray
     covariance: FloatArray
@@ -67,20 +81,37 @@ def solve_linear(
     known: FloatArray,
     precision: FloatArray,
 ) -> Solved:
-    """Least squares; `known` with its `precision` is the prior."""
+    """Least squares with correlated noise and a prior.
+
+    Parameters
+    ----------
+    design : (m, k) array
+        Derivatives of the data by the unknowns.
+    residual : (m,) array
+        Data less the model.
+    noise : (m, m) array
+        Covariance of the data.
+    known, precision : (k,) arrays
+        Values of the prior, and their inverse variances.
+    """
+    # Rows of unit variance: the data, whitened by the root of their covariance, and the prior.
     root = np.linalg.cholesky(noise)
-    a, b = np.linalg.solve(root, design), np.linalg.solve(root, residual)
-    rows, right = (
-        np.vstack([a, np.diag(np.sqrt(precision))]),
-        np.append(b, np.sqrt(precision) * known),
-    )
+    prior_rows = np.diag(np.sqrt(precision))
+    rows = np.vstack([np.linalg.solve(root, design), prior_rows])
+    right = np.append(np.linalg.solve(root, residual), np.sqrt(precision) * known)
+
+    # Q R factors of the scaled rows: R^-1 is a root of the covariance.
     scale = np.sqrt(np.sum(rows**2, axis=0))
     q, r = np.linalg.qr(rows / scale)
     inverse = np.linalg.solve(r, np.eye(scale.size)) / scale[:, None]
     mean = inverse @ (q.T @ right)
+
+    # Evidence: the sum of squares, and the logarithms of both determinants.
     left = np.sum((right - rows @ mean) ** 2)
-    volume = np.sum(np.log(np.diag(root))) + np.sum(np.log(np.abs(np.diag(r)) * scale))
-    return Solved(mean, inverse @ inverse.T, float(-left / 2 - volume))
+    log_noise = np.sum(np.log(np.diag(root)))
+    log_unknowns = np.sum(np.log(np.abs(np.diag(r)) * scale))
+    log_evidence = float(-left / 2 - (log_noise + log_unknowns))
+    return Solved(mean, inverse @ inverse.T, log_evidence)
 
 
 def average_over_misfits(
@@ -92,20 +123,38 @@ def average_over_misfits(
     precision: FloatArray,
     seen_mm: float,
 ) -> Solved:
-    """The unknowns averaged over the misfit's size, about `seen_mm`, and over the ways in which it
-    grows.
+    """Average the unknowns over the misfit's size and over the ways in which it grows.
+
+    Each pair of size and growth is a model; its weight is its evidence times the prior of the size.
+
+    Parameters
+    ----------
+    design, residual, noise, known, precision
+        As those of `solve_linear`.
+    misfits : (growths, m, m) array
+        Covariances of a misfit of size 1.
+    seen_mm : float
+        Size of the misfit in the terms that the law does not determine.
     """
-    found, logs, sizes = [], [], []
-    for size in seen_mm * _TIMES_SEEN:
+    found = []
+    logs = []
+    sizes_mm = []
+    for size_mm in seen_mm * _SIZES:
+        log_prior = -float(np.log1p((np.log(size_mm / seen_mm) / _LOG_WIDTH) ** 2))
         for misfit in misfits:
-            one = solve_linear(design, residual, noise + size**2 * misfit, known, precision)
-            found.append(one)
-            sizes.append(size)
-            logs.append(one.log_evidence - float(np.log1p((np.log(size / seen_mm) / _UNLIKE) ** 2)))
+            covariance = noise + size_mm**2 * misfit
+            solved = solve_linear(design, residual, covariance, known, precision)
+            found.append(solved)
+            sizes_mm.append(size_mm)
+            logs.append(solved.log_evidence + log_prior)
     weight = np.exp(np.array(logs) - np.max(logs))
     weight /= weight.sum()
-    means = np.array([one.mean for one in found])
+
+    # Mean over the models, and its covariance: within the models, and between their means.
+    means = np.array([solved.mean for solved in found])
     mean = weight @ means
-    within = np.einsum("k,kij->ij", weight, np.array([one.covariance for one in found]))
-    covariance = within + np.einsum("k,ki,kj->ij", weight, means - mean, means - mean)
-    return Solved(mean, covariance, float(np.max(logs)), float(np.sqrt(weight @ np.square(sizes))))
+    covariances = np.array([solved.covariance for solved in found])
+    within = np.einsum("k,kij->ij", weight, covariances)
+    between = np.einsum("k,ki,kj->ij", weight, means - mean, means - mean)
+    size_mm = float(np.sqrt(weight @ np.square(sizes_mm)))
+    return Solved(mean, within + between, float(np.max(logs)), size_mm)

@@ -124,7 +124,7 @@ class SetPhases:
         """Which points (n,) were seen with the screen in that place."""
         if self.screen is None:
             return np.full(self.sigma_mm.size, True)
-        return self.screen == screen
+        return np.asarray(self.screen == screen)
 
     def thinned(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""

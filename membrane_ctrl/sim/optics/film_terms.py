@@ -31,38 +31,53 @@ def height_and_slopes(
     terms: FilmTerms, sag_mm: float, x_mm: float, y_mm: float
 ) -> tuple[float, float, float]:
     """Height above the vertex (mm) and its derivatives along x and y."""
-    X, Y = x_mm / terms.radius_mm, y_mm / terms.radius_mm
+    X = x_mm / terms.radius_mm
+    Y = y_mm / terms.radius_mm
+
+    # The bowl, a polynomial in u: value and derivative by Horner's rule.
     u = X * X + Y * Y
-    bowl, bowl_u = 0.0, 0.0  # value and derivative to u, Horner
+    bowl = 0.0
+    bowl_u = 0.0
     for k in range(len(terms.bowl) - 1, -1, -1):
         bowl_u = bowl_u * u + bowl
         bowl = bowl * u + terms.bowl[k]
     h = sag_mm * bowl - terms.offset_mm
-    hx, hy = 2.0 * X * sag_mm * bowl_u, 2.0 * Y * sag_mm * bowl_u
+    hx = 2.0 * X * sag_mm * bowl_u
+    hy = 2.0 * Y * sag_mm * bowl_u
 
+    # The polynomial in x and y, likewise.
     degree = terms.poly_mm.shape[0] - 1
-    value, value_x, value_y = 0.0, 0.0, 0.0
+    value = 0.0
+    value_x = 0.0
+    value_y = 0.0
     for i in range(degree, -1, -1):
-        row, row_y = 0.0, 0.0
+        row = 0.0
+        row_y = 0.0
         for k in range(degree - i, -1, -1):
             row_y = row_y * Y + row
             row = row * Y + terms.poly_mm[i, k]
         value_x = value_x * X + value
         value_y = value_y * X + row_y
         value = value * X + row
-    h, hx, hy = h + value, hx + value_x, hy + value_y
+    h = h + value
+    hx = hx + value_x
+    hy = hy + value_y
 
+    # Wrinkles, amplitude Re((X + iY)^m e^(i phase)): m lobes at the rim.
     for n in range(terms.wrinkles.shape[0]):
-        # amplitude Re((X + iY)^m e^(i phase)): m lobes at the rim
-        amplitude, phase = terms.wrinkles[n, 0], terms.wrinkles[n, 2]
-        below, order = complex(cos(phase), sin(phase)), int(terms.wrinkles[n, 1])
+        amplitude = terms.wrinkles[n, 0]
+        order = int(terms.wrinkles[n, 1])
+        phase = terms.wrinkles[n, 2]
+        below = complex(cos(phase), sin(phase))
         for _ in range(order - 1):
             below *= complex(X, Y)
         h += amplitude * (below * complex(X, Y)).real
         hx += amplitude * order * below.real
         hy -= amplitude * order * below.imag
-    hx, hy = hx / terms.radius_mm, hy / terms.radius_mm
+    hx = hx / terms.radius_mm
+    hy = hy / terms.radius_mm
 
+    # Ripples and bumps, in mm.
     for n in range(terms.ripples.shape[0]):
         amplitude, kx, ky, phase = terms.ripples[n]
         angle = kx * x_mm + ky * y_mm + phase
@@ -71,7 +86,8 @@ def height_and_slopes(
         hy -= amplitude * ky * sin(angle)
     for n in range(terms.bumps.shape[0]):
         amplitude, x0, y0, sigma = terms.bumps[n]
-        dx, dy = x_mm - x0, y_mm - y0
+        dx = x_mm - x0
+        dy = y_mm - y0
         bump = amplitude * exp(-(dx * dx + dy * dy) / (2.0 * sigma * sigma))
         h += bump
         hx -= bump * dx / (sigma * sigma)
