@@ -20,7 +20,7 @@ from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
-from membrane_ctrl.service.feed import HoldSeen
+from membrane_ctrl.service.hold_seen import HoldSeen
 from membrane_ctrl.service.metrics import render_metrics
 from membrane_ctrl.sim.lab import Lab
 

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from membrane_ctrl.cli.ctl import AuthorityOption, HostOption, TokenOption
 from membrane_ctrl.model import errors
 
 if TYPE_CHECKING:
-    from membrane_ctrl.bridges.names import Bridge
+    from membrane_ctrl.bridges.bridge import Bridge
 
 _BRIDGES = ("opcua", "epics", "mqtt")  # tables of the configuration, and modules
 
@@ -37,15 +38,24 @@ def bridges(
     socket: Annotated[
         Path | None, typer.Option("--socket", help="Control port of the hold.")
     ] = None,
+    host: HostOption = "",
+    token_file: TokenOption = None,
+    authority: AuthorityOption = None,
+    hold: Annotated[
+        str, typer.Option(help="With --host: name of the hold there, if there are several.")
+    ] = "",
 ) -> None:
     """Serve until interrupted."""
     if context.invoked_subcommand is not None:
         return
     import asyncio
 
-    from membrane_ctrl.bridges.names import Bridge
+    from membrane_ctrl.bridges.bridge import Bridge
     from membrane_ctrl.cli.options import load_configuration
     from membrane_ctrl.config.needed_packages import list_missing_packages
+    from membrane_ctrl.control_port.ctl import Where
+    from membrane_ctrl.control_port.service_client import ServiceAddress, read_token
+    from membrane_ctrl.service.service_feed import make_feed
 
     settings = load_configuration(config)
     for needed in list_missing_packages(settings):
@@ -55,13 +65,20 @@ def bridges(
             "no bridge is configured: add [bridges.mqtt], [bridges.opcua] or [bridges.epics] "
             "(docs/how-to/bridges.md)"
         )
-    asyncio.run(_serve(Bridge.to(settings, logs, socket)))
+    if host:
+        address = ServiceAddress(host, read_token(token_file), authority, hold)
+        where = Where(service=address)
+    else:
+        folder = logs or Path(settings.recording.logs_dir)
+        where = Where(socket or settings.port.socket_in(folder), logs=folder)
+    asyncio.run(_serve(Bridge(make_feed(where, with_signals=True), settings)))
 
 
 @app.command()
 def names() -> None:
     """Print the published names with their units, as a Markdown table."""
-    from membrane_ctrl.bridges.names import TABLE, table_lines
+    from membrane_ctrl.bridges.bridge import TABLE
+    from membrane_ctrl.service.published_signals import table_lines
 
     print("\n".join(table_lines(TABLE)))
 

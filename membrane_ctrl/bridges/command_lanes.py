@@ -22,10 +22,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from membrane_ctrl.bridges.hold_link import SendLimits
 from membrane_ctrl.control_port.fair_queue import FairQueue
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import is_safety_command
+from membrane_ctrl.service.hold_command import NO_LIMITS, SendLimits
 
 ORDINARY_MOST = 8  # commands that wait
 SAFETY_MOST_EACH = 4  # different safety commands of one kind that wait
@@ -174,9 +174,7 @@ class CommandLanes:
 
     async def _serve_safety(self) -> None:
         while (waiting := self._safety.take()) is not None:
-            outcome = await self._send_on_thread(
-                waiting.request, SendLimits(float("inf"), _no_refusal)
-            )
+            outcome = await self._send_on_thread(waiting.request, NO_LIMITS)
             if waiting.answered:
                 self._report_late(outcome)
             waiting.answer(outcome)
@@ -215,7 +213,3 @@ def _answer_provisionally(outcome: asyncio.Future[Outcome], kind: str) -> None:
 def overtaken(winner: str) -> str:
     """Why a command is refused that came before the safety command `winner`, and would undo it."""
     return f"{winner} came meanwhile and takes precedence; send again"
-
-
-def _no_refusal() -> str:
-    return ""

@@ -25,16 +25,17 @@ from aiomqtt.exceptions import MqttConnectError
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from membrane_ctrl.bridges.bridge import TABLE, Bridge
 from membrane_ctrl.bridges.command_lanes import MOVES_NOTHING, overtaken
 from membrane_ctrl.bridges.mqtt_barrier import OrderBarrier
 from membrane_ctrl.bridges.mqtt_client import CancellableClient
 from membrane_ctrl.bridges.mqtt_inbox import HandleMessage, Inbox, Reports
 from membrane_ctrl.bridges.mqtt_owner import NameOwnership, OwnerClaim
-from membrane_ctrl.bridges.names import TABLE, Bridge, Published
 from membrane_ctrl.config.bridges import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY, is_safety_command
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.columns import QUANTITY_OF_UNIT
+from membrane_ctrl.service.published_signals import Published
 
 _LEAVES_S = 2.0
 _ANSWER_S = 5.0  # of the broker to each message

@@ -15,12 +15,13 @@ from asyncua import Server, ua
 from asyncua.common.node import Node
 from cryptography.hazmat.primitives.asymmetric import rsa
 
-from membrane_ctrl.bridges.names import TABLE, Bridge, Value
+from membrane_ctrl.bridges.bridge import TABLE, Bridge
 from membrane_ctrl.bridges.opcua_server import AnonymousClients, BridgeServer, NamedClients, caller
 from membrane_ctrl.config.bridges import OpcuaConfig
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.service.access import ActionButton
 from membrane_ctrl.service.accounts import KnownUser, known_users
+from membrane_ctrl.service.published_signals import Value
 
 _UNITS = "http://www.opcfoundation.org/UA/units/un/cefact"
 _OPEN = [ua.SecurityPolicyType.NoSecurity]

@@ -33,7 +33,15 @@ def load_toml(path: str | Path, model: type[Model], follow: bool = True) -> Mode
     Raises InputError with one line that names the file, the field and a valid value.
     """
     path = Path(path)
-    tables = read_toml(path, follow)
+    return _parse_model(read_toml(path, follow), path, model, follow)
+
+
+def load_toml_text(text: str, path: Path, model: type[Model]) -> Model:
+    """As `load_toml`, of a text that is to become the file `path`. Raises InputError."""
+    return _parse_model(parse_toml(text, path), path, model, follow=True)
+
+
+def _parse_model(tables: dict[str, Any], path: Path, model: type[Model], follow: bool) -> Model:
     optics = tables.get("optics")
     if isinstance(optics, dict):
         with_height_map(optics.get("geometry"), path, follow)
@@ -45,12 +53,7 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
     TOML).
     """
     try:
-        text = read_text(path, _BYTES_MAX, follow=follow).removeprefix(
-            "\ufeff"
-        )  # as some editors begin a file
-        if any(map(_has_too_many_parts, text.splitlines())):
-            raise InputError(f"{path}: not valid TOML: a key of more than {_PARTS_MAX} parts")
-        return tomllib.loads(text)
+        text = read_text(path, _BYTES_MAX, follow=follow)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -59,12 +62,22 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
         raise InputError(f"{path}: no permission to read it") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({os_reason(error)})") from None
-    except RecursionError:
-        raise InputError(f"{path}: not valid TOML: nested too deep") from None
     except UnicodeDecodeError:
         raise InputError(
             f"{path}: not valid TOML: not UTF-8 text (UTF-16, perhaps); save it as UTF-8"
         ) from None
+    return parse_toml(text, path)
+
+
+def parse_toml(text: str, path: Path) -> dict[str, Any]:
+    """The tables of a text of the file `path`. Raises InputError as `read_toml`."""
+    text = text.removeprefix("\ufeff")  # as some editors begin a file
+    if any(map(_has_too_many_parts, text.splitlines())):
+        raise InputError(f"{path}: not valid TOML: a key of more than {_PARTS_MAX} parts")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: nested too deep") from None
     except ValueError as error:  # of TOML, of a number with thousands of digits
         raise InputError(f"{path}: not valid TOML: {_describe_cause(str(error), text)}") from None
 

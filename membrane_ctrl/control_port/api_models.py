@@ -64,13 +64,13 @@ class StatesAnswer(_Answer):
 
 
 class SignalAnswer(_Answer):
-    """A published signal: a row of the table of telemetry columns, with its present value."""
+    """A published signal, the same as through all bridges, with its present value."""
 
     name: _Line
     title: _Line
     description: _Line
     unit: _Line
-    value: float | None
+    value: float | Annotated[str, Field(max_length=20_000)] | None
 
 
 class HistoryAnswer(_Answer):
@@ -105,6 +105,20 @@ class ConfigurationAnswer(_Answer):
     problem: _Line
 
 
+class ConfigurationTextAnswer(_Answer):
+    """A configuration's file; `digest` identifies this text."""
+
+    text: str
+    digest: _Line
+
+
+class CheckedConfigurationAnswer(_Answer):
+    """What is wrong with a configuration: `errors` refuse it."""
+
+    errors: _Lines
+    warnings: _Lines
+
+
 class UserAnswer(_Answer):
     """Who asks."""
 
@@ -126,6 +140,8 @@ class CommandBody(BaseModel):
     shape_time_constant_s: float | None = None
     why: Annotated[str, Field(max_length=WHY_BYTES)] = ""
     take_over: bool = False
+    expires_in_s: Annotated[float, Field(gt=0, le=600)] | None = None
+    """Time after which the hold must not obey any more."""
 
 
 class SafetyBody(BaseModel):
@@ -135,6 +151,15 @@ class SafetyBody(BaseModel):
 
     text: Annotated[str, Field(max_length=TEXT_BYTES)] = ""
     why: Annotated[str, Field(max_length=WHY_BYTES)] = ""
+
+
+class ConfigurationBody(BaseModel):
+    """The text of a configuration, and the digest of the text that was edited."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    text: Annotated[str, Field(max_length=200_000)]
+    digest: Annotated[str, Field(max_length=64)] = ""
 
 
 class StartBody(BaseModel):

@@ -16,14 +16,19 @@ import threading
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 from urllib.parse import quote, urlsplit
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from membrane_ctrl.config.port import LOCAL_HOSTS
 from membrane_ctrl.control_port import answers
-from membrane_ctrl.control_port.api_models import CommandAnswer, StateAnswer, UserAnswer
+from membrane_ctrl.control_port.api_models import (
+    CommandAnswer,
+    SignalAnswer,
+    StateAnswer,
+    UserAnswer,
+)
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.controller.commands import SAME_AS
 from membrane_ctrl.model import errors, files, plain_json, terminal
@@ -32,7 +37,16 @@ TOKEN_VARIABLE = "MEMBRANE_CTRL_TOKEN"
 ANSWER_S = 10.0
 _ANSWER_BYTES_MAX = 1_000_000
 _SAFETY_FIELDS = ("text", "why")
-_COMMAND_FIELDS = ("value", "text", "loop", "pump", "shape_time_constant_s", "why", "take_over")
+_COMMAND_FIELDS = (
+    "value",
+    "text",
+    "loop",
+    "pump",
+    "shape_time_constant_s",
+    "why",
+    "take_over",
+    "expires_in_s",
+)
 _REFUSALS = frozenset(
     {
         HTTPStatus.FORBIDDEN,
@@ -41,6 +55,7 @@ _REFUSALS = frozenset(
         HTTPStatus.NOT_FOUND,
     }
 )
+_SIGNALS = TypeAdapter(Annotated[list[SignalAnswer], Field(max_length=1000)])
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -134,6 +149,18 @@ class ServiceClient:
             except answers.AnswerError as error:
                 raise self._not_of_a_service(str(error)) from None
         return state
+
+    def read_signals(self) -> dict[str, float | str | None]:
+        """Return the values of the published signals by name. Raises as `read_state`."""
+        status, body = self._request("GET", "/api/signals")
+        if status != HTTPStatus.OK:
+            raise self._make_refusal(status, body)
+        try:
+            found = plain_json.loads(body.decode())
+            signals = _SIGNALS.validate_python(found)
+        except ValueError as error:  # a ValidationError is one
+            raise self._not_of_a_service(f"signals: {str(error).splitlines()[0]}") from None
+        return {each.name: each.value for each in signals}
 
     def read_user(self) -> UserAnswer:
         """Return whose token it is there, with its role. Raises as `read_state`."""

@@ -7,6 +7,7 @@ threads, of their own.
 import asyncio
 import json
 import math
+import time
 from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import contextmanager
 from http import HTTPStatus
@@ -16,9 +17,12 @@ from fastapi import Body, Depends, FastAPI, HTTPException, Query, Request, Respo
 from fastapi.responses import StreamingResponse
 
 from membrane_ctrl.control_port.api_models import (
+    CheckedConfigurationAnswer,
     CommandAnswer,
     CommandBody,
     ConfigurationAnswer,
+    ConfigurationBody,
+    ConfigurationTextAnswer,
     HistoryAnswer,
     Reading,
     RunAnswer,
@@ -33,16 +37,22 @@ from membrane_ctrl.control_port.api_models import (
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.protocol import Peer, explain_missing_role, role_includes
 from membrane_ctrl.control_port.status import alarm_lines, lock_lines
+from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
-from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
+from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.model.program import program_identity
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.service.access import WebUser, on_behalf
+from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.ended_run import REPORT_NAME, EndedRun
-from membrane_ctrl.service.feed import SIGNALS, HoldFeed, HoldSeen, history
+from membrane_ctrl.service.feed import SIGNALS, HoldFeed, history
+from membrane_ctrl.service.hold_command import SendLimits
+from membrane_ctrl.service.hold_seen import HoldSeen
 from membrane_ctrl.service.hold_starter import HoldStarter, StartOptions
 from membrane_ctrl.service.metrics import METRICS_TYPE, render_metrics
+from membrane_ctrl.service.published_signals import SIGNAL_TABLE
 from membrane_ctrl.service.work_pools import (
+    CONFIGURATIONS,
     LONG_CHARTS,
     RUN_LISTS,
     SAFETY_COMMANDS,
@@ -74,7 +84,9 @@ async def _find_user(request: Request) -> WebUser:
 User = Annotated[WebUser, Depends(_find_user)]
 
 
-def make_api(feeds: Mapping[str, HoldFeed], starter: HoldStarter) -> FastAPI:
+def make_api(
+    feeds: Mapping[str, HoldFeed], starter: HoldStarter, editor: ConfigurationEditor
+) -> FastAPI:
     """Return the application.
 
     Parameters
@@ -83,6 +95,8 @@ def make_api(feeds: Mapping[str, HoldFeed], starter: HoldStarter) -> FastAPI:
         The holds by name.
     starter : HoldStarter
         Starts the holds of the service's own folder.
+    editor : ConfigurationEditor
+        Of the configurations with which they are started.
     """
     api = FastAPI(
         title="membrane_ctrl", version=program_identity(), description=_DESCRIPTION, redoc_url=None
@@ -116,18 +130,17 @@ def make_api(feeds: Mapping[str, HoldFeed], starter: HoldStarter) -> FastAPI:
 
     @api.get("/api/signals")
     async def list_signals(feed: Feed) -> list[SignalAnswer]:
-        """The published signals with units and present values."""
-        seen = feed.seen
-        row = {} if seen.silent else seen.status.get("row") or {}
+        """The published signals with units and present values; null: not known."""
+        values = feed.signal_values()
         return [
             SignalAnswer(
-                name=column.name,
-                title=column.title,
-                description=column.description,
-                unit=column.unit,
-                value=row.get(column.name),
+                name=each.name,
+                title=each.title,
+                description=each.description,
+                unit="text" if each.is_text else each.unit,
+                value=values.get(each.name),
             )
-            for column in PUBLISHED
+            for each in SIGNAL_TABLE
         ]
 
     @api.get("/api/history")
@@ -172,6 +185,38 @@ def make_api(feeds: Mapping[str, HoldFeed], starter: HoldStarter) -> FastAPI:
             ConfigurationAnswer(name=each.name, has_devices=each.has_devices, problem=each.problem)
             for each in found
         ]
+
+    @api.get("/api/configurations/{name}")
+    async def read_configuration(name: str, user: User) -> ConfigurationTextAnswer:
+        """A configuration as it is in its file."""
+        _require_role(user, "tune", "reading a configuration")
+        with _refused_as_409():
+            found = await CONFIGURATIONS.run(editor.read, name)
+        return ConfigurationTextAnswer(text=found.text, digest=found.digest)
+
+    @api.post("/api/configurations/{name}/check")
+    async def check_configuration(
+        name: str, body: ConfigurationBody, user: User
+    ) -> CheckedConfigurationAnswer:
+        """Check a text that is to become this configuration."""
+        _require_role(user, "tune", "checking a configuration")
+        with _refused_as_409():
+            checked = await CONFIGURATIONS.run(editor.check, name, body.text)
+        return CheckedConfigurationAnswer(
+            errors=list(checked.errors), warnings=list(checked.warnings)
+        )
+
+    @api.put("/api/configurations/{name}")
+    async def save_configuration(
+        name: str, body: ConfigurationBody, user: User
+    ) -> ConfigurationTextAnswer:
+        """Save a configuration that passes the check; 409 with the findings if it does not, or if
+        it is no longer the text of `digest` (empty: a new one).
+        """
+        _require_role(user, "tune", "saving a configuration")
+        with _refused_as_409():
+            saved = await CONFIGURATIONS.run(editor.save, name, body.text, body.digest, user.name)
+        return ConfigurationTextAnswer(text=saved.text, digest=saved.digest)
 
     @api.post("/api/start", status_code=HTTPStatus.ACCEPTED)
     async def start_hold(body: StartBody, user: User) -> CommandAnswer:
@@ -307,10 +352,12 @@ async def _send(
         if refusal := explain_missing_role(Peer(user.name, role), do):  # type: ignore[arg-type]
             raise HTTPException(HTTPStatus.FORBIDDEN, refusal)
     request.setdefault("why", f"{user.via}: {user.name}")
+    expires_in_s = request.pop("expires_in_s", math.inf)
+    limits = SendLimits(time.monotonic() + expires_in_s)
     request["on_behalf"] = on_behalf(user, user.via)
     try:
         with _busy_as_503():
-            answer = await pool.run(feed.ask_hold, request)
+            answer = await pool.run(feed.ask_hold, request, limits)
     except errors.CommandError as error:
         response.status_code = HTTPStatus.SERVICE_UNAVAILABLE
         return CommandAnswer(done=False, text=f"{do}: {'; '.join(error.lines)}")
@@ -357,11 +404,21 @@ def _event_message(kind: str, value: object) -> str:
     return f"event: {kind}\ndata: {json.dumps(value, allow_nan=False)}\n\n"
 
 
-def _require_role(user: WebUser, needed: Literal["operate"], what: str) -> None:
+def _require_role(user: WebUser, needed: Role, what: str) -> None:
     if not role_includes(user.role, needed):
         raise HTTPException(
             HTTPStatus.FORBIDDEN, f"{what} needs the role {needed}; {user.name} has {user.role}"
         )
+
+
+@contextmanager
+def _refused_as_409() -> Iterator[None]:
+    """Answer 409 with the reason for what is refused, 503 if too many tasks wait."""
+    try:
+        with _busy_as_503():
+            yield
+    except errors.CommandError as error:
+        raise HTTPException(HTTPStatus.CONFLICT, "; ".join(error.lines)) from None
 
 
 @contextmanager

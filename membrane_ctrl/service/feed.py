@@ -11,11 +11,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,24 +23,24 @@ from membrane_ctrl.control_port.ctl import Where, connected, socket_path
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.model.columns import MISSING, PUBLISHED
+from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.processes import published_rings, ring
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.run_files.event_log import parse_logged_line
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.service.ended_run import EndedRun, EndKind, find_newest_run, read_ended_run
+from membrane_ctrl.service.hold_command import NO_LIMITS, SendLimits, ask_hold
+from membrane_ctrl.service.hold_seen import HoldSeen, Message
+from membrane_ctrl.service.published_signals import Value, signal_values
 
 PERIOD_S = 0.5  # as fast as people read changing figures
-SILENT_S = 5.0  # without a status, the hold hangs or the connection is lost
 SIGNALS = tuple(each.name for each in PUBLISHED)
 _KEPT_S = 3600  # of seconds for the chart; the run's tables have the rest
 _EVENTS_KEPT = 200
 _AGAIN_S = 2.0
 _NO_HOLD = "no hold runs"
 _RECORDING_S = 30.0  # a recorder that lives has written within this time
-
-Message = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,38 +49,6 @@ class Second:
 
     utc_s: float
     values: dict[str, tuple[float, float, float]]
-
-
-@dataclass(frozen=True, slots=True)
-class HoldSeen:
-    """What the page knows of a hold at one moment; replaced as a whole."""
-
-    name: str  # of the run; empty before the first contact
-    role: str = "read"  # of this process at the port
-    status: Message = field(default_factory=dict)  # the port's last status
-    seen_s: float = -math.inf  # monotonic time of that status
-    problem: str = "not connected yet"  # why there is no status; empty if there is
-    events: tuple[str, ...] = ()  # newest last
-    figure: shape_estimate.ShapeEstimate | None = None
-    reference: shape_estimate.ShapeEstimate | None = None  # the first usable figure that was seen
-    ended: EndedRun | None = None  # the newest run, if its hold has gone
-
-    @property
-    def silent(self) -> str:
-        """Why the shown status must not be believed; empty if it may be."""
-        if self.problem:
-            return self.problem if self.ended is None else self.ended.headline
-        age_s = time.monotonic() - self.seen_s
-        return f"no status for {age_s:.0f} s" if age_s > SILENT_S else ""
-
-    @property
-    def state_name(self) -> str:
-        """The hold's state as people read it; without a hold, how the newest run ended."""
-        if not self.silent:
-            return str(self.status.get("state", MISSING))
-        if self.problem and self.ended is not None:
-            return "fault" if self.ended.kind is EndKind.FAULT else "ended"
-        return "no contact"
 
 
 class Seconds:
@@ -166,23 +133,24 @@ class HoldFeed:
             self._client.close()
         self._thread.join(5.0)
 
-    def ask(self, request: Message) -> Outcome:
+    def signal_values(self) -> dict[str, Value]:
+        """The values of the published signals."""
+        return signal_values(self.seen)
+
+    def ask(self, request: Message, limits: SendLimits = NO_LIMITS) -> Outcome:
         """Send a request on a connection of its own; returns what became of it."""
         what = str(request["do"]).replace("_", " ")
         try:
-            answer = self.ask_hold(request)
+            answer = self.ask_hold(request, limits)
         except errors.CommandError as error:
             return Outcome.failed(what, "; ".join(error.lines))
         return Outcome.from_answer(what, answer)
 
-    def ask_hold(self, request: Message) -> Message:
+    def ask_hold(self, request: Message, limits: SendLimits = NO_LIMITS) -> Message:
         """Send a request on a connection of its own; returns the hold's answer. Raises DeviceError
         without an answer.
         """
-        with connected(self._where, notice=lambda _: None) as client:
-            if client.greeting["run"] != self.seen.name:
-                raise errors.DeviceError("not sent: another run is listening now; look again")
-            return client.ask(**request)
+        return ask_hold(self._where, self.seen.name, request, limits)
 
     def _follow(self) -> None:
         while not self._ending.is_set():

@@ -100,7 +100,9 @@ class HoldStarter:
         found = [] if self._units else [Configuration(TWIN, None)]
         with suppress(OSError):
             paths = sorted(self._configurations.glob("*.toml"))[:_CONFIGURATIONS_MOST]
-            found += [_read_configuration(file) for file in paths if _is_configuration(file)]
+            found += [
+                _read_configuration(file) for file in paths if is_configuration_name(file.stem)
+            ]
         return [each for each in found if each.has_devices or each.problem or not self._units]
 
     def is_running(self) -> bool:
@@ -122,6 +124,10 @@ class HoldStarter:
         self.is_running()
         with self._lock:
             return self._failure
+
+    def can_start(self) -> bool:
+        """Whether no hold runs, also none that is about to listen or to end."""
+        return not self.is_running() and not sockets.is_listening(self._logs / SOCKET_NAME)
 
     def start_hold(self, name: str, who: str, options: StartOptions) -> Future[None]:
         """Start a hold with a configuration.
@@ -152,7 +158,7 @@ class HoldStarter:
             )
         if chosen.problem:
             raise errors.InputError(chosen.problem)
-        if sockets.is_listening(self._logs / SOCKET_NAME):
+        if not self.can_start():
             raise errors.InputError("a hold runs already; stop it before")
         words = " ".join([name, *options.words])
         print(f"membrane-ctrl serve: {who} starts a hold: {words}", file=sys.stderr, flush=True)
@@ -243,9 +249,9 @@ def options_file(logs: Path, name: str) -> Path:
     return logs / f".start-{name}.env"
 
 
-def _is_configuration(file: Path) -> bool:
-    """Whether a file's name may be that of a configuration: it becomes the name of a run."""
-    return file.stem != TWIN and _CONFIGURATION_NAME.fullmatch(file.stem) is not None
+def is_configuration_name(name: str) -> bool:
+    """Whether a name may be that of a configuration: it becomes the name of a file and of a run."""
+    return name != TWIN and _CONFIGURATION_NAME.fullmatch(name) is not None
 
 
 def _read_configuration(file: Path) -> Configuration:

@@ -11,7 +11,7 @@ from prometheus_client.registry import Collector
 
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.columns import COLUMNS
-from membrane_ctrl.service.feed import HoldSeen
+from membrane_ctrl.service.hold_seen import HoldSeen
 
 METRICS_TYPE = CONTENT_TYPE_LATEST
 # columns that only grow, as Prometheus names counters

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 
 from membrane_ctrl.control_port.api_models import StateAnswer
 from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.service_client import ServiceAddress, ServiceClient
 from membrane_ctrl.controller.commands import Role
-from membrane_ctrl.service.feed import HoldFeed, HoldSeen, Message
+from membrane_ctrl.service.feed import HoldFeed
+from membrane_ctrl.service.hold_command import NO_LIMITS, SendLimits
+from membrane_ctrl.service.hold_seen import HoldSeen, Message
+from membrane_ctrl.service.published_signals import Value
 
 _PERIOD_S = 1.0
 _ANSWER_S = 5.0
+_EXPIRES_LEAST_S = 0.001
 
 
 class ServiceFeed(HoldFeed):
@@ -22,15 +28,30 @@ class ServiceFeed(HoldFeed):
     the token's name, and with the viewer's in their reason.
     """
 
-    def __init__(self, where: Where, address: ServiceAddress) -> None:
+    def __init__(self, where: Where, address: ServiceAddress, with_signals: bool) -> None:
         super().__init__(where)
+        self._with_signals = with_signals
+        self._values: dict[str, Value] = {}
         self._service = ServiceClient(address, _ANSWER_S)
         self._role: Role | None = None
 
-    def ask_hold(self, request: Message) -> Message:
+    def signal_values(self) -> dict[str, Value]:
+        """The values of the published signals; the other service knows those of the figure."""
+        values = super().signal_values()
+        if not self.seen.silent:
+            values |= {name: value for name, value in self._values.items() if name in values}
+        return values
+
+    def ask_hold(self, request: Message, limits: SendLimits = NO_LIMITS) -> Message:
         """Send a request; returns the hold's answer. Raises DeviceError without an answer,
         InputError if the other service refuses it.
         """
+        if not is_safety_command(str(request["do"])):
+            if reason := limits.find_refusal():
+                return {"ok": False, "refused": reason}
+            left_s = limits.deadline_s - time.monotonic()
+            if math.isfinite(left_s):
+                request = request | {"expires_in_s": max(left_s, _EXPIRES_LEAST_S)}
         return self._service.send_command(request)
 
     def follow_once(self) -> None:
@@ -44,6 +65,8 @@ class ServiceFeed(HoldFeed):
             seen, role=self._role, status=state.status, seen_s=time.monotonic(), problem=problem
         )
         self._take_row(state)
+        if self._with_signals and state.in_contact:
+            self._values = self._service.read_signals()
 
     def _follow(self) -> None:
         while not self._ending.is_set():
@@ -55,6 +78,10 @@ class ServiceFeed(HoldFeed):
             self._take_ticks(state.status.get("row") or {}, None)
 
 
-def make_feed(where: Where) -> HoldFeed:
-    """Return what follows a hold, wherever it is."""
-    return HoldFeed(where) if where.service is None else ServiceFeed(where, where.service)
+def make_feed(where: Where, with_signals: bool = False) -> HoldFeed:
+    """Return what follows a hold, wherever it is; `with_signals`: also the published signals of a
+    hold behind a service.
+    """
+    if where.service is None:
+        return HoldFeed(where)
+    return ServiceFeed(where, where.service, with_signals)

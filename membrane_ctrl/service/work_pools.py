@@ -81,6 +81,7 @@ ANSWERS = WorkPool("answers to tuning sessions", workers=2, waiting_max=16)
 RUN_LISTS = WorkPool("lists of runs", workers=1, waiting_max=20, niceness=5)
 REPORTS = WorkPool("reports", workers=1, waiting_max=8, niceness=5)
 REPORT_FILES = WorkPool("report files", workers=1, waiting_max=20, niceness=5)
+CONFIGURATIONS = WorkPool("configurations", workers=1, waiting_max=8, niceness=5)
 COMMANDS = WorkPool("commands", workers=4, waiting_max=32)
 SAFETY_COMMANDS = WorkPool("safety commands", workers=8, waiting_max=32)
 

@@ -25,6 +25,7 @@ from membrane_ctrl.service.access import (
     on_behalf,
     request,
 )
+from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.work_pools import COMMANDS, PoolFullError, pool_of_command
@@ -32,6 +33,7 @@ from membrane_ctrl.web import figure_map, history_chart
 from membrane_ctrl.web.action_dialog import ask_for_confirmation
 from membrane_ctrl.web.alarms_panel import alarms_panel
 from membrane_ctrl.web.chart_marks import is_now, mark_past
+from membrane_ctrl.web.configuration_panel import EDITS, ConfigurationPanel
 from membrane_ctrl.web.consequences import Consequence, find_consequence
 from membrane_ctrl.web.fleet_panel import fleet_panel
 from membrane_ctrl.web.held_by import describe_holder
@@ -86,7 +88,9 @@ class WebPage:
         user: WebUser,
         views: SharedViews,
         starter: HoldStarter | None = None,
+        editor: ConfigurationEditor | None = None,
     ) -> None:
+        self._editor = editor
         self._feeds, self._hold, self._user, self._views = feeds, hold, user, views
         self._starter = starter
         self._feed = feeds[hold]
@@ -150,6 +154,8 @@ class WebPage:
         with ui.tabs().classes("w-full") as tabs:
             now, look_back = ui.tab("Now"), ui.tab("Look back")
             alarms, tune = ui.tab("Alarms"), ui.tab("Tune")
+            configuration = ui.tab("Configuration")
+            configuration.set_visibility(self._may_edit)
             for tab in (look_back, alarms, tune):
                 tab.set_visibility(self._logs is not None)  # the runs of a hold elsewhere are there
         with ui.tab_panels(tabs, value=now).classes("w-full"):
@@ -167,13 +173,33 @@ class WebPage:
                 TuningPanel(
                     lambda: self._views.sessions.get(self._hold), self._user, self._may_choose
                 )
-        loads = {look_back.props["name"]: load_runs, alarms.props["name"]: load_alarms}
+            loads = {look_back.props["name"]: load_runs, alarms.props["name"]: load_alarms}
+            if self._may_edit:
+                with ui.tab_panel(configuration):
+                    loads[configuration.props["name"]] = self._build_editor().load_list
 
         async def load(event: Any) -> None:
             if event.value in loads:
                 await loads[event.value]()
 
         tabs.on_value_change(load)
+
+    @property
+    def _may_edit(self) -> bool:
+        """Whether this viewer may see and edit the configurations of this folder."""
+        is_ours = self._editor is not None and self._starter is not None
+        return is_ours and role_includes(self._user.role, EDITS)
+
+    def _build_editor(self) -> ConfigurationPanel:
+        assert self._editor is not None
+        assert self._starter is not None
+        return ConfigurationPanel(
+            self._feed,
+            self._user,
+            self._editor,
+            self._starter,
+            lambda: on_behalf(self._user, self._session),
+        )
 
     def _may_choose(self) -> bool:
         return role_includes(self._user.role, CHOOSES) and role_includes(

@@ -24,6 +24,7 @@ from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.accounts import Accounts
 from membrane_ctrl.service.alarm_child import AlarmChild
 from membrane_ctrl.service.api import make_api
+from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.connections import ConnectionGuard, GuardedHttp, raise_file_limit
 from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed
@@ -108,6 +109,7 @@ def _run_server(
 ) -> None:
     address = public_address(page)
     guard = ConnectionGuard(raise_file_limit())
+    editor = ConfigurationEditor(Path(page.configurations))
     session_key = read_or_make_secret("session-key")
     build_inside = app.build_middleware_stack
 
@@ -115,7 +117,7 @@ def _run_server(
         """Put the login outside of everything: NiceGUI adds middlewares later than we could with
         `add_middleware`.
         """
-        inside = HangUp(PathDispatch(make_api(feeds, starter), build_inside()))
+        inside = HangUp(PathDispatch(make_api(feeds, starter, editor), build_inside()))
         tokens = TokenBook(tokens_file())
         return with_login(inside, accounts, address, session_key, tokens, guard)
 
@@ -149,7 +151,8 @@ def _run_server(
         user: WebUser = request.scope["membrane_user"]
         shown = hold if hold in feeds else next(iter(feeds))
         is_ours = feeds[shown].logs == Path(page.logs)
-        WebPage(feeds, shown, user, views, starter if is_ours else None).build()
+        ours = (starter, editor) if is_ours else (None, None)
+        WebPage(feeds, shown, user, views, *ours).build()
 
     @app.get("/chart")
     async def chart(hold: str, signals: str, span: str, utc: bool) -> Response:

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from membrane_ctrl.bridges.names import TABLE
+from membrane_ctrl.bridges.bridge import TABLE
 from tests.studies.bridge_clients import lines
 from tests.support.machine_needs import needs, program_path
 from tests.worlds.free_port import free_port

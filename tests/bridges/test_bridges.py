@@ -15,8 +15,8 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from membrane_ctrl.bridges import mqtt
+from membrane_ctrl.bridges.bridge import COMMANDS, TABLE, Bridge
 from membrane_ctrl.bridges.cli import app
-from membrane_ctrl.bridges.names import COMMANDS, TABLE, Bridge, values
 from membrane_ctrl.config.bridges import BridgesConfig, EpicsConfig, MqttConfig, OpcuaConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
@@ -25,7 +25,9 @@ from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
-from membrane_ctrl.service.feed import HoldFeed, HoldSeen
+from membrane_ctrl.service.feed import HoldFeed
+from membrane_ctrl.service.hold_seen import HoldSeen
+from membrane_ctrl.service.published_signals import signal_values
 from tests.worlds.port_run import port_run
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "bridges.md"
@@ -80,7 +82,7 @@ def bridge_with(
     where = Where(socket=port)
     feed = HoldFeed(where)
     feed.seen = seen or seen_hold()
-    return Bridge(feed, Config(bridges=BridgesConfig(role=role)), where)  # type: ignore[arg-type]
+    return Bridge(feed, Config(bridges=BridgesConfig(role=role)))  # type: ignore[arg-type]
 
 
 def test_names_are_unique_and_short_enough() -> None:
@@ -101,7 +103,7 @@ def test_the_page_has_the_table() -> None:
 
 def test_each_tick_value_is_that_of_the_tick() -> None:
     row = {name: float(place) for place, name in enumerate(FIELDS)}
-    found = values(seen_hold(**row))
+    found = signal_values(seen_hold(**row))
     shared = [each.name for each in TABLE if each.name in FIELDS and not each.is_text]
     assert shared == [each.name for each in PUBLISHED]
     assert [found[name] for name in shared] == [row[name] for name in shared]
@@ -116,7 +118,7 @@ def test_without_contact_no_number_is_shown() -> None:
         dataclasses.replace(live, problem="the run has ended"),
         dataclasses.replace(live, seen_s=time.monotonic() - 60.0),
     ):
-        found = values(seen)
+        found = signal_values(seen)
         assert found["state"] == "no contact"
         assert "run has ended" in str(found["why"]) or "no status for 60 s" in str(found["why"])
         assert [name for name, value in found.items() if value is not None] == [
@@ -127,7 +129,7 @@ def test_without_contact_no_number_is_shown() -> None:
 
 
 def test_a_figure_has_its_age_and_terms() -> None:
-    found = values(dataclasses.replace(seen_hold(), figure=figure(sag_sigma_um=math.nan)))
+    found = signal_values(dataclasses.replace(seen_hold(), figure=figure(sag_sigma_um=math.nan)))
     assert found["figure_age_s"] == 2.5
     assert [found[f"z{j}_um"] for j in range(4, 12)] == [float(j) for j in range(4, 12)]
     assert found["sag_sigma_um"] is None, "JSON has no NaN"
@@ -140,7 +142,7 @@ def test_faults_and_notices_are_in_words() -> None:
         {"topic": "recorder", "text": "disk full"},
     ]
     seen.status.update(fault=FAULT, notices=notices)
-    found = values(seen)
+    found = signal_values(seen)
     assert found["fault"] == "7 laser_lost: no light; clean it"
     assert found["interlocks"] == "door open"
     assert found["notices"] == "door open; disk full"
@@ -190,10 +192,13 @@ async def test_a_bridge_locks_for_nobody_and_removes_no_lock(tmp_path: Path) -> 
 def test_the_locks_are_published() -> None:
     seen = seen_hold()
     lock = {"word": "bofak", "text": "hands inside", "author": "unix:ann", "set_utc": "2026-01-02"}
-    assert values(seen)["locks"] == ""
+    assert signal_values(seen)["locks"] == ""
     seen = dataclasses.replace(seen, status={**seen.status, "locks": [lock, lock]})
     assert (
-        str(values(seen)["locks"]).count('"hands inside" by unix:ann, 2026-01-02, word bofak') == 2
+        str(signal_values(seen)["locks"]).count(
+            '"hands inside" by unix:ann, 2026-01-02, word bofak'
+        )
+        == 2
     )
 
 

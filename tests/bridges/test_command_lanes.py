@@ -14,9 +14,9 @@ import pytest
 
 from membrane_ctrl.bridges import command_lanes
 from membrane_ctrl.bridges.command_lanes import ORDINARY_MOST, SAFETY_MOST_EACH, CommandLanes
-from membrane_ctrl.bridges.hold_link import SendLimits
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import SAFETY
+from membrane_ctrl.service.hold_command import SendLimits
 
 SAFETY_KINDS = sorted(SAFETY)
 

@@ -20,10 +20,10 @@ import aiomqtt
 import pytest
 
 from membrane_ctrl.bridges import mqtt, mqtt_owner
+from membrane_ctrl.bridges.bridge import Bridge
 from membrane_ctrl.bridges.mqtt_client import CancellableClient
 from membrane_ctrl.bridges.mqtt_inbox import Reports
 from membrane_ctrl.bridges.mqtt_owner import OwnerClaim
-from membrane_ctrl.bridges.names import Bridge
 from membrane_ctrl.config.bridges import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.model.errors import DeviceError

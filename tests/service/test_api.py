@@ -20,8 +20,10 @@ from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.api import make_api
+from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
+from membrane_ctrl.service.published_signals import SIGNAL_TABLE
 from tests.service.test_ended_run import FAULT, write_run
 from tests.worlds.port_run import PortRun, port_run
 
@@ -31,8 +33,10 @@ ROLES = {"read": "bob", "operate": "anna", "tune": "carl"}
 class Programs:
     """Clients of the interface, one for each role, without the login."""
 
-    def __init__(self, feeds: dict[str, HoldFeed], starter: HoldStarter) -> None:
-        api = make_api(feeds, starter)
+    def __init__(
+        self, feeds: dict[str, HoldFeed], starter: HoldStarter, editor: ConfigurationEditor
+    ) -> None:
+        api = make_api(feeds, starter, editor)
 
         def app_for(role: str) -> Any:
             user = WebUser(ROLES[role], role, has_login=True, via="token")  # type: ignore[arg-type]
@@ -57,7 +61,7 @@ async def programs_of(folder: Path) -> AsyncIterator[Programs]:
     starter = HoldStarter(folder, folder, units=False)
     feed.open()
     try:
-        yield Programs({"": feed}, starter)
+        yield Programs({"": feed}, starter, ConfigurationEditor(folder))
     finally:
         await asyncio.to_thread(feed.close)
         starter.close()
@@ -104,7 +108,9 @@ async def test_a_program_reads_everything_about_a_hold(tmp_path: Path) -> None:
         assert (state.run, state.state, state.error_um) == ("the-run", "hold", 0.25)
         assert state.ended is None
         signals = (await reader.get("/api/signals")).json()
-        assert [each["name"] for each in signals] == [column.name for column in PUBLISHED]
+        assert [each["name"] for each in signals] == [each.name for each in SIGNAL_TABLE]
+        assert {column.name for column in PUBLISHED} < {each["name"] for each in signals}
+        assert {each["name"]: each["value"] for each in signals}["state"] == "hold"
         assert {each["name"]: each["unit"] for each in signals}["error_um"] == "µm"
         assert {each["name"]: each["value"] for each in signals}["error_um"] == 0.25
         run.port.note_report(Mark("door", "anna"))
@@ -243,7 +249,9 @@ async def test_after_a_hold_the_end_of_its_run_is_answered(tmp_path: Path) -> No
         assert 'membrane_hold_up{hold=""} 0.0' in metrics
         assert "membrane_error_um{" not in metrics, "no value of a hold that has gone"
         signals = (await reader.get("/api/signals")).json()
-        assert all(each["value"] is None for each in signals)
+        values = {each["name"]: each["value"] for each in signals}
+        assert values.pop("state") == "no contact"
+        assert all(values[name] is None for name in ("error_um", "sag_um", "fault"))
         answer = await operator.post("/api/safety/stop")
         assert (answer.status_code, answer.json()) == (
             503,
@@ -271,3 +279,27 @@ async def test_a_start_needs_its_role_and_a_configuration(
         begun = await operator.post("/api/start", json=body)
         assert (begun.status_code, begun.json()["done"]) == (202, True)
         assert (await reader.get("/api/start")).json()["done"]
+
+
+async def test_only_the_role_tune_reads_and_edits_configurations(tmp_path: Path) -> None:
+    (tmp_path / "lab.toml").write_text("[loop]\nkp_per_s = 0.5\n")
+    async with programs_of(tmp_path) as programs:
+        for role in ("read", "operate"):
+            client = programs.of[role]
+            assert (await client.get("/api/configurations/lab")).status_code == 403
+            body = {"text": "", "digest": ""}
+            assert (
+                await client.post("/api/configurations/lab/check", json=body)
+            ).status_code == 403
+            assert (await client.put("/api/configurations/lab", json=body)).status_code == 403
+        tuner = programs.of["tune"]
+        found = (await tuner.get("/api/configurations/lab")).json()
+        wrong = {"text": "[loop]\nkp = 1\n", "digest": found["digest"]}
+        checked = (await tuner.post("/api/configurations/lab/check", json=wrong)).json()
+        assert "kp" in checked["errors"][0]
+        assert (await tuner.put("/api/configurations/lab", json=wrong)).status_code == 409
+        good = {"text": "[loop]\nkp_per_s = 0.4\n", "digest": found["digest"]}
+        assert (await tuner.put("/api/configurations/lab", json=good)).status_code == 200
+        assert (await tuner.put("/api/configurations/lab", json=good)).status_code == 409
+        assert (await tuner.get("/api/configurations/..%2Fsecret")).status_code in (404, 409)
+        assert (await tuner.get("/api/configurations/none")).status_code == 409

@@ -75,9 +75,11 @@ async def test_a_command_for_the_last_run_does_not_reach_the_next(tmp_path: Path
     feed = HoldFeed(Where(socket=tmp_path / "control.sock"))
     feed.seen = dataclasses.replace(feed.seen, name="an-earlier-run")
     async with port_run(tmp_path) as run:
-        said = await asyncio.to_thread(feed.ask, {"do": "stop"})
+        said = await asyncio.to_thread(feed.ask, {"do": "pause"})
         assert "another run" in said.text
         assert run.asked == []
+        said = await asyncio.to_thread(feed.ask, {"do": "stop"})
+        assert said == Outcome.succeeded("stop"), "whatever runs there becomes safe"
 
 
 async def test_without_a_hold_the_answer_says_so(tmp_path: Path) -> None:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
 
+from membrane_ctrl.bridges.bridge import TABLE, Bridge
 from membrane_ctrl.cli import run as command
+from membrane_ctrl.config.bridges import BridgesConfig
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.service_client import (
     TOKEN_VARIABLE,
@@ -19,11 +23,12 @@ from membrane_ctrl.control_port.service_client import (
     read_token,
 )
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
+from membrane_ctrl.service.hold_command import SendLimits
 from membrane_ctrl.service.service_feed import ServiceFeed, make_feed
 from membrane_ctrl.service.tokens import add_token, revoke_token, tokens_file
 from membrane_ctrl.web.fleet_panel import fleet_rows
 from tests.web.test_page import served
-from tests.worlds.port_run import keep_ticking, port_run
+from tests.worlds.port_run import ROW, PortRun, keep_ticking, port_run
 
 
 @pytest.fixture
@@ -32,6 +37,34 @@ def token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     made = add_token(tokens_file(), "ops", "operate")
     monkeypatch.setenv(TOKEN_VARIABLE, made)
     return made
+
+
+async def check_bridge(where: Where, run: PortRun) -> None:
+    """Bridges through a service: its signals, commands with a time limit, safety commands."""
+    feed = make_feed(where, with_signals=True)
+    bridge = Bridge(feed, Config(bridges=BridgesConfig(role="operate")))
+    feed.open()
+    try:
+        async with asyncio.timeout(60.0):
+            while not bridge.live:  # noqa: ASYNC110
+                await asyncio.sleep(0.1)
+        values = bridge.values()
+        assert values["state"] == "hold"
+        assert values["error_um"] == ROW.error_um
+        assert set(values) == {each.name for each in TABLE}
+        late = SendLimits(time.monotonic() - 1.0)
+        said = await asyncio.to_thread(feed.ask, {"do": "hold"}, late)
+        assert "answered too late" in said.text
+        before = len(run.asked)
+        flood = [asyncio.create_task(bridge.ask("mqtt", "shape_on")) for _ in range(150)]
+        await asyncio.sleep(0)
+        locked = await bridge.ask("mqtt", "latch", "hands inside")
+        refused = await asyncio.gather(*flood)
+        assert "latch" in [each.kind for each in run.asked[before:]] or "still being" in locked
+        assert sum("too many commands" in each for each in refused) >= 140
+    finally:
+        await bridge.close()
+        await asyncio.to_thread(feed.close)
 
 
 @pytest.mark.real_time
@@ -82,6 +115,7 @@ async def test_a_person_and_another_service_reach_a_hold_through_its_service(
             assert feed.logs is None, "its runs are there"
             outcome = await asyncio.to_thread(feed.ask, {"do": "mark", "text": "door"})
             assert outcome.text == "mark: done"
+            await check_bridge(Where(service=ServiceAddress(url, token)), run)
             revoke_token(tokens_file(), "ops")
             code, _, err = await ctl("status")
             assert (code, "the token is unknown there, or revoked" in err) == (2, True)

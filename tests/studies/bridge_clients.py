@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.bridges.names import TABLE
+from membrane_ctrl.bridges.bridge import TABLE
 
 NAMES = [each.name for each in TABLE]
 SWEEP_S, FRESH_S, RATE_HZ, SAMPLE_S = 0.5, 2.0, 50.0, 5.0

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.bridges.names import TABLE, table_lines
+from membrane_ctrl.bridges.bridge import TABLE
 from membrane_ctrl.model.columns import (
     EVERY_COLUMN,
     Aggregation,
@@ -25,6 +25,7 @@ from membrane_ctrl.model.columns import (
     plots_of,
 )
 from membrane_ctrl.service.metrics import metric_name
+from membrane_ctrl.service.published_signals import table_lines
 
 _ROOT = Path(__file__).parents[2]
 TELEMETRY = _ROOT / "docs" / "reference" / "telemetry.md"

@@ -18,8 +18,8 @@ from typing import Any
 
 from rich.console import Console
 
+from membrane_ctrl.bridges.bridge import Bridge
 from membrane_ctrl.bridges.mqtt import discovery
-from membrane_ctrl.bridges.names import Bridge, values
 from membrane_ctrl.config.bridges import BridgesConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import ConsoleModel
@@ -31,8 +31,10 @@ from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.recorder.blueprint import run_blueprint
 from membrane_ctrl.review.viewer.blueprints import ReviewBlueprint
 from membrane_ctrl.run_files.run import open_run
-from membrane_ctrl.service.feed import HoldFeed, HoldSeen
+from membrane_ctrl.service.feed import HoldFeed
+from membrane_ctrl.service.hold_seen import HoldSeen
 from membrane_ctrl.service.metrics import render_metrics
+from membrane_ctrl.service.published_signals import signal_values
 
 WIDTH, HEIGHT = 200, 60
 
@@ -59,7 +61,7 @@ def bridge_values(status: RunStatus, column: str) -> dict[str, Any]:
     seen = HoldSeen("a-run", status=table, seen_s=time.monotonic(), problem="")
     bridge = Bridge(HoldFeed(Where()), Config(bridges=BridgesConfig()))
     return {
-        "value": values(seen)[column],
+        "value": signal_values(seen)[column],
         "entity": discovery(bridge, "membrane/mirror")["components"][column],
     }
 

@@ -1,26 +1,17 @@
-"""What every bridge publishes: one table of names with units, their values, and who may act
-through a bridge.
-"""
+"""What all bridges have in common: the values that they publish, and who may act through them."""
 
 import asyncio
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 from membrane_ctrl.bridges.command_lanes import CommandLanes
-from membrane_ctrl.bridges.hold_link import SendLimits, send_command
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.protocol import TEXT_BYTES, role_includes
 from membrane_ctrl.control_port.safety_commands import is_safety_command
-from membrane_ctrl.control_port.status import fault_line, lock_lines, notice_lines
 from membrane_ctrl.controller.commands import Role
-from membrane_ctrl.model.columns import PUBLISHED, unit_of
-from membrane_ctrl.model.notices import Topic
 from membrane_ctrl.model.numbers import parse_number
 from membrane_ctrl.service.access import (
     ACTIONS,
@@ -30,9 +21,8 @@ from membrane_ctrl.service.access import (
     is_action_allowed,
     request,
 )
-from membrane_ctrl.service.feed import HoldFeed, HoldSeen
-
-Value = float | str | None  # None: not known
+from membrane_ctrl.service.feed import HoldFeed
+from membrane_ctrl.service.published_signals import SIGNAL_TABLE, Published, Value
 
 # Who removes a lock must be known; the clients of a bridge are not.
 _NEVER = frozenset({"unlock"})
@@ -41,84 +31,8 @@ COMMANDS = {str(action.do): action for action in (*ACTIONS, STOP) if str(action.
 _SAFETY_SHOWN_S = 5.0
 
 
-@dataclass(frozen=True, slots=True)
-class Published:
-    """A published value: a text, or a number with its unit (empty for counts and fractions)."""
-
-    name: str
-    description: str
-    is_text: bool = False
-
-    @property
-    def unit(self) -> str:
-        """Unit for people, from the name."""
-        return unit_of(self.name)
-
-
-_TICK = tuple(Published(each.name, each.description) for each in PUBLISHED)
-_TERMS = range(4, 12)  # Noll: defocus to the first spherical term
-_FIGURE = (
-    Published("sag_um", "sag of the newest figure"),
-    Published("sag_sigma_um", "its standard deviation from noise"),
-    Published("figure_age_s", "age of that figure"),
-    *(Published(f"z{j}_um", f"its Zernike term j = {j} (Noll, RMS)") for j in _TERMS),
-)
-_TEXTS = (
-    Published("state", "state of the hold, or `no contact`", is_text=True),
-    Published("why", "the one-line reason", is_text=True),
-    Published("run", "name of the run", is_text=True),
-    Published("fault", "the fault with its cause and remedy; empty without one", is_text=True),
-    Published(
-        "locks", "the locks: text, author, time and word of each; empty without one", is_text=True
-    ),
-    Published(
-        "interlocks", "the open interlocks with their texts; empty without one", is_text=True
-    ),
-    Published(
-        "notices",
-        "all notices: open interlocks, maintenance, recording, link, processes",
-        is_text=True,
-    ),
-    Published("figure_verdict", "verdict on the newest figure", is_text=True),
-    Published("answer", "result of the last command", is_text=True),
-)
-TABLE = (*_TEXTS, *_TICK, *_FIGURE)
-
-
-def table_lines(published: Sequence[Published]) -> list[str]:
-    """Return published values as the lines of a Markdown table."""
-    rows = [
-        f"| `{each.name}` | {'text' if each.is_text else each.unit or '1'} | {each.description} |"
-        for each in published
-    ]
-    return ["| name | unit | what |", "|---|---|---|", *rows]
-
-
-def values(seen: HoldSeen) -> dict[str, Value]:
-    """The values of `TABLE` except `answer`; None, or `no contact`, instead of old ones."""
-    found: dict[str, Value] = {each.name: None for each in TABLE if each.name != "answer"}
-    found["run"] = seen.name
-    if seen.silent:
-        return {**found, "state": "no contact", "why": seen.silent}
-    status, row = seen.status, seen.status.get("row") or {}
-    found |= {
-        "state": str(status.get("state", "")),
-        "why": str(status.get("why") or "as it should be"),
-        "fault": fault_line(status),
-        "locks": "; ".join(lock_lines(status)),
-        "interlocks": "; ".join(notice_lines(status, Topic.INTERLOCK)),
-        "notices": "; ".join(notice_lines(status)),
-    }
-    found |= {each.name: row.get(each.name) for each in _TICK}
-    if seen.figure is not None:
-        age_s = (row.get("mono_s") or math.nan) - seen.figure.time_s
-        found |= {"figure_verdict": seen.figure.verdict, "figure_age_s": age_s}
-        found |= {"sag_um": seen.figure.sag_um, "sag_sigma_um": seen.figure.sag_sigma_um}
-        found |= {f"z{j}_um": float(seen.figure.coeffs_um[j - 1]) for j in _TERMS}
-    return {
-        name: None if isinstance(v, float) and not math.isfinite(v) else v
-        for name, v in found.items()
-    }
+_ANSWER = Published("answer", "result of the last command", is_text=True)
+TABLE = (*SIGNAL_TABLE, _ANSWER)
 
 
 class Bridge:
@@ -126,7 +40,7 @@ class Bridge:
     bridges of the process.
     """
 
-    def __init__(self, feed: HoldFeed, config: Config, where: Where | None = None) -> None:
+    def __init__(self, feed: HoldFeed, config: Config) -> None:
         self.feed = feed
         self.settings = config.bridges
         limits, flow_max = config.limits, config.loop.flow_most_um_per_s(config.pump)
@@ -135,10 +49,9 @@ class Bridge:
             "setpoint": (limits.displacement_min_um, limits.displacement_max_um),
             "manual": (0.0, flow_max),
         }
-        self._where = where or Where()
         self._answer = ""
         self._safety_answered_s = -math.inf
-        self._lanes = CommandLanes(self._send, self._report_late)
+        self._lanes = CommandLanes(feed.ask, self._report_late)
         self.late_listeners: list[
             Callable[[str], None]
         ] = []  # get the late outcomes of safety commands
@@ -146,16 +59,9 @@ class Bridge:
             asyncio.Lock()
         )  # one bridge after the other: a server blocks the event loop while it opens
 
-    @classmethod
-    def to(cls, config: Config, logs: Path | None, socket: Path | None) -> "Bridge":
-        """A bridge to the hold of a configuration, or to another one."""
-        folder = logs or Path(config.recording.logs_dir)
-        where = Where(socket or config.port.socket_in(folder), logs=folder)
-        return cls(HoldFeed(where), config, where)
-
     def values(self) -> dict[str, Value]:
         """The values of `TABLE` now."""
-        return {**values(self.feed.seen), "answer": self._answer}
+        return {**self.feed.signal_values(), _ANSWER.name: self._answer}
 
     @property
     def live(self) -> bool:
@@ -240,9 +146,6 @@ class Bridge:
         answer = self._noted("late", outcome.command, outcome)
         for listener in self.late_listeners:
             listener(answer)
-
-    def _send(self, asked: dict[str, Any], limits: SendLimits) -> Outcome:
-        return send_command(self._where, self.feed.seen.name, asked, limits)
 
     def _request(self, by: str, name: str, given: Any, role: Role, who: str) -> dict[str, Any]:
         """The request of a command. Raises ValueError with what is wrong, in one line."""

@@ -1,5 +1,5 @@
-"""No command of a bridge is obeyed late, whatever hangs;
-safety commands are obeyed nevertheless.
+"""No command with a time limit is obeyed late, whatever hangs; safety commands are obeyed
+nevertheless.
 """
 
 from __future__ import annotations
@@ -13,16 +13,23 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.bridges import command_lanes
-from membrane_ctrl.bridges.hold_link import SendLimits, send_command
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.service.feed import HoldFeed
+from membrane_ctrl.service.hold_command import SendLimits
 from tests.bridges.test_bridges import bridge_with, seen_hold
 from tests.worlds.port_run import port_run
 
 
 def limits(seconds: float, refusal: str = "") -> SendLimits:
     return SendLimits(time.monotonic() + seconds, lambda: refusal)
+
+
+def feed_of(run: str, socket: Path) -> HoldFeed:
+    feed = HoldFeed(Where(socket=socket))
+    feed.seen = dataclasses.replace(seen_hold(), name=run)
+    return feed
 
 
 async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) -> None:
@@ -62,7 +69,7 @@ async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) 
 async def test_a_command_that_arrives_after_its_time_is_refused_by_the_hold(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
         run.state = State.STANDBY
-        where = Where(socket=tmp_path / "control.sock")
+        feed = feed_of("the-run", tmp_path / "control.sock")
         greeted_s = run.now_s
 
         def refusal() -> str:  # the hold hangs for a minute, right after its greeting
@@ -71,28 +78,25 @@ async def test_a_command_that_arrives_after_its_time_is_refused_by_the_hold(tmp_
 
         asked = {"do": "hold", "why": "bridge: mqtt"}
         late = SendLimits(time.monotonic() + 2.0, refusal)
-        said = await asyncio.to_thread(send_command, where, "the-run", asked, late)
+        said = await asyncio.to_thread(feed.ask, asked, late)
         assert "hold refused: hold came 58" in said.text
         assert run.asked == []
 
 
 async def test_a_command_is_not_sent_after_its_deadline_or_another_decision(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
-        where = Where(socket=tmp_path / "control.sock")
+        feed = feed_of("the-run", tmp_path / "control.sock")
         for given, says in (
             (limits(-0.1), "the hold answered too late"),
             (limits(2.0, "latch came meanwhile"), "hold refused: latch came meanwhile"),
         ):
-            said = await asyncio.to_thread(send_command, where, "the-run", {"do": "hold"}, given)
+            said = await asyncio.to_thread(feed.ask, {"do": "hold"}, given)
             assert says in said.text
             assert not said.done
-        said = await asyncio.to_thread(
-            send_command, where, "another-run", {"do": "hold"}, limits(2.0)
-        )
+        other = feed_of("another-run", tmp_path / "control.sock")
+        said = await asyncio.to_thread(other.ask, {"do": "hold"}, limits(2.0))
         assert "another run is listening now" in said.text
-        said = await asyncio.to_thread(
-            send_command, where, "another-run", {"do": "stop"}, limits(-5.0, "no")
-        )
+        said = await asyncio.to_thread(other.ask, {"do": "stop"}, limits(-5.0, "no"))
         assert said == Outcome.succeeded("stop"), "a safety command has no conditions"
         assert [command.kind for command in run.asked] == ["stop"]
 

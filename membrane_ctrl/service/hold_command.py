@@ -1,0 +1,66 @@
+"""One command to a hold on this machine, on a connection of its own. Blocking."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from membrane_ctrl.control_port.ctl import Where, connected
+from membrane_ctrl.control_port.safety_commands import is_safety_command
+from membrane_ctrl.model import errors
+
+Message = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class SendLimits:
+    """What may keep a command from being sent after the hold has answered the connection."""
+
+    # monotonic time; later it is not sent, and the hold does not obey it
+    deadline_s: float = math.inf
+    refusal: Callable[[], str] = str  # why it must not be sent any more; empty if it may
+
+    def find_refusal(self) -> str:
+        """Why the command must not be sent now; empty if it may."""
+        if time.monotonic() > self.deadline_s:
+            return "the hold answered too late, so it was not sent"
+        return self.refusal()
+
+
+NO_LIMITS = SendLimits()
+
+
+def ask_hold(where: Where, run: str, request: Message, limits: SendLimits = NO_LIMITS) -> Message:
+    """Send a command to the run named `run`; returns the hold's answer.
+
+    A hold that hangs does not greet, so nothing is sent to it that it could obey a minute later. If
+    it hangs between greeting and tick, it refuses the command by its time limit. Safety commands
+    have none of these conditions.
+
+    Raises DeviceError without an answer, or if another run is listening.
+    """
+    with connected(where, notice=_ignore_notice) as client:
+        if not is_safety_command(str(request["do"])):
+            if client.greeting.get("run") != run:
+                raise errors.DeviceError("not sent: another run is listening now; look again")
+            if reason := limits.find_refusal():
+                return {"ok": False, "refused": reason}
+            request = request | _expiry(client.greeting, limits.deadline_s)
+        return client.ask(**request)
+
+
+def _expiry(greeting: Message, deadline_s: float) -> Message:
+    """The request's time limit on the hold's clock; none for a hold
+    that does not send its clock.
+    """
+    now_s = greeting.get("now_s")
+    if not isinstance(now_s, int | float) or math.isinf(deadline_s):
+        return {}
+    return {"expires_s": now_s + deadline_s - time.monotonic()}
+
+
+def _ignore_notice(text: str) -> None:
+    """Notices are for people at a terminal."""
