@@ -143,7 +143,7 @@ def test_an_installed_copy_runs_and_leaves_nothing_behind(installed: Installed) 
 
 @pytest.mark.campaign
 def test_a_hold_of_an_installed_copy_leaves_nothing_behind(installed: Installed) -> None:
-    installed.command("hold", "--twin", "--duration", "5s", "--name", "short")
+    installed.command("hold", "--twin", "--standby", "--duration", "5s", "--name", "short")
     assert [path.name for path in installed.empty.iterdir()] == ["logs"]
     installed.pip("uninstall", "--quiet", "--yes", "membrane-ctrl")
     assert installed.files() == installed.before

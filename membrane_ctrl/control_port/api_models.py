@@ -127,6 +127,9 @@ class UserAnswer(_Answer):
     via: _Line
 
 
+Viewer = Annotated[str, Field(max_length=40, pattern=r"^[\w.@+ -]*$")]
+
+
 class CommandBody(BaseModel):
     """A command of `ctl` (docs/reference/control-port.md)."""
 
@@ -142,6 +145,8 @@ class CommandBody(BaseModel):
     take_over: bool = False
     expires_in_s: Annotated[float, Field(gt=0, le=600)] | None = None
     """Time after which the hold must not obey any more."""
+    viewer: Viewer = ""
+    """For whom the program asks; it is recorded behind the token's name, and not verified."""
 
 
 class SafetyBody(BaseModel):
@@ -151,6 +156,7 @@ class SafetyBody(BaseModel):
 
     text: Annotated[str, Field(max_length=TEXT_BYTES)] = ""
     why: Annotated[str, Field(max_length=WHY_BYTES)] = ""
+    viewer: Viewer = ""
 
 
 class ConfigurationBody(BaseModel):

@@ -66,6 +66,8 @@ class OnBehalf(Section):
     account: Annotated[str, _words(WHO_BYTES - 8)] = ""
     name: Annotated[str, _words(WHO_BYTES - 8)] = ""  # who it is, for people, if there is no login
     session: Annotated[str, _words(WHO_BYTES)] = ""  # of that person
+    # for whom a program asks, as it states itself
+    viewer: Annotated[str, _words(WHO_BYTES - 8)] = ""
     role: Role
 
 
@@ -307,6 +309,8 @@ def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
         return Sender(peer.who, role, session=peer.session, from_person=from_person)
     who = f"{on_behalf.via}:{on_behalf.account or on_behalf.name}"
     account = who if from_person and on_behalf.account else ""
+    if on_behalf.viewer:
+        who = f"{who} for {on_behalf.viewer}"
     return Sender(who, role, account, on_behalf.session, from_person)
 
 

@@ -36,7 +36,7 @@ from membrane_ctrl.model import errors, files, plain_json, terminal
 TOKEN_VARIABLE = "MEMBRANE_CTRL_TOKEN"
 ANSWER_S = 10.0
 _ANSWER_BYTES_MAX = 1_000_000
-_SAFETY_FIELDS = ("text", "why")
+_SAFETY_FIELDS = ("text", "why", "viewer")
 _COMMAND_FIELDS = (
     "value",
     "text",
@@ -46,6 +46,7 @@ _COMMAND_FIELDS = (
     "why",
     "take_over",
     "expires_in_s",
+    "viewer",
 )
 _REFUSALS = frozenset(
     {

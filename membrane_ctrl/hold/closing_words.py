@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.config.schema import RecordingConfig
+from membrane_ctrl.control_port.link_code import draw_link_code
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.model import errors, events
 from membrane_ctrl.model.standing_fault import standing_fault_after
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.run_files.held_error import HeldError
 
 _UNKNOWN_PUMP = (
@@ -46,24 +48,47 @@ class RunEnd:
         The fault that stands; None if there is none.
     fault_s : float
         When it tripped, on the run's clock.
+    state : State or None
+        Of the last tick before the run ended.
+    has_held : bool
+        Whether the run has reached the state `hold`.
     """
 
     exit: errors.Exit | None = None
     fault: events.Fault | None = None
     fault_s: float = math.nan
+    state: State | None = None
+    has_held: bool = False
 
     def handle_tick(self, outputs: TickOutputs) -> None:
-        """Note a tick's events."""
+        """Note a tick's state and events."""
+        if outputs.finished is None:
+            self.state = State(int(outputs.row.state))
+            self.has_held |= self.state is State.HOLD
         for event in outputs.events:
             if isinstance(event, events.Fault):
                 self.fault_s = outputs.row.mono_s
             self.fault = standing_fault_after(self.fault, event)
 
+    def judge_exit(self, finished: errors.Exit, is_standby: bool) -> errors.Exit:
+        """Return the exit code of a run that has ended: one whose duration is over before it has
+        held has not done what it was started for, unless it was to wait in standby.
+        """
+        if finished is errors.Exit.DONE and not self.has_held and not is_standby:
+            return errors.Exit.REJECTED
+        return finished
+
 
 def make_closing_lines(closing: RunEnd) -> list[str]:
-    """The lines about a fault: code and name, what was seen, what to do; nothing for a run that
-    ended well.
+    """The lines about a fault, or about a run that has never held: what was seen, what to do;
+    nothing for a run that ended well.
     """
+    if closing.exit is errors.Exit.REJECTED:
+        state = "starting" if closing.state is None else closing.state.name.lower()
+        return [
+            f"NEVER HELD: the duration was over in the state {state}",
+            "  to do:    give a longer --duration; what it waited for is in events.jsonl",
+        ]
     if closing.exit not in (errors.Exit.SAFETY_TRIP, errors.Exit.DEVICE_FAILED):
         return []
     fault = closing.fault
@@ -113,6 +138,7 @@ def print_closing_report(
         )
     if link:
         print(f"page:       {link}", file=sys.stderr)
+        print(draw_link_code(link), end="", file=sys.stderr)
 
 
 def _list_headlines(summary: dict[str, Any]) -> Iterator[str]:

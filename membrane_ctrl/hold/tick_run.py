@@ -106,7 +106,8 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
                     # last: the board's watchdog runs from here on
                     if (await connect_bench(bench, config.devices)).map_version == 1:
                         supervisor.record_event(run_events.NoClaim(NO_CLAIM))
-                    closing.exit = exit_code = await supervisor.run(options.duration_s)
+                    finished = await supervisor.run(options.duration_s)
+                    closing.exit = exit_code = closing.judge_exit(finished, options.standby)
         except asyncio.CancelledError:  # a signal before the first tick
             exit_code = errors.Exit.INTERRUPTED if closing.exit is None else exit_code
             raise

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Body, Depends, FastAPI, HTTPException, Query, Request, Response
 from fastapi.responses import StreamingResponse
+from fastapi_offline import FastAPIOffline
 
 from membrane_ctrl.control_port.api_models import (
     CheckedConfigurationAnswer,
@@ -61,6 +62,7 @@ from membrane_ctrl.service.work_pools import (
     pool_of_command,
 )
 
+_DOCS_FILES = "/docs/files"
 PATHS = ("/api", "/docs", "/openapi.json", "/metrics")
 _STREAMS_MOST = 100
 _STREAM_S = 0.5  # between looks for something new
@@ -98,8 +100,13 @@ def make_api(
     editor : ConfigurationEditor
         Of the configurations with which they are started.
     """
-    api = FastAPI(
-        title="membrane_ctrl", version=program_identity(), description=_DESCRIPTION, redoc_url=None
+    # with its scripts from this machine: a laboratory may have no internet
+    api = FastAPIOffline(
+        static_url=_DOCS_FILES,
+        title="membrane_ctrl",
+        version=program_identity(),
+        description=_DESCRIPTION,
+        redoc_url=None,
     )
     streams: set[object] = set()
 
@@ -354,7 +361,10 @@ async def _send(
     request.setdefault("why", f"{user.via}: {user.name}")
     expires_in_s = request.pop("expires_in_s", math.inf)
     limits = SendLimits(time.monotonic() + expires_in_s)
+    viewer = request.pop("viewer", "")
     request["on_behalf"] = on_behalf(user, user.via)
+    if viewer:
+        request["on_behalf"]["viewer"] = viewer
     try:
         with _busy_as_503():
             answer = await pool.run(feed.ask_hold, request, limits)

@@ -39,6 +39,7 @@ class EndKind(Enum):
     DEVICE = auto()
     STOPPED = auto()  # by a person or a signal
     FINISHED = auto()  # its duration was over
+    NEVER_HELD = auto()  # its duration was over before it held
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +105,8 @@ class EndedRun:
                 return f"stopped by {self.stopped_by}{reason}"
             case EndKind.FINISHED:
                 return "its duration was over"
+            case EndKind.NEVER_HELD:
+                return "its duration was over before it held"
             case EndKind.CONTROL_GONE:
                 return (
                     "the control process ended without a report; cause unknown: it looks like "
@@ -125,6 +128,8 @@ class EndedRun:
             return "look whether the pump runs; find out why the link failed"
         if self.kind in (EndKind.CONTROL_GONE, EndKind.NO_RECORD):
             return _LOOK_AT_BENCH
+        if self.kind is EndKind.NEVER_HELD:
+            return "give the hold more time; the events state what it waited for"
         return "nothing; start a hold when you want one"
 
     @property
@@ -217,6 +222,8 @@ def _judge_end(
         return EndKind.FAULT
     if exit_word in (Exit.DEVICE_FAILED.name.lower(), Exit.SAFETY_TRIP.name.lower()):
         return EndKind.DEVICE
+    if exit_word == Exit.REJECTED.name.lower():
+        return EndKind.NEVER_HELD
     return EndKind.FINISHED if stop is None else EndKind.STOPPED
 
 

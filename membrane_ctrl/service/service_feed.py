@@ -46,6 +46,8 @@ class ServiceFeed(HoldFeed):
         """Send a request; returns the hold's answer. Raises DeviceError without an answer,
         InputError if the other service refuses it.
         """
+        viewer = request.get("on_behalf", {}).get("name", "")
+        request = request | {"viewer": viewer}
         if not is_safety_command(str(request["do"])):
             if reason := limits.find_refusal():
                 return {"ok": False, "refused": reason}

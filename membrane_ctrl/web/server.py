@@ -18,6 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.link_code import draw_link_code
 from membrane_ctrl.control_port.service_link import link_key, publish_address, read_or_make_secret
 from membrane_ctrl.model import files
 from membrane_ctrl.service.access import WebUser
@@ -199,6 +200,7 @@ def _run_server(
 
     link = address.base_url + ("" if accounts.users else f"?key={accounts.secret}")
     print(f"membrane-ctrl serve: open {link}", file=sys.stderr, flush=True)
+    print(draw_link_code(link), end="", file=sys.stderr, flush=True)
     ui.run(
         host=page.host,
         port=page.port,

@@ -372,7 +372,8 @@ def test_no_shared_memory_is_left_behind(tmp_path: Path) -> None:
     done = subprocess.run(
         hold(tmp_path, "--duration", "2s"), capture_output=True, text=True, timeout=120, check=False
     )
-    assert done.returncode == 0
+    assert done.returncode == 3, "two seconds are too short to hold"
+    assert "NEVER HELD: the duration was over in the state" in done.stderr
     assert "leaked" not in done.stderr
     wait_for(lambda: not nobodys_shared_memory() - before)
 

@@ -81,6 +81,7 @@ FAULT = Fault(
         (Exit.DONE, None, []),
         (Exit.DONE, FAULT, []),  # stopped while the cause was there, and ended well
         (Exit.INTERRUPTED, None, []),
+        (Exit.REJECTED, None, ["NEVER HELD: the duration was over in the state starting"]),
     ],
 )
 def test_a_run_that_ends_in_a_fault_states_the_fault_first(
@@ -171,3 +172,19 @@ def test_exit_code_words_summary_and_catalogue_agree(
         assert said[4].strip().startswith("to do:")
     assert cli.run(["runs", "--logs", str(logs)]) == 0
     assert name in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("finished", "has_held", "is_standby", "exit_"),
+    [
+        (Exit.DONE, True, False, Exit.DONE),
+        (Exit.DONE, False, False, Exit.REJECTED),
+        (Exit.DONE, False, True, Exit.DONE),  # it was to wait
+        (Exit.INTERRUPTED, False, False, Exit.INTERRUPTED),  # a person ended it
+        (Exit.SAFETY_TRIP, False, False, Exit.SAFETY_TRIP),
+    ],
+)
+def test_a_run_whose_duration_ends_before_it_held_has_failed(
+    finished: Exit, has_held: bool, is_standby: bool, exit_: Exit
+) -> None:
+    assert RunEnd(has_held=has_held).judge_exit(finished, is_standby) is exit_

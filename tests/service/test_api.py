@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -129,7 +130,13 @@ async def test_a_program_reads_everything_about_a_hold(tmp_path: Path) -> None:
         assert (await reader.get("/api/history?signal=x")).status_code == 404
         paths = (await reader.get("/openapi.json")).json()["paths"]
         assert {"/api/state", "/api/commands", "/api/safety/{command}"} <= set(paths)
-        assert (await reader.get("/docs")).status_code == 200
+        described = await reader.get("/docs")
+        assert described.status_code == 200
+        sources = re.findall(r'(?:src|href)="([^"]+)"', described.text)
+        assert len(sources) >= 2
+        for source in sources:
+            assert source.startswith("/docs/files/"), "nothing from other machines"
+            assert (await reader.get(source)).status_code == 200
         metrics = {
             (sample.name, *sample.labels.values()): sample.value
             for family in text_string_to_metric_families((await reader.get("/metrics")).text)

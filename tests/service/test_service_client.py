@@ -23,6 +23,7 @@ from membrane_ctrl.control_port.service_client import (
     read_token,
 )
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
+from membrane_ctrl.service.access import WebUser, on_behalf
 from membrane_ctrl.service.hold_command import SendLimits
 from membrane_ctrl.service.service_feed import ServiceFeed, make_feed
 from membrane_ctrl.service.tokens import add_token, revoke_token, tokens_file
@@ -113,8 +114,11 @@ async def test_a_person_and_another_service_reach_a_hold_through_its_service(
                 "hold",
             )
             assert feed.logs is None, "its runs are there"
-            outcome = await asyncio.to_thread(feed.ask, {"do": "mark", "text": "door"})
-            assert outcome.text == "mark: done"
+            viewer = on_behalf(WebUser("anna", "tune"), "page 1")
+            asked = {"do": "pause", "on_behalf": viewer}
+            outcome = await asyncio.to_thread(feed.ask, asked)
+            assert outcome.text == "pause: done"
+            assert run.asked[-1].who == "token:ops for anna"
             await check_bridge(Where(service=ServiceAddress(url, token)), run)
             revoke_token(tokens_file(), "ops")
             code, _, err = await ctl("status")
