@@ -1,6 +1,8 @@
 """The controller's interface to devices: the roles, and the values exchanged.
 
-A driver converts to these units; nothing beyond it knows registers, counts or byte orders.
+A driver converts to these units; nothing beyond it knows registers, counts or byte orders. Drivers
+of sensors and actuators run in the tick and are awaited. Drivers of cameras and displays run in the
+acquisition process, which waits for them: nothing there is awaited.
 """
 
 import math
@@ -417,10 +419,6 @@ class ExposingCamera(Protocol):
 
     def fetch(self) -> Frame:
         """The frame of the last `expose`. Raises FrameLostError, LinkError."""
-
-
-# Drivers of cameras and displays. They run in the acquisition process, which waits for them:
-# nothing is awaited.
 
 
 @dataclass(frozen=True, slots=True)

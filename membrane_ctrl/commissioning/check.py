@@ -315,13 +315,13 @@ async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> Device
         await board.close()
     reading = timed.last
     who = f"{identity.kind} {identity.firmware}, map {identity.map_version}"
-    said, problem = _describe_board_reading(reading), _find_board_problem(reading, laser)
+    shown, problem = _describe_board_reading(reading), _find_board_problem(reading, laser)
     notes = NO_CLAIM if identity.map_version == 1 else ""
     return DeviceProbe(
         role="board",
         device=name,
         identity=who,
-        reading=said,
+        reading=shown,
         latency_p50_ms=timed.p50_ms,
         latency_p99_ms=timed.p99_ms,
         samples_hz=_measure_samples_hz(timed.first, reading),

@@ -224,7 +224,8 @@ class InnerLoop:
         output = self._make_output(
             terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um
         )
-        self.memory.kept_output, self.memory.kept_s = output, 0.0
+        self.memory.kept_output = output
+        self.memory.kept_s = 0.0
         return output
 
     def keep_output(self, given: LoopInput, dt_s: float) -> LoopOutput:
@@ -241,7 +242,8 @@ class InnerLoop:
         return memory.kept_output
 
     def _forget_output(self) -> None:
-        self.memory.kept_output, self.memory.kept_s = None, 0.0
+        self.memory.kept_output = None
+        self.memory.kept_s = 0.0
 
     def _step_on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
         """PI(D) on the filtered reading: its terms, and the ramp's own speed."""

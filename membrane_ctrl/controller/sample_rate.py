@@ -50,7 +50,9 @@ class SampleRate:
             return []
         share = memory.samples / memory.answers
         rates_hz = (memory.samples / window_s, memory.answers / window_s)
-        memory.since_s, memory.answers, memory.samples = now_s, 0, 0
+        memory.since_s = now_s
+        memory.answers = 0
+        memory.samples = 0
         return self._report(share, *rates_hz)
 
     def _report(self, share: float, samples_hz: float, answers_hz: float) -> list[Event]:

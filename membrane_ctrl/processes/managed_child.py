@@ -57,63 +57,66 @@ class ManagedChild:
         """Return reports and fate of the child since the last call; start the next one when due
         (some ms).
         """
-        said = self._read_reports(now_s)
+        reports = self._read_reports(now_s)
         if self.child.alive:
             if now_s > self._expected_s and not self._silent:
-                said.append(self._fell_silent(now_s))
-            return said
+                reports.append(self._kill_silent(now_s))
+            return reports
         name = self.child.name
         if self._ended_s is None:
             self._ended_s = now_s
-            said.append(child_events.ChildEnded(name, self.child.exit_code))
-        if self._used_up(now_s):
+            reports.append(child_events.ChildEnded(name, self.child.exit_code))
+        if self._has_no_replacement_left(now_s):
             if not self._given_up:
                 self._given_up = True
-                said.append(child_events.ChildGivenUp(name, len(self._replaced_s)))
-            return said
+                reports.append(child_events.ChildGivenUp(name, len(self._replaced_s)))
+            return reports
         # at once, then at growing intervals: a child that dies at its start must not keep the
         # machine busy
         if now_s - self._ended_s >= pause_s(len(self._replaced_s)):
             self.replace_child(now_s)
-            said.append(child_events.ChildRestarted(name, self._count))
-        return said
+            reports.append(child_events.ChildRestarted(name, self._count))
+        return reports
 
     def replace_child(self, now_s: float) -> None:
         """Start another child in its place."""
         self._line.close()
         self._count += 1
         self._replaced_s.append(now_s)
-        self._ended_s, self._given_up, self._silent = None, False, False
+        self._ended_s = None
+        self._given_up = False
+        self._silent = False
         self._expected_s = now_s + _STARTS_S
         self.child, self._line = self._make(self._count)
         self.child.start()
 
-    def _fell_silent(self, now_s: float) -> events.Event:
+    def _kill_silent(self, now_s: float) -> events.Event:
         """Kill a silent child, unless it may not be replaced:
         a slow recorder is better than none.
         """
         self._silent = True
         late_s = round(now_s - self._expected_s, 1)
-        killed = not self._used_up(now_s)
+        killed = not self._has_no_replacement_left(now_s)
         if killed:
             self.child.kill()
         return child_events.ChildSilent(self.child.name, late_s, killed)
 
-    def _used_up(self, now_s: float) -> bool:
+    def _has_no_replacement_left(self, now_s: float) -> bool:
         """Whether this hour's replacements are spent."""
         while self._replaced_s and now_s - self._replaced_s[0] > _HOUR_S:
             self._replaced_s.popleft()
         return len(self._replaced_s) >= _MOST_PER_HOUR
 
     def _read_reports(self, now_s: float) -> list[events.Event]:
-        said: list[events.Event] = []
+        reports: list[events.Event] = []
         try:
             while self._line.poll():
                 event = event_lines.from_dict(self._line.recv())
                 if isinstance(event, child_events.Alive):
-                    self._expected_s, self._silent = now_s + event.for_s, False
+                    self._expected_s = now_s + event.for_s
+                    self._silent = False
                 else:
-                    said.append(event)
+                    reports.append(event)
         except (EOFError, OSError):  # it has ended
             pass
-        return said
+        return reports
