@@ -105,7 +105,7 @@ class Controller:
         self._resume = resume_rule.ResumeRule(config.resume, config.limits, memory.resume)
         self._consistency = sensor_consistency.SensorConsistency(config, memory.consistency)
         self._estimation = centre_estimation.CentreEstimation(
-            config.model_copy(update={"estimator": estimator}), memory.holders
+            config.model_copy(update={"estimator": estimator}), memory.estimation
         )
         self._estimation.set_gains(present.loop)
         self._consistency.set_gains(present.loop, present.pump)

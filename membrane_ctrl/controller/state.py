@@ -60,7 +60,7 @@ class ControllerState(StateNode):
     sample_rate: SampleRateState = field(default_factory=SampleRateState)
     loop: InnerLoopState = field(default_factory=InnerLoopState)
     shape: ShapeLoopMemory = field(default_factory=ShapeLoopMemory)
-    holders: CentreEstimationState = field(default_factory=CentreEstimationState)
+    estimation: CentreEstimationState = field(default_factory=CentreEstimationState)
 
 
 def make_first_state(config: Config) -> ControllerState:

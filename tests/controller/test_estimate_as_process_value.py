@@ -77,7 +77,7 @@ LASER_STUCK = set_to("laser_stuck", True)
 
 
 @pytest.mark.parametrize(
-    ("fail", "holders"),
+    ("fail", "used_sensors"),
     [
         (LASER_LOST, [ALL, "optics, barometer, thermometer", ALL]),
         pytest.param(LASER_STUCK, [ALL], marks=pytest.mark.campaign),
@@ -92,12 +92,12 @@ LASER_STUCK = set_to("laser_stuck", True)
     ids=["no laser", "stuck laser", "no camera", "no barometer", "knocked laser"],
 )
 def test_a_lost_sensor_causes_neither_a_step_nor_a_fault(
-    fail: Callable[[Wrong, bool], None], holders: list[str]
+    fail: Callable[[Wrong, bool], None], used_sensors: list[str]
 ) -> None:
     ticks = held(fail)
     assert moved_um(ticks) < 0.3
     assert not [event for tick in ticks for event in tick.events if isinstance(event, Fault)]
-    assert told(ticks) == holders
+    assert told(ticks) == used_sensors
     alone = [
         event
         for tick in ticks

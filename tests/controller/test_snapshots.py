@@ -184,7 +184,7 @@ def test_damaged_or_foreign_data_is_refused_as_snapshot(snapshot: bytes) -> None
         ("shape.reference.coeffs_um", "not base64"),
         ("shape.reference.coeffs_um", [0.0]),
         ("loop.drift.spread", ""),
-        ("holders.centre", {"x": ""}),
+        ("estimation.centre", {"x": ""}),
     ],
 )
 def test_every_value_is_checked_against_its_type(path: str, value: object) -> None:

@@ -351,8 +351,8 @@ def _judge_knock(um: float, until_s: float) -> None:
     jumps = [jump for event in told(ticks, SensorsUsed) for jump in event.jumped]
     assert [jump.split()[0] for jump in jumps] == ["laser"]
     assert float(jumps[0].split()[1]) == pytest.approx(um, abs=4.5)
-    liars = [event.faulty for event in told(ticks, Plausibility)]
-    assert liars == ["laser", "none"]
+    faulty_sensors = [event.faulty for event in told(ticks, Plausibility)]
+    assert faulty_sensors == ["laser", "none"]
     assert ticks[-1].row.laser_innovation == pytest.approx(0.0, abs=5.0)  # it is used again
     assert told(ticks, ShapeLoopState)[-1].state == "tracking"
     assert (
@@ -421,8 +421,8 @@ def _judge_jump(um: float, seen: bool) -> None:
         AmbientChange(JUMP_S, um / -0.358, 0.1),
     )
     assert not told(ticks, Fault)
-    liars = [event.faulty for event in told(ticks, Plausibility)]
-    assert liars == ([] if seen else ["optics"])
+    faulty_sensors = [event.faulty for event in told(ticks, Plausibility)]
+    assert faulty_sensors == ([] if seen else ["optics"])
     before_um = true_um(ticks, 30.0, JUMP_S).mean()
     assert np.abs(true_um(ticks, JUMP_S, JUMP_S + 1) - before_um).max() == pytest.approx(
         abs(um), rel=0.15
@@ -459,12 +459,12 @@ def _early(
         0.2,
     )
     faults = [fault.name for fault in told(ticks, Fault) if fault.name != "displacement_missing"]
-    liars = [event.faulty for event in told(ticks, Plausibility)]
+    faulty_sensors = [event.faulty for event in told(ticks, Plausibility)]
     off_um = (
         true_um(ticks, ticks[-1].row.mono_s - 3.0).mean()
         - true_um(ticks, jump_s - 1.0, jump_s).mean()
     )
-    return (faults or liars or [""])[-1], off_um
+    return (faults or faulty_sensors or [""])[-1], off_um
 
 
 @pytest.mark.parametrize("jump_s", [12.0, 20.0, 30.0])

@@ -57,7 +57,7 @@ class Change:
     lasts_s: float
     bump_um: float = np.nan
     held_by: list[str] = field(default_factory=list)
-    liars: list[str] = field(default_factory=list)
+    faulty_sensors: list[str] = field(default_factory=list)
 
     @property
     def told_once(self) -> bool:
@@ -66,7 +66,7 @@ class Change:
         """
         jumps = [words for words in self.held_by if ";" in words]
         if self.kind == "knock":
-            return len(jumps) == 1 and self.liars == ["laser", "none"]
+            return len(jumps) == 1 and self.faulty_sensors == ["laser", "none"]
         plain = (
             [TOLD[self.kind] in words for words in self.held_by]
             if self.kind in TOLD
@@ -230,7 +230,7 @@ class _Week:
                 "; ".join(filter(None, (", ".join(event.sensors), ", ".join(event.jumped))))
             )
         if isinstance(event, Plausibility) and last:
-            last.liars.append(event.faulty)
+            last.faulty_sensors.append(event.faulty)
         if isinstance(event, SensorsUsed | Plausibility) and not last:
             self.day.notices.append(f"{now_s:.0f} s {event}")
 
