@@ -53,7 +53,8 @@ def main() -> None:
         for change in day.changes:
             print(
                 f"{change.at_s:.0f} s {change.kind} {'begins' if change.begins else 'ends'}: "
-                f"{change.bump_um:.2f} µm; {' | '.join(change.held_by)} {' '.join(change.faulty_sensors)}"
+                f"{change.bump_um:.2f} µm; {' | '.join(change.held_by)} "
+                f"{' '.join(change.faulty_sensors)}"
                 f"{'' if change.told_once else ' NOT ONCE'}",
                 flush=True,
             )
