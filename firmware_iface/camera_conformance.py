@@ -15,7 +15,7 @@ import numpy as np
 
 from firmware_iface import roles
 from firmware_iface.guarded_camera import GuardedCamera
-from firmware_iface.requirement import require, require_error
+from firmware_iface.requirement import overrides, require, require_error, require_identity
 
 _STEP_S = 1e-4  # that a reading of the clock takes: no two moments are the same
 _REPEATS = 3
@@ -101,25 +101,13 @@ Check = Callable[[CameraBench], None]
 
 def list_checks(bench: type[CameraBench]) -> list[Check]:
     """List the checks for which a bench can bring about the faults."""
-    return [
-        check
-        for check, faults in _CHECKS.items()
-        if all(getattr(bench, fault) is not getattr(CameraBench, fault) for fault in faults)
-    ]
+    return [check for check, faults in _CHECKS.items() if overrides(bench, CameraBench, faults)]
 
 
 def check_identity(bench: CameraBench) -> None:
     """Opening gives the identity; the description names port and settings."""
     with _open_driver(bench) as driver:
-        identity = driver.open()
-        require(bool(identity.kind), "open returns an identity without a kind")
-        described = driver.describe()
-        require("port" in described, "describe has no port")
-        words = [word for pair in described.items() for word in pair]
-        require(
-            all(isinstance(word, str) for word in words),
-            "describe returns something else than text",
-        )
+        require_identity(driver)
 
 
 def check_pictures(bench: CameraBench) -> None:

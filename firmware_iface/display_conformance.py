@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from firmware_iface.display_patterns import make_checkerboard
-from firmware_iface.requirement import require, require_error
+from firmware_iface.requirement import overrides, require, require_error, require_identity
 from firmware_iface.roles import DeviceRefusedError, Display, Levels, LinkDownError, LinkError
 
 _REPEATS = 3
@@ -61,25 +61,13 @@ Check = Callable[[DisplayBench], None]
 
 def list_checks(bench: type[DisplayBench]) -> list[Check]:
     """List the checks for which a bench can bring about the faults."""
-    return [
-        check
-        for check, faults in _CHECKS.items()
-        if all(getattr(bench, fault) is not getattr(DisplayBench, fault) for fault in faults)
-    ]
+    return [check for check, faults in _CHECKS.items() if overrides(bench, DisplayBench, faults)]
 
 
 def check_identity(bench: DisplayBench) -> None:
     """Opening gives the identity; the description names port and settings."""
     with _open_display(bench) as display:
-        identity = display.open()
-        require(bool(identity.kind), "open returns an identity without a kind")
-        described = display.describe()
-        require("port" in described, "describe has no port")
-        words = [word for pair in described.items() for word in pair]
-        require(
-            all(isinstance(word, str) for word in words),
-            "describe returns something else than text",
-        )
+        require_identity(display)
 
 
 def check_pictures(bench: DisplayBench) -> None:

@@ -1,8 +1,8 @@
 """What the conformance tests of boards and drivers require, and raise."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
-from firmware_iface.roles import LinkError
+from firmware_iface.roles import LinkError, OpticalDevice
 
 
 class ConformanceError(Exception):
@@ -28,3 +28,20 @@ def require_error(act: Callable[[], object], kind: type[LinkError]) -> str:
             f"raises {type(error).__name__} instead of {kind.__name__}: {error}"
         ) from error
     raise ConformanceError(f"raises no {kind.__name__}")
+
+
+def require_identity(device: OpticalDevice) -> None:
+    """Require that opening gives an identity, and that the description has the port and is text."""
+    identity = device.open()
+    require(bool(identity.kind), "open returns an identity without a kind")
+    described = device.describe()
+    require("port" in described, "describe has no port")
+    words = [word for pair in described.items() for word in pair]
+    require(
+        all(isinstance(word, str) for word in words), "describe returns something else than text"
+    )
+
+
+def overrides(bench: type, base: type, methods: Iterable[str]) -> bool:
+    """Whether a bench overrides all these methods of its base, i.e. can bring about the faults."""
+    return all(getattr(bench, method) is not getattr(base, method) for method in methods)

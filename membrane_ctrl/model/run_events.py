@@ -53,7 +53,24 @@ class NoClaim(Event, kind="no_claim", level=LogLevel.WARNING):
     message: str
 
 
+class _LinkReport:
+    """Common to the events of a link, which fails and returns."""
+
+    up: bool
+
+    @property
+    def stands(self) -> bool:
+        """Whether it failed."""
+        return not self.up
+
+    @property
+    def level(self) -> LogLevel:
+        """A failure is a warning."""
+        return LogLevel.INFO if self.up else LogLevel.WARNING
+
+
 class Link(
+    _LinkReport,
     Event,
     kind="link",
     sentence="Link to the pump board: {message}[ ({count} failures since the last report)]",
@@ -67,18 +84,9 @@ class Link(
     up: bool
     count: int | None = None  # of failures since the last such event, if more than one
 
-    @property
-    def stands(self) -> bool:
-        """Whether it failed."""
-        return not self.up
-
-    @property
-    def level(self) -> LogLevel:
-        """A failure is a warning."""
-        return LogLevel.INFO if self.up else LogLevel.WARNING
-
 
 class SensorLink(
+    _LinkReport,
     Event,
     kind="sensor_link",
     sentence="Link to {role}: {message}[ ({count} failures since the last report)]",
@@ -93,16 +101,6 @@ class SensorLink(
     message: str
     up: bool
     count: int | None = None  # of failures since the last such event, if more than one
-
-    @property
-    def stands(self) -> bool:
-        """Whether it failed."""
-        return not self.up
-
-    @property
-    def level(self) -> LogLevel:
-        """A failure is a warning."""
-        return LogLevel.INFO if self.up else LogLevel.WARNING
 
 
 class InputsNotRecorded(Event, kind="inputs_not_recorded", level=LogLevel.WARNING):

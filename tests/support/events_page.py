@@ -64,7 +64,7 @@ def _row(kind: str, cls: type[Event]) -> str:
     keys = ", ".join(
         _describe_key(key, field.type, field.default is MISSING) for field, key in cls.keys
     )
-    level = "by its keys" if "level" in vars(cls) else cls._level.value
+    level = "by its keys" if cls.level is not Event.level else cls._level.value
     notices = [f"+`{_name_alarm(topic)}`" for topic in cls.opens] + [
         f"-`{_name_alarm(topic)}`" for topic in cls.closes
     ]
