@@ -111,8 +111,10 @@ def bytes_of_bits(count: int) -> int:
 
 def exception_error(what: str, code: int) -> LinkError:
     """The error for an exception answer."""
-    kind = (
-        DeviceRefusedError if code in _REFUSALS else DeviceBusyError if code == _BUSY else LinkError
-    )
+    kind: type[LinkError] = LinkError
+    if code in _REFUSALS:
+        kind = DeviceRefusedError
+    elif code == _BUSY:
+        kind = DeviceBusyError
     remedy = f"; {_REMEDIES[code]}" if code in _REMEDIES else ""
     return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')}){remedy}")

@@ -95,13 +95,11 @@ def write_package(name: str, role: str, folder: Path) -> int:
     target = (
         folder / f"{words['dashed']}-driver"
     )  # with a dash, Python never takes the folder for the module
-    kind = (
-        "actuator"
-        if role in roles.ACTUATORS
-        else "displacement"
-        if role == "displacement"
-        else "value"
-    )
+    kind = "value"
+    if role in roles.ACTUATORS:
+        kind = "actuator"
+    elif role == "displacement":
+        kind = "displacement"
     prefix, lab = (f"{role}_", "optics_lab.toml.txt") if role in _OPTICS else ("", "lab.toml.txt")
     files = {
         "pyproject.toml": "pyproject.toml.txt",

@@ -284,13 +284,9 @@ def _describe_range(field: Any) -> str:
         return "true, false"
     if "pattern" in field:
         return f"text like `{field['pattern']}`"
-    return (
-        "a table"
-        if "$ref" in field or "oneOf" in field
-        else "a file"
-        if field.get("format") == "path"
-        else "text"
-    )
+    if "$ref" in field or "oneOf" in field:
+        return "a table"
+    return "a file" if field.get("format") == "path" else "text"
 
 
 def _list_limits(field: Any) -> str:

@@ -190,11 +190,10 @@ def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
         )
     message = error["msg"].removeprefix("Value error, ").partition(" for <class")[0]
     if kind == "value_error":  # some begin with the key
-        return (
-            f"{field}{'.' if re.match(r'[a-z_0-9]+: ', message) else ': '}{message}"
-            if field
-            else message
-        )
+        if not field:
+            return message
+        join = "." if re.match(r"[a-z_0-9]+: ", message) else ": "
+        return f"{field}{join}{message}"
     if kind == "missing":
         return f"{field}: missing; it has no default"
     if kind in ("dict_type", "model_type"):

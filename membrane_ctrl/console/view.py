@@ -196,6 +196,9 @@ class ConsolePage:
             style = "bold yellow" if self._asks else "dim"
             parts.append(Text(self._foot, style=style, no_wrap=True, overflow="ellipsis"))
         held = view.state == telemetry.State.HOLD
+        border = "green" if held else "blue"
+        if view.fault or view.silent_s:
+            border = "red"
         return Panel(
             Group(*parts),
             title=title,
@@ -206,7 +209,7 @@ class ConsolePage:
                 overflow="ellipsis",
             ),
             subtitle_align="left",
-            border_style="red" if view.fault or view.silent_s else "green" if held else "blue",
+            border_style=border,
         )
 
 
@@ -254,7 +257,9 @@ def _make_headline(view: ConsoleView, config: Config) -> Text:
     if view.silent_s:
         return Text(f"no tick for {view.silent_s:.1f} s", style="bold red")
     outside = view.row is not None and abs(view.row.error_um) > config.limits.band_um
-    style = "bold red" if view.fault else "bold yellow" if outside else "bold"
+    style = "bold yellow" if outside else "bold"
+    if view.fault:
+        style = "bold red"
     line = Text(overflow="fold")
     for lock in view.locks[:_LOCKS_SHOWN]:
         line.append(f"LOCKED {lock}\n", style="bold white on red")
@@ -304,7 +309,9 @@ def _format_error(view: ConsoleView, config: Config) -> Text:
     row = view.row
     assert row is not None
     inside = abs(row.error_um) <= config.limits.band_um
-    style = "bold green" if inside else "bold red" if math.isfinite(row.error_um) else "dim"
+    style = "bold red" if math.isfinite(row.error_um) else "dim"
+    if inside:
+        style = "bold green"
     error = COLUMNS["error_um"]
     text = Text(f"{row.format_quantity('error_um', sign=True):>10}", style=style)
     std = error.format_value(view.error_std_um)

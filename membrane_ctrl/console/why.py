@@ -118,7 +118,9 @@ def explain_next_step(
     if state == State.STANDBY and latched:
         state = State.FAULT
     command, key = ("resume", " or key p") if paused else _NEXT_COMMANDS.get(state, ("", ""))
-    return f"next: `{ctl} {command}`{key if keys else ''}" if command else ""
+    if not command:
+        return ""
+    return f"next: `{ctl} {command}`{key if keys else ''}"
 
 
 def _describe_deviation(row: TelemetryRow) -> str:

@@ -41,15 +41,15 @@ class PumpHealth:
         bad = abs(change) > max(self._change_max, _PUMP_SIGMAS * known.sigma) * (
             WITHDRAWN_BELOW if memory.warned else 1.0
         )
-        sentence = (
-            f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than "
-            "its curve"
-        )
-        sentence += f" (+- {100 * known.sigma:.0f} %): check it, then `tune pump`"
-        notices = (
-            (MaintenanceNotice("pump_drift", sentence if bad else "no longer so", bad),)
-            if bad != memory.warned
-            else ()
-        )
+        notices: tuple[MaintenanceNotice, ...] = ()
+        if bad != memory.warned:
+            side = "less" if change < 0 else "more"
+            message = "no longer so"
+            if bad:
+                message = (
+                    f"the pump gives {100 * abs(change):.0f} % {side} than its curve "
+                    f"(+- {100 * known.sigma:.0f} %): check it, then `tune pump`"
+                )
+            notices = (MaintenanceNotice("pump_drift", message, bad),)
         memory.warned = bad
         return bool(notices) or memory.count % _PUMP_EVERY == 0, notices

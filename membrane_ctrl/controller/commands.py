@@ -205,7 +205,9 @@ def make_command_event(command: Command, refused: str) -> CommandTaken:
     """The event of a command: its sender, reason and settings, and why it was refused (empty: it
     was not).
     """
-    spec = command.experiment
+    spec, experiment = command.experiment, None
+    if spec is not None:
+        experiment = spec.model_dump(exclude=None if spec.steps else {"steps"})
     return CommandTaken(
         command=command.kind,
         who=command.who,
@@ -213,9 +215,7 @@ def make_command_event(command: Command, refused: str) -> CommandTaken:
         value=_or_none(command.value),
         text=command.text or None,
         loop=_list_settings(command),
-        experiment=None
-        if spec is None
-        else spec.model_dump(exclude=None if spec.steps else {"steps"}),
+        experiment=experiment,
         shape_time_constant_s=_or_none(command.shape_time_constant_s),
         setpoint_step_um=_or_none(command.setpoint_step_um),
         refused=refused or None,

@@ -175,11 +175,9 @@ def weak_gains(loop: LoopConfig) -> tuple[Severity, str] | None:
         f"{gains} the loop is close to unstable (peak sensitivity {sensitivity:.1f}, the "
         "defaults have 1.3)"
     )
-    return (
-        ("error" if sensitivity > _MS_MOST else "warning", close)
-        if sensitivity > _MS_WARN
-        else None
-    )
+    if sensitivity > _MS_MOST:
+        return "error", close
+    return ("warning", close) if sensitivity > _MS_WARN else None
 
 
 def judge_loop(config: Config, findings: ConfigFindings) -> None:

@@ -109,7 +109,9 @@ def _record_run(
     next_write_s = 0.0
     while not recorder.ended:
         # asked before draining, so that this round still sees a dying parent's last messages
-        exit_word = "killed" if orphan() else "terminated" if is_stop_requested() else ""
+        exit_word = "terminated" if is_stop_requested() else ""
+        if orphan():
+            exit_word = "killed"
         recorder.drain_rings()
         if exit_word and not recorder.ended:
             recorder.add_events([_end_event(spec.clock, exit_word)])

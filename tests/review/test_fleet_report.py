@@ -149,7 +149,7 @@ def test_what_no_run_can_break(lab: Path, tmp_path: Path, monkeypatch: pytest.Mo
         raise KeyError("frames")
 
     monkeypatch.setattr(fleet, "report_table", broken)
-    line = fleet.run_report(None, None, lab / "north" / NAMES[0]).line
+    line = fleet.run_report(None, None, lab / "north" / NAMES[0]).entry
     assert line == {"problem": "cannot be reported: KeyError: 'frames'"}
 
 

@@ -68,14 +68,14 @@ def tune_shape_loop(options: TuneOptions) -> int:
         )
         journal.append_entry(options.logs, journal.make_entry(what, *entry_values))
         session_json.write_session_file(folder.file_path("outer_verified.json"), done)
-        progress.print_line(
-            f"taken back: {done.reason}"
-            if done.reason
-            else f"kept until the hold ends: the next shape is predicted to {done.error_um:.2f} "
-            "µm (before "
-            f"{done.error_before_um:.2f} µm); `membrane-ctrl tune save --config FILE` saves "
-            "it for the next one"
-        )
+        if done.reason:
+            progress.print_line(f"taken back: {done.reason}")
+        else:
+            progress.print_line(
+                f"kept until the hold ends: the next shape is predicted to {done.error_um:.2f} µm "
+                f"(before {done.error_before_um:.2f} µm); `membrane-ctrl tune save --config FILE` "
+                "saves it for the next one"
+            )
     code = conclude(folder, options)
     return Exit.REJECTED if done.reason else code
 

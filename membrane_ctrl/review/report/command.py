@@ -91,6 +91,8 @@ def _print_result(analysis: Analysis, other: Analysis | None, folder: Path, took
     if len(analysis.found) > _SHOWN_MOST:
         print(f"  and {len(analysis.found) - _SHOWN_MOST} more in the report")
     if other is not None:
-        part = "" if not analysis.is_part else ", same part" if other.is_part else ", all of it"
+        part = ""
+        if analysis.is_part:
+            part = ", same part" if other.is_part else ", all of it"
         print(f"against {other.run.name}{part}: {make_verdict(other)[1]}")
     print(f"{folder / 'report.html'} ({took_s:.1f} s)")

@@ -234,7 +234,9 @@ def _make_row(entry: dict[str, Any], curve: str) -> list[str]:
 def _make_page(entries: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
     failed = sum("problem" in entry for entry in entries)
     unusual = sum(entry.get("verdict") in ("look", "bad") for entry in entries)
-    word = "bad" if failed else "look" if unusual else "good"
+    word = "look" if unusual else "good"
+    if failed:
+        word = "bad"
     sentence = f"{len(entries)} runs: {unusual} to look at, {failed} cannot be reported."
     section = PageSection("", [PageText(sentence, MARKS[word]), PageTable(_HEAD, rows)])
     return render_page(ReportPage("Fleet", [section], wide=True))

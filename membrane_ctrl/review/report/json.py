@@ -28,7 +28,9 @@ def make_verdict(analysis: Analysis) -> tuple[Word, str]:
     series = analysis.true or analysis.reading
     whole = format_span(ticks.end_s - ticks.start_s)
     names = [anomaly.name for anomaly in analysis.anomalies]
-    word: Word = "bad" if _GRAVE & set(names) else "look" if names else "good"
+    word: Word = "look" if names else "good"
+    if _GRAVE & set(names):
+        word = "bad"
     if series is None or not series.windows[0].count:
         return "bad", f"Not held: no second of {whole} counts as settled{_join_names(names)}."
     seconds = series.windows[0]
