@@ -2,12 +2,22 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 from membrane_ctrl.acquisition import exposures
 from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, ShapeCycle
-from membrane_ctrl.acquisition.remote import Remote
+from membrane_ctrl.acquisition.remote import CaptureRequest, Remote
 from membrane_ctrl.model import acquisition_events, shape_estimate
+
+
+class KeepSet(Protocol):
+    """Writes the frames of a cycle as the requested set."""
+
+    def __call__(self, estimate: shape_estimate.ShapeEstimate, request: CaptureRequest) -> Path:
+        """The set's folder. Raises OSError with the reason."""
+        ...
 
 
 def keep_cycling(
@@ -16,7 +26,7 @@ def keep_cycling(
     publish: Callable[[shape_estimate.ShapeEstimate], None],
     clock: exposures.CycleClock,
     period_s: Callable[[], float],
-    keep: Callable[[shape_estimate.ShapeEstimate], Path],
+    keep: KeepSet,
 ) -> None:
     """Take cycles until stopped.
 
@@ -36,13 +46,13 @@ def keep_cycling(
         if remaining_s > 0:
             remote.take_commands(remaining_s)
             continue
-        captures = remote.take_capture()
-        if remote.take_full() or captures:
+        capture = remote.take_capture()
+        if remote.take_full() or capture is not None:
             taking.want_full()
         result = taking.run_cycle()
         _report_result(result, remote, publish)
-        if captures:
-            remote.send_event(_capture_event(result, keep))
+        if capture is not None:
+            remote.send_event(_capture_event(result, partial(keep, request=capture)))
         pause_s = result.pause_s if result is not None else 0.0
         due_s = next_deadline_s(due_s, period_s(), clock.now() + pause_s)
         taking.prepare_next()

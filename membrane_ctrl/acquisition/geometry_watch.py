@@ -1,4 +1,4 @@
-"""Reports when the calibrated geometry of a run does not fit its cycles."""
+"""Reports how well the geometry of a run is known, and when it does not fit its cycles."""
 
 import numpy as np
 
@@ -8,6 +8,10 @@ from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction import slope_noise
+from membrane_ctrl.metrology.uncertainty.geometry_statement import (
+    GeometryState,
+    GeometryStatement,
+)
 from membrane_ctrl.model import acquisition_events, events, shape_estimate
 
 
@@ -17,6 +21,26 @@ def geometry_event(geometry: RunGeometry) -> acquisition_events.GeometryInUse:
     return acquisition_events.GeometryInUse(
         origin.hash, origin.file or None, origin.calibrated_utc or None, geometry.note
     )
+
+
+class StatementWatch:
+    """Reports how well the geometry is known, when the full cycles' statement changes."""
+
+    def __init__(self) -> None:
+        self._state: GeometryState | None = None
+
+    def check_statement(self, statement: GeometryStatement | None) -> events.Event | None:
+        """The event of a new state; None if it has not changed, or is not known."""
+        if statement is None or statement.state is self._state:
+            return None
+        self._state = statement.state
+        table = statement.table()
+        return acquisition_events.GeometryKnown(
+            state=table["state"],
+            source=table["source"],
+            next_step=table["next_step"] or None,
+            why="; ".join(statement.doubts) or None,
+        )
 
 
 class GeometryWatch:

@@ -19,7 +19,7 @@ import tomli_w
 from firmware_iface.roles import Pattern, Pixels
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
-from membrane_ctrl.model import acquisition_events, events, program, telemetry
+from membrane_ctrl.model import acquisition_events, events, files, program, telemetry
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes.frame_address import FrameAddress
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
@@ -127,8 +127,11 @@ class RawFrames:
             self._reference = kept
             self._reference_needed = is_due
 
-    def write_capture(self, estimate: ShapeEstimate) -> Path:
-        """Write a cycle's frames and wait; returns the set's folder. Raises OSError."""
+    def write_capture(self, estimate: ShapeEstimate, turned_deg: float | None = None) -> Path:
+        """Write a cycle's frames and wait; returns the set's folder. Raises OSError.
+
+        `turned_deg` is the angle of a mirror that was turned about its axis, which the set states.
+        """
         kept = self._copy_and_queue(estimate.cycle)
         wait(write.done for write in self._writing)
         self._collect_writes()
@@ -137,6 +140,8 @@ class RawFrames:
                 "the set could not be written completely: is the disk full, or slower than "
                 "the cycles?"
             )
+        if turned_deg is not None:
+            _state_turn(kept / "capture.toml", turned_deg)
         if kept == self._reference:
             self._reference_needed = True  # the set now belongs to the user
         return kept
@@ -261,6 +266,12 @@ def _write_set(folder: Path, table: dict[str, Any], content: _Set) -> None:
     except Exception:
         shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+def _state_turn(path: Path, turned_deg: float) -> None:
+    """Add the mirror's turn to a set that may have been written before it was asked for."""
+    turn = {"mirror_turned": {"angle_deg": turned_deg}}
+    files.write_text_atomic(path, f"{path.read_text('utf-8')}\n{tomli_w.dumps(turn)}")
 
 
 def _make_set_table(

@@ -2,6 +2,7 @@
 
 import select
 import time
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Literal
 
@@ -19,15 +20,24 @@ _STEP_S = 60.0
 _PREPARING_S = 900.0
 
 
+@dataclass(frozen=True)
+class CaptureRequest:
+    """A capture set that somebody asked for."""
+
+    turned_deg: float | None = None  # of a mirror that was turned about its axis
+
+
 class Remote:
-    """Commands "pause", "resume", "full", "capture" and "stop" over a Connection; reports as dicts.
+    """Commands "pause", "resume", "full", "capture", "capture DEGREES" and "stop" over a
+    Connection; reports as dicts.
 
     `stop` and `paused` reflect the last commands; the parent's death also sets `stop`.
     """
 
     def __init__(self, control: Connection) -> None:
         self._control = control
-        self._full = self._capture = False
+        self._full = False
+        self._capture: CaptureRequest | None = None
         self._said = ("", "")
         self._step_s = _PREPARING_S
         self._alive_due_s = 0.0
@@ -61,9 +71,9 @@ class Remote:
         wanted, self._full = self._full, False
         return wanted
 
-    def take_capture(self) -> bool:
-        """Whether a full cycle to keep on disk was requested since the last call."""
-        wanted, self._capture = self._capture, False
+    def take_capture(self) -> CaptureRequest | None:
+        """The newest request of a full cycle to keep on disk since the last call."""
+        wanted, self._capture = self._capture, None
         return wanted
 
     def report_state(
@@ -114,7 +124,9 @@ class Remote:
             case "full":
                 self._full = True
             case "capture":
-                self._capture = True
+                self._capture = CaptureRequest()
+            case str() if command.startswith("capture "):
+                self._capture = CaptureRequest(float(command.removeprefix("capture ")))
             case "stop":
                 self.stop = True
             case _:

@@ -16,7 +16,7 @@ from membrane_ctrl.acquisition import (
     optical_bench,
     raw_frames,
 )
-from membrane_ctrl.acquisition.remote import Remote
+from membrane_ctrl.acquisition.remote import CaptureRequest, Remote
 from membrane_ctrl.acquisition.spec import AcquisitionSpec
 from membrane_ctrl.acquisition.twin_truth import TwinTruth
 from membrane_ctrl.acquisition.vibrations import make_vibration_handler
@@ -69,7 +69,9 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
             return
 
         # What makes figures, and what evaluates them.
-        reconstructor, plan, period_s = _make_reconstructor(spec, geometry.optics, plan)
+        cycles = _make_cycles(spec, geometry.optics)
+        reconstructor, plan, period_s = _make_reconstructor(spec, geometry.optics, plan, cycles)
+        statement_watch = geometry_watch.StatementWatch()
         drift = geometry_watch.GeometryWatch(geometry, config.shape.bin_px)
         handle_vibrations = make_vibration_handler(config, spec.clock, spec.run_dir)
 
@@ -95,17 +97,18 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
         def publish(estimate: ShapeEstimate) -> None:
             """Send a figure to the other processes, with the events that follow from it."""
             shapes.put(pack_estimate(estimate))
-            for event in (drift.check_estimate(estimate), *handle_vibrations(estimate)):
+            stated = statement_watch.check_statement(cycles.geometry_statement)
+            for event in (stated, drift.check_estimate(estimate), *handle_vibrations(estimate)):
                 if event is not None:
                     remote.send_event(event)
             if raw is not None:
                 raw.keep_due_frames(estimate)
 
-        def write_capture(estimate: ShapeEstimate) -> Path:
+        def write_capture(estimate: ShapeEstimate, request: CaptureRequest) -> Path:
             """Write a requested set. Raises OSError."""
             if raw is None:
                 raise OSError("the run has no folder")
-            return raw.write_capture(estimate)
+            return raw.write_capture(estimate, request.turned_deg)
 
         remote.start_line_checks()
         remote.report_state("running", "first cycle")
@@ -122,22 +125,32 @@ def _cycle_plan(config: Config, optics: OpticsConfig) -> cycle_plan.CyclePlan:
     )
 
 
+def _make_cycles(
+    spec: AcquisitionSpec, optics: OpticsConfig
+) -> live_reconstructor.LiveReconstructor:
+    """What makes figures of full and fringes-only cycles, with the geometry's uncertainty."""
+    kept = None if spec.run_dir is None else spec.run_dir / run_geometry.GEOMETRY_COPY
+    file = kept if kept is not None and kept.exists() else None
+    spread, source = spread_file.geometry_spread(optics, file)
+    return live_reconstructor.LiveReconstructor(
+        optics,
+        spec.config.shape.bin_px,
+        spread=spread,
+        known_by=spread_file.find_known_by(optics, file),
+        source=source,
+    )
+
+
 def _make_reconstructor(
-    spec: AcquisitionSpec, optics: OpticsConfig, plan: cycle_plan.CyclePlan
+    spec: AcquisitionSpec,
+    optics: OpticsConfig,
+    plan: cycle_plan.CyclePlan,
+    cycles: live_reconstructor.LiveReconstructor,
 ) -> tuple[cycle.Reconstructor, cycle_plan.CyclePlan, Callable[[], float]]:
     """The reconstructor of the figures, the patterns that it needs, and the function of the
     interval between its figures.
-
-    The figures have the covariance of the geometry if its uncertainty is stated.
     """
     shape = spec.config.shape
-    geometry_copy = None
-    if spec.run_dir is not None:
-        geometry_copy = spec.run_dir / run_geometry.GEOMETRY_COPY
-        if not geometry_copy.exists():
-            geometry_copy = None
-    spread, _ = spread_file.geometry_spread(optics, geometry_copy)
-    cycles = live_reconstructor.LiveReconstructor(optics, shape.bin_px, spread=spread)
     if shape.mode == "cycle":
         return cycles, plan, lambda: shape.period_s
 

@@ -100,15 +100,35 @@ def _set_rows(solution: solver.Solution) -> list[dict[str, Any]]:
             "screen_residual_um": 1e3 * linear.residual_rms_mm,
             "left_out_fall": out.fall,
             "left_out_freedom": out.freedom,
+            "turned": _turn_row(solution, k),
         }
-        for phases, state, linear, out in zip(
-            solution.problem.sets,
-            solution.states,
-            solution.equations,
-            model_tests.compare_left_out_sets(solution),
-            strict=True,
+        for k, (phases, state, linear, out) in enumerate(
+            zip(
+                solution.problem.sets,
+                solution.states,
+                solution.equations,
+                model_tests.compare_left_out_sets(solution),
+                strict=True,
+            )
         )
     ]
+
+
+def _turn_row(solution: solver.Solution, index: int) -> dict[str, float] | None:
+    """Stated and fitted angle of a turned mirror, and the fitted place of its axis."""
+    turned = solution.problem.sets[index].turned
+    if turned is None:
+        return None
+    x_mm, y_mm, more_rad = solution.states[index].seat
+    sigmas = figure_uncertainty.seat_sigmas(solution, index)
+    return {
+        "angle_deg": turned.angle_deg,
+        "found_deg": turned.angle_deg + float(np.degrees(more_rad)),
+        "sigma_deg": float(np.degrees(sigmas[2])),
+        "x_mm": x_mm,
+        "y_mm": y_mm,
+        "seat_sigma_mm": float(np.max(sigmas[:2])),
+    }
 
 
 def format_report(report: dict[str, Any]) -> list[str]:
@@ -138,6 +158,13 @@ def format_report(report: dict[str, Any]) -> list[str]:
             f"{row['screen_residual_um']:>12.2f}  {row['left_out_fall']:.0f} of "
             f"{row['left_out_freedom']} expected"
         )
+    for row in report["sets"]:
+        if (turn := row["turned"]) is not None:
+            lines.append(
+                f"{row['name']}: mirror turned by {turn['found_deg']:.2f} +- "
+                f"{turn['sigma_deg']:.2f} degrees ({turn['angle_deg']:g} stated), its axis at "
+                f"({turn['x_mm']:+.2f}, {turn['y_mm']:+.2f}) +- {turn['seat_sigma_mm']:.2f} mm"
+            )
     claim = report["uncertainty"]
     lines.append(
         f"figure with this geometry: sag +- {claim['sag_um']:.2f} µm, figure +- "

@@ -11,7 +11,7 @@ import numpy as np
 from membrane_ctrl.calibration.set_points import edges_of, phases_of, phases_of_screen
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry import file, prior_file, set_tables
-from membrane_ctrl.measure.capture_set import read_head, read_set
+from membrane_ctrl.measure.capture_set import CaptureHead, read_head, read_set
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.rays import set_phases
 from membrane_ctrl.model import errors, terminal
@@ -89,18 +89,19 @@ def read_sets(
     for folder in terminal.track_progress(ordered, "sets"):
         # Its phases.
         head = heads[folder]
+        _refuse_turned_artefact(head)
         if head.artefact == "screen":
             phases = phases_of_screen(read_set(folder, stated))
         else:
             figure = figures.measure_folder(folder)
             head = figure.head
             phases = phases_of(folder.name, figure.checked, head.optics)
-            phases = replace(phases, artefact=figure.artefact)
+            phases = replace(phases, artefact=figure.artefact, turned=head.turned)
             notes += [
                 f"{folder.name}: {head.files[flag.frame]} omitted: {flag.reason}"
                 for flag in figure.checked.flags
             ]
-            if head.artefact is None:
+            if head.artefact is None and head.turned is None:
                 edges_px = edges_of(figure)
                 if edges_px is not None:
                     edges.append(edges_px)
@@ -123,6 +124,11 @@ def read_sets(
     films = [k for k, phases in enumerate(sets) if phases.artefact is None]
     if not films:
         raise errors.InputError(f"{folders[0]}: {_NO_FILM}")
+    if all(sets[k].turned is not None for k in films):
+        raise errors.InputError(
+            f"{used[films[0]] / 'capture.toml'}: mirror_turned: all sets of the film have it; "
+            "a calibration needs one of the mirror as it usually stands"
+        )
 
     # The laser reading at the origin.
     stated_um = sorted({benches[k].geometry.reference_displacement_um or 0.0 for k in films})
@@ -142,6 +148,15 @@ def read_sets(
     if not edges:
         notes.append("the rim is not seen in any full set: its size is not used")
     return Bundle(tuple(sets), benches[films[0]], reference_um, tuple(notes), apart, tuple(edges))
+
+
+def _refuse_turned_artefact(head: CaptureHead) -> None:
+    """Raise InputError for a set that shows no film, or a moved screen, and a turned mirror."""
+    if head.turned is not None and (head.artefact is not None or head.screen_moved is not None):
+        raise errors.InputError(
+            f"{head.folder / 'capture.toml'}: mirror_turned: only of a film, with the screen in "
+            "its place"
+        )
 
 
 def join_moved_screen(

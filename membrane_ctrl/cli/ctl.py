@@ -48,6 +48,13 @@ GainsArgument = Annotated[
         metavar="FILE", help="TOML or JSON file with loop keys, or just the keys: 'kp_per_s = 0.5'."
     ),
 ]
+TurnedOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="DEGREES",
+        help="Turn of the mirror about its axis, counter-clockwise for the camera.",
+    ),
+]
 TrialOption = Annotated[
     str,
     typer.Option(
@@ -168,6 +175,10 @@ def _gains(loop: GainsArgument, trial: TrialOption = "") -> dict[str, Any]:
     )
 
 
+def _capture(turned_deg: TurnedOption = None) -> dict[str, Any]:
+    return {} if turned_deg is None else {"value": turned_deg}
+
+
 def _mark(text: TextArgument) -> dict[str, Any]:
     return {"text": text}
 
@@ -192,6 +203,7 @@ _OWN: dict[str, Callable[..., dict[str, Any]]] = {
     "setpoint": _setpoint,
     "manual": _manual,
     "gains": _gains,
+    "capture": _capture,
     "mark": _mark,
     "latch": _latch,
     "unlock": _unlock,

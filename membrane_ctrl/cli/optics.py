@@ -39,6 +39,10 @@ ArtefactOption = Annotated[
 ScreenMovedOption = Annotated[
     float, typer.Option(help="Put the screen this much nearer to the mirror, mm.")
 ]
+TurnedOption = Annotated[
+    float | None,
+    typer.Option(help="Turn the mirror about its axis by this, counter-clockwise, degrees."),
+]
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -313,6 +317,7 @@ def simulate(
     coarser_mm: CoarserOption = None,
     artefact: ArtefactOption = "",
     screen_moved_mm: ScreenMovedOption = 0.0,
+    turned_deg: TurnedOption = None,
     track: Annotated[
         int,
         typer.Option(
@@ -348,6 +353,7 @@ def simulate(
         coarser_mm=tuple(coarser_mm or ()),
         artefact=artefact,
         screen_moved_mm=screen_moved_mm,
+        turned_deg=turned_deg,
         track=track,
         rate_hz=rate_hz,
     )

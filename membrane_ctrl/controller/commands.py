@@ -40,6 +40,7 @@ Role = Literal["read", "operate", "tune"]
 AT_START = "command line"  # sender of the first commands
 AT_END = "duration"  # sender of the last `stop`
 TRIAL_MAX_S = 7200.0  # a longer trial would be unattended
+TURN_MAX_DEG = 360.0  # of a mirror about its axis
 MEMORY_MAX_S = 1e5  # of the shape loop, as in the configuration
 
 # People lock the mirror with `lock`; `latch` is the name of that command in the protocol, in the
@@ -70,6 +71,7 @@ class Command:
     who: str  # recorded, as is `why`
     why: str = ""
     # `setpoint`: µm. `manual`: flow, µm/s of the centre. `gains`: trial time, s; NaN: no trial.
+    # `capture`: angle by which the mirror was turned about its axis, degrees; NaN: it was not.
     # `resumed`: age of the resume, s
     value: float = math.nan
     # `mark`: text for the timeline. `latch`: why the mirror is locked. `unlock`: the typed word.
@@ -122,7 +124,9 @@ TABLE: dict[Kind, CommandRule] = {
     "shape_on": CommandRule("operate", ANY, "Switch the shape loop on."),
     "shape_off": CommandRule("operate", ANY, "Switch the shape loop off."),
     "mark": CommandRule("operate", ANY, "Add a remark to the timeline.", needs=("text",)),
-    "capture": CommandRule("operate", _HOLD, "Save a full capture set to the run's raw/ folder."),
+    "capture": CommandRule(
+        "operate", _HOLD, "Save a full capture set to the run's raw/ folder.", takes=("value",)
+    ),
     "ack": CommandRule(
         "operate",
         {State.STANDBY, State.FAULT},
@@ -196,6 +200,8 @@ def explain_refusal(command: Command, state: State, config: Config) -> str:
         and command.loop.rate_hz != config.loop.rate_hz
     ):
         return "the tick rate cannot be changed during a run"
+    if command.kind == "capture" and abs(command.value) > TURN_MAX_DEG:
+        return f"a mirror turned by {command.value:g} degrees: at most {TURN_MAX_DEG:g} either way"
     if command.kind == "capture" and not config.shape.enabled:
         return "no shape measurement in this run: [shape] enabled = false"
     return ""

@@ -11,6 +11,11 @@ from membrane_ctrl.config import sight
 from membrane_ctrl.config.optics import CameraPoseConfig, ScreenPoseConfig
 from membrane_ctrl.config.schema import GeometryConfig
 from membrane_ctrl.metrology.rays.artefacts import Artefact
+from membrane_ctrl.metrology.rays.set_phases import (
+    SEAT_SIGMA_MM,
+    TURN_SIGMA_DEG,
+    TurnedMirror,
+)
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -62,6 +67,18 @@ class ScreenMovedTable(Section):
     shift_sigma_mm: _Length = 1.0  # of its length
     # of its direction; and how parallel the screen stayed
     turn_sigma_deg: Annotated[float, Field(gt=0, le=30)] = 0.5
+
+
+class MirrorTurnedTable(Section):
+    """The `[mirror_turned]` table: the mirror was turned about its axis."""
+
+    angle_deg: Annotated[float, Field(ge=-360, le=360)]  # counter-clockwise for the camera
+    angle_sigma_deg: Annotated[float, Field(gt=0, le=10)] = TURN_SIGMA_DEG
+    seat_sigma_mm: Annotated[float, Field(gt=0, le=5)] = SEAT_SIGMA_MM  # of the place of its axis
+
+    def make_turn(self) -> TurnedMirror:
+        """As the calibration takes it."""
+        return TurnedMirror(self.angle_deg, self.angle_sigma_deg, self.seat_sigma_mm)
 
 
 def move_screen(

@@ -1,6 +1,5 @@
 """How well a geometry is known: the covariance in its file, or the sigmas that it states."""
 
-from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +12,13 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     PAPER_SPREAD,
     POSE_NAMES,
     GeometrySpread,
+    KnownBy,
     moved_bench,
     stated_spread,
 )
 from membrane_ctrl.model.errors import InputError
 
 _NAMED = 6  # inputs without a stated sigma; the others are counted
-
-
-class KnownBy(StrEnum):
-    """What a geometry's uncertainty rests on."""
-
-    CALIBRATION = "calibration"  # a covariance in its file
-    STATED = "stated sigmas"  # its own sigmas of a, b and alpha
-    DATA_SHEETS = "data sheets"  # the sigmas of the paper's instruments
 
 
 class CovarianceTable(Section):

@@ -166,13 +166,14 @@ class ChildProcesses:
             for event in managed.check_child(self._clock.now())
         ]
 
-    def request_capture(self) -> events.Event | None:
-        """Ask the acquisition to save and report a full set; returns an event if that is
-        impossible.
+    def request_capture(self, turned_deg: float | None = None) -> events.Event | None:
+        """Ask the acquisition to save and report a full set, of a mirror that was turned about its
+        axis; returns an event if that is impossible.
         """
         if self._acquisition is None:
             return acquisition_events.Capture(failed="no shape measurement in this run")
-        if not self._acquisition.send("capture"):
+        word = "capture" if turned_deg is None else f"capture {turned_deg!r}"
+        if not self._acquisition.send(word):
             return acquisition_events.Capture(
                 failed="the acquisition does not answer; it may be restarting"
             )

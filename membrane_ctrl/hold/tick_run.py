@@ -177,10 +177,10 @@ def _forward_captures(
     """Pass accepted requests for a capture set to the acquisition."""
     for event in outputs.events:
         match event:
-            case events.CommandTaken(command="capture", refused=None) if (
-                failed := children.request_capture()
-            ) is not None:
-                report(failed)
+            case events.CommandTaken(command="capture", refused=None, value=turned_deg):
+                failed = children.request_capture(turned_deg)
+                if failed is not None:
+                    report(failed)
 
 
 @contextlib.contextmanager

@@ -23,11 +23,17 @@ from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.config.origin import OriginSection
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, stated_origin
-from membrane_ctrl.geometry.set_tables import ArtefactTable, ScreenMovedTable, move_screen
+from membrane_ctrl.geometry.set_tables import (
+    ArtefactTable,
+    MirrorTurnedTable,
+    ScreenMovedTable,
+    move_screen,
+)
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.measure.pixel_format import find_pixel_mistake, find_size_mistake
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.rays.artefacts import Artefact
+from membrane_ctrl.metrology.rays.set_phases import TurnedMirror
 from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes
@@ -64,6 +70,7 @@ class CaptureFile(OriginSection):
     mirror: schema.MirrorConfig
     artefact: ArtefactTable | None = None
     screen_moved: ScreenMovedTable | None = None
+    mirror_turned: MirrorTurnedTable | None = None
     frames: tuple[FrameRow, ...]
 
 
@@ -102,6 +109,8 @@ class CaptureHead:
         Move of the screen from its usual place; `optics` has it after the move.
     before_move : schema.GeometryConfig, optional
         The geometry before the move.
+    turned : TurnedMirror, optional
+        How the mirror stood, if it was turned about its axis.
     """
 
     folder: Path
@@ -119,6 +128,7 @@ class CaptureHead:
     artefact: Artefact | Literal["screen"] | None = None
     screen_moved: ScreenMovedTable | None = None
     before_move: schema.GeometryConfig | None = None
+    turned: TurnedMirror | None = None
 
     @property
     def finest_frames(self) -> list[int]:
@@ -210,6 +220,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         else content.artefact.make_artefact(content.mirror.radius_mm, path),
         screen_moved=moved,
         before_move=before,
+        turned=None if content.mirror_turned is None else content.mirror_turned.make_turn(),
     )
 
 

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.geometry.spread_file import find_known_by, geometry_spread
-from membrane_ctrl.measure.geometry_statement import GeometryStatement
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
 from membrane_ctrl.measure.result_files import number_or_null, write_arrays, write_json
 from membrane_ctrl.metrology.figure import radial_profile
@@ -22,6 +21,7 @@ from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.reconstruction import slope_noise
 from membrane_ctrl.metrology.uncertainty import height_map, set_budget
 from membrane_ctrl.metrology.uncertainty.budget import Budget
+from membrane_ctrl.metrology.uncertainty.geometry_statement import GeometryStatement
 from membrane_ctrl.model import errors, program, shape_estimate, zernike_terms
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import make_folder

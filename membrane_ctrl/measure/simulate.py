@@ -17,6 +17,7 @@ from membrane_ctrl.geometry.set_tables import move_screen
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics import film_shape, pattern_levels, simulate, simulation_spec
+from membrane_ctrl.sim.optics.turned_film import MirrorSeat, turn_film
 
 _USED = 0.95  # of the artefact's radius, as of the mirror's
 _LEANS = 2e-3  # a hand puts it down to some tenths of a millimetre
@@ -49,6 +50,7 @@ class SimulateOptions:
     coarser_mm: tuple[float, ...] = ()
     artefact: str = ""  # "flat:RADIUS", "sphere:CURVATURE:RADIUS" or "screen:DISTANCE", mm
     screen_moved_mm: float = 0.0  # towards the mirror
+    turned_deg: float | None = None  # angle of a mirror that was turned about its axis
     track: int = 0  # frames of a tracking set
     rate_hz: float = 20.0
 
@@ -92,8 +94,11 @@ def simulate_command(options: SimulateOptions) -> int:
 def make_specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
     """The set described by the options. Raises ValueError naming an impossible one."""
     optics = _adjust_optics(options)
-    if (options.artefact or options.screen_moved_mm) and (options.sets > 1 or options.track):
-        raise ValueError("--artefact, --screen-moved-mm: one set, for `calibrate`")
+    single = options.artefact or options.screen_moved_mm or options.turned_deg is not None
+    if single and (options.sets > 1 or options.track):
+        raise ValueError("--artefact, --screen-moved-mm, --turned-deg: one set, for `calibrate`")
+    if options.turned_deg is not None and (options.artefact or options.screen_moved_mm):
+        raise ValueError("--turned-deg: of the film, with the screen in its place")
     if options.artefact.startswith("screen:"):
         return _of_screen(options, optics)
     if options.artefact:
@@ -110,10 +115,17 @@ def _of_film(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.
     mounted = film_shape.typical_film(
         options.sag_mm, radius_mm, options.seed, twin.film_prestrain, twin.film_poisson
     )
+    shape = mounted if options.figure else replace(mounted, zernike_um=())
+    seat, stated_turn = None, {}
+    if options.turned_deg is not None:
+        # the film is that of --seed; its seat differs from angle to angle
+        seat = MirrorSeat.drawn(options.turned_deg, options.seed + round(1e3 * options.turned_deg))
+        shape = turn_film(shape, seat, options.motion.start_um)
+        stated_turn = {"angle_deg": options.turned_deg}
     return replace(
-        _make_rest_specification(
-            options, optics, mounted if options.figure else replace(mounted, zernike_um=())
-        ),
+        _make_rest_specification(options, optics, shape),
+        mirror_turned=stated_turn,
+        seat=seat,
         stiffness_n_per_m=twin.film_stiffness_n_per_m,
         disturbances=twin.disturbances,
         drum_nm=twin.drum_nm,

@@ -24,6 +24,7 @@ from membrane_ctrl.measure import (
     stability_pictures,
     stability_results,
 )
+from membrane_ctrl.measure.set_statement import SetStatement, state_set
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, parameter_to_coeffs
 from membrane_ctrl.metrology.uncertainty import (
     figure_pairs,
@@ -87,6 +88,7 @@ class StabilityRun:
         self._bad: list[dict[str, str]] = []
         self._bad_count = 0
         self.degraded = 0
+        self._stated: SetStatement | None = None
 
     def __enter__(self) -> "StabilityRun":
         return self
@@ -115,6 +117,10 @@ class StabilityRun:
     def first_reason(self) -> str:
         """Reason of the first bad set."""
         return self._bad[0]["reason"] if self._bad else ""
+
+    def state(self, stated: SetStatement) -> None:
+        """Take what `measure` states of the first set with a figure: it anchors the others."""
+        self._stated = stated
 
     def skip_set(self, name: str, reason: str) -> None:
         """Count a bad set."""
@@ -169,6 +175,7 @@ class StabilityRun:
                 "bad": self._bad_count,
                 "bad_sets": self._bad,
             },
+            "first_set": None if self._stated is None else self._stated.table(),
             "duration_s": self._time.high - self._time.low if self._time.count else None,
             "sd_um": {"mean": float(sd_um.mean()), "max": float(sd_um.max())},
             "points": self._point_table(),
@@ -321,6 +328,7 @@ def stability_command(options: StabilityOptions) -> int:
         files.make_folder(out)
         with StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:
             _analyse_sets(folders, figures, run)
+            _state_first_set(folders, run, options.geometry)
         if run.used_count == 0:
             raise errors.RejectedError(
                 f"{options.folder}: none of the {len(folders)} sets gave a figure "
@@ -403,6 +411,17 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
             raise errors.InputError(f"--point {text}: needs a name and a place {within}")
         points[name] = (x, y)
     return points or running_statistics.default_points_mm(analysis_radius_mm)
+
+
+def _state_first_set(folders: list[Path], run: StabilityRun, geometry: Path | None) -> None:
+    """Judge the first set that gives a figure as `measure` does."""
+    given = None if geometry is None else read_geometry(geometry)
+    for folder in folders:
+        try:
+            run.state(state_set(folder, given, geometry))
+        except errors.CommandError:
+            continue
+        return
 
 
 def _analyse_sets(folders: list[Path], figures: measurement.Figures, run: StabilityRun) -> None:

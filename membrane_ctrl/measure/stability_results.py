@@ -54,6 +54,11 @@ def format_stability(table: Mapping[str, Any]) -> list[str]:
         f"{sets['bad']} bad",
         f"SD        mean {sd_um['mean']:.4g} µm, largest {sd_um['max']:.4g} µm",
     ]
+    if (first := table["first_set"]) is not None:
+        known = first["geometry_known"]
+        reason = f": {first['reason']}" if first["reason"] else ""
+        out.append(f"first set {first['verdict']}{reason}")
+        out.append(f"geometry  {known['state']}: {known['source']}")
     out += [
         f"point {name:3s} ({p['x_mm']:.0f}, {p['y_mm']:.0f}) mm: SD {p['sd_um']:.4g} µm, "
         f"peak to peak {p['peak_to_peak_um']:.4g} µm"

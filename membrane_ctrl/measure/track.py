@@ -23,6 +23,7 @@ from membrane_ctrl.geometry.file import GeometryFile, read_geometry
 from membrane_ctrl.measure.capture_set import read_image, reference_of, require_inside
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.result_files import write_arrays, write_picture
+from membrane_ctrl.measure.set_statement import SetStatement, state_set
 from membrane_ctrl.metrology.figure.bin_figure import BinFigure
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
@@ -81,6 +82,8 @@ class Track:
     Attributes
     ----------
     frames : tuple of TrackedFrame
+    reference : SetStatement
+        What `measure` states of the set that anchors it.
     stepped : bool
         Whether it began with five usable steps.
     residual_adu : (rows, columns) array
@@ -88,6 +91,7 @@ class Track:
     """
 
     frames: tuple[TrackedFrame, ...]
+    reference: SetStatement
     stepped: bool
     residual_adu: FloatArray
 
@@ -116,7 +120,8 @@ def track_command(
 ) -> int:
     """Track a set, write the result and report it. Returns the exit code; raises CommandError."""
     begin = time.perf_counter()
-    track = track_set(folder, None if geometry is None else read_geometry(geometry))
+    given = None if geometry is None else read_geometry(geometry)
+    track = track_set(folder, given, geometry)
     passed_s = time.perf_counter() - begin
     out = out.resolve() if out else folder / "result"
     table = _make_track_table(track)
@@ -131,12 +136,19 @@ def track_command(
     return int(errors.Exit.DONE if table["usable"] else errors.Exit.REJECTED)
 
 
-def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
-    """The figures of a set's frames. Raises InputError if the set or its reference is invalid."""
+def track_set(
+    folder: Path, geometry: GeometryFile | None = None, file: Path | None = None
+) -> Track:
+    """The figures of a set's frames; `file` is the geometry's, with its covariance.
+
+    Raises InputError if the set or its reference is invalid, RejectedError if the reference gives
+    no usable figure.
+    """
     content = read_track(folder)
     path = folder / "capture.toml"
     reference = Figures(geometry).measure_folder(reference_of(content.reference, folder, path))
     _require_reference(content, reference, path)
+    stated = state_set(reference.head.folder, geometry, file)
     crossed, optics = content.pattern.crossed, reference.head.optics
     size = (optics.camera.height_px, optics.camera.width_px)
     try:
@@ -181,6 +193,7 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
             found.append(tracker.follow(picture, (shifts[k, 0], shifts[k, 1]), at_s, reading))
     return Track(
         tuple(found),
+        stated,
         stepped and not any(f.verdict == "rejected" for f in found[:ENOUGH_STEPS]),
         tracker.mean_residual_adu(),
     )
@@ -279,6 +292,7 @@ def _make_track_table(track: Track) -> dict[str, Any]:
         "verdicts": {verdict: counts[verdict] for verdict in ("ok", "degraded", "rejected")},
         "usable": len(used),
         "stepped": track.stepped,
+        "reference": track.reference.table(),
         "seconds": track.frames[-1].time_s - track.frames[0].time_s,
         "sag_mean_um": float(sag.mean()) if used else None,
         "sag_sd_um": float(sag.std()) if used else None,
@@ -299,6 +313,12 @@ def _format_track(table: dict[str, Any]) -> list[str]:
         f"          {count} x {reason}" for reason, count in list(table["reasons"].items())[:_NAMED]
     ]
     light = "five steps of the first frames" if table["stepped"] else "the reference"
+    known = table["reference"]["geometry_known"]
+    judged = table["reference"]
+    lines.append(
+        f"reference {judged['verdict']}" + (f": {judged['reason']}" if judged["reason"] else "")
+    )
+    lines.append(f"geometry  {known['state']}: {known['source']}")
     lines.append(f"anchor    light and phases of the bins from {light}")
     if table["usable"]:
         lines.append(

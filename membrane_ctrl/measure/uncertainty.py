@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.geometry import file, spread_file
-from membrane_ctrl.measure.measure import light_and_rim
-from membrane_ctrl.measure.measurement import Figures, SetFigure, measure_set
+from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.result_files import write_arrays, write_json
-from membrane_ctrl.measure.results import error_bars
+from membrane_ctrl.measure.set_statement import SetStatement, state_set
 from membrane_ctrl.metrology.rays.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import (
     geometry_spread,
@@ -124,6 +123,7 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
         raise errors.InputError(
             f"{options.against}: geometry: differs from {options.folder}; a pair needs one bench"
         )
+    stated = [state_set(folder, given, options.geometry) for folder in folders]
     begin = time.perf_counter()
     parameters = run_everywhere(
         benches,
@@ -134,12 +134,10 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
         scheduler=options.scheduler,
     )
     seconds = time.perf_counter() - begin
-    result = _compute_spread(
-        benches, spread, parameters, *_compute_budget(folders, given, options.geometry)
-    )
+    result = _compute_spread(benches, spread, parameters, *_combine_budgets(stated))
     mirror = sets[0].head.optics.mirror
     grid = height_map.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
-    table = _make_comparison_table(options, sets, spread, source, result, grid) | {
+    table = _make_comparison_table(options, sets, stated, spread, source, result, grid) | {
         "timing_s": {"trials": seconds}
     }
     out = options.out.resolve() if options.out else options.folder / "uncertainty"
@@ -151,20 +149,13 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
     return 0
 
 
-def _compute_budget(
-    folders: Sequence[Path], given: file.GeometryFile | None, geometry: Path | None
+def _combine_budgets(
+    stated: Sequence[SetStatement],
 ) -> tuple[FloatArray, MotionFinding | None]:
     """Covariance (parameters, parameters), mm^2, of the only set by its budget, or of its change
     since the second, and what it contains of motions of the bench.
     """
-    budgets = []
-    for folder in folders:
-        measured = measure_set(folder, given)
-        bars = error_bars(measured, geometry, light_and_rim(measured)[1])
-        if bars is None:
-            raise errors.RejectedError(f"{folder}: rejected: {measured.reason}")
-        budgets.append(bars.budget)
-    own, *earlier = budgets
+    own, *earlier = (each.budget for each in stated)
     if not earlier:
         return own.covariance(True) + own.covariance(False), None
     return own.change_covariance(earlier[0]), own.find_motion(earlier[0])
@@ -192,6 +183,7 @@ def _compute_spread(
 def _make_comparison_table(
     options: UncertaintyOptions,
     sets: list[SetFigure],
+    stated: list[SetStatement],
     spread: geometry_spread.GeometrySpread,
     source: str,
     result: Spread,
@@ -211,8 +203,8 @@ def _make_comparison_table(
         "set": str(options.folder),
         "against": None if options.against is None else str(options.against),
         "verdicts": [
-            {"set": str(one.head.folder), "verdict": one.verdict, "reason": one.reason}
-            for one in sets
+            {"set": str(one.head.folder)} | each.table()
+            for one, each in zip(sets, stated, strict=True)
         ],
         "trials": options.trials,
         "seed": options.seed,
@@ -262,7 +254,9 @@ def _format_comparison(table: dict[str, Any]) -> list[str]:
         )
     if table["moved"]:
         motion.append(f"moved       {table['moved']}")
+    sets = [line for each in table["verdicts"] for line in _format_verdict(each)]
     return [
+        *sets,
         f"{what}: mean RMSE {table['rmse_um']['mean']:.4g} µm, largest "
         f"{table['rmse_um']['max']:.4g} µm "
         f"({table['trials']} trials, seed {table['seed']})",
@@ -275,4 +269,14 @@ def _format_comparison(table: dict[str, Any]) -> list[str]:
         f"{table['budget_um']['max']:.4g} µm: "
         "also film, light, blur and slopes left of each set",
         *motion,
+    ]
+
+
+def _format_verdict(each: dict[str, Any]) -> list[str]:
+    """How good a set is, and how well its geometry is known."""
+    reason = f": {each['reason']}" if each["reason"] else ""
+    known = each["geometry_known"]
+    return [
+        f"{each['set']}: {each['verdict']}{reason}",
+        f"geometry    {known['state']}: {known['source']}",
     ]

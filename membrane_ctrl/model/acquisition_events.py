@@ -40,6 +40,25 @@ class GeometryInUse(
     message: str
 
 
+class GeometryKnown(
+    Event,
+    kind="geometry_known",
+    sentence="Geometry {state}: {source}[; {why}][; {next_step}]",
+    notable=True,
+):
+    """How well the geometry is known: calibrated, uncalibrated, or contradicted by full cycles."""
+
+    state: str
+    source: str
+    next_step: str | None = None
+    why: str | None = None
+
+    @property
+    def level(self) -> LogLevel:
+        """A geometry that the frames contradict is a warning."""
+        return LogLevel.INFO if self.why is None else LogLevel.WARNING
+
+
 class Capture(
     Event,
     kind="capture",

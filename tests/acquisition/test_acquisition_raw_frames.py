@@ -55,6 +55,9 @@ class Keeping:
     def capture(self, cycle: int) -> Path:
         return self.raw.write_capture(estimate("full", cycle=cycle))
 
+    def capture_turned(self, cycle: int, turned_deg: float) -> Path:
+        return self.raw.write_capture(estimate("full", cycle=cycle), turned_deg)
+
     def fault(self, code: int) -> None:
         nothing = TelemetryRow(**dict.fromkeys(FIELDS, 0.0))
         values = {**{name: getattr(nothing, name) for name in FIELDS}, "fault": float(code)}
@@ -201,3 +204,18 @@ def test_what_the_disk_did_not_take_whole_goes_and_is_told_once(
     assert (
         "reference" not in (keeping.folder / "cycle-000003" / "capture.toml").read_text()
     )  # it is not there
+
+
+@pytest.mark.parametrize("every", [0, 1])
+def test_a_capture_of_a_turned_mirror_states_its_angle(
+    stack: ExitStack, tmp_path: Path, every: int
+) -> None:
+    """Also where the cycle's frames were kept before anybody asked for them."""
+    keeping = Keeping(stack, tmp_path, raw_every_cycles=every)
+    keeping.take("full")
+    turned = read_head(keeping.capture_turned(1, 120.0)).turned
+    assert turned is not None
+    assert turned.angle_deg == 120.0
+    keeping.take("full")
+    assert read_head(keeping.capture(2)).turned is None
+    assert keeping.kept() == ["cycle-000001", "cycle-000002"]

@@ -12,7 +12,7 @@ from acquisition_fakes import VirtualClock, estimate
 
 from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed
 from membrane_ctrl.acquisition.cycle_loop import keep_cycling, next_deadline_s
-from membrane_ctrl.acquisition.remote import Remote
+from membrane_ctrl.acquisition.remote import CaptureRequest, Remote
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes import child
@@ -25,7 +25,8 @@ class ScriptedRemote(Remote):
         self.clock = clock
         self.script = sorted(script.items())
         self.told: list[tuple[str, str]] = []
-        self.stop = self.paused = self._full = self._capture = False
+        self.stop = self.paused = self._full = False
+        self._capture = None
         self.events: list[dict[str, object]] = []
 
     def take_commands(self, timeout_s: float = 0.0) -> None:
@@ -80,6 +81,7 @@ class Loop:
         self.remote = ScriptedRemote(self.clock, script)
         self.cycle = ScriptedCycle(self.clock, duration_s)
         self.published: list[ShapeEstimate] = []
+        self.turned_deg: list[float | None] = []
         self.disk_full = False
 
     def run(self) -> None:
@@ -87,7 +89,8 @@ class Loop:
             self.cycle, self.remote, self.published.append, self.clock, lambda: 2.0, self.keep
         )  # type: ignore[arg-type]
 
-    def keep(self, estimate: ShapeEstimate) -> Path:
+    def keep(self, estimate: ShapeEstimate, request: CaptureRequest) -> Path:
+        self.turned_deg.append(request.turned_deg)
         if self.disk_full:
             raise OSError(28, "No space left on device")
         return Path("raw") / f"cycle-{estimate.cycle}"
@@ -146,6 +149,12 @@ def test_a_set_on_request_is_a_full_cycle_that_is_kept_and_named() -> None:
             "reason": "",
         }
     ]
+
+
+def test_a_set_of_a_turned_mirror_is_kept_with_its_angle() -> None:
+    loop = Loop({1.0: "capture -120.5", 3.0: "capture", 7.0: "stop"})
+    loop.run()
+    assert loop.turned_deg == [-120.5, None]
 
 
 @pytest.mark.parametrize(

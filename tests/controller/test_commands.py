@@ -18,6 +18,12 @@ def test_a_capture_is_refused_where_nothing_measures(state: State) -> None:
     assert explain_refusal(capture, state, Config()) == ""
 
 
+@pytest.mark.parametrize("turned_deg", [361.0, -400.0, float("inf")])
+def test_a_capture_of_an_impossible_turn_is_refused(turned_deg: float) -> None:
+    capture = Command("capture", "tester", value=turned_deg)
+    assert "at most 360" in explain_refusal(capture, State.HOLD, Config())
+
+
 @pytest.mark.parametrize("state", sorted(set(State) - {State.STANDBY, State.FAULT}))
 def test_an_ack_is_refused_without_a_latched_fault(state: State) -> None:
     assert "ack is not allowed" in explain_refusal(Command("ack", "anybody"), state, Config())

@@ -86,9 +86,9 @@ def test_a_small_motion_is_within_the_error_bars(
     ("part", "course", "word"),
     [
         ("camera_ry", lambda t: 50.0 * (t > BEGINS_S), "knocked"),
-        ("camera_ry", lambda t: 50.0 * (t > 0.2), "tilted"),  # before the first frame
-        ("camera_rx", lambda t: 15.0 * t, "tilted"),  # a mount that bends
-        ("screen_x", lambda t: 40.0 * (t > 0.2), "tilted"),
+        ("camera_ry", lambda t: 50.0 * (t > 0.2), "camera turned"),  # before the first
+        ("camera_rx", lambda t: 15.0 * t, "camera turned"),  # a mount that bends
+        ("screen_x", lambda t: 40.0 * (t > 0.2), "screen shifted"),
         ("screen_rz", lambda t: 200.0 * (t > BEGINS_S), "rolled"),
         ("camera_rz", lambda t: 200.0 * (t > 0.2), "rolled"),
     ],

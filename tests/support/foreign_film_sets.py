@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry, bench_at
-from membrane_ctrl.metrology.rays.set_phases import SetPhases
+from membrane_ctrl.metrology.rays.set_phases import SetPhases, TurnedMirror
 from tests.support.calibration_truth import (
     NOMINAL_MM,
     PIXEL_SIGMA_MM,
@@ -20,6 +23,16 @@ from tests.worlds.second_optics import Mirror
 
 FloatArray = NDArray[np.float64]
 RADIUS_MM = 500.0
+
+
+@dataclass(frozen=True)
+class TurnedSet:
+    """A mirror as it is seated, and what its set states of that."""
+
+    mirror: Mirror
+    stated: TurnedMirror | None
+
+
 _REACH_MM = 475.0
 _STEP_MM = 1.0
 
@@ -30,20 +43,28 @@ def make_foreign_film(
     seed: int,
     points: int = 600,
     sags_mm: tuple[float, ...] = SAGS_MM,
+    turned: Sequence[TurnedSet] = (),
 ) -> Truth:
-    """Sets with as few points as that and the information of all pixels. The bow must be 0."""
+    """Sets with as few points as that and the information of all pixels. The bow must be 0.
+
+    `turned` are sets of the mirror as it is seated there, at the sag of the middle set.
+    """
     rng = np.random.default_rng(seed)
     sigma_mm = PIXEL_SIGMA_MM * np.sqrt(points / PIXELS)
     bench = bench_at(STATED, values)
     sets = []
-    for k, sag_mm in enumerate(sags_mm):
+    usual = [TurnedSet(mirror, None)] * len(sags_mm)
+    seen_at_mm = [*sags_mm, *[sags_mm[len(sags_mm) // 2]] * len(turned)]
+    for k, (sag_mm, seated) in enumerate(zip(seen_at_mm, [*usual, *turned], strict=True)):
         moved_um = 1e3 * (sag_mm - NOMINAL_MM)
         column, row = (rng.uniform(0, size, int(points / 0.43)) for size in (2447, 2047))
-        seen, inside = _trace(bench, mirror, moved_um, column, row)
+        seen, inside = _trace(bench, seated.mirror, moved_um, column, row)
         seen = seen + rng.normal(0, sigma_mm, seen.shape)
         reading_um = moved_um / (1 + values[NAMES.index("laser_relative")]) + rng.normal(0, 1.0)
         sigmas_mm = np.full(seen.shape[1], sigma_mm)
-        sets.append(SetPhases(f"set{k}", column[inside], row[inside], seen, sigmas_mm, reading_um))
+        place = column[inside], row[inside]
+        phases = SetPhases(f"set{k}", *place, seen, sigmas_mm, reading_um, turned=seated.stated)
+        sets.append(phases)
     return Truth(values, mirror, tuple(sets))
 
 

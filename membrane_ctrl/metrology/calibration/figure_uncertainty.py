@@ -62,6 +62,17 @@ def propagate_to_figure(solution: Solution, index: int, analysis_radius_mm: floa
     )
 
 
+def seat_sigmas(solution: Solution, index: int) -> FloatArray:
+    """Standard deviations (3,) of a turned mirror's seat: place of its axis, mm, and turn, rad."""
+    local = forward_model.LOCAL
+    sums = solution.equations[index].sums
+    own = np.linalg.inv(sums[:local, :local])
+    by_common = (own @ sums[:local, local:-1])[forward_model.SEAT]
+    covariance = own[forward_model.SEAT, forward_model.SEAT]
+    covariance = covariance + by_common @ solution.covariance @ by_common.T
+    return np.asarray(np.sqrt(np.diag(covariance)))
+
+
 def sag_um(covariance: FloatArray) -> float:
     """Standard deviation of the sag from a covariance (parameters, parameters) in mm^2 of a
     surface's parameters.

@@ -3,8 +3,9 @@
 Such waves are hundredths of a micrometre, but their slopes are far above the noise of a full set:
 without them the sets contradict each other, and every other test of the model blames something
 else. With them the sets determine the bench less well. So the sets are solved without waves first.
-Where waves would explain more than noise, the sets are solved with them, and what they explain is
-compared with what every other cause would explain in their place (Akaike's rule).
+Where waves would explain more than noise, or the sets would be refused, they are solved with waves,
+and what these explain is compared with what every other cause would explain in their place
+(Akaike's rule).
 """
 
 from collections.abc import Callable
@@ -13,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from membrane_ctrl.metrology.calibration import model_tests, verdict
+from membrane_ctrl.metrology.calibration import model_tests, turn_tests, verdict
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve_calibration
-from membrane_ctrl.metrology.film import terms_beyond_fit
+from membrane_ctrl.metrology.film import film_form, terms_beyond_fit
 
 _UNLIKELY = 1e-3  # probability that noise looks as much like waves: then they are tried
 
@@ -44,6 +45,27 @@ def solve_any_film(
     ValueError
         As `solve_calibration`.
     """
+    refused: ValueError | None = None
+    try:
+        solution, findings = _solve_as_stated(problem, progress)
+        if not any(finding.fatal for finding in findings):
+            return solution, findings
+    except ValueError as error:
+        refused = error
+    unturned = _solve_unturned(problem, progress)
+    if unturned is not None:
+        return unturned
+    if refused is not None:
+        raise refused
+    return solution, findings
+
+
+def _solve_as_stated(
+    problem: Problem, progress: Callable[[int, float], None] | None
+) -> tuple[Solution, tuple[verdict.CalibrationFinding, ...]]:
+    """The solution of sets whose mirrors were turned as stated; with waves where these explain
+    most.
+    """
     failed: ValueError | None = None
     even: Solution | None = None
     try:
@@ -51,13 +73,43 @@ def solve_any_film(
     except ValueError as error:
         failed = error
     if even is not None and even.converged and not _may_have_waves(even):
-        return even, verdict.check_solution(even)
+        judged = verdict.check_solution(even)
+        # sets that contradict each other scatter so much that waves are lost in it
+        if not any(finding.fatal for finding in judged):
+            return even, judged
     uneven = _solve_with_waves(problem, progress)
     if uneven is not None and _waves_explain_most(uneven):
         return uneven, (*verdict.check_solution(uneven), _note_on_waves(uneven))
     if even is None:
         raise failed or ValueError("the calibration diverges")
     return even, verdict.check_solution(even)
+
+
+def _solve_unturned(
+    problem: Problem, progress: Callable[[int, float], None] | None
+) -> tuple[Solution, tuple[verdict.CalibrationFinding, ...]] | None:
+    """The cause of a refusal, if the sets agree as soon as the figure of a turned mirror is free.
+
+    It is that figure, or what would explain more in its place (Akaike's rule): a camera that was
+    bumped looks like another figure, too.
+    """
+    turned = [k for k, phases in enumerate(problem.sets) if phases.turned is not None]
+    for group in dict.fromkeys([*((k,) for k in turned), tuple(turned)]):
+        freed = _solve_with_waves(turn_tests.free_figures(problem, group), progress)
+        if not group or freed is None or verdict.list_causes(freed):
+            continue
+        bound = turn_tests.bind_figures(freed, problem)
+        fall = model_tests.sum_of_squares(bound) - model_tests.sum_of_squares(freed)
+        explained = fall - 2 * len(film_form.TURNING) * len(group)
+        others = verdict.list_causes_besides_turns(bound)
+        if others:
+            share, cause = max(others, key=lambda each: each[0])
+            if share > explained:
+                return freed, (cause,)
+        found = [(k, turn_tests.find_angle_of_set(freed, k)) for k in group]
+        findings = [verdict.describe_unturned(problem, *each) for each in found]
+        return freed, tuple(findings)
+    return None
 
 
 def _may_have_waves(solution: Solution) -> bool:

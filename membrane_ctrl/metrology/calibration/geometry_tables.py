@@ -21,6 +21,7 @@ from membrane_ctrl.config.optics import (
     ScreenPoseConfig,
     Vector3,
 )
+from membrane_ctrl.metrology.calibration.set_state import RING_PLACE
 from membrane_ctrl.metrology.calibration.solver import Solution
 from membrane_ctrl.metrology.rays import bench_parameters, bench_poses
 from membrane_ctrl.metrology.rays.geometry import Geometry
@@ -85,7 +86,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
         "screen_residual_um": origin.screen_residual_um,
         "slope_residual_urad": origin.slope_residual_urad,
         "slope_noise_urad": origin.slope_noise_urad,
-        "ring_um": (1e3 * solution.common[len(bench_parameters.NAMES) + 1 :]).tolist(),
+        "ring_um": (1e3 * solution.common[RING_PLACE][1:]).tolist(),
         "condition": origin.condition,
         "notes": list(origin.notes),
         "hash": hash_content(tables),

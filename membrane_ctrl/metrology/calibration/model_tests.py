@@ -268,6 +268,24 @@ def leave_set_out(solution: solver.Solution, index: int) -> solver.Solution:
     )
 
 
+def move_to_solution(solution: solver.Solution) -> solver.Solution:
+    """The solution of equations that were changed, to first order: the unknowns of all and of each
+    set moved.
+    """
+    sigmas = solution.problem.sigmas
+    reduced = np.sum(_reduce_equations(solution), axis=0)
+    moved = solver.solve_step(reduced + solution.known(sigmas), sigmas)
+    common = solution.common + moved.delta
+    pairs = zip(solution.states, solution.equations, strict=True)
+    return replace(
+        solution,
+        values=common[: len(bench_parameters.NAMES)],
+        common=common,
+        states=tuple(solver.move_state(state, each, moved.delta) for state, each in pairs),
+        covariance=moved.covariance,
+    )
+
+
 def _reduce_equations(solution: solver.Solution) -> list[FloatArray]:
     return [each.reduced() for each in solution.equations]
 
@@ -277,7 +295,7 @@ def film_rise(solution: solver.Solution, film: set_state.FilmModel) -> float:
     rises if the film is like that.
     """
     bound = _change_film_rows(
-        solution, lambda state: (1.0, reference_rows.film_rows(state.surface, film))
+        solution, lambda _, state: (1.0, reference_rows.film_rows(state.surface, film))
     )
     return sum_of_squares(bound) - sum_of_squares(solution)
 
@@ -285,17 +303,17 @@ def film_rise(solution: solver.Solution, film: set_state.FilmModel) -> float:
 def bind_waves(solution: solver.Solution) -> solver.Solution:
     """The equations of a solution with waves, for a film without; its unknowns stay."""
     return _change_film_rows(
-        solution, lambda state: (1.0, reference_rows.wave_rows(state.surface, free=False))
+        solution, lambda phases, state: (1.0, reference_rows.wave_rows(phases, state, free=False))
     )
 
 
 def wave_fall(solution: solver.Solution) -> float:
     """By how much the sum of squares of a solution without waves falls if the film has them."""
     without = _change_film_rows(
-        solution, lambda state: (-1.0, reference_rows.wave_rows(state.surface, free=False))
+        solution, lambda phases, state: (-1.0, reference_rows.wave_rows(phases, state, free=False))
     )
     free = _change_film_rows(
-        without, lambda state: (1.0, reference_rows.wave_rows(state.surface, free=True))
+        without, lambda phases, state: (1.0, reference_rows.wave_rows(phases, state, free=True))
     )
     return sum_of_squares(solution) - sum_of_squares(free)
 
@@ -307,12 +325,12 @@ def sum_of_squares(solution: solver.Solution) -> float:
 
 def _change_film_rows(
     solution: solver.Solution,
-    rows_of: Callable[[set_state.SetState], tuple[float, FloatArray]],
+    rows_of: Callable[[set_phases.SetPhases, set_state.SetState], tuple[float, FloatArray]],
 ) -> solver.Solution:
     """The solution with rows added to the equations of its films, or subtracted."""
     changed = list(solution.equations)
     for k in solution.problem.films:
-        sign, rows = rows_of(solution.states[k])
+        sign, rows = rows_of(solution.problem.sets[k], solution.states[k])
         changed[k] = replace(changed[k], sums=changed[k].sums + sign * rows.T @ rows)
     return replace(solution, equations=tuple(changed))
 

@@ -7,16 +7,21 @@ import numpy as np
 
 from membrane_ctrl.metrology.calibration.set_state import (
     COMMON,
+    RING_PLACE,
     FilmModel,
     References,
     SetState,
     rim_beyond,
     rim_of,
 )
+from membrane_ctrl.metrology.calibration.turned_rows import (
+    form_rows,
+    seat_rows,
+    shift_derivatives,
+)
 from membrane_ctrl.metrology.film import terms_beyond_fit
 from membrane_ctrl.metrology.film.terms_beyond_fit import round_of
 from membrane_ctrl.metrology.rays import (
-    bench_parameters,
     bench_poses,
     forward_model,
     set_phases,
@@ -32,6 +37,8 @@ _FREE_MM = 1e-3
 _LAW_MM = 1e-7
 # 1 sigma of a wave that is held at 0: the fringes of a full set determine it to 1e-7.
 _HELD_MM = 1e-10
+# A film shifted by 1 mm has 7 nm of one wave beyond the fit's; a coarse picture is 2 nm off there.
+_SHIFTED_MM = 5e-6
 _EXCESS_STEP_MM = 1e-5  # for the derivative of the law
 _TILT_STEP = 1e-4  # for the derivative of an artefact's form
 
@@ -64,7 +71,7 @@ def reference_rows(
         # There is no surface: its unknowns are held.
         return np.eye(forward_model.LOCAL, forward_model.LOCAL + COMMON + 1)
     if phases.artefact is not None:
-        return _artefact_rows(phases.artefact, state)
+        return np.vstack([_artefact_rows(phases.artefact, state), seat_rows(None, state)])
     rows = np.zeros((RING + 2, forward_model.LOCAL + COMMON + 1))
 
     # The motion from the x to the y frames.
@@ -78,9 +85,12 @@ def reference_rows(
     ring[:, :PARAMETERS] = rim_harmonics()
     ring[0, PARAMETERS] = 1.0
     ring[:, forward_model.BEYOND] = rim_beyond()
-    ring[:, forward_model.LOCAL + len(bench_parameters.NAMES) : -1] = -np.eye(RING)
-    ring[:, -1] = common[len(bench_parameters.NAMES) :] - rim_of(state)
+    rows[:RING, forward_model.LOCAL :][:, RING_PLACE] = -np.eye(RING)
+    ring[:, -1] = common[RING_PLACE] - rim_of(state)
     ring /= references.ring_sigma_um * 1e-3
+    if phases.turned is not None:
+        # It stands elsewhere, and its waves are part of the figure that turns.
+        ring[:] = 0.0
 
     # The laser: the vertex is at -(1 + scale) (d - reference).
     if np.isfinite(phases.displacement_um):
@@ -91,7 +101,9 @@ def reference_rows(
         laser[-1] = -(1 + common[bench_poses.OPTICAL]) * moved_mm - state.vertex_z_mm
         laser /= references.laser_sigma_um * 1e-3
     law = film_rows(state.surface, references.film)
-    return np.vstack([rows, law, wave_rows(state.surface, references.waves)])
+    waves = wave_rows(phases, state, references.waves)
+    seat = seat_rows(phases.turned, state)
+    return np.vstack([rows, law, waves, seat, form_rows(phases.turned, state, common, references)])
 
 
 def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
@@ -108,13 +120,20 @@ def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
     return rows / sigma_mm
 
 
-def wave_rows(surface: Surface, free: bool) -> FloatArray:
-    """Equations of the waves beyond the fit's, as `reference_rows`: 0, with the uncertainty of a
-    film that may be orthotropic if they are `free`.
+def wave_rows(phases: set_phases.SetPhases, state: SetState, free: bool) -> FloatArray:
+    """The waves beyond the fit's as weighted rows [derivatives, miss]: of a film that may be
+    orthotropic, or only those of a round film whose axis is not the bench's.
     """
-    sigmas_mm = [wave.sigma_mm if free else _HELD_MM for wave in terms_beyond_fit.WAVES]
-    rows = _beyond_rows(surface)[terms_beyond_fit.WAVE]
-    return np.asarray(rows / np.array(sigmas_mm)[:, None])
+    sigmas_mm = np.array([wave.sigma_mm if free else _HELD_MM for wave in terms_beyond_fit.WAVES])
+    if phases.turned is not None:
+        once = np.array([abs(wave.azimuthal_order) == 1 for wave in terms_beyond_fit.WAVES])
+        sigmas_mm = np.hypot(sigmas_mm, np.where(once, _SHIFTED_MM, 0.0))
+    rows = _beyond_rows(state.surface)[terms_beyond_fit.WAVE]
+    waves = PARAMETERS + np.arange(terms_beyond_fit.BEYOND_TERMS)[terms_beyond_fit.WAVE]
+    by_shift = shift_derivatives(state.surface, waves)
+    rows[:, forward_model.SEAT.start : forward_model.SEAT.start + 2] = by_shift
+    rows[:, -1] -= by_shift @ state.seat[:2]
+    return np.asarray(rows / sigmas_mm[:, None])
 
 
 def _beyond_rows(surface: Surface) -> FloatArray:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.metrology.calibration.rim_edges import EDGE_SIGMA_PX, RADIUS_SIGMA_MM, on_rim
+from membrane_ctrl.metrology.calibration.set_state import RING_PLACE
 from membrane_ctrl.metrology.rays import bench_parameters, bench_poses
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.model.arrays import FloatArray
@@ -18,7 +19,6 @@ from membrane_ctrl.model.arrays import FloatArray
 _CENTRE_MM = 0.5  # the film's axis, by its clamp, against the edge that is seen
 _OVAL_MM = 0.3  # a welded or turned ring of a metre, each of two directions
 _STEP = 1e-3  # of a parameter's sigma by hand
-_RING = slice(len(bench_parameters.NAMES), None)
 _OF_SCREEN = {
     name for name in bench_parameters.NAMES if name.startswith(("b_", "screen_", "bow_", "pitch_"))
 }
@@ -52,7 +52,7 @@ class Rim:
             for k, name in enumerate(bench_parameters.NAMES[: bench_poses.OPTICAL])
             if name not in _OF_SCREEN
         ]
-        for k in (*optical, *range(len(bench_parameters.NAMES), common.size)):
+        for k in (*optical, *range(RING_PLACE.start, RING_PLACE.stop)):
             step = _STEP * (
                 bench_parameters.ALL[k].sigma if k < len(bench_parameters.NAMES) else 1.0
             )
@@ -71,7 +71,7 @@ class Rim:
         """Mean radius less the ring's, place (2,) and ovalness (2,) of the edges."""
         geometry, ring = (
             bench_poses.bench_at(stated, common[: len(bench_parameters.NAMES)]).geometry,
-            common[_RING],
+            common[RING_PLACE],
         )
         orders = np.arange(1, ring.size // 2 + 1)
 

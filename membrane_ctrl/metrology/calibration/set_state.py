@@ -6,19 +6,23 @@ from typing import Literal
 
 import numpy as np
 
-from membrane_ctrl.metrology.film import terms_beyond_fit
+from membrane_ctrl.metrology.film import film_form, terms_beyond_fit
 from membrane_ctrl.metrology.rays import bench_parameters
 from membrane_ctrl.metrology.rays.rim_harmonics import RING, rim_harmonics
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
-COMMON = len(bench_parameters.NAMES) + RING  # unknowns: parameters of `NAMES`, then the ring
+# The common unknowns: parameters of `NAMES`, the ring, and the film's figure in the mirror's frame
+RING_PLACE = slice(len(bench_parameters.NAMES), len(bench_parameters.NAMES) + RING)
+FORM_PLACE = slice(RING_PLACE.stop, RING_PLACE.stop + film_form.FORM)
+COMMON = FORM_PLACE.stop
 # What determines the film's round terms beyond the fit's. They are a micrometre of a 37 mm bowl,
 # and a nanometre of them is 10 µm of sag, so that the film checks the geometry. "free": nothing.
 # "prestressed": the law, for the slackness that the set's own excess shows. "hencky": the excess,
 # of a film without pre-strain and with nu = 0.3.
 FilmModel = Literal["free", "hencky", "prestressed"]
+FORM_SIGMA_UM = 0.3
 
 
 @dataclass(frozen=True)
@@ -35,12 +39,16 @@ class SetState:
         By how much the film was deeper in the x frames than in the y frames.
     elsewhere : tuple of (MOVED,) arrays
         Unknowns of each further place of the screen.
+    seat : (float, float, float)
+        Of a turned mirror: place of its axis along x and y, mm, and by how much it is turned
+        further than stated, rad.
     """
 
     surface: Surface
     vertex_z_mm: float
     motion_mm: float = 0.0
     elsewhere: tuple[FloatArray, ...] = ()
+    seat: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -60,6 +68,10 @@ class References:
         What determines the film's round terms beyond the fit's.
     waves : bool
         Whether the film has waves beyond the fit's terms (`film_waves`).
+    form_sag_mm : float, optional
+        Sag at which the film's figure in the mirror's frame is stated; None: no mirror was turned.
+    form_sigma_um : float
+        How well each term of the figure turns with the mirror.
     """
 
     reference_um: float
@@ -67,6 +79,8 @@ class References:
     ring_sigma_um: float = 1.0
     film: FilmModel = "free"
     waves: bool = False
+    form_sag_mm: float | None = None
+    form_sigma_um: float = FORM_SIGMA_UM
 
 
 def rim_of(state: SetState) -> FloatArray:

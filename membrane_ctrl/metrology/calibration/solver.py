@@ -26,7 +26,7 @@ from membrane_ctrl.metrology.calibration import (
     set_state,
 )
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
-from membrane_ctrl.metrology.film import terms_beyond_fit
+from membrane_ctrl.metrology.film import film_form, terms_beyond_fit
 from membrane_ctrl.metrology.rays import (
     bench_parameters,
     bench_poses,
@@ -36,6 +36,7 @@ from membrane_ctrl.metrology.rays import (
 )
 from membrane_ctrl.metrology.rays.artefacts import Artefact, SeenScreen
 from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.rim_harmonics import RING
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruction import surface_fit
 from membrane_ctrl.model.arrays import FloatArray
@@ -173,7 +174,8 @@ def make_prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
     (COMMON + 1, COMMON + 1) array
         Normal matrix, with the right-hand side as last column and row.
     """
-    wide = np.append(sigmas, np.full(set_state.COMMON - _PARAMETERS, _FREE_RING_MM))
+    form_mm = np.repeat(film_form.POWER_SIGMAS_MM, len(film_form.TURNING))
+    wide = np.concatenate([sigmas, np.full(RING, _FREE_RING_MM), form_mm])
     weight = np.divide(1, wide**2, out=np.zeros(set_state.COMMON), where=wide > 0)
     rows = np.hstack([np.diag(np.sqrt(weight)), -(np.sqrt(weight) * common)[:, None]])
     return np.asarray(rows.T @ rows)
@@ -276,12 +278,12 @@ def _solve_sets(
         )
         problem = replace(problem, sets=averaged)
     if start is not None:
+        sag_mm = start.problem.references.form_sag_mm
+        problem = replace(problem, references=replace(problem.references, form_sag_mm=sag_mm))
         return _iterate(problem, progress, start.states, start.common)
-
-    # The parameters as stated, and the ring as the first surfaces show it.
     states = first_states(problem)
-    ring = np.mean([set_state.rim_of(states[k]) for k in problem.films], axis=0)
-    return _iterate(problem, progress, states, np.append(np.zeros(_PARAMETERS), ring))
+    problem = _with_form_sag(problem, states)
+    return _iterate(problem, progress, states, _make_first_common(problem, states))
 
 
 def _iterate(
@@ -343,7 +345,7 @@ def _iterate(
         if far > 0:
             delta = step.delta * min(1.0, _FURTHEST / far)
         states = tuple(
-            _move_state(state, equations, delta)
+            move_state(state, equations, delta)
             for state, equations in zip(states, linear, strict=True)
         )
         common = common + delta
@@ -388,7 +390,7 @@ def _linearise_sets(
     )
 
 
-def _move_state(
+def move_state(
     state: set_state.SetState, linear: normal_equations.Equations, common_step: FloatArray
 ) -> set_state.SetState:
     """The unknowns of a set after a step (COMMON,) of the common ones."""
@@ -406,7 +408,28 @@ def _move_state(
     motion_mm = state.motion_mm + own[forward_model.MOTION]
     steps = linear.moved(own, common_step)
     elsewhere = tuple(move + step for move, step in zip(state.elsewhere, steps, strict=True))
-    return set_state.SetState(surface, float(vertex_z_mm), float(motion_mm), elsewhere)
+    x_mm, y_mm, turn_rad = (np.array(state.seat) + own[forward_model.SEAT]).tolist()
+    seat = (x_mm, y_mm, turn_rad)
+    return set_state.SetState(surface, float(vertex_z_mm), float(motion_mm), elsewhere, seat)
+
+
+def _with_form_sag(problem: Problem, states: Sequence[set_state.SetState]) -> Problem:
+    """The problem with the sag at which the film's figure is stated, if a mirror was turned."""
+    references = problem.references
+    if references.form_sag_mm is not None or all(each.turned is None for each in problem.sets):
+        return problem
+    sag_mm = float(np.mean([states[k].surface.sag_mm for k in problem.films]))
+    return replace(problem, references=replace(references, form_sag_mm=sag_mm))
+
+
+def _make_first_common(problem: Problem, states: Sequence[set_state.SetState]) -> FloatArray:
+    """The parameters as stated, the ring as the first surfaces have it, and no figure."""
+    rings = [set_state.rim_of(states[k]) for k in problem.films if problem.sets[k].turned is None]
+    if not rings:
+        raise ValueError("every mirror was turned: a set of the mirror as it stands is needed")
+    common = np.zeros(set_state.COMMON)
+    common[set_state.RING_PLACE] = np.mean(rings, axis=0)
+    return common
 
 
 def first_states(problem: Problem) -> tuple[set_state.SetState, ...]:

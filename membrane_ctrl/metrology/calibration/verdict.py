@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from membrane_ctrl.metrology.calibration import model_tests, set_state
+from membrane_ctrl.metrology.calibration import model_tests, set_state, turn_tests
 from membrane_ctrl.metrology.calibration.solver import (
     Problem,
     Solution,
@@ -43,8 +43,16 @@ class CalibrationFinding:
 
 
 def check_before_solving(problem: Problem) -> tuple[CalibrationFinding, ...]:
-    """Findings without solving: sets too close together, a laser with another scale or sign."""
+    """Findings without solving: a mirror turned by another angle, sets too close together, a laser
+    with another scale or sign.
+    """
     states = first_states(problem)
+    wrong_angles = turn_tests.find_wrong_angles(problem, states)
+    if wrong_angles:
+        return tuple(
+            CalibrationFinding(True, _describe_angle(problem, k, found_deg), (k,))
+            for k, found_deg in wrong_angles
+        )
     moved = np.array([problem.sets[k].displacement_um for k in problem.films])
     known = np.isfinite(moved)
     sag_um = np.array([1e3 * states[k].surface.sag_mm for k in problem.films])
@@ -94,6 +102,11 @@ def check_solution(solution: Solution) -> tuple[CalibrationFinding, ...]:
 
 def list_causes(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     """Errors of bench and sets that the equations show, each with what it explains."""
+    return [*_judge_turns(solution), *list_causes_besides_turns(solution)]
+
+
+def list_causes_besides_turns(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    """As `list_causes`, without mirrors that were not turned as stated."""
     return [
         *_judge_screen_positions(solution),
         *_judge_sets(solution),
@@ -113,6 +126,36 @@ def _judge_screen_positions(solution: Solution) -> list[tuple[float, Calibration
         )
         for k, fall in model_tests.find_moved_screens(solution)
     ]
+
+
+def _judge_turns(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    """Mirrors that were not turned as their sets state, with the share that it explains."""
+    return [
+        (each.explained, describe_unturned(solution.problem, each.index, each.found_deg))
+        for each in turn_tests.find_unturned_figures(solution)
+    ]
+
+
+def describe_unturned(problem: Problem, index: int, found_deg: float | None) -> CalibrationFinding:
+    """Finding on a figure that did not turn as stated; None: no other angle fits better."""
+    if found_deg is not None:
+        return CalibrationFinding(True, _describe_angle(problem, index, found_deg), (index,))
+    says = (
+        f"{problem.sets[index].name}: the film's figure did not turn with the mirror, cause "
+        "unknown; it looks like a ring that bends in its seat, a film that changed meanwhile, or "
+        "an error of the bench that no parameter describes: seat the mirror anew, wait, and take "
+        "the set again"
+    )
+    return CalibrationFinding(True, says, (index,))
+
+
+def _describe_angle(problem: Problem, index: int, found_deg: float) -> str:
+    phases = problem.sets[index]
+    stated_deg = 0.0 if phases.turned is None else phases.turned.angle_deg
+    return (
+        f"{phases.name}: the film's figure is turned by {found_deg:.4g} degrees, mirror_turned "
+        f"says {stated_deg:g} (counter-clockwise as the camera sees the mirror): correct angle_deg"
+    )
 
 
 def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> CalibrationFinding:
@@ -277,6 +320,8 @@ def _name_wrong_part(solution: Solution, index: int) -> str:
     rest, phases = model_tests.leave_set_out(solution, index), solution.problem.sets[index]
     if phases.artefact is not None:
         return phases.artefact.doubt
+    if phases.turned is not None:
+        return "its fringes show another bench"  # its ring stands elsewhere
     rim_mm = set_state.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
     vertex_um = 1e3 * (rest.common[len(bench_parameters.NAMES)] - rim_mm)
     moved_um = phases.displacement_um - solution.problem.references.reference_um

@@ -18,7 +18,7 @@ import numpy as np
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.cycle import cycle_motion
+from membrane_ctrl.metrology.cycle import cycle_geometry, cycle_motion
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.frame_checks import (
     band_removal,
@@ -45,6 +45,7 @@ from membrane_ctrl.metrology.reconstruction import (
     tracked_points,
 )
 from membrane_ctrl.metrology.uncertainty import cycle_errors, geometry_spread
+from membrane_ctrl.metrology.uncertainty.geometry_statement import GeometryStatement
 from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding, find_motion_doubt
 from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge_quality
@@ -86,7 +87,9 @@ class LiveReconstructor:
         Phase steps, of x and y if they differ; equal ones if not given.
     spread : GeometrySpread, optional
         How well the geometry is known; with it the first full cycle computes
-        `common_covariance_um2`.
+        `common_covariance_um2`, and each full cycle a `geometry_statement`.
+    known_by, source : KnownBy, str, optional
+        What the spread rests on, for the statement.
 
     Raises
     ------
@@ -102,6 +105,8 @@ class LiveReconstructor:
         laser_noise_um: float = 0.3,
         shifts_rad: ArrayLike | None = None,
         spread: geometry_spread.GeometrySpread | None = None,
+        known_by: geometry_spread.KnownBy = geometry_spread.KnownBy.DATA_SHEETS,
+        source: str = "",
     ) -> None:
         self._optics = optics
         self._geometry = geometry.Geometry.from_config(optics)
@@ -137,6 +142,12 @@ class LiveReconstructor:
         bench = (optics, self._grid, self._binner.saturated.shape, bin_px)
         self._motion: cycle_motion.CycleMotion | None = None
         self._watch = cycle_errors.ErrorWatch(*bench, self._shifts_rad, laser_noise_um, spread)
+        self._geometry_watch = (
+            None
+            if spread is None
+            else cycle_geometry.CycleGeometry(optics, self._grid, bin_px, spread, known_by, source)
+        )
+        self._statement: GeometryStatement | None = None
 
     def full(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
@@ -190,7 +201,9 @@ class LiveReconstructor:
         # The figure, without light of previous pictures.
         self._remove_lag_of_full(state)
         self._watch.begin(state, self._lag)
+        self._statement = None
         estimate = self._follow("full", state, times, readings)
+        estimate = self._judge_geometry(estimate, state, readings)
 
         # If no surface explains the slopes, pictures or pattern may be turned.
         if estimate.slope_residual_urad <= picture_orientation.SUSPICIOUS_URAD:
@@ -233,7 +246,8 @@ class LiveReconstructor:
         if self._bands_rad.size:
             self._take_bands(self._bands_rad)
         self._remove_lag_of_fringes()
-        return self._follow("fringes", self._tracked, times, readings)
+        estimate = self._follow("fringes", self._tracked, times, readings)
+        return self._degrade_contradicted(estimate)
 
     def prepare(self) -> None:
         """Nothing: a cycle needs no preparation (`LiveTracker.prepare` does)."""
@@ -266,6 +280,35 @@ class LiveReconstructor:
     def sag_sensitivity(self) -> FloatArray:
         """Change of the coefficients (terms,) in µm per µm of sag of a Hencky bowl."""
         return hencky_bowl.zernike_projection().copy()
+
+    @property
+    def geometry_statement(self) -> GeometryStatement | None:
+        """How well the geometry is known, by the newest full cycle; None without a spread, and if
+        that cycle has no figure.
+        """
+        return self._statement
+
+    def _judge_geometry(
+        self, estimate: ShapeEstimate, state: tracked_points.TrackedPoints, readings: FloatArray
+    ) -> ShapeEstimate:
+        """State how well the geometry is known, by a full cycle; the figure of one that is
+        contradicted is degraded.
+        """
+        if self._geometry_watch is None or estimate.verdict == "rejected":
+            return estimate
+        sinusoids = self._binner.sums[np.r_[self._slots.sinusoids]]
+        light = sinusoids.mean(axis=0) / self._bin_px**2
+        tracer = self._make_tracer(readings)
+        self._statement = self._geometry_watch.judge(tracer, state, state.surface, light)
+        return self._degrade_contradicted(estimate)
+
+    def _degrade_contradicted(self, estimate: ShapeEstimate) -> ShapeEstimate:
+        """The estimate, degraded if the last full cycle contradicts the geometry."""
+        doubts = () if self._statement is None else self._statement.doubts
+        if not doubts or estimate.verdict == "rejected":
+            return estimate
+        known = [estimate.reason] if estimate.reason else []
+        return replace(estimate, verdict="degraded", reason="; ".join([*known, *doubts]))
 
     def _make_tracer(self, readings_um: FloatArray) -> ray_tracing.Tracer:
         """The bench with the vertex where the laser saw it, on average over the frames."""

@@ -2,32 +2,11 @@
 
 import math
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-from numpy.polynomial import polynomial as series
 
-from membrane_ctrl.metrology.film import hencky_bowl
-from membrane_ctrl.metrology.numerics import zernike
-from membrane_ctrl.metrology.rays import surface_basis
-from membrane_ctrl.metrology.rays.surface import PARAMETERS, parameter_to_coeffs
+from membrane_ctrl.metrology.rays.height_projection import height_projection
 from membrane_ctrl.model.arrays import FloatArray
-
-
-@cache
-def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """x and y (n,) over the unit disc, and least squares (k, n) from heights there to the
-    parameters and the terms beyond the fit's.
-    """
-    k = np.arange(1024)
-    rho, theta = np.sqrt((k + 0.5) / k.size), k * np.pi * (3 - np.sqrt(5))
-    x, y = rho * np.cos(theta), rho * np.sin(theta)
-    excess = series.polyval(rho**2, hencky_bowl.excess_series()) / hencky_bowl.excess_rms()
-    own = zernike.evaluate_terms(x, y).T @ parameter_to_coeffs() + np.outer(
-        excess, np.eye(PARAMETERS)[-1]
-    )
-    beyond = surface_basis.evaluate_beyond_basis(x, y)[0].T
-    return x, y, np.linalg.pinv(np.hstack([own, beyond]))
 
 
 @dataclass(frozen=True)
@@ -72,12 +51,12 @@ class Artefact:
         """Parameters (parameters,) of the surface with these slopes at its vertex, and its terms
         beyond the fit's.
         """
-        x, y, onto = _from_heights()
+        x, y, onto = height_projection()
         return np.asarray(onto @ self._heights_mm(self.curvature_per_mm, x, y, tilt_x, tilt_y))
 
     def covariance_mm2(self) -> FloatArray:
         """Covariance of `terms_mm` by curvature and form."""
-        x, y, onto = _from_heights()
+        x, y, onto = height_projection()
         step = 1e-9  # per mm: the sag is linear in so little
         change = self._heights_mm(self.curvature_per_mm + step, x, y) - self._heights_mm(
             self.curvature_per_mm, x, y

@@ -49,12 +49,14 @@ from membrane_ctrl.metrology.rays.surface_basis import evaluate_basis, evaluate_
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # Columns of the derivatives. First the set's own unknowns: its surface's parameters, the height of
-# its vertex, its terms beyond them (round ones and waves), and by how much the film was deeper in
-# the x frames than in the y frames; then the optical parameters.
+# its vertex, its terms beyond them (round ones and waves), by how much the film was deeper in the x
+# frames than in the y frames, and the seat of a turned mirror (`set_state`), on which the fringes
+# do not depend; then the optical parameters.
 BEYOND = slice(PARAMETERS + 1, PARAMETERS + 1 + terms_beyond_fit.BEYOND_TERMS)
 MOTION = BEYOND.stop
-LOCAL = MOTION + 1
-LOCAL_EVEN = LOCAL - len(terms_beyond_fit.WAVES)  # of a film without waves beyond the fit's
+SEAT = slice(MOTION + 1, MOTION + 4)
+LOCAL = SEAT.stop
+LOCAL_EVEN = MOTION + 1 - len(terms_beyond_fit.WAVES)  # of a film without waves beyond the fit's
 COLUMNS = LOCAL + OPTICAL
 _CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
 _GLASS_INDEX = 1.52

@@ -13,6 +13,9 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 # than in y.
 MOVED = SCREEN_MOVE + 2
 STILL_UM = 1e-3  # 1 sigma of the motion of a film that does not move
+# Of a mirror that is turned by hand, by marks on its ring.
+TURN_SIGMA_DEG = 0.2
+SEAT_SIGMA_MM = 0.5
 _PER_POINT = ("column_px", "row_px", "screen_mm", "sigma_mm")  # arrays whose last axis is points
 
 
@@ -75,6 +78,16 @@ ANYWHERE = Elsewhere((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0, glass_sigma_mm=3.
 
 
 @dataclass(frozen=True)
+class TurnedMirror:
+    """How the mirror stood that was turned about its axis; height and tilt of its seat are free."""
+
+    angle_deg: float  # counter-clockwise as the camera sees the mirror
+    angle_sigma_deg: float = TURN_SIGMA_DEG
+    seat_sigma_mm: float = SEAT_SIGMA_MM  # of the place of its axis, along x and along y
+    figure_turns: bool = True  # False: its figure is unknown, whatever the other sets show
+
+
+@dataclass(frozen=True)
 class SetPhases:
     """One capture set as screen points of bins, and those of the same film with the screen put
     elsewhere.
@@ -99,6 +112,8 @@ class SetPhases:
     artefact : Artefact | SeenScreen, optional
         What is seen instead of the film.
     elsewhere : tuple of Elsewhere
+    turned : TurnedMirror, optional
+        How the mirror stood, if it was turned about its axis.
     screen : (n,) int array, optional
         Place of the screen (from 1, in `elsewhere`) with which a point was seen; 0 or None: its
         own place.
@@ -117,6 +132,7 @@ class SetPhases:
     moved_um: float = 0.0
     artefact: Artefact | SeenScreen | None = None
     elsewhere: tuple[Elsewhere, ...] = ()
+    turned: TurnedMirror | None = None
     screen: IntArray | None = None
     period_mm: float = 0.0
 

@@ -37,6 +37,7 @@ from membrane_ctrl.metrology.uncertainty import (
 )
 from membrane_ctrl.metrology.uncertainty.cycle_frames import FrameErrors, estimate_frame_errors
 from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_of_cycles
+from membrane_ctrl.metrology.uncertainty.round_slopes import RoundSlopes
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray
 
 # So many points determine light and place of a frame to 1e-4 and 20 nm, a tenth of what remains
@@ -438,12 +439,14 @@ class ErrorWatch:
 
         # Slopes that the fit leaves, as patches, and as a film that is not Hencky's.
         field = tracer.slope_field(state.points, fit.surface)
-        residual_slopes = field[2:4] - field[4:6]
+        slopes = field[2:4] - field[4:6]
         reach_mm = self._optics.mirror.analysis_radius_mm
-        patches = residual_patches.Patches.of(
-            field[:2], state.points.weights, residual_slopes, reach_mm
-        )
-        law, _ = film_shape_error.law_effect(patches, tracer.radius_mm, fit.normal.inverse)
+        patches = residual_patches.Patches.of(field[:2], state.points.weights, slopes, reach_mm)
+        rings = RoundSlopes.of(field[:2], state.points.weights, slopes, reach_mm)
+        inverse = fit.normal.inverse
+        of_round, _ = film_shape_error.round_effect(patches, rings, tracer.radius_mm, inverse)
+        of_waves, _ = film_shape_error.wave_effect(patches, tracer.radius_mm, inverse)
+        law = np.column_stack([of_round, of_waves])
         left = np.column_stack([patches.effects(tracer.radius_mm, fit.normal.inverse), law])
 
         # Light over the amplitude of the fringes, and blur of the image.

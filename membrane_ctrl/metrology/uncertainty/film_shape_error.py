@@ -14,10 +14,14 @@ from membrane_ctrl.metrology.film import terms_beyond_fit
 from membrane_ctrl.metrology.rays import surface_basis
 from membrane_ctrl.metrology.rays.surface import sag_gradient
 from membrane_ctrl.metrology.uncertainty import budget, residual_patches
+from membrane_ctrl.metrology.uncertainty.round_slopes import RoundSlopes
 from membrane_ctrl.model.arrays import FloatArray
 
 _SAG_WEIGHT = 1e3  # of the sag, relative to one height
 _GRID = 41  # points along the diameter
+# Points of a ring at which the mean of a smooth slope is computed.
+_AZIMUTHS = 24
+_RADII = 4
 
 
 @cache
@@ -41,17 +45,66 @@ def _most_similar_surfaces() -> FloatArray:
     return np.asarray(np.linalg.lstsq(table, wanted, rcond=None)[0])
 
 
-def law_effect(
+def round_effect(
+    patches: residual_patches.Patches,
+    rings: RoundSlopes,
+    radius_mm: float,
+    inverse: FloatArray,
+    slope_variance: float = 0.0,
+) -> tuple[FloatArray, float]:
+    """Errors of the parameters for a film with another round profile, by its residual slopes.
+
+    Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the terms and
+    the excess. Least squares take some of that for other terms, and the rest is missing from the
+    sag.
+
+    Parameters
+    ----------
+    patches : Patches
+        Where the fit has its points, which decides what the terms take.
+    rings : RoundSlopes
+        The round part of the residual slopes.
+    radius_mm : float
+        Of the terms' disc.
+    inverse : (parameters, parameters) array
+        Of the fit's normal matrix.
+    slope_variance : float
+        Of the noise of a point's slope.
+
+    Returns
+    -------
+    (parameters, 2) array
+        In mm: the error that the rings show, and 1 sigma of it in the direction of the sag.
+    float
+        Sum of squares that noise of the points' slopes alone would give these, mm^2.
+    """
+    absorbed = _absorbed_terms(patches, radius_mm, inverse)[:, terms_beyond_fit.ROUND]
+    error = absorbed - _most_similar_surfaces()[:, terms_beyond_fit.ROUND]
+
+    # What each round term leaves of the rings' slopes, and from the slopes back to the terms.
+    left = _mean_of_rings(rings, absorbed, radius_mm)
+    noise = np.sqrt(slope_variance * rings.share)
+    sigma = np.maximum(np.maximum(rings.sigma, noise), 1e-12)
+    terms_of_slopes = np.linalg.pinv(left / sigma[:, None]) / sigma * radius_mm
+    answer = error @ terms_of_slopes
+
+    seen = answer @ rings.slope
+    by_noise = (answer * noise**2) @ answer.T
+    by_scatter = (answer * sigma**2) @ answer.T
+    noise_mm2 = float(np.trace(by_noise)) + float(np.sum(_along_sag(by_noise) ** 2))
+    return np.column_stack([seen, _along_sag(by_scatter)]), noise_mm2
+
+
+def wave_effect(
     patches: residual_patches.Patches,
     radius_mm: float,
     inverse: FloatArray,
     slope_variance: float = 0.0,
-) -> tuple[FloatArray, FloatArray]:
-    """Errors of the parameters for a film that is not Hencky's, as its residual slopes show it.
+) -> tuple[FloatArray, float]:
+    """Errors of the parameters for a film with waves, by its residual slopes.
 
-    Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the terms and
-    the excess; an orthotropic film or a ring that is not flat adds waves. Least squares assign some
-    of that to other terms, and the rest is missing from the sag.
+    An orthotropic film or a ring that is not flat adds waves. Their prior is that of a film that
+    was never measured.
 
     Parameters
     ----------
@@ -66,10 +119,10 @@ def law_effect(
 
     Returns
     -------
-    effects_mm : (parameters, 2) array
-        Errors by the round profile, and by waves.
-    noise_mm2 : (2,) array
-        What the noise adds to the sums of their squares.
+    effect_mm : (parameters, 1) array
+        The error.
+    noise_mm2 : float
+        What the noise adds to the sum of its squares.
     """
     x, y = patches.places_mm / radius_mm
     _, *slopes = surface_basis.evaluate_basis(x, y)
@@ -77,30 +130,60 @@ def law_effect(
     pairs = list(zip(slopes, beyond_slopes, strict=True))
 
     # Parameters that the fit takes for each term beyond, less those that are right.
-    products = sum((own * patches.count) @ beyond.T for own, beyond in pairs)
-    absorbed = inverse @ products / radius_mm**2
+    absorbed = _absorbed_terms(patches, radius_mm, inverse)
     error = absorbed - _most_similar_surfaces()
 
     # Slopes that the fit leaves of each term beyond, and those that it left of the film, weighted.
     left = np.hstack([beyond - absorbed.T @ own for own, beyond in pairs]).T
     weights = np.sqrt(np.tile(patches.count, 2))
-    left = left * weights[:, None] / radius_mm
+    wave_left = (left * weights[:, None] / radius_mm)[:, terms_beyond_fit.WAVE]
     seen = patches.slopes.ravel() * weights
 
-    # Amplitudes of the terms from the slopes, by least squares. The round profile is free; waves
-    # have the prior of a film that was never measured.
-    round_left = left[:, terms_beyond_fit.ROUND]
-    wave_left = left[:, terms_beyond_fit.WAVE]
+    # Amplitudes of the waves from the slopes, by least squares with their prior.
     scatter = max(float(np.mean(seen**2)), slope_variance)
     sigmas_mm = np.array([wave.sigma_mm for wave in terms_beyond_fit.WAVES])
     waves = wave_left.T @ wave_left + scatter * np.diag(1 / sigmas_mm**2)
-    answers = (
-        error[:, terms_beyond_fit.ROUND] @ np.linalg.pinv(round_left),
-        error[:, terms_beyond_fit.WAVE] @ np.linalg.solve(waves, wave_left.T),
+    answer = error[:, terms_beyond_fit.WAVE] @ np.linalg.solve(waves, wave_left.T)
+    return (answer @ seen)[:, None], slope_variance * float(np.sum(answer**2))
+
+
+def _absorbed_terms(
+    patches: residual_patches.Patches, radius_mm: float, inverse: FloatArray
+) -> FloatArray:
+    """Parameters (parameters, k) that least squares take for each term beyond the fit's."""
+    x, y = patches.places_mm / radius_mm
+    _, *slopes = surface_basis.evaluate_basis(x, y)
+    _, *beyond_slopes = surface_basis.evaluate_beyond_basis(x, y)
+    products = sum(
+        (own * patches.count) @ beyond.T for own, beyond in zip(slopes, beyond_slopes, strict=True)
     )
-    effects_mm = np.stack([answer @ seen for answer in answers], axis=1)
-    noise = np.array([float(np.sum(answer**2)) for answer in answers])
-    return effects_mm, slope_variance * noise
+    return np.asarray(inverse @ products / radius_mm**2)
+
+
+def _mean_of_rings(rings: RoundSlopes, absorbed: FloatArray, radius_mm: float) -> FloatArray:
+    """Mean radial slopes (rings, k), in radii, that the fit leaves of the round terms beyond it."""
+    # Points of each ring.
+    share = (np.arange(_RADII) + 0.5) / _RADII
+    radius = rings.inner_mm[:, None] + (rings.outer_mm - rings.inner_mm)[:, None] * share
+    rho = np.repeat(radius.ravel() / radius_mm, _AZIMUTHS)
+    theta = np.tile(2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS, radius.size)
+    cosine = np.cos(theta)
+    sine = np.sin(theta)
+
+    # Their radial slopes, and the means, weighted by area.
+    _, own_x, own_y = surface_basis.evaluate_basis(rho * cosine, rho * sine)
+    _, beyond_x, beyond_y = surface_basis.evaluate_round_basis(rho * cosine, rho * sine)
+    radial = (beyond_x - absorbed.T @ own_x) * cosine + (beyond_y - absorbed.T @ own_y) * sine
+    of_radii = radial.reshape(-1, *radius.shape, _AZIMUTHS).mean(axis=-1)
+    means = np.sum(of_radii * radius, axis=-1) / np.sum(radius, axis=-1)
+    return np.asarray(means.T)
+
+
+def _along_sag(covariance: FloatArray) -> FloatArray:
+    """1 sigma (parameters,) of the sag, and of the parameters what is correlated with it."""
+    with_sag = covariance @ sag_gradient()
+    sigma_mm = math.sqrt(max(float(sag_gradient() @ with_sag), 0.0))
+    return np.asarray(with_sag / max(sigma_mm, 1e-30))
 
 
 def film_shape_sources(full: FullResult, slope_variance: FloatArray) -> tuple[budget.Source, ...]:
@@ -108,19 +191,25 @@ def film_shape_sources(full: FullResult, slope_variance: FloatArray) -> tuple[bu
 
     `slope_variance` (2,) is that of an x and of a y slope from the noise.
     """
-    patches = residual_patches.Patches.of_grid(full.fit_grid)
+    grid = full.fit_grid
+    inverse = full.fit.normal.inverse
+    radius_mm = full.surface.radius_mm
     variance = float(slope_variance.mean())
-    effects_mm, noise_mm2 = law_effect(
-        patches, full.surface.radius_mm, full.fit.normal.inverse, variance
-    )
+
+    # Slopes that the fit leaves, as patches and as means of rings.
+    patches = residual_patches.Patches.of_grid(grid)
+    seen = grid.count > 0
+    x, y = np.meshgrid(grid.axis_mm, grid.axis_mm)
+    places_mm = np.stack([x[seen], y[seen]])
+    slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
+    rings = RoundSlopes.of(places_mm, grid.count[seen], slopes, float(grid.axis_mm[-1]))
+    of_round = round_effect(patches, rings, radius_mm, inverse, variance)
+    of_waves = wave_effect(patches, radius_mm, inverse, variance)
     rows = (
-        ("film_law", "film that is not Hencky's: round slopes that no term explains"),
-        ("film_waves", "film or ring that is not even: waves that no term explains"),
+        ("film_law", "film that is not Hencky's: round slopes that no term explains", of_round),
+        ("film_waves", "film or ring that is not even: waves that no term explains", of_waves),
     )
-    sources = []
-    for k, (name, says) in enumerate(rows):
-        effect_mm = effects_mm[:, [k]]
-        noise = float(noise_mm2[k])
-        source = budget.Source(name, says, math.nan, effect_mm, common=False, noise_mm2=noise)
-        sources.append(source)
-    return tuple(sources)
+    return tuple(
+        budget.Source(name, says, math.nan, effects, common=False, noise_mm2=noise)
+        for name, says, (effects, noise) in rows
+    )

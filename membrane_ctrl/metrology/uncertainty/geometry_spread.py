@@ -7,6 +7,7 @@ a rotation vector in world, about the pinhole and about O'). Lens, bow and pitch
 """
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import cv2
 import numpy as np
@@ -27,6 +28,14 @@ GENERAL_NAMES = tuple(
 )
 # Least eigenvalue of a correlation: rounding of a written matrix may leave a little below 0.
 _LEAST_EIGENVALUE = -1e-6
+
+
+class KnownBy(StrEnum):
+    """What a geometry's uncertainty rests on."""
+
+    CALIBRATION = "calibration"  # a covariance in its file
+    STATED = "stated sigmas"  # its own sigmas of a, b and alpha
+    DATA_SHEETS = "data sheets"  # the sigmas of the paper's instruments
 
 
 @dataclass(frozen=True)

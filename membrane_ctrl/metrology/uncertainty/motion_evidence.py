@@ -201,6 +201,12 @@ class MotionFinding:
             return best.describe()
         return f"it looks like {best.describe()}, or {second.describe()}"
 
+    def describe_tilt(self) -> str:
+        """Every motion that may have tilted the ring: no cause is proven."""
+        least = self.tilted[0].gain - _PLAUSIBLE_GAIN
+        plausible = [fit.describe() for fit in self.tilted if fit.gain >= least]
+        return f"it looks like {', or '.join(plausible)}"
+
 
 def find_motion_doubt(motion: MotionFinding, own_mm2: FloatArray, tilt_urad: float) -> str:
     """Why a figure must not be used as it is; empty if the error bars suffice.
@@ -219,8 +225,9 @@ def find_motion_doubt(motion: MotionFinding, own_mm2: FloatArray, tilt_urad: flo
     own_um = 1e3 * math.sqrt(float(np.trace(own_mm2[_FIGURE, _FIGURE])))
     if motion.figure_um > max(own_um, _POSSIBLE_UM):
         return (
-            f"tilted by {tilt_urad:.2g} µrad since the reference: camera, screen or mirror moved, "
-            f"and the figure may be {motion.figure_um:.2f} µm off"
+            f"the ring seems tilted by {tilt_urad:.2g} µrad since the reference: camera, screen or "
+            f"mirror moved, cause unknown; {motion.describe_tilt()}; the figure may be "
+            f"{motion.figure_um:.2f} µm off"
         )
     return ""
 

@@ -81,6 +81,15 @@ def measure_slope_misfit(
     ArithmeticError
         If the spread is so wide that a fit does not converge.
     """
+    seen_urad = measure_curl_urad(grid, height_mm)
+    return SlopeMisfit(seen_urad, estimate_explained_urad(bench, spread))
+
+
+def estimate_explained_urad(bench: TrialBench, spread: GeometrySpread) -> float:
+    """Slopes without a surface, 1 sigma, that the geometry's spread and the light explain.
+
+    Raises ArithmeticError if the spread is so wide that a fit does not converge.
+    """
     squares_urad2 = [_LIGHT_URAD**2]
     for k, sigma in enumerate(spread.sigmas):
         step = np.zeros(len(spread.names))
@@ -88,10 +97,10 @@ def measure_slope_misfit(
         fit = bench.fit(bench.geometry(spread.names, step), linear=True)
         # What the fit leaves belongs to no surface: the terms represent nearly all of the rest.
         squares_urad2.append(1e12 * (fit.residual_x**2 + fit.residual_y**2) / 2)
-    return SlopeMisfit(_measure_curl_urad(grid, height_mm), math.sqrt(sum(squares_urad2)))
+    return math.sqrt(sum(squares_urad2))
 
 
-def _measure_curl_urad(grid: ResidualGrid, height_mm: FloatArray) -> float:
+def measure_curl_urad(grid: ResidualGrid, height_mm: FloatArray) -> float:
     """RMS, µrad, of the slopes less the gradient of the height, averaged over patches."""
     seen = grid.count > 0
     # The slope between two neighbouring cells: measured as the mean of theirs, and by the height.

@@ -17,7 +17,7 @@ from membrane_ctrl.sim import hencky, stretched_film
 from membrane_ctrl.sim.optics.film_terms import FilmTerms, film_heights, height_and_slopes
 from membrane_ctrl.sim.optics.zernike_polynomials import zernike_polynomial
 
-MAX_FILM_TERMS = 66  # Noll's, up to radial order 10: finer errors are ripples, wrinkles and bumps
+MAX_FILM_TERMS = 105  # Noll's, up to radial order 13: finer errors are ripples, wrinkles and bumps
 # of a mounted film, up to radial order 7; the film does not depend on how many are fitted
 _TYPICAL_TERMS = 36
 _SPHERE_TERMS = 40  # those left out are below 1e-12 for radii up to half of the curvature's

@@ -55,6 +55,7 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
         "mirror": _make_config_table(spec.optics.mirror),
         **({"artefact": dict(spec.artefact)} if spec.artefact else {}),
         **({"screen_moved": dict(spec.screen_moved)} if spec.screen_moved else {}),
+        **({"mirror_turned": dict(spec.mirror_turned)} if spec.mirror_turned else {}),
         "frames": [
             _frame_row(spec, frame, float(readings_um[frame]))
             for frame in range(len(spec.patterns))
@@ -110,6 +111,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
         | {"reference_displacement_um": spec.reference_um},
         "light": asdict(spec.light),
         "screen_error": None if spec.screen_error is None else asdict(spec.screen_error),
+        "seat": None if spec.seat is None else spec.seat.as_table(),
         "faults": [asdict(fault) for fault in spec.faults],
         "seed": spec.seed,
     }

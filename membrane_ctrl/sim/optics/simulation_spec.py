@@ -12,6 +12,7 @@ from membrane_ctrl.config.schema import DisturbancesConfig, GeometryConfig, Opti
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film as gas_film
 from membrane_ctrl.sim.optics import bench_poses, film_shape, pattern_levels, zernike_polynomials
+from membrane_ctrl.sim.optics.turned_film import MirrorSeat
 
 # Faults of single frames on a real bench, for simulated sets.
 
@@ -184,6 +185,10 @@ class SimulationSpec:
         `[artefact]` of a set that shows one.
     screen_moved : Mapping[str, Any]
         `[screen_moved]`, if the true one is elsewhere.
+    mirror_turned : Mapping[str, Any]
+        `[mirror_turned]`, if the mirror was turned about its axis.
+    seat : MirrorSeat, optional
+        Where such a mirror truly stands; `film` is as it is seen there.
     faults : tuple of FrameFault
         Faults of single frames.
     stiffness_n_per_m : float
@@ -211,6 +216,8 @@ class SimulationSpec:
     seed: int = 1
     artefact: Mapping[str, str | float] = field(default_factory=dict)
     screen_moved: Mapping[str, Any] = field(default_factory=dict)
+    mirror_turned: Mapping[str, Any] = field(default_factory=dict)
+    seat: MirrorSeat | None = None
     faults: tuple[FrameFault, ...] = ()
     stiffness_n_per_m: float = gas_film.MODULUS_PA * gas_film.MIRROR_FILM.thickness_um * 1e-6
 

@@ -165,6 +165,18 @@ def test_a_ring_that_is_not_flat_is_distinguished_from_an_uneven_strain() -> Non
     assert abs(waves["round", 2].amounts[0]) < 0.05
 
 
+@pytest.mark.parametrize("amount_mm", [0.02, -0.02])
+def test_a_round_figure_that_all_sets_share_widens_the_bars(amount_mm: float) -> None:
+    """20 µm of Noll 11 were refused as figures of different films."""
+    figures = World().figures(1)
+    for figure in figures:
+        figure.parameters_mm[ROUND[1]] += amount_mm
+    fit = _fit(figures)
+    off = np.array([fit.law.prestrain, fit.law.poisson]) - (5e-4, 0.36)
+    assert np.all(np.abs(off) < 3 * fit.sigmas[:2])
+    assert fit.misfit_um > 5.0
+
+
 def test_one_set_is_too_few() -> None:
     with pytest.raises(ValueError, match="two or more pressures"):
         _fit(World().figures(1)[:1])

@@ -96,7 +96,9 @@ def test_derivatives_are_those_of_the_model() -> None:
             step[column - LOCAL] = 1e-2 * ALL[column - LOCAL].sigma
             numeric = (predicted(VALUES + step) - predicted(VALUES - step)) / (2 * step.max())
         error = np.abs(chunk.derivatives[:, column] - numeric).max()
-        assert error < 3e-6 * np.abs(numeric).max(), column
+        assert error <= 3e-6 * np.abs(numeric).max(), (
+            column
+        )  # of a seat: the fringes do not depend on it
 
 
 def test_the_model_is_the_twins_trace() -> None:

@@ -58,6 +58,9 @@ CAUSES = {
     ),
     "cut at black": Cause(Effects(sensor=Sensor(black_clip=0.06)), "black"),
     "camera gamma": Cause(Effects(sensor=Sensor(response_gamma=1.8)), "response"),
+    "camera gamma and panel gamma": Cause(
+        Effects(sensor=Sensor(response_gamma=2.2), panel=Panel(gamma=2.4))
+    ),
     "slow panel, 1 %": Cause(Effects(panel=Panel(previous_share=0.01))),
     "slow panel, 3 %": Cause(Effects(panel=Panel(previous_share=0.03))),
     "slow panel, 10 %": Cause(Effects(panel=Panel(previous_share=0.1)), "slow panel"),

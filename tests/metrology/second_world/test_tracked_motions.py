@@ -86,7 +86,11 @@ def test_a_motion_along_an_axis_is_within_the_bars(
 @pytest.mark.parametrize(
     ("name", "effects", "word"),
     [
-        ("yaw", Effects(laser=False, camera_motion=step_motion(YAW, 5e-5, MOVES_S)), "tilted"),
+        (
+            "yaw",
+            Effects(laser=False, camera_motion=step_motion(YAW, 5e-5, MOVES_S)),
+            "camera turned",
+        ),
         ("roll", Effects(laser=False, screen_motion=step_motion(ROLL, 2e-4, MOVES_S)), "rolled"),
     ],
 )

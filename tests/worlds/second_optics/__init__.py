@@ -18,6 +18,7 @@ Another film: finite strains, orthotropic, on a ring that is neither plane nor r
            ring=Ring(height={2: (3e-4, 0.0)}),          # in radii: 0.15 mm of saddle
            wrinkles=Wrinkles(amplitude_um=20.0))
     drawn_mirror(rng, orthotropic=True)                 # a random one
+    mirror.seated(drawn_seat(rng, 120.0))               # turned by 120 degrees, by hand
     mirror.height_mm(x_mm, y_mm, displacement_um)       # its truth anywhere
 
 Effects are planted one by one, each with a size; see `effects.Effects` for all of them::
@@ -74,6 +75,7 @@ from tests.worlds.second_optics.effects import (
 )
 from tests.worlds.second_optics.film import Material, Ring
 from tests.worlds.second_optics.mirror import Mirror, Wrinkles, drawn_mirror
+from tests.worlds.second_optics.seat import Seat, drawn_seat
 from tests.worlds.second_optics.world import FRAME_S, Stated, Truth, World
 
 # degrees of freedom of a motion; of the screen they are along and about s_x, s_y and out
@@ -95,6 +97,7 @@ __all__ = [
     "Mirror",
     "Panel",
     "Ring",
+    "Seat",
     "Sensor",
     "Stated",
     "Truth",
@@ -102,6 +105,7 @@ __all__ = [
     "Wrinkles",
     "drawn_errors",
     "drawn_mirror",
+    "drawn_seat",
     "ramp_motion",
     "step_motion",
 ]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.worlds.second_optics.film import Field, FilmSolver, Material, Ring, Shape
+from tests.worlds.second_optics.seat import Seat
 
 FloatArray = NDArray[np.float64]
 
@@ -55,6 +56,7 @@ class Mirror:
     material: Material = field(default_factory=Material)
     ring: Ring = field(default_factory=Ring)
     wrinkles: Wrinkles | None = None
+    seat: Seat | None = None  # None: the mirror stands as usual
 
     def __post_init__(self) -> None:
         self._solved: dict[int, tuple[Shape, FloatArray]] = {}
@@ -67,6 +69,16 @@ class Mirror:
         smooth._solved = self._solved  # wrinkles are no part of the equilibrium
         return smooth
 
+    def seated(self, seat: Seat) -> Mirror:
+        """The same film in a mirror that stands otherwise."""
+        other = replace(self, seat=seat)
+        other._solved = self._solved
+        return other
+
+    def own_axes(self, xy: FloatArray) -> FloatArray:
+        """Places (2, n) of the world in the axes of the mirror, about."""
+        return xy if self.seat is None else self.seat.unturned(xy)
+
     def load(self, displacement_um: float = 0.0) -> float:
         """Pressure over E1 t / R."""
         return self._shape(displacement_um).load
@@ -75,6 +87,8 @@ class Mirror:
         self, x: FloatArray, y: FloatArray, displacement_um: float
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Places (3, n) in the world of material points in radii, and their derivatives by each."""
+        if self.seat is not None:
+            displacement_um = displacement_um + 1e3 * self.seat.raised_mm
         shape = self._shape(displacement_um)
         u, u_x, u_y = shape.u.values(x, y)
         v, v_x, v_y = shape.v.values(x, y)
@@ -84,23 +98,35 @@ class Mirror:
             w, w_x, w_y = w + added[0], w_x + added[1], w_y + added[2]
         scale = self.radius_mm
         place = scale * np.stack([x + u, y + v, w]) + np.array([[0.0], [0.0], [self.sag_mm]])
-        return place, scale * np.stack([1 + u_x, v_x, w_x]), scale * np.stack([u_y, 1 + v_y, w_y])
+        along_x = scale * np.stack([1 + u_x, v_x, w_x])
+        along_y = scale * np.stack([u_y, 1 + v_y, w_y])
+        if self.seat is None:
+            return place, along_x, along_y
+        turn = self.seat.rotation()
+        place = self.seat.places(place, -1e-3 * displacement_um)
+        return place, turn @ along_x, turn @ along_y
 
     def height_mm(self, x_mm: FloatArray, y_mm: FloatArray, displacement_um: float) -> FloatArray:
         """Height above the centre of the film at places of the world."""
-        x_mm, y_mm = np.atleast_1d(x_mm, y_mm)
-        material = np.stack([x_mm, y_mm]) / self.radius_mm
-        wanted = np.stack([x_mm, y_mm])
+        wanted = np.stack(np.atleast_1d(x_mm, y_mm))
+        place = self._place_over(wanted, displacement_um)
+        zero = np.zeros(1)
+        if self.seat is None:
+            centre, _, _ = self.position_mm(zero, zero, displacement_um)
+        else:
+            centre = self._place_over(np.zeros((2, 1)), displacement_um)
+        return np.asarray(place[2] - centre[2])
+
+    def _place_over(self, wanted: FloatArray, displacement_um: float) -> FloatArray:
+        """The film's points (3, n) at places (2, n) of the world."""
+        material = self.own_axes(wanted) / self.radius_mm
         for _ in range(40):
             place, _, _ = self.position_mm(material[0], material[1], displacement_um)
             off = wanted - place[:2]
-            material = material + off / self.radius_mm
+            material = material + self.own_axes(off) / self.radius_mm
             if np.abs(off).max() < 1e-10:
                 break
-        place, _, _ = self.position_mm(material[0], material[1], displacement_um)
-        zero = np.zeros(1)
-        centre, _, _ = self.position_mm(zero, zero, displacement_um)
-        return np.asarray(place[2] - centre[2])
+        return self.position_mm(material[0], material[1], displacement_um)[0]
 
     def rim_sag_um(self, displacement_um: float) -> float:
         """Mean height of the ring above the centre."""

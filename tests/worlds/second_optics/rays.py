@@ -71,7 +71,7 @@ def _meet_film(
     radius = mirror.radius_mm
     # a flat sheet half way down the bowl gives the first guess
     path = (mirror.sag_mm / 2 - start[2]) / rays[2]
-    film = (start[:2] + path * rays[:2]) / radius
+    film = mirror.own_axes(start[:2] + path * rays[:2]) / radius
     for _ in range(12):
         place, along_x, along_y = mirror.position_mm(film[0], film[1], displacement_um)
         off = start + path * rays + path**2 / 2 * bend - place

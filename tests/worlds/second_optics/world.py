@@ -52,11 +52,14 @@ class Stated:
         Keys that replace those of `[geometry]`.
     camera : mapping
         Keys that replace those of `[camera]`.
+    turned_deg : float or None
+        Angle of `[mirror_turned]`, without which the mirror stands as usual.
     """
 
     sigma_share: float = 1.0
     geometry: Mapping[str, Any] = field(default_factory=dict)
     camera: Mapping[str, Any] = field(default_factory=dict)
+    turned_deg: float | None = None
 
 
 @dataclass(frozen=True)
@@ -169,6 +172,8 @@ class World:
                 row["displacement_um"] = float(readings_um[k])
             rows.append(row)
         table = self.stated_table() | {"frames": rows}
+        if self.stated.turned_deg is not None:
+            table["mirror_turned"] = {"angle_deg": self.stated.turned_deg}
         if pressure_pa is not None:
             table["pressure_pa"] = pressure_pa
         _write(folder, table, [row["file"] for row in rows], frames)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from membrane_ctrl.geometry.spread_file import KnownBy
+from membrane_ctrl.metrology.uncertainty.geometry_spread import KnownBy
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit
 from membrane_ctrl.metrology.uncertainty.slope_misfit import SlopeMisfit
 

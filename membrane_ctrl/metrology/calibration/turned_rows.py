@@ -1,0 +1,81 @@
+"""Rows of the normal equations for a mirror that was turned about its axis.
+
+The film's figure turns with the mirror, what the bench adds does not. Common unknowns are the
+turning terms of the film in the mirror's frame (`film_form`) as a function of the sag. A set's own
+unknowns are where its mirror's axis is, and by how much more than stated the mirror is turned.
+"""
+
+import numpy as np
+
+from membrane_ctrl.metrology.calibration.set_state import (
+    COMMON,
+    FORM_PLACE,
+    References,
+    SetState,
+)
+from membrane_ctrl.metrology.film import film_form
+from membrane_ctrl.metrology.rays.forward_model import LOCAL, SEAT
+from membrane_ctrl.metrology.rays.height_projection import height_projection
+from membrane_ctrl.metrology.rays.set_phases import TurnedMirror
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.model.arrays import FloatArray, IntArray
+
+# What does not turn: an upright film hangs by its weight, and its gas is lighter or heavier than
+# air. Half a micrometre of coma each
+_HANGS_UM = 1.0
+_SEATED = 1e-6  # mm and rad, of a mirror that was not turned
+
+
+def seat_rows(turned: TurnedMirror | None, state: SetState) -> FloatArray:
+    """What is known of the seat, as weighted rows [derivatives, miss]."""
+    rows = np.zeros((3, LOCAL + COMMON + 1))
+    rows[:, SEAT] = np.eye(3)
+    rows[:, -1] = -np.array(state.seat)
+    sigmas = np.full(3, _SEATED)
+    if turned is not None:
+        angle_rad = np.radians(turned.angle_sigma_deg)
+        sigmas = np.array([turned.seat_sigma_mm, turned.seat_sigma_mm, angle_rad])
+    return np.asarray(rows / sigmas[:, None])
+
+
+def form_rows(
+    turned: TurnedMirror | None, state: SetState, common: FloatArray, references: References
+) -> FloatArray:
+    """The figure of a set is the film's, turned and shifted: weighted rows [derivatives, miss].
+
+    None without a turned mirror among the sets, or where the figure does not turn.
+    """
+    if references.form_sag_mm is None or (turned is not None and not turned.figure_turns):
+        return np.zeros((0, LOCAL + COMMON + 1))
+    terms = np.array(film_form.TURNING)
+    powers = film_form.depth_powers(state.surface.sag_mm - references.form_sag_mm)
+    form = common[FORM_PLACE].reshape(film_form.POWERS, terms.size)
+    x_mm, y_mm, more_rad = state.seat
+    angle_rad = more_rad + (0.0 if turned is None else np.radians(turned.angle_deg))
+    turn = film_form.turn_matrix(angle_rad)
+    of_film = powers @ form
+    by_shift = shift_derivatives(state.surface, terms)
+
+    rows = np.zeros((terms.size, LOCAL + COMMON + 1))
+    rows[np.arange(terms.size), terms] = 1.0
+    by_turn = film_form.turn_derivative(angle_rad) @ of_film
+    rows[:, SEAT] = np.column_stack([by_shift, -by_turn])
+    rows[:, LOCAL:][:, FORM_PLACE] = -np.kron(powers, turn)
+    shifted = turn @ of_film - by_shift @ (x_mm, y_mm)
+    rows[:, -1] = shifted - state.surface.parameters[terms]
+    return np.asarray(rows / form_sigmas_mm(references)[:, None])
+
+
+def form_sigmas_mm(references: References) -> FloatArray:
+    """How well each turning term (terms,) turns with the mirror."""
+    hangs_um = np.where(np.array(film_form.TURNING_ORDERS) == 1, _HANGS_UM, 0.0)
+    return np.asarray(1e-3 * np.hypot(references.form_sigma_um, hangs_um))
+
+
+def shift_derivatives(surface: Surface, places: IntArray) -> FloatArray:
+    """Slopes of a surface along x and y, (n, 2), as terms at these places among the parameters and
+    the terms beyond the fit's, mm per mm.
+    """
+    x, y, project = height_projection()
+    slopes = surface.slopes(x * surface.radius_mm, y * surface.radius_mm)
+    return np.stack([project[places] @ slope for slope in slopes], axis=1)

@@ -1,0 +1,90 @@
+"""The round part of the slopes that a fit leaves: means over rings of the mirror.
+
+Waves around the mirror, of wrinkles at its rim, are a thousand times larger than a film's round
+error and grow steeply with the radius. They cancel in the mean over a whole ring, if each sector of
+the ring counts equally. The means of every fourth sector must then agree: their scatter is the
+error of the ring's mean.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.model.arrays import FloatArray
+
+_SECTORS, _GROUPS = 72, 4
+_RINGS_LEAST, _RINGS_MOST = 12, 60
+_POINTS_A_SECTOR = 16.0  # on average: their noise is then far below their slopes
+
+
+@dataclass(frozen=True)
+class RoundSlopes:
+    """Mean radial slopes of rings of even width.
+
+    Attributes
+    ----------
+    inner_mm, outer_mm : (rings,) array
+        Edges of the rings that were seen.
+    slope : (rings,) array
+        Mean over azimuth of the radial slope.
+    sigma : (rings,) array
+        1 sigma, by the scatter between interleaved sectors.
+    share : (rings,) array
+        Variance of the mean over that of a point's slope, by independent noise of the points.
+    """
+
+    inner_mm: FloatArray
+    outer_mm: FloatArray
+    slope: FloatArray
+    sigma: FloatArray
+    share: FloatArray
+
+    @classmethod
+    def of(
+        cls, places_mm: FloatArray, count: FloatArray, slopes: FloatArray, reach_mm: float
+    ) -> "RoundSlopes":
+        """Average the slopes of points.
+
+        Parameters
+        ----------
+        places_mm, slopes : (2, n) arrays
+            Along x and y.
+        count : (n,) array
+            What each stands for; 0 leaves it out.
+        reach_mm : float
+            Outer edge of the last ring.
+        """
+        rings = int(
+            np.clip(places_mm.shape[1] / _SECTORS / _POINTS_A_SECTOR, _RINGS_LEAST, _RINGS_MOST)
+        )
+        x, y = places_mm
+        radius = np.maximum(np.hypot(x, y), 1e-9)
+        ring = np.minimum((radius / reach_mm * rings).astype(int), rings - 1)
+        sector = (np.arctan2(y, x) / (2 * np.pi) % 1.0 * _SECTORS).astype(int) % _SECTORS
+        cell = ring * _SECTORS + sector
+        size = rings * _SECTORS
+        total = np.bincount(cell, count, size).reshape(rings, _SECTORS)
+        radial = (slopes[0] * x + slopes[1] * y) / radius
+        sums = np.bincount(cell, count * radial, size).reshape(rings, _SECTORS)
+        full = total > 0
+        means = np.where(full, sums / np.maximum(total, 1e-300), 0.0)
+
+        # means of every fourth sector; a ring counts if each of them was seen
+        groups = np.arange(_SECTORS) % _GROUPS == np.arange(_GROUPS)[:, None]
+        filled = full.astype(float) @ groups.T
+        of_groups = means @ groups.T / np.maximum(filled, 1.0)
+        used = filled.min(axis=1) > 0
+        scatter = np.var(of_groups[used], axis=1, ddof=1) / _GROUPS
+        # neighbours have about the same scatter, and four means know theirs badly
+        near = np.convolve(scatter, np.ones(3), "same") / np.convolve(
+            np.ones(scatter.size), np.ones(3), "same"
+        )
+        inverse = np.where(full, 1 / np.maximum(total, 1e-300), 0.0).sum(axis=1)
+        edges = reach_mm * np.arange(rings + 1) / rings
+        return cls(
+            edges[:-1][used],
+            edges[1:][used],
+            of_groups[used].mean(axis=1),
+            np.sqrt(near),
+            (inverse / np.maximum(full.sum(axis=1), 1.0) ** 2)[used],
+        )
