@@ -194,7 +194,7 @@ def tune(context: TickContext) -> State:
     wanted: float | Finished
     if context.hold_wanted:
         wanted = Finished(ExperimentEnd.INTERRUPTED, f"ended by {context.asked_by}")
-    elif context.levels.safe_level != SafeLevel.NONE:
+    elif context.levels.safe_level != SafeLevel.NONE and not _has_lost_laser(context):
         wanted = Finished(ExperimentEnd.INTERRUPTED, "the safety table holds the mean flow")
     else:
         wanted = trial.step(measurement, context.dt_s)
@@ -214,6 +214,14 @@ def tune(context: TickContext) -> State:
     tuning = f"tuning: {trial.spec.kind} requested by {context.asked_by}"
     context.explain(WhyCode.EXPERIMENT, tuning, trial.spec.kind, context.asked_by)
     return State.TUNE
+
+
+def _has_lost_laser(context: TickContext) -> bool:
+    """Whether an experiment has no reading for a moment: its guard tolerates 0.3 s and allows for
+    the motion in that time, so that a short loss does not end it.
+    """
+    may_be_short = not context.config.by_optics and not context.laser_doubted
+    return may_be_short and math.isnan(context.observer.laser_um)
 
 
 def lower(context: TickContext) -> State:

@@ -331,7 +331,8 @@ def _least_squares(gram: FloatArray, rows: int) -> tuple[float, FloatArray, Floa
     """Variance of the residual, values, their covariance, from the columns' products; the last is
     the reading.
     """
-    scale = np.maximum(np.sqrt(np.diag(gram)[:-1]), 1e-9)
+    # A column that never moved has a product of zero, or less by rounding
+    scale = np.sqrt(np.maximum(np.diag(gram)[:-1], 1e-18))
     inverse = np.linalg.inv(gram[:-1, :-1] / np.outer(scale, scale) + 1e-9 * np.eye(scale.size))
     values = inverse @ (gram[:-1, -1] / scale) / scale
     variance = max(float(gram[-1, -1] - values @ gram[:-1, -1]) / max(1, rows - scale.size), 1e-12)

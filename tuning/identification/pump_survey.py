@@ -45,6 +45,7 @@ _MOST_S = 1500.0
 _ROUND_S = 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
+_DARK_S = 15.0  # a longer run has shown something before its reading was lost
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
 _HIGHEST = 0.25  # of the limit, where a run begins at most
 # of the limit; the rest is for gusts, and for the noise that the guard keeps in hand
@@ -80,7 +81,7 @@ class PumpSurvey:
     laser_um: float = 0.5
     runs: list[PumpRun] = field(default_factory=list)
     fit: PumpFit = NO_FIT
-    dark: int = 0  # the latest runs that ended without a reading
+    dark: int = 0  # the latest runs that were short and ended without a reading
     _share: float = 1.0  # of the travel, smaller after a run that was stopped
     _longer: float = 1.0  # the first pulses, while no flow is known
     _rounds: int = 0
@@ -107,7 +108,9 @@ class PumpSurvey:
             self._longer *= 2.0 if run.sank else 0.5
         if run.fraction.size * run.dt_s > _LEAST_S:
             self.runs.append(run)
-        self.dark = self.dark + 1 if np.isnan(run.displacement_um[-1:]).any() else 0
+        is_short = run.fraction.size * run.dt_s < _DARK_S
+        is_dark = is_short and bool(np.isnan(run.displacement_um[-1:]).any())
+        self.dark = self.dark + 1 if is_dark else 0
         if self.runs:
             self.fit = fit_pump(
                 self.runs, self.fit if self._rounds > 3 and self.fit.levels else None

@@ -65,6 +65,13 @@ class Record:
         """Share of readings that were lost."""
         return float(np.mean(~np.isfinite(self.displacement_um)))
 
+    @property
+    def gaps_s(self) -> list[float]:
+        """Duration of each time without a reading."""
+        is_lost = np.concatenate(([False], ~np.isfinite(self.displacement_um), [False]))
+        edges = np.flatnonzero(np.diff(is_lost.astype(int)))
+        return [float(samples) * self.dt_s for samples in edges[1::2] - edges[::2]]
+
     def part(self, start_s: float, stop_s: float) -> Record:
         """The samples from `start_s` up to, but excluding, `stop_s`."""
         cut = slice(round(start_s / self.dt_s), round(stop_s / self.dt_s))

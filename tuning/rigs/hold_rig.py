@@ -26,7 +26,12 @@ from tuning.rigs.ticks_by_figures import TicksByFigures
 _WITHIN = 0.1  # of a tick: figures of about its time
 Progress = Callable[[float], None]  # seconds of hold recorded since the last call
 _HELD = frozenset({telemetry.State.HOLD, telemetry.State.TUNE})
-_ANSWER_TICKS = 500  # for the state to change after a command: 10 s at 50 Hz
+# Ticks after a command in which its experiment must begin: 10 s at 50 Hz
+_ANSWER_TICKS = 500
+# An experiment whose reading was lost is repeated so often, after so long with a reading
+_REPEATS_MOST = 3
+_READING_BACK_S = 5.0
+_REFUSALS_MOST = 5  # of an experiment, while the safety table holds the mean flow
 
 
 class HoldRig:
@@ -44,6 +49,9 @@ class HoldRig:
         self._figures = TicksByFigures(link.config) if link.config.by_optics else None
         self._every = 0  # ticks of a reading; 0: not known yet
         self._state = math.nan  # of the newest tick
+        self._tick = math.nan  # its number
+        self._reads = 0  # of news
+        self.repeated = 0  # experiments that were repeated because the reading was lost
         self.loop, self.pump = link.config.loop, link.config.pump  # as last set
         self.good = self.loop, self.pump  # to go back to
         self.dt_s = 1 / self.loop.rate_hz
@@ -85,20 +93,66 @@ class HoldRig:
     def performed(
         self, spec: ExperimentSpec
     ) -> tuple[list[telemetry.TelemetryRow], experiment.Finished]:
-        """As `perform`, with the ticks instead of a record."""
-        self._events.clear()
-        self._link.send_command(
-            Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec)
-        )
-        rows: list[telemetry.TelemetryRow] = []
+        """As `perform`, with the ticks instead of a record.
+
+        An experiment that a lost reading ended is repeated, and the ticks of both are returned. A
+        pump map is not: its session plans the next round by what the ended one has shown.
+        """
+        rows, finished = self._perform_once(spec)
+        for _ in range(_REPEATS_MOST):
+            lost = finished.end is experiment.ExperimentEnd.READING_LOST
+            if not lost or spec.kind == "pump_map":
+                break
+            self.repeated += 1
+            rows += self._wait_for_reading()
+            more, finished = self._perform_once(spec)
+            rows += more
+        return rows, finished
+
+    def _wait_for_reading(self) -> list[telemetry.TelemetryRow]:
+        """Ticks until the safety table has held no mean flow for some seconds."""
+        latest = rows = self.ticks(_READING_BACK_S)
+        while any(row.safe_level for row in latest):
+            latest = self.ticks(_READING_BACK_S)
+            rows += latest
+        return rows
+
+    def _perform_once(
+        self, spec: ExperimentSpec
+    ) -> tuple[list[telemetry.TelemetryRow], experiment.Finished]:
+        rows = self._request_experiment(spec)
+        # Ticks that were queued before the request belong to the record, and are no answer to it:
+        # the first read after the request has them all
+        reads, asked_tick = self._reads, math.nan
         begun = False
         while not begun or rows[-1].state == telemetry.State.TUNE:
             rows.append(self._next_held())
             begun = begun or rows[-1].state == telemetry.State.TUNE
-            if not begun and len(rows) > _ANSWER_TICKS:
+            if math.isnan(asked_tick) and self._reads > reads:
+                asked_tick = self._tick
+            if not begun and rows[-1].tick - asked_tick > _ANSWER_TICKS:
                 raise HoldError("the hold accepted the experiment but did not begin it")
         end = self._experiment_ended()
         return rows, experiment.Finished(experiment.ExperimentEnd(end.end), end.reason)
+
+    def _request_experiment(self, spec: ExperimentSpec) -> list[telemetry.TelemetryRow]:
+        """Ask for an experiment, again while a lost reading makes the hold refuse it; returns the
+        ticks of the time between.
+        """
+        command = Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec)
+        rows: list[telemetry.TelemetryRow] = []
+        for number in range(_REFUSALS_MOST):
+            self._events.clear()
+            try:
+                self._link.send_command(command)
+                break
+            except HoldError:
+                waited = self.ticks(len(self._rows) * self.dt_s + _READING_BACK_S)
+                about = waited[-round(2.0 * _READING_BACK_S / self.dt_s) :]
+                if number == _REFUSALS_MOST - 1 or not any(row.safe_level for row in about):
+                    raise
+                rows += waited
+        return rows
 
     def set_gains(
         self,
@@ -211,7 +265,10 @@ class HoldRig:
 
     def _read_news(self) -> None:
         news = self._link.read_news()
-        self._state = news.rows[-1].state if news.rows else self._state
+        self._reads += 1
+        if news.rows:
+            self._state = news.rows[-1].state
+            self._tick = news.rows[-1].tick
         self._rows.extend(
             news.rows if self._figures is None else self._figures.add_rows(news.rows, news.shapes)
         )

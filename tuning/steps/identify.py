@@ -66,12 +66,29 @@ def describe_result(session: folder.SessionFolder) -> str:
     sigma = found.identified.sigma
     reasons = "".join(f"; {reason}" for reason in found.quality.reasons)
     too_tight = model.leak_um_per_s < TOO_TIGHT_UM_PER_S
+    lossy = describe_losses(load_experiments(session).record, session.config.by_optics)
     return (
         f"k {model.gain:.3f} +- {sigma.gain:.3f}, "
         f"delay {model.delay_s:.3f} +- {sigma.delay_s:.3f} s "
         f"(dead time {model.dead_time_s:.3f} +- {sigma.dead_time_s:.3f} s), "
         f"leak {model.leak_um_per_s:.2f} µm/s: {found.quality.verdict}{reasons}"
         + (f"; {TOO_TIGHT}" if too_tight else "")
+        + (f"; {lossy}" if lossy else "")
+    )
+
+
+def describe_losses(record: Record, by_optics: bool) -> str:
+    """How often and how long the sensor of the displacement had no reading; empty if it never
+    had.
+    """
+    gaps_s = record.gaps_s
+    if not gaps_s:
+        return ""
+    sensor = "camera" if by_optics else "laser"
+    return (
+        f"the {sensor} had no reading {len(gaps_s)} times in {record.duration_s:.0f} s of "
+        f"experiments, {max(gaps_s):.2f} s at the longest: look for something in its way and a "
+        "loose cable"
     )
 
 
@@ -90,6 +107,7 @@ def _describe_fit(session: folder.SessionFolder) -> list[PageBlock]:
     model, sigma = fit.model, fit.sigma
     mark = TextMark.BAD if found.quality.verdict == "refused" else TextMark.GOOD
     reasons = "; ".join(found.quality.reasons)
+    lossy = describe_losses(load_experiments(session).record, session.config.by_optics)
     rows = [
         ("gain k", f"{model.gain:.3f}", f"{sigma.gain:.3f}"),
         ("dead time (s)", f"{model.dead_time_s:.3f}", f"{sigma.dead_time_s:.3f}"),
@@ -102,8 +120,10 @@ def _describe_fit(session: folder.SessionFolder) -> list[PageBlock]:
         f"{fit.independence_p:.3g}, largest {fit.largest_residual:.1f} sigma. "
         f"Data {found.data_sha256[:16]}."
     )
+    losses = [PageText(f"{lossy[0].upper()}{lossy[1:]}.", TextMark.BAD)] if lossy else []
     return [
         PageText(f"Data: {found.quality.verdict}. {reasons}", mark),
+        *losses,
         PageTable(("", "value", "1 sigma"), rows),
         PageText(tests),
     ]
