@@ -128,7 +128,7 @@ def _probe_all(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.
         return probe_optics(config), []
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(device_claim.claim_devices(device_names.device_names(devices)))
+            stack.enter_context(device_claim.claim_devices(device_names.list_device_names(devices)))
         except errors.DeviceError as error:
             return [
                 DeviceProbe(

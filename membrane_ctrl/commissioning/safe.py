@@ -43,7 +43,7 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
     if config.devices is None:
         raise InputError(f"{source}: devices: missing; nothing to make safe")
     if not latch:
-        with device_claim.claim_devices(device_names.device_names(config.devices)):
+        with device_claim.claim_devices(device_names.list_device_names(config.devices)):
             print(asyncio.run(_after_a_run(config.devices)), file=sys.stderr)
         return Exit.DONE
     folder = logs_dir or Path(config.recording.logs_dir)

@@ -33,7 +33,7 @@ class NeededPackage:
         return describe_missing(f"[{self.table}]", self.package, self.extra)
 
 
-def needed_packages(config: Config) -> Iterator[NeededPackage]:
+def list_needed_packages(config: Config) -> Iterator[NeededPackage]:
     """The packages of the bridges.
 
     Drivers and alarms name theirs where they are made (`GpioLine`, `require_sendable`).
@@ -46,4 +46,4 @@ def needed_packages(config: Config) -> Iterator[NeededPackage]:
 
 def list_missing_packages(config: Config) -> list[NeededPackage]:
     """Those that are not installed."""
-    return [each for each in needed_packages(config) if not is_installed(each.package)]
+    return [each for each in list_needed_packages(config) if not is_installed(each.package)]

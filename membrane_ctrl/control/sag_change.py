@@ -37,7 +37,7 @@ class SagChange(StateNode):
 NO_CHANGE = SagChange(math.nan, math.nan)
 
 
-def sag_change(
+def compute_sag_change(
     coeffs_um: FloatArray,
     reference_um: FloatArray,
     covariance_um2: FloatArray,

@@ -20,7 +20,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.drift_tracker import DriftTracker
-from membrane_ctrl.control.sag_change import NO_CHANGE, SagChange, sag_change
+from membrane_ctrl.control.sag_change import NO_CHANGE, SagChange, compute_sag_change
 from membrane_ctrl.control.shape_reference import ReferenceMean
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
@@ -220,7 +220,7 @@ class ShapeLoop:
                 memory.drift.begin(reference.time_s)
                 reference.taken.clear()  # their mean is all that is needed
             return
-        change = sag_change(
+        change = compute_sag_change(
             estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity
         )
         drift_um = estimate.displacement_um - reference.displacement_um - change.change_um

@@ -31,7 +31,7 @@ from membrane_ctrl.hold.start_checks import (
 from membrane_ctrl.hold.tick_run import HoldResources, run_ticks
 from membrane_ctrl.instruments.bench import make_bench
 from membrane_ctrl.instruments.device_claim import claim_devices
-from membrane_ctrl.instruments.device_names import device_names
+from membrane_ctrl.instruments.device_names import list_device_names
 from membrane_ctrl.model import errors, job_control, terminal
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes import published_rings
@@ -71,7 +71,7 @@ def hold_mirror(options: HoldOptions) -> int:
         config = twin.config if twin else options.config
         assert config.devices is not None
         stack.enter_context(
-            claim_devices(device_names(config.devices))
+            claim_devices(list_device_names(config.devices))
         )  # one with other folders ends here
         lock_storage = find_locks(config, options)  # before anything is cleared
         latched = open_latched_fault(config, logs_dir, options)

@@ -10,7 +10,7 @@ from firmware_iface.links import modbus_rtu, port_names
 from membrane_ctrl.config.schema import DevicesConfig
 
 
-def device_names(devices: DevicesConfig) -> set[str]:
+def list_device_names(devices: DevicesConfig) -> set[str]:
     """Canonical names of the configured devices on this machine, however spelt."""
     names = {serial_name(port) for port in _interlock_ports(devices)}
     if devices.board is not None:

@@ -15,9 +15,9 @@ _BY_ID = Path("/dev/serial/by-id")
 def list_device_keys(devices: DevicesConfig) -> frozenset[str]:
     """Return the names by which a bench's devices are known to the lock store.
 
-    Besides the present names (`device_names.device_names`), by which programs exclude each other,
-    these are the configured ones and those of `/dev/serial/by-id`: a USB adapter or an address may
-    get another name while a lock is set.
+    Besides the present names (`device_names.list_device_names`), by which programs exclude each
+    other, these are the configured ones and those of `/dev/serial/by-id`: a USB adapter or an
+    address may get another name while a lock is set.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def list_device_keys(devices: DevicesConfig) -> frozenset[str]:
             keys |= modbus_keys(section.link, section.unit_id)
         else:
             keys |= _serial_keys(section.port)
-    return frozenset(keys | device_names.device_names(devices))
+    return frozenset(keys | device_names.list_device_names(devices))
 
 
 def modbus_keys(url: str, unit_id: int) -> frozenset[str]:

@@ -18,7 +18,7 @@ class DetailLevel(IntEnum):
     ESSENTIAL = 2  # events, tick inputs, summary: a few kB/s, enough to replay the run
 
 
-def detail_level(free_mb: float, min_free_mb: float, before: DetailLevel) -> DetailLevel:
+def decide_detail_level(free_mb: float, min_free_mb: float, before: DetailLevel) -> DetailLevel:
     """Level of detail for this much free space, given the previous level."""
     level = _level_for_free_space(free_mb, min_free_mb)
     return max(level, min(before, _level_for_free_space(free_mb / _HYSTERESIS, min_free_mb)))

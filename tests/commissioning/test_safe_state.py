@@ -22,7 +22,7 @@ from membrane_ctrl.commissioning.safe import make_safe
 from membrane_ctrl.config.schema import Config, DevicesConfig, RecordingConfig
 from membrane_ctrl.instruments.bench import make_pump_board
 from membrane_ctrl.instruments.device_claim import claim_devices
-from membrane_ctrl.instruments.device_names import device_names
+from membrane_ctrl.instruments.device_names import list_device_names
 from membrane_ctrl.instruments.lock_keys import list_device_keys
 from membrane_ctrl.instruments.lock_store import VARIABLE, LockStore
 from membrane_ctrl.model.errors import DeviceError
@@ -127,7 +127,7 @@ def test_a_board_with_claims_keeps_it_stopped_until_the_holder_clears_it(bench: 
 
 
 def test_it_waits_for_no_lock(bench: Bench) -> None:
-    with claim_devices(device_names(bench.devices)):
+    with claim_devices(list_device_names(bench.devices)):
         assert make_safe(bench.config, "lab.toml") == 0
     assert bench.read().pump_fraction == 0.0
 
@@ -174,7 +174,7 @@ def test_a_pump_that_the_watchdog_leaves_on_is_stopped_after_all(
 
 def test_without_a_latch_a_running_program_is_left_alone(bench: Bench) -> None:
     with (
-        claim_devices(device_names(bench.devices)),
+        claim_devices(list_device_names(bench.devices)),
         pytest.raises(DeviceError, match="in use by process"),
     ):
         make_safe(bench.config, "lab.toml", latch=False)

@@ -14,7 +14,7 @@ import pytest
 
 from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments.device_claim import claim_devices
-from membrane_ctrl.instruments.device_names import device_names, modbus_names
+from membrane_ctrl.instruments.device_names import list_device_names, modbus_names
 from membrane_ctrl.model.errors import DeviceError
 
 HOLDS = """
@@ -162,7 +162,7 @@ def test_a_composed_bench_has_all_its_devices(tmp_path: Path) -> None:
             "gauge_pressure": {**analog, "unit_id": 4, "value": [0.0, 1000.0]},
         }
     )
-    assert device_names(devices) == {
+    assert list_device_names(devices) == {
         f"{tmp_path}/laser",
         f"{tmp_path}/pump",
         "localhost port 1502 unit 3",

@@ -14,7 +14,7 @@ from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.recorder_events import RecorderError, RecorderRecovered
 from membrane_ctrl.recorder.housekeeping import RETENTION_INTERVAL_S, Housekeeping
 from membrane_ctrl.recorder.recorder_errors import RecorderErrors
-from membrane_ctrl.run_files.detail_level import DetailLevel, detail_level
+from membrane_ctrl.run_files.detail_level import DetailLevel, decide_detail_level
 from membrane_ctrl.run_files.retention import OldRun, delete_run, find_expired, list_deletable_runs
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
@@ -32,14 +32,14 @@ NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
     ],
 )
 def test_pictures_go_first_and_numbers_last(free_mb: float, level: DetailLevel) -> None:
-    assert detail_level(free_mb, 500.0, DetailLevel.ALL) == level
+    assert decide_detail_level(free_mb, 500.0, DetailLevel.ALL) == level
 
 
 def test_a_level_is_left_only_with_room_to_spare() -> None:
-    assert detail_level(1050, 500.0, DetailLevel.NO_PICTURES) == DetailLevel.NO_PICTURES
-    assert detail_level(1101, 500.0, DetailLevel.NO_PICTURES) == DetailLevel.ALL
-    assert detail_level(105, 500.0, DetailLevel.ESSENTIAL) == DetailLevel.ESSENTIAL
-    assert detail_level(120, 500.0, DetailLevel.ESSENTIAL) == DetailLevel.NO_PICTURES
+    assert decide_detail_level(1050, 500.0, DetailLevel.NO_PICTURES) == DetailLevel.NO_PICTURES
+    assert decide_detail_level(1101, 500.0, DetailLevel.NO_PICTURES) == DetailLevel.ALL
+    assert decide_detail_level(105, 500.0, DetailLevel.ESSENTIAL) == DetailLevel.ESSENTIAL
+    assert decide_detail_level(120, 500.0, DetailLevel.ESSENTIAL) == DetailLevel.NO_PICTURES
 
 
 def old_run(days: float, size_gb: float) -> OldRun:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.control.sag_change import sag_change
+from membrane_ctrl.control.sag_change import compute_sag_change
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sessions.live_hold import HoldError
 from tuning.identification.local_level import fit_local_level
@@ -120,7 +120,7 @@ def compute_gaps_um(shapes: Sequence[ShapeEstimate], assumed: Series) -> tuple[S
     """
     first = shapes[0]
     seen = (
-        sag_change(s.coeffs_um, first.coeffs_um, s.covariance_um2, assumed).change_um
+        compute_sag_change(s.coeffs_um, first.coeffs_um, s.covariance_um2, assumed).change_um
         for s in shapes
     )
     gaps_um = np.array(

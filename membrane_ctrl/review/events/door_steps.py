@@ -35,7 +35,7 @@ class _Candidates:
     score: Column
 
 
-def door_steps(
+def find_door_steps(
     mean_pa: Column, reading_pa: Column, least_pa: float, least_sigmas: float
 ) -> list[FoundStep]:
     """Steps of the air pressure, each once; both of a door that is closed at once.

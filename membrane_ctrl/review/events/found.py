@@ -110,7 +110,7 @@ def list_unjudged(level: found_event.Level) -> tuple[str, ...]:
 def pressure_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Doors: steps of the air pressure within a few seconds."""
     values = level["mean_ambient_pressure_pa"]
-    found = door_steps.door_steps(
+    found = door_steps.find_door_steps(
         values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS
     )
     places = values.size * len(door_steps.LAGS)
