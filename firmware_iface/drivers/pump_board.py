@@ -31,9 +31,9 @@ class PumpBoard:
     `clear_faults` clears it, and until then the board keeps the pump off.
 
     `open` claims a board of map version 2 for this object: until it is closed, or its watchdog has
-    run out, the board takes commands from nobody else. A board of map version 1 has no claim and
-    obeys every program. Boards before map version 3 do not stop the pump when their gauge fails,
-    and have no interlock inputs: readings show none closed.
+    run out, the board takes commands from no other program. A board of map version 1 has no claim
+    and obeys every program. Boards before map version 3 do not stop the pump when their gauge
+    fails, and have no interlock inputs: readings show none closed.
 
     The board turns the pump off when it gets no `write` for `watchdog_s`. The URL is
     `tcp://HOST:PORT` (502 when left out) or `rtu:///dev/ttyUSB0?baud=115200`; an existing `link`

@@ -5,8 +5,8 @@ python-control-Development-Kit. `#W<register>,<value>` LF writes and is not answ
 LF is answered `#R<register>,<value>`.
 
 The pump has no watchdog: it runs on at its last power when the host is gone, and after power-up it
-follows its analogue input until a host commands it. Where gas must stop by itself, another device
-must stop it.
+follows its analogue input until a host commands it. Where gas must stop without a host, another
+device must stop it.
 """
 
 import contextlib
@@ -95,7 +95,7 @@ class Ventus(line_link.LineDriver):
         """Read back the pump's setting.
 
         Raises LinkError (no valid answer, or the pump reports an error), LinkDownError (the port is
-        gone, or the pump has a setting that nobody commanded: open it again).
+        gone, or the pump has a setting that this program did not command: open it again).
         """
         return await self._check_state(await self._write_and_read({}, *_STATE)) / self._power_max_mw
 

@@ -163,7 +163,7 @@ class PtyWire:
         if self._ends is not None:
             with contextlib.suppress(
                 BlockingIOError
-            ):  # nobody reads: lost, as on a line without flow control
+            ):  # without a reader it is lost, as on a line without flow control
                 os.write(self._ends[0], self._distort_bytes(data))
 
     def _distort_bytes(self, data: bytes) -> bytes:

@@ -143,7 +143,7 @@ class SerialExchange:
     def _release_turn(self, task: asyncio.Task[bytes]) -> None:
         self._turn.release()
         if not task.cancelled():
-            task.exception()  # after a cancelled caller nobody else retrieves it
+            task.exception()  # after a cancelled caller no other task retrieves it
 
     async def _transact(
         self, question: Question, timeout_s: float, fence: Question | None, key: int

@@ -148,7 +148,7 @@ class GuardedModbusTcp:
             del self._request_times_s[next(iter(self._request_times_s))]
 
     def _note_reply(self, transaction: int, newest: int) -> None:
-        """Measure how late a reply comes that nobody waits for; `newest` is the present request."""
+        """Measure how late a reply comes after its time-out; `newest` is the present request."""
         request_s = self._request_times_s.pop(transaction, None)
         if request_s is None:
             return
@@ -271,7 +271,7 @@ class GuardedModbusTcp:
     def _release_turn(self, task: asyncio.Task[ModbusPDU]) -> None:
         self._turn.release()
         if not task.cancelled():
-            task.exception()  # for a cancelled caller nobody else retrieves it
+            task.exception()  # after a cancelled caller no other task retrieves it
 
     async def _transact(
         self,
@@ -317,6 +317,6 @@ def _check_reply(reply: ModbusPDU, function_code: int, transaction_id: int, what
 
 def _fail_in_flight(client: AsyncModbusTcpClient, message: str) -> None:
     """End the wait for a reply that can no longer come."""
-    waiting = client.ctx.response_future  # initially a future that nobody awaits
+    waiting = client.ctx.response_future  # initially a future that no task awaits
     if not waiting.done() and client.ctx.request_transaction_id:
         waiting.set_exception(LinkDownError(message))

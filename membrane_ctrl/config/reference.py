@@ -87,7 +87,7 @@ class Key:
 @dataclass(frozen=True, slots=True)
 class TableHelp:
     """A table and where it may stand; one of a device has the name of its driver, and of several
-    alike `many`.
+    equal `many`.
     """
 
     places: tuple[str, ...]

@@ -175,9 +175,8 @@ class FilmMonitor:
             return ""
         memory = self.memory
         laser_um = memory.laser.update(laser_um, dt_s, SMOOTH_S)
-        trim_um = memory.trim.update(
-            trim_um, dt_s, SMOOTH_S
-        )  # a knock that the optics have found moves both alike
+        # A knock that the optics have found moves laser and trim equally.
+        trim_um = memory.trim.update(trim_um, dt_s, SMOOTH_S)
         # The mean of the root always follows the mean of the sag; the mean of the pressure does
         # not.
         root = memory.root.update(math.cbrt(gauge_pressure_pa), dt_s, SMOOTH_S)

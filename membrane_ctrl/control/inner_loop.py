@@ -280,7 +280,7 @@ class InnerLoop:
         """One tick without control: the integrator is frozen and put out, for it is the mean flow.
 
         Repeating the last reading instead would integrate its error: 5 times the excursion
-        (docs/explanation/physics.md). A reading that is there (a pause) is filtered all the same,
+        (docs/explanation/physics.md). A reading that is there (a pause) is filtered nevertheless,
         so that the error is the present one.
         """
         self._forget_output()

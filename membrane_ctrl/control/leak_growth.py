@@ -71,6 +71,6 @@ class LeakGrowth(StateNode):
         if self.stands_s < LEAK_STANDS_S:
             return ""
         return (
-            f"the film takes {takes_um_per_s:.1f} µm/s of gas; it used to take "
+            f"the film takes {takes_um_per_s:.1f} µm/s of gas; before it took "
             f"{usual_um_per_s:.1f} µm/s"
         )

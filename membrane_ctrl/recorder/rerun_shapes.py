@@ -222,7 +222,7 @@ def _make_change_scalars(
     estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate
 ) -> dict[streams.Stream, tuple[list[float], list[float]]]:
     """Values and variances; these are this cycle's own,
-    as those of the reference shift all alike.
+    as those of the reference shift all equally.
     """
     change_um, variances_um2 = (
         estimate.coeffs_um - reference.coeffs_um,

@@ -83,7 +83,7 @@ def test_unexplained_gas_consumption_is_reported_until_the_hold_ends() -> None:
     mirror = Seconds()
     mirror.pass_by(600)
     mirror.pass_by(90, leak_um_per_s=3.0)
-    assert "3.0 µm/s of gas; it used to take 1.2 µm/s" in mirror.consistency.gas_excess
+    assert "3.0 µm/s of gas; before it took 1.2 µm/s" in mirror.consistency.gas_excess
     mirror.pass_by(1, leak_um_per_s=3.0, state=State.FAULT)
     assert mirror.consistency.gas_excess == ""
     mirror.pass_by(600, leak_um_per_s=3.0)

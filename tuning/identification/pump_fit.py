@@ -51,7 +51,7 @@ class FlowAt:
 
 @dataclass(frozen=True, slots=True)
 class PumpFit:
-    """What the runs say of the pump and the leak."""
+    """What the runs show of the pump and the leak."""
 
     levels: dict[Level, FlowAt]
     covariance: FloatArray  # of the levels' flows, in their order

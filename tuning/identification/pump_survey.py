@@ -1,8 +1,8 @@
 """Which commands to give next, until the pump's curve is known.
 
 A round is a minute or two of short runs, each from below the centre to above it or back; the hold
-between two rounds brings the mirror back. What is known so far says how long a command may last.
-Levels are added where the curve bends or jumps, and repeated until they are known.
+between two rounds brings the mirror back. What is known so far determines how long a command may
+last. Levels are added where the curve bends or jumps, and repeated until they are known.
 """
 
 import math

@@ -42,7 +42,7 @@ class ExcursionGuard:
 
     Back it goes on the holding flow with a weak pull: behind a curve other than the configured one,
     an integrator would wind up on the way and carry the mirror further past the centre than the
-    experiment may. A mirror that strays all the same, behind an open vent or a dead pump, is given
+    experiment may. A mirror that strays nevertheless, behind an open vent or a dead pump, is given
     to the loop at twice the limit. An experiment that sets raw commands (`raw`) ends where it is.
     """
 
