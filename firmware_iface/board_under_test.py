@@ -25,9 +25,8 @@ class BoardUnderTest:
     ) -> None:
         self._link = link
         self._sleep = sleep
-        self._registers: register_map.RegisterMap = (
-            register_map.load_default_map()
-        )  # of the board, once it has said its version
+        # of the board, once it has said its version
+        self._registers: register_map.RegisterMap = register_map.load_default_map()
         # its own protections, from map version 3 on
         self._gauge_fitted = False
         self._gauge_timeout_s = 0.0

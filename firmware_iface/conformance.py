@@ -22,9 +22,8 @@ _NEAR = 0.002  # of a fraction: counts of a board that rounds its output
 _FEED_S = 0.2  # between two commands where a check keeps the pump commanded for long
 _UNDISTURBED_S = 1.0
 
-_Check = tuple[
-    str, str, Callable[[], Awaitable[None]]
-]  # its name, the section of docs/reference/firmware.md, the check
+# its name, the section of docs/reference/firmware.md, the check
+_Check = tuple[str, str, Callable[[], Awaitable[None]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +46,8 @@ class Conformance(board_under_test.BoardUnderTest):
         findings = [await self._make_check("identity", "Registers", self._check_identity)]
         if findings[0].problem:
             return findings
-        with contextlib.suppress(
-            roles.DeviceRefusedError
-        ):  # the check of the watchdog reports a failure to arm it
+        # the check of the watchdog reports a failure to arm it
+        with contextlib.suppress(roles.DeviceRefusedError):
             await self._arm_watchdog(REST_S)
         await self._bring_to_rest()
         checks, not_run = await self._possible_checks()
@@ -246,9 +244,8 @@ class Conformance(board_under_test.BoardUnderTest):
                 for raw in _words_outside_limits(register):
                     words = block.encode(right)
                     at = register.address - block.address
-                    words[at : at + register.words] = [
-                        raw
-                    ] * register.words  # of two words only 0 is outside
+                    # of two words only 0 is outside
+                    words[at : at + register.words] = [raw] * register.words
                     what = f"{register.name} = {raw / register.counts_per_unit:g}"
                     await self._expect_refusal(words, block.address, what, "limits")
 
@@ -388,10 +385,11 @@ class Conformance(board_under_test.BoardUnderTest):
 
     async def _check_stop_by_others(self) -> None:
         await self._write_block("stop", {"stop": 1.0})
+        # the low word, and the high word
         for key in (
             self._key ^ 1 or 2,
             self._key ^ (1 << 31) or 2,
-        ):  # the low word, and the high word
+        ):
             self._heartbeat = (self._heartbeat + 1) % 2**16
             other = "with another key than the claim's"
             await self._expect_busy(

@@ -7,9 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from firmware_iface.arrays import FloatArray
 
-RAMP_LEVELS = tuple(
-    round(255 * step / 16) for step in range(17)
-)  # a cubic between 17 points is off by < 0.2 %
+# a cubic between 17 points is off by < 0.2 %
+RAMP_LEVELS = tuple(round(255 * step / 16) for step in range(17))
 # Least share of the light between the end levels; less means that the ramp was not seen
 _LEAST_SWING_ADU = 10.0
 # A step back by more than this share is not noise: something moved, or the display adapts its light

@@ -111,9 +111,8 @@ class CircuitPoller:
         if task is not None:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
-        with contextlib.suppress(
-            Exception
-        ):  # one driver's mistake must not leave the next device open
+        # one driver's mistake must not leave the next device open
+        with contextlib.suppress(Exception):
             await self.polled.source.close()
         self._opened = False
 
@@ -135,9 +134,8 @@ class CircuitPoller:
             asked_s = self._clock()
             self._memory.take(await answer("interlock", source.closed_circuits()), asked_s)
         except roles.LinkWaitsError as error:
-            self.problem = self.problem or str(
-                error
-            )  # the failure after which it waits states more
+            # the failure after which it waits states more
+            self.problem = self.problem or str(error)
         except roles.LinkError as error:
             self.problem = str(error)
             if isinstance(error, roles.LinkDownError | roles.DeviceRefusedError):

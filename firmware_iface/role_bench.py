@@ -192,9 +192,8 @@ class RoleBench:
         await self._stop_reopening()
         await self._stop_watchdog()
         for device in reversed(self._devices.by_role().values()):
-            with contextlib.suppress(
-                Exception
-            ):  # one driver's mistake must not leave the next device open
+            # one driver's mistake must not leave the next device open
+            with contextlib.suppress(Exception):
                 await device.close()
 
     async def _read_sensors(self) -> tuple[roles.DisplacementSample, dict[str, Any]]:

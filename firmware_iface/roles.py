@@ -181,9 +181,8 @@ class BenchIdentity:
     displacement_range_um: tuple[float, float] = (-math.inf, math.inf)  # range of the sensor
     gauge_range_pa: tuple[float, float] = (-math.inf, math.inf)
     gauge_fitted: bool = True  # False: the board has no gauge, and so no over-pressure protection
-    gauge_timeout_s: float = (
-        math.inf
-    )  # the board itself stops the pump this long after its gauge fails
+    # the board itself stops the pump this long after its gauge fails
+    gauge_timeout_s: float = math.inf
     # bit i: the board itself stops the pump when interlock input i opens
     interlocks_fitted: int = 0
 

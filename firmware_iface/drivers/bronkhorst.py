@@ -14,10 +14,11 @@ from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownErr
 
 FULL_SCALE = 32_000  # of measure and setpoint: 100 %
 BUS_SETPOINT = 0  # control mode: the setpoint comes over the interface
+# device type (113, 1) of an EL-FLOW, and of its sister for liquids
 FLOW_CONTROLLERS = (
     "DMFC",
     "DLFC",
-)  # device type (113, 1) of an EL-FLOW, and of its sister for liquids
+)
 PRESSURE_INSTRUMENTS = ("DEPC", "DEPM")  # EL-PRESS controller and meter
 # a pressure "(a)" against vacuum would be 1e5 Pa off
 _GAUGE_UNITS_PA = {

@@ -24,12 +24,13 @@ _BUFFERS = 3
 _SOCKET_BYTES = 8 << 20
 # A newly started stream misses the first trigger (seen on loopback without this)
 _STREAM_READY_S = 0.2
+# arvenums.h, arvgvdevice.h, arvgvstream.h
 _AUTO_OFF, _CONTINUOUS, _ADJUST_NEVER, _NO_PACKET_SOCKET = (
     0,
     0,
     0,
     1,
-)  # arvenums.h, arvgvdevice.h, arvgvstream.h
+)
 _RANGE_CHECKED = 1  # arvdevice.h; by default the library writes values outside the camera's range
 _SUCCESS = 0  # ArvBufferStatus
 _REAL_TIME = roles.DriverClock()
@@ -225,9 +226,8 @@ class AravisCamera:
             call("arv_camera_set_exposure_time_auto", camera, _AUTO_OFF)
         call("arv_camera_set_exposure_time", camera, 1000.0 * config.exposure_ms)
         exposure_ms = call("arv_camera_get_exposure_time", camera) / 1000.0
-        if abs(exposure_ms - config.exposure_ms) > max(
-            0.02 * config.exposure_ms, 0.02
-        ):  # sensors count in lines
+        # sensors count in lines
+        if abs(exposure_ms - config.exposure_ms) > max(0.02 * config.exposure_ms, 0.02):
             self._must_be("exposure_ms", exposure_ms, config.exposure_ms)
         if call("arv_camera_is_gain_auto_available", camera):
             call("arv_camera_set_gain_auto", camera, _AUTO_OFF)
@@ -249,9 +249,8 @@ class AravisCamera:
         library, camera = arv.load_aravis(), self._camera
         gige = bool(library.call("arv_camera_is_gv_device", camera))
         if gige:
-            library.call(
-                "arv_camera_gv_set_stream_options", camera, _NO_PACKET_SOCKET
-            )  # packet sockets need root
+            # packet sockets need root
+            library.call("arv_camera_gv_set_stream_options", camera, _NO_PACKET_SOCKET)
             if self.config.packet_bytes:
                 library.call("arv_camera_gv_set_packet_size_adjustment", camera, _ADJUST_NEVER)
                 library.call("arv_camera_gv_set_packet_size", camera, self.config.packet_bytes)

@@ -93,9 +93,8 @@ class GpioLines:
         """Give the lines back. Never raises."""
         request, self._request = self._request, None
         if request is not None:
-            with contextlib.suppress(
-                LinkError
-            ):  # the chip is gone, or its driver hangs: nothing can be given back
+            # the chip is gone, or its driver hangs: nothing can be given back
+            with contextlib.suppress(LinkError):
                 await self._in_thread(request.release)
 
     def describe(self) -> dict[str, str]:

@@ -91,9 +91,8 @@ class KeyenceDlRs1a(line_link.LineDriver):
                 f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} µm"
             )
         errors = await self._link.query(self._errors_command, self._errors_answer)
-        if (
-            errors[2] != _NOT_READABLE
-        ):  # amplifiers without this number: the value shows their head error
+        # amplifiers without this number: the value shows their head error
+        if errors[2] != _NOT_READABLE:
             _raise_refusal(self._link.name, errors[2])
         if bits := int(errors[1] or 0):
             raise roles.DeviceRefusedError(

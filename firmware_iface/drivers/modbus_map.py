@@ -27,9 +27,8 @@ class ValueMap:
 
     address: int  # of its first register, counted from 0
     value: tuple[float, float]  # two values in the role's unit ...
-    raw: tuple[
-        float, float
-    ]  # ... and the register's contents there; linear between and beyond them
+    # ... and the register's contents there; linear between and beyond them
+    raw: tuple[float, float]
     limits: tuple[float, float]  # values outside are refused, read or written
     function: str = "holding"  # "holding" or "input"
     type: str = "u16"  # "u16", "i16", "u32", "i32" or "f32"

@@ -130,9 +130,8 @@ class Optoncdt1420:
         self._reset_stream()
         self._port.open(self)
         try:
-            with contextlib.suppress(
-                roles.DeviceRefusedError
-            ):  # refused together with a half-sent earlier command
+            # refused together with a half-sent earlier command
+            with contextlib.suppress(roles.DeviceRefusedError):
                 await self._send_command("OUTPUT NONE")
             await self._send_command("OUTPUT NONE")
             identity = await self._identify()
@@ -200,9 +199,8 @@ class Optoncdt1420:
             async with asyncio.timeout(self._config.timeout_s):
                 while not self._buffer.rstrip().endswith(_PROMPT):
                     await self._wait_for_bytes()
-        if not self._buffer.rstrip().endswith(
-            _PROMPT
-        ):  # it may have arrived while this process was suspended
+        # it may have arrived while this process was suspended
+        if not self._buffer.rstrip().endswith(_PROMPT):
             hint = (
                 f"no answer within {self._config.timeout_s:g} s; is it on, wired and set to "
                 f"{self._port.settings}?"

@@ -51,18 +51,16 @@ class PumpBoard:
     ) -> None:
         if link is None:
             link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)
-        self._registers = (
-            register_map.load_default_map()
-        )  # of the board that answers, once its version is known
+        # of the board that answers, once its version is known
+        self._registers = register_map.load_default_map()
         period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
             raise ValueError(
                 f"watchdog_s = {watchdog_s:g}: the board takes {period.minimum:g} .. "
                 f"{period.maximum:g} s"
             )
-        self._watchdog_s = period.to_value(
-            period.to_raw(watchdog_s)
-        )  # as the board will read it back
+        # as the board will read it back
+        self._watchdog_s = period.to_value(period.to_raw(watchdog_s))
         # The same for every opening by this object, so that a claim whose answer was lost can be
         # repeated. The name is public, the key is secret.
         self._claim_id, self._claim_key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))

@@ -143,9 +143,8 @@ class Ventus(line_link.LineDriver):
     async def close(self) -> None:
         """Switch the pump off and close the port. Never raises."""
         if self._link.port.is_open:
-            with contextlib.suppress(
-                roles.LinkError
-            ):  # out of reach: this program can no longer stop the gas
+            # out of reach: this program can no longer stop the gas
+            with contextlib.suppress(roles.LinkError):
                 await self.set_pump(0.0)
         await self._link.close()
 

@@ -70,9 +70,8 @@ def _answer_function(function_code: int, data: bytes, table: RegisterTable) -> b
     if function_code == READ_WRITE:
         read_address, read_count = struct.unpack_from(">HH", data)
         address, words = _decode_written_words(data[4:], _READ_WRITE_MAX)
-        _read_words(
-            table, read_address, read_count
-        )  # refused as a whole: a wrong read writes nothing
+        # refused as a whole: a wrong read writes nothing
+        _read_words(table, read_address, read_count)
         table.write(address, words)
         return _read_words(table, read_address, read_count)
     raise RegisterRefusal(ILLEGAL_FUNCTION)

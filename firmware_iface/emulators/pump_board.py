@@ -26,9 +26,8 @@ GAUGE_PRESSURE_LIMIT_PA = 800.0
 PUMP_LIMIT_FRACTION = 1.0
 WATCHDOG_PERIOD_S = 1.0  # after power-up; the watchdog itself is then off, as on most devices
 _GAUGE_RANGE_PA = load_default_map().register("gauge_pressure_pa").to_value(2**31 - 1)
-_SECRETS = dict.fromkeys(
-    ("claim_key", "command_key", "clear_key", "stop"), 0.0
-)  # registers that read as 0
+# registers that read as 0
+_SECRETS = dict.fromkeys(("claim_key", "command_key", "clear_key", "stop"), 0.0)
 # the register of a block that carries the claim's secret; a block without one needs no claim
 _KEYS = {"settings": "claim_key", "command": "command_key", "reset": "clear_key"}
 # the board's own loop; the pump is off at most this and one wake-up after the watchdog period

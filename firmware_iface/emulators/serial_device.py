@@ -129,10 +129,11 @@ class PtyWire:
     def plug(self) -> None:
         """Plug in. Raises OSError, for example when the path is taken."""
         device_end, program_end = os.openpty()
+        # the second is kept open, or the first would report a hang-up
         self._ends = (
             device_end,
             program_end,
-        )  # the second is kept open, or the first would report a hang-up
+        )
         tty.setraw(program_end)
         line = termios.tcgetattr(program_end)
         line[_SPEED] = line[_SPEED + 1] = _read_baud_rate(self._device)
@@ -161,9 +162,8 @@ class PtyWire:
 
     def _transmit(self, data: bytes) -> None:
         if self._ends is not None:
-            with contextlib.suppress(
-                BlockingIOError
-            ):  # without a reader it is lost, as on a line without flow control
+            # without a reader it is lost, as on a line without flow control
+            with contextlib.suppress(BlockingIOError):
                 os.write(self._ends[0], self._distort_bytes(data))
 
     def _distort_bytes(self, data: bytes) -> bytes:

@@ -170,9 +170,8 @@ class Aravis:
     def fix_socket_buffer(self, stream: int, size_bytes: int) -> None:
         """Let a GigE Vision stream keep packets of this many bytes while it is busy."""
         kind = self.call("arv_gv_stream_socket_buffer_get_type")
-        self._set_property(
-            stream, "socket-buffer", kind, "g_value_set_enum", 0
-        )  # ..._FIXED, arvgvstream.h
+        # ..._FIXED, arvgvstream.h
+        self._set_property(stream, "socket-buffer", kind, "g_value_set_enum", 0)
         self.set_int(stream, "socket-buffer-size", size_bytes)
 
     def _set_property(self, instance: int, name: str, kind: int, setter: str, value: float) -> None:

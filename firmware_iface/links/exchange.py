@@ -82,9 +82,8 @@ class SerialExchange:
         self._quiet_s = quiet_s
         self._blank = blank
         self._key_turns: defaultdict[int, asyncio.Lock] = defaultdict(asyncio.Lock)
-        self._turn = (
-            asyncio.Lock()
-        )  # released when the question ends, whatever happens to its caller
+        # released when the question ends, whatever happens to its caller
+        self._turn = asyncio.Lock()
         self._in_flight: asyncio.Task[bytes] | None = None
         self._sure: set[int] = set()  # devices without outstanding answers
         self._failures = 0

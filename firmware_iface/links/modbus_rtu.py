@@ -197,9 +197,8 @@ class GuardedModbusRtu:
         reply = await self._transact(
             struct.pack(">BHH", function_code, address, count), answer_bytes, what
         )
-        packed = int.from_bytes(
-            reply[2:], "little"
-        )  # the first coil is the lowest bit of the first byte
+        # the first coil is the lowest bit of the first byte
+        packed = int.from_bytes(reply[2:], "little")
         return [bool(packed >> place & 1) for place in range(count)]
 
     async def _transact(

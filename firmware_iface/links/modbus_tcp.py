@@ -67,9 +67,8 @@ class GuardedModbusTcp:
         self._timeout_s = timeout_s
         self._clock = clock
         self._client: AsyncModbusTcpClient | None = None
-        self._turn = (
-            asyncio.Lock()
-        )  # released when the request ends, whatever happens to its caller
+        # released when the request ends, whatever happens to its caller
+        self._turn = asyncio.Lock()
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
         self._back_off = serial_port.BackOff()
         self._received_bytes = 0  # since the last request was sent

@@ -255,9 +255,8 @@ def _open_serial(path: str, name: str, settings: SerialSettings) -> Any:
             raise DeviceRefusedError(f"{name}: {remedy}") from error
         raise LinkDownError(f"{name}: {remedy}") from error
     with contextlib.suppress(ValueError, OSError):
-        port.set_low_latency_mode(
-            True
-        )  # FTDI adapters otherwise hold bytes back for 16 ms; others lack this mode
+        # FTDI adapters otherwise hold bytes back for 16 ms; others lack this mode
+        port.set_low_latency_mode(True)
     if settings.parity != "N":
         _drop_wrong_parity(port.fileno())
     return port

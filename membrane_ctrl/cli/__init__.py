@@ -41,9 +41,8 @@ def run(arguments: Sequence[str]) -> int:
                 print(f"membrane-ctrl: {terminal.one_line(line)}", file=sys.stderr)
             return error.exit
         except typer.TyperException as error:
-            if (
-                message := error.format_message()
-            ):  # a group without a command has printed its help instead
+            # a group without a command has printed its help instead
+            if message := error.format_message():
                 print(f"membrane-ctrl: {terminal.one_line(message)} (see --help)", file=sys.stderr)
             return errors.Exit.BAD_INPUT
         except OSError as error:  # a file error that the command itself should have caught

@@ -232,9 +232,8 @@ def add_actions() -> None:
     ctl_app.command("fleet")(_fleet)
     _add_command("watch", "Print a status line repeatedly until the run ends.", _watch)
     for kind, rule in TABLE.items():
-        if kind in _OWN or not (
-            rule.needs or kind.startswith("shape_")
-        ):  # `tune` is a separate command
+        # `tune` is a separate command
+        if kind in _OWN or not (rule.needs or kind.startswith("shape_")):
             _add_command(kind, rule.does, _OWN.get(kind, _plain))
     for name, kind in SAME_AS.items():
         _add_command(name, TABLE[kind].does, _OWN.get(kind, _plain))

@@ -145,9 +145,8 @@ def _ask_table(name: str, known: Mapping[str, type[BaseModel]], optional: bool) 
             continue
         table: TomlTable = {"driver": driver}
         for key, field in known[driver].model_fields.items():
-            if key == "raw" or (
-                field.is_required() and key != "driver"
-            ):  # only a preset replaces `raw`
+            # only a preset replaces `raw`
+            if key == "raw" or (field.is_required() and key != "driver"):
                 answer = _ask_question(f"  {key} ({_key_meaning(f'{driver}.{key}').rstrip('.')})")
                 table[key] = answer if field.annotation is str else _parse_answer(answer)
         try:

@@ -92,9 +92,8 @@ def write_package(name: str, role: str, folder: Path) -> int:
     words = _make_driver_names(name, role) | (
         _make_optics_tables(name, role) if role in _OPTICS else _make_instrument_terms(role)
     )
-    target = (
-        folder / f"{words['dashed']}-driver"
-    )  # with a dash, Python never takes the folder for the module
+    # with a dash, Python never takes the folder for the module
+    target = folder / f"{words['dashed']}-driver"
     kind = "value"
     if role in roles.ACTUATORS:
         kind = "actuator"

@@ -98,9 +98,10 @@ def _load_preset(name: str) -> dict[str, Any]:
     """Defaults of a preset; none for an unknown one, which is refused when the devices are made."""
     if not name:
         return {}
+    # imports the links, which most readers of a configuration need not
     from firmware_iface.drivers import (
         modbus_map,
-    )  # imports the links, which most readers of a configuration need not
+    )
 
     try:
         return modbus_map.load_preset(name)

@@ -15,10 +15,11 @@ Axis = Annotated[tuple[Length, ...], Field(min_length=2, max_length=500)]
 
 _DISTORTION_LENGTHS = (0, 4, 5, 8)
 _EVEN = 1e-6  # of the node spacing: rounding of written decimals
+# of the squared length, from rounding to five digits, and of the cosine
 _UNIT, _SQUARE = (
     1.1e-5,
     1e-6,
-)  # of the squared length, from rounding to five digits, and of the cosine
+)
 Share = Annotated[float, Field(ge=0, le=0.5)]
 
 
@@ -71,9 +72,8 @@ class HeightMapConfig(Section):
                 f"heights_mm has {shape} numbers; s_y_mm and s_x_mm require {rows} rows of "
                 f"{columns}"
             )
-        if (
-            max(abs(h) for row in self.heights_mm for h in row) > 100
-        ):  # no screen is that crooked: µm taken for mm?
+        # no screen is that crooked: µm taken for mm?
+        if max(abs(h) for row in self.heights_mm for h in row) > 100:
             raise ValueError("heights_mm has a height beyond 100 mm")
         return self
 

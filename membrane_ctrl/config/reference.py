@@ -126,9 +126,8 @@ def json_schema(root: type[BaseModel] = Config) -> dict[str, Any]:
                 field["description"] = " ".join(field["description"].split())
             if field.get("default", 0) is None:
                 del field["default"]
-        if (
-            name in chosen
-        ):  # from a union, by the driver: the file must name it, although the class has a default
+        # from a union, by the driver: the file must name it, although the class has a default
+        if name in chosen:
             table["required"] = sorted({*table.get("required", ()), "driver"})
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
@@ -155,9 +154,8 @@ def _walk_tables(
         place = f"{prefix}{key}"
         for name in re.findall(r'"\$ref": "#/\$defs/(\w+)"', json.dumps(field)):
             inner = defaults.get(key) if isinstance(defaults, dict) else None
-            if (
-                inner is None and field.get("type") == "array"
-            ):  # below a table that is absent by default
+            # below a table that is absent by default
+            if inner is None and field.get("type") == "array":
                 inner = []
             yield place, name, inner
             yield from _walk_tables(schema, f"{place}.", schema["$defs"][name], inner)

@@ -112,10 +112,11 @@ class DevicesConfig(SensorTables):
                 'name the pump board (board = "tcp://HOST:PORT"), or give one table per role'
             )
         missing = [role for role in NEEDED if role not in filled]
+        # a laser is `Config`'s affair
         if self.board is None and missing not in (
             [],
             ["displacement"],
-        ):  # a laser is `Config`'s affair
+        ):
             raise ValueError(f"no device for {missing[0]}; required: {', '.join(NEEDED)}")
         for role in ACTUATORS:
             section = getattr(self, role)

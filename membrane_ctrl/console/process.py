@@ -99,9 +99,8 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     terminal.
     """
     child.leave_at_stop()
-    signal.signal(
-        signal.SIGTTOU, signal.SIG_IGN
-    )  # it may restore a terminal that has passed to the shell
+    # it may restore a terminal that has passed to the shell
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     report = event_pipe.make_event_sender(status)
     with closing(_Feed(spec)) as feed:
 
@@ -134,9 +133,8 @@ def restore_terminal(keyboard: key_reader.Keyboard | None = None) -> None:
     if keyboard is not None:
         keyboard.restore_modes()
     with suppress(OSError):
-        terminal = getattr(
-            sys.stderr, "rich_proxied_file", sys.stderr
-        )  # these control bytes are intended
+        # these control bytes are intended
+        terminal = getattr(sys.stderr, "rich_proxied_file", sys.stderr)
         if terminal.isatty():
             terminal.write("\x1b[?1049l\x1b[?25h")
             terminal.flush()
@@ -212,9 +210,8 @@ def _draw_on_terminal(
             yield show
         finally:
             live.stop()
-    print(
-        format_line(feed.model.make_view(spec.clock.now())), file=sys.stderr
-    )  # a last line that remains
+    # a last line that remains
+    print(format_line(feed.model.make_view(spec.clock.now())), file=sys.stderr)
 
 
 @contextmanager

@@ -60,9 +60,8 @@ _SHARE_S = 2.0  # memory of the sensors' weights
 _RUN = 14.0, 8.0
 # a jump that the optics see and the laser's noise hides is the film's, most likely
 _OPTICS_JUMP_SHARE = 0.3
-_ONE: FloatArray = np.eye(
-    _PLANT + CLONES
-)  # a reading's expectation is a sum of states: one of them, as a row
+# a reading's expectation is a sum of states: one of them, as a row
+_ONE: FloatArray = np.eye(_PLANT + CLONES)
 _STATES = _PLANT + CLONES
 
 

@@ -119,9 +119,8 @@ class FilmMonitorState(StateNode):
 
     laser: LowPass = field(default_factory=LowPass.with_early_mean)
     trim: LowPass = field(default_factory=LowPass.with_early_mean)
-    root: LowPass = field(
-        default_factory=LowPass.with_early_mean
-    )  # of the cube root of the gauge pressure
+    # of the cube root of the gauge pressure
+    root: LowPass = field(default_factory=LowPass.with_early_mean)
     seen_s: float = 0.0
     readings: Count = 0
     minutes: ComparisonState = field(default_factory=ComparisonState)

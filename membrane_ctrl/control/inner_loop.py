@@ -48,9 +48,8 @@ class LoopOutput(StateNode):
 
     setpoint_um: float = math.nan  # ramp and trim
     filtered_um: float = math.nan  # NaN in a tick without a reading
-    error_um: float = (
-        math.nan
-    )  # setpoint minus filtered reading; NaN without one, and while another sets the flow
+    # setpoint minus filtered reading; NaN without one, and while another sets the flow
+    error_um: float = math.nan
     p_um_per_s: float = math.nan
     i_um_per_s: float = math.nan
     d_um_per_s: float = math.nan

@@ -30,9 +30,8 @@ def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
     share = lag_step_fraction(dt_s, loop.measurement_filter_s)
     measurement_filter = share / (1 - (1 - share) / z)
     derivative = loop.td_s * (1 - 1 / z) / dt_s
-    pi = loop.kp_per_s * (
-        1 + dt_s / loop.ti_s / (z - 1) + derivative
-    )  # the integrator moves after the output
+    # the integrator moves after the output
+    pi = loop.kp_per_s * (1 + dt_s / loop.ti_s / (z - 1) + derivative)
     mirror = np.zeros_like(z)
     for k in range(-_ALIASES, _ALIASES + 1):  # what the samples fold back; at 1 Hz it decides
         s = 1j * (omega + 2 * math.pi * k / dt_s)

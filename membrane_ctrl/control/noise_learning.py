@@ -90,9 +90,8 @@ class ReadingNoise(StateNode):
         forget = min(1.0, dt_s / _MEMORY_S)
         innovation, known = min(max(innovation, -_LIMIT), _LIMIT), share / 8
         size, runs = (innovation**2 - 1) / 2, math.sqrt(known) * innovation * self.past
-        by_noise = (
-            1 - share / 2
-        )  # change of the innovations' variance with the noise, both as logarithms
+        # change of the innovations' variance with the noise, both as logarithms
+        by_noise = 1 - share / 2
         leads = bool(walks)
         information = by_noise**2 / 2 + leads * known
         self.level.learn(by_noise * size - leads * runs, information, forget, _READING_BOUND)

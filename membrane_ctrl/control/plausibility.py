@@ -285,9 +285,8 @@ class PlausibilityCheck:
     def _judge_fast(self, means: tuple[float, float, float]) -> None:
         memory = self.memory
         memory.changes = changes = memory.fast.changes(means, self._sag_um)
-        limit_um = (
-            self._limit_um if memory.faulty == FaultySensor.NONE else self._limit_um / 2
-        )  # and back only when clearly so
+        # and back only when clearly so
+        limit_um = self._limit_um if memory.faulty == FaultySensor.NONE else self._limit_um / 2
         agree = abs(changes.laser_um - changes.optics_um) <= limit_um + self._lag_um
         memory.faulty = FaultySensor.NONE if agree else changes.judge()
 

@@ -72,12 +72,10 @@ class PumpDriftState(StateNode):
     whole: bool = True  # no tick of the segment is missing
     mean_um: LowPass = field(default_factory=LowPass)
     mean_flow: LowPass = field(default_factory=LowPass)
-    sums: _Pair = field(
-        default_factory=lambda: np.zeros(2, complex)
-    )  # of the segment: centre and flow
-    means: _Pair = field(
-        default_factory=lambda: np.zeros(2, complex)
-    )  # of the segments: motion seen, and expected
+    # of the segment: centre and flow
+    sums: _Pair = field(default_factory=lambda: np.zeros(2, complex))
+    # of the segments: motion seen, and expected
+    means: _Pair = field(default_factory=lambda: np.zeros(2, complex))
     rate_per_s: float = 0.0  # of the scale
     # covariance of scale and rate
     spread: Annotated[FloatArray, ArrayShape((2, 2))] = field(

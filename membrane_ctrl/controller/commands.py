@@ -82,9 +82,8 @@ class Command:
     number: int = 0  # chosen by the client, returned with the answer
     shape_time_constant_s: float = math.nan  # `gains`: of the shape loop; NaN: as it is
     pump: PumpConfig | None = None  # `gains`: the pump's curve, if it changes
-    setpoint_step_um: float = (
-        math.nan
-    )  # `gains` on trial: moves the setpoint, the shape loop off; NaN: neither
+    # `gains` on trial: moves the setpoint, the shape loop off; NaN: neither
+    setpoint_step_um: float = math.nan
     # `latch`: the lock, with author, word and time; None: made of the other fields
     lock: Lock | None = None
     account: str = ""  # login of the sender; empty: none, or not proven

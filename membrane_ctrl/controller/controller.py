@@ -150,9 +150,8 @@ class Controller:
         events: list[Event] = []
         self._begin_tick(inputs, events)
         last = context.output or inner_loop.NO_OUTPUT
-        judged = (
-            self.state in safety.MOVING and not context.paused
-        )  # nothing follows a setpoint in a pause
+        # nothing follows a setpoint in a pause
+        judged = self.state in safety.MOVING and not context.paused
         error_um = last.error_um if judged else math.nan
         context.observer.observe_inputs(inputs, self._may_follow_optics())
         consistency = self._consistency

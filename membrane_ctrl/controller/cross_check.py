@@ -192,9 +192,8 @@ def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
         if not isinstance(section, VaisalaPtb330Config):  # read in the background
             line = str(getattr(section, "link", None) or getattr(section, "port", ""))
             lines[line].append((f"devices.{role}.timeout_s", section.timeout_s))
-    for index, interlock in enumerate(
-        devices.interlocks
-    ):  # read in the background, but a serial line has one turn
+    # read in the background, but a serial line has one turn
+    for index, interlock in enumerate(devices.interlocks):
         if (
             isinstance(interlock, ModbusInputConfig)
             and interlock.link.startswith("rtu:")

@@ -24,9 +24,8 @@ class GainsState(StateNode):
     good: GainsInUse
     tried: GainsInUse
     until_s: float = math.nan  # end of the trial; NaN: there is none
-    setpoint_step_um: float = (
-        math.nan
-    )  # part of the trial; NaN: the setpoint and the shape loop are not
+    # part of the trial; NaN: the setpoint and the shape loop are not
+    setpoint_step_um: float = math.nan
 
 
 class GainsTrial:

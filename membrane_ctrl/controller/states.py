@@ -103,9 +103,8 @@ def inflate(context: TickContext) -> State:
     ):
         return State.SETTLE
     rises = not output.filtered_um <= context.highest_um + context.config.limits.band_um
-    if math.isfinite(to_go_um) and (
-        rises or to_go_um <= 0.0
-    ):  # from above the leak lowers it, however slowly
+    # from above the leak lowers it, however slowly
+    if math.isfinite(to_go_um) and (rises or to_go_um <= 0.0):
         context.highest_um = output.filtered_um
         context.highest_s = context.now_s
     if context.now_s - context.highest_s > states.inflate_stall_s:
@@ -121,9 +120,8 @@ def settle(context: TickContext) -> State:
     """Stay within the band for a while before `hold` begins."""
     output = _drive_pump(context, context.setpoint_um)
     band_um = context.config.limits.band_um
-    settled_s = context.measure_good_time_s(
-        not abs(output.error_um) >= band_um
-    )  # a lost reading is no error
+    # a lost reading is no error
+    settled_s = context.measure_good_time_s(not abs(output.error_um) >= band_um)
     context.explain(WhyCode.SETTLING, f"settling: inside the band for {settled_s:.0f} s")
     if settled_s >= context.config.states.settle_s:
         context.explain(WhyCode.SETTLED, f"inside +-{band_um:g} µm for {settled_s:.1f} s")
@@ -366,9 +364,8 @@ def _explain_manual_end(context: TickContext) -> str:
 def _find_requested_state(context: TickContext) -> State | None:
     """The requested state, if it is not a hold."""
     if context.trial is not None:
-        _drive_pump(
-            context, context.setpoint_um
-        )  # the loop runs this tick: otherwise the pump would be off for 20 ms
+        # the loop runs this tick: otherwise the pump would be off for 20 ms
+        _drive_pump(context, context.setpoint_um)
         requested = f"{context.asked_by} requested the experiment {context.trial.spec.kind}"
         context.explain(WhyCode.EXPERIMENT_REQUESTED, requested)
         return State.TUNE

@@ -42,8 +42,7 @@ class TickOutputs:
     row: telemetry.TelemetryRow
     events: tuple[Event, ...]
     finished: errors.Exit | None  # exit code if the run is over
-    answers: tuple[
-        tuple[int, str], ...
-    ] = ()  # number of each command, and why it was refused (empty: executed)
+    # number of each command, and why it was refused (empty: executed)
+    answers: tuple[tuple[int, str], ...] = ()
     # the board's latches to clear: all after `ack`, the watchdog's by the resume rule
     clear_mask: int = 0

@@ -56,9 +56,8 @@ class TickContextState(StateNode):
     last_good_s: float = math.nan  # in `check`
     highest_um: float = math.nan  # filtered reading, in `inflate`
     highest_s: float = math.nan  # when the mirror was last rising
-    sinking: line_slope.Slope = field(
-        default_factory=line_slope.Slope
-    )  # of the mirror with the pump off, in `check`
+    # of the mirror with the pump off, in `check`
+    sinking: line_slope.Slope = field(default_factory=line_slope.Slope)
     test_memory: actuator_test.ActuatorTestState | None = None  # of the actuator test, in `check`
     ramp_from_fraction: float = 0.0
     pump_response: PumpResponse | None = None  # identified at this run's last start

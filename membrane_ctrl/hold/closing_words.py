@@ -129,9 +129,8 @@ def print_closing_report(
         print("summary.json is missing; the recorded data are readable", file=sys.stderr)
     print(f"run folder: {run_dir}", file=sys.stderr)
     if any(run_dir.glob("ticks/*")):
-        newest = run_dir.parent == Path(
-            RecordingConfig().logs_dir
-        )  # where `review` looks for `last`
+        # where `review` looks for `last`
+        newest = run_dir.parent == Path(RecordingConfig().logs_dir)
         print(
             f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}",
             file=sys.stderr,

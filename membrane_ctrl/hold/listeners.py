@@ -196,6 +196,5 @@ class SystemdNotify:
     def _send_message(self, message: str) -> None:
         if self._address:
             with contextlib.suppress(OSError):
-                self._socket.sendto(
-                    message.encode(errors="replace"), self._address
-                )  # a path need not be valid text
+                # a path need not be valid text
+                self._socket.sendto(message.encode(errors="replace"), self._address)

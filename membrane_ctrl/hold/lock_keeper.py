@@ -67,9 +67,8 @@ class LockKeeper:
         self._files: dict[str, Path | None] = {}  # by word; of the disk thread after the start
         if storage is not None:
             self._files = {each.lock.word: each.file for each in storage.locks}
-        self._failed: dict[
-            str, Callable[[], None]
-        ] = {}  # by word: what to try again; of the disk thread
+        # by word: what to try again; of the disk thread
+        self._failed: dict[str, Callable[[], None]] = {}
         self._pending: deque[events.Event] = deque()  # from the disk thread, as the next one
         self._asked: deque[Command] = deque()
         self._looking: Future[None] | None = None

@@ -20,11 +20,12 @@ INTERLOCK_SWITCHES: dict[str, Callable[[virtual_interlocks.VirtualInterlocks], s
     "interlock_open": lambda interlocks: interlocks.open_names,
     "interlock_lost": lambda interlocks: interlocks.lost_names,
 }
+# the plant refuses values beyond
 _FRACTIONS = (
     "pump_share",
     "pump_stuck_fraction",
     "vent_stuck_fraction",
-)  # the plant refuses values beyond
+)
 _REPEATS_MAX = 100_000
 Happening = Literal[
     "ambient",

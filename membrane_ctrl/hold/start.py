@@ -70,9 +70,8 @@ def hold_mirror(options: HoldOptions) -> int:
         )
         config = twin.config if twin else options.config
         assert config.devices is not None
-        stack.enter_context(
-            claim_devices(list_device_names(config.devices))
-        )  # one with other folders ends here
+        # one with other folders ends here
+        stack.enter_context(claim_devices(list_device_names(config.devices)))
         lock_storage = find_locks(config, options)  # before anything is cleared
         latched = open_latched_fault(config, logs_dir, options)
         resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)

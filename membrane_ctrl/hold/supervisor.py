@@ -37,10 +37,11 @@ _CHILD_WATCH_S = 0.5  # checking on a child costs a system call
 SNAPSHOT_EVERY_S = 300.0
 # In a row: a single lost answer of a sensor is no fault of its link
 _SENSOR_FAILURES = 3
+# characters to keep if the event exceeds its slot; each takes up to 12 bytes in JSON
 _TEXT_CUTS = (
     200,
     20,
-)  # characters to keep if the event exceeds its slot; each takes up to 12 bytes in JSON
+)
 
 
 @dataclass(slots=True)
@@ -137,9 +138,8 @@ class Supervisor:
         """
         wiring = self._wiring
         self.ticks += 1
-        wait_ms = (
-            self._waits.take_wait_ms()
-        )  # of the last tick, which this one's lateness is due to
+        # of the last tick, which this one's lateness is due to
+        wait_ms = self._waits.take_wait_ms()
         if not self._link_up:
             await self._reconnect()
         reading = await self._read() if self._link_up else None

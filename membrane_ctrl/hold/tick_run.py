@@ -197,9 +197,8 @@ def _stop_on_signals(supervisor: Supervisor) -> Iterator[None]:
         loop.add_signal_handler(
             number, supervisor.queue_command, commands.Command("stop", number.name)
         )
-    signal.signal(
-        signal.SIGTSTP, signal.SIG_IGN
-    )  # Ctrl-Z: without ticks the board's watchdog stops the pump
+    # Ctrl-Z: without ticks the board's watchdog stops the pump
+    signal.signal(signal.SIGTSTP, signal.SIG_IGN)
     try:
         yield
     finally:

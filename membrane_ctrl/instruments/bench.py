@@ -92,9 +92,8 @@ async def connect_bench(bench: roles.Bench, devices: DevicesConfig) -> roles.Ben
 
     Raises DeviceError, naming the device and the problem in one line.
     """
-    return await retry_connecting(
-        bench.open, devices.board or "devices"
-    )  # a bench of roles names the role itself
+    # a bench of roles names the role itself
+    return await retry_connecting(bench.open, devices.board or "devices")
 
 
 async def retry_connecting(attempt: Callable[[], Awaitable[T]], where: str) -> T:
@@ -108,9 +107,8 @@ async def retry_connecting(attempt: Callable[[], Awaitable[T]], where: str) -> T
         except roles.LinkError as error:
             if not (isinstance(error, roles.LinkWaitsError) and failure):
                 failure = str(error).removeprefix(f"{where}: ")
-            if isinstance(
-                error, roles.DeviceBusyError
-            ):  # a killed program's claim lapses with its watchdog
+            # a killed program's claim lapses with its watchdog
+            if isinstance(error, roles.DeviceBusyError):
                 patience_s = max(patience_s, error.lapses_in_s + _LAPSE_S)
             if isinstance(error, roles.DeviceRefusedError) or loop.time() > begin_s + patience_s:
                 raise DeviceError(f"{where}: {failure}") from None

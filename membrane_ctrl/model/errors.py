@@ -58,9 +58,8 @@ class DeviceError(CommandError):
 
 def os_reason(error: OSError) -> str:
     """The operating system's reason, for use within a sentence."""
-    text = (error.strerror or str(error)).partition(" (while attempting")[
-        0
-    ]  # what the socket module adds
+    # what the socket module adds
+    text = (error.strerror or str(error)).partition(" (while attempting")[0]
     return text[:1].lower() + text[1:]
 
 

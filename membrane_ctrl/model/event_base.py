@@ -66,9 +66,8 @@ class Event:
     urgent: ClassVar[bool] = False
     opens: ClassVar[tuple[Topic, ...]] = ()
     closes: ClassVar[tuple[Topic, ...]] = ()
-    keys: ClassVar[
-        tuple[tuple[Field[Any], str], ...]
-    ] = ()  # the fields, each with its key in the line
+    # the fields, each with its key in the line
+    keys: ClassVar[tuple[tuple[Field[Any], str], ...]] = ()
 
     def __init_subclass__(
         cls,

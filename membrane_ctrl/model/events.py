@@ -9,12 +9,13 @@ from membrane_ctrl.model.event_base import LogLevel
 from membrane_ctrl.model.notices import GLITCH_S, Notice, NoticeChanges, NoticeKey, Notices, Topic
 
 _COMMAND_UNITS = {"setpoint": "µm", "manual": "µm/s", "gains": "s on trial"}  # of a command's value
+# others: "command"
 _COMMAND_MARKS = {
     "setpoint": "setpoint",
     "pause": "pause",
     "resume": "pause",
     "mark": "mark",
-}  # others: "command"
+}
 
 
 class StateEntered(

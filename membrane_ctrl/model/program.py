@@ -98,9 +98,8 @@ def find_commit(checkout: Path) -> str:
 
 def _describe_with_git(checkout: Path) -> str:
     words = ["git", "describe", "--always", "--dirty", "--exclude=*", f"--abbrev={_COMMIT_DIGITS}"]
-    environment = os.environ | {
-        "GIT_OPTIONAL_LOCKS": "0"
-    }  # writes nothing, not even a refreshed index
+    # writes nothing, not even a refreshed index
+    environment = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}
     try:
         done = subprocess.run(
             words,

@@ -39,9 +39,8 @@ class RunStatus:
     loop: Mapping[str, Any] | None = None
     kept_loop: Mapping[str, Any] | None = None  # what a trial goes back to
     locks: tuple[Lock, ...] = ()  # set by people, oldest first
-    unstored: Mapping[str, str] = field(
-        default_factory=dict
-    )  # by a lock's word: why it is not on the disk
+    # by a lock's word: why it is not on the disk
+    unstored: Mapping[str, str] = field(default_factory=dict)
     latched: str = ""  # a fault of an earlier run that waits for `ack`
     trial_ends_s: float = math.nan  # when gains on trial are reverted; NaN: none are
     ended: bool = False

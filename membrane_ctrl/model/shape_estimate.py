@@ -27,9 +27,8 @@ _OTHERS = {"reason", "cycle", "tracking_lost"}
 _UPPER = np.triu_indices(ZERNIKE_TERMS)
 _LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
 _COEFFS_BYTES = 8 * ZERNIKE_TERMS
-ESTIMATE_BYTES_MAX = (
-    _LINE_BYTES_MAX + 1 + _COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE
-)  # of `pack_estimate`
+# of `pack_estimate`
+ESTIMATE_BYTES_MAX = _LINE_BYTES_MAX + 1 + _COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE
 _LARGEST = 1e300  # excludes infinity, and integers that a float cannot hold
 # Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the phase noise exceeds
 # 0.06 rad per pixel and rounding no longer averages out; at 6 % something is wrong with exposure,

@@ -57,18 +57,16 @@ def table_console(stderr: bool = False, width: int | None = None) -> Console:
     """
     from rich.console import Console
 
-    made = Console(
-        stderr=stderr, width=width, markup=False, emoji=False
-    )  # texts have [square brackets]
+    # texts have [square brackets]
+    made = Console(stderr=stderr, width=width, markup=False, emoji=False)
     made.push_render_hook(_Cells())  # type: ignore[arg-type]  # its base class is Rich's, loaded here only
     return made
 
 
 def live_line(text: str, end: str = "") -> None:
     """Replace the last line of stderr, a terminal, by a text."""
-    stream = getattr(
-        sys.stderr, "rich_proxied_file", sys.stderr
-    )  # `_Text` would escape what moves the cursor
+    # `_Text` would escape what moves the cursor
+    stream = getattr(sys.stderr, "rich_proxied_file", sys.stderr)
     stream.write(f"\r\033[K{one_line(text)}{end}")
     stream.flush()
 
@@ -78,9 +76,8 @@ def track_progress(items: Iterable[_T], what: str, total: int | None = None) -> 
     from rich.progress import track
 
     rich, on = table_console(stderr=True), sys.stderr.isatty()
-    rich.file = getattr(
-        sys.stderr, "rich_proxied_file", sys.stderr
-    )  # while it draws, Rich replaces `_Text`
+    # while it draws, Rich replaces `_Text`
+    rich.file = getattr(sys.stderr, "rich_proxied_file", sys.stderr)
     return track(items, what, total, console=rich, transient=True, disable=not on)
 
 

@@ -15,9 +15,8 @@ ZERNIKE_TERMS = 36
 _SUPPORTED_DEGREES = range(5, 11)  # 21 to 66 terms; a campaign test sets both ends
 NOLL_INDICES = range(1, ZERNIKE_TERMS + 1)
 FIRST_FIGURE_INDEX = 4  # Noll 1 to 3 are piston and tilts
-COVARIANCE_UPPER_SIZE = (
-    ZERNIKE_TERMS * (ZERNIKE_TERMS + 1) // 2
-)  # numbers in the upper half of a covariance
+# numbers in the upper half of a covariance
+COVARIANCE_UPPER_SIZE = ZERNIKE_TERMS * (ZERNIKE_TERMS + 1) // 2
 
 
 def degree_of(terms: int) -> int:

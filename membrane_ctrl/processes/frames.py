@@ -156,9 +156,8 @@ class _FrameSlots:
     def __init__(self, memory: SharedMemory, address: FrameAddress) -> None:
         assert memory.buf is not None  # None only after close()
         self._buffer = memory.buf
-        self._words = memory.buf.cast(
-            "Q"
-        )  # each assignment is one store (`membrane_ctrl.processes.ring`)
+        # each assignment is one store (`membrane_ctrl.processes.ring`)
+        self._words = memory.buf.cast("Q")
         self._stride = _slot_bytes(address)
         shape = (address.height_px, address.width_px)
         # frombuffer holds the memory, so that closing it under a live view raises;

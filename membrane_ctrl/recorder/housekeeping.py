@@ -85,10 +85,11 @@ class Housekeeping:
         )
         # a folder that a person has moved away is no longer an error
         self._errors.clear_errors(_RUN, but={_RUN + run.folder.name for run, _ in expired})
+        # one by one: a folder that cannot be deleted must not block the others
         for (
             run,
             why,
-        ) in expired:  # one by one: a folder that cannot be deleted must not block the others
+        ) in expired:
             self._errors.run_guarded(_RUN + run.folder.name, partial(self._delete_run, run, why))
 
     def _delete_run(self, run: retention.OldRun, why: str) -> None:

@@ -116,9 +116,8 @@ class Recorder:
     def drain_rings(self) -> None:
         """Take all ring messages; events go to `events.jsonl` at once."""
         self._messages += self._feeds["inputs"].drain_messages()
-        if (
-            "snapshots" in self._feeds
-        ):  # behind the ticks: then those of all drained ticks are there
+        # behind the ticks: then those of all drained ticks are there
+        if "snapshots" in self._feeds:
             self._assembler.add_snapshots(self._feeds["snapshots"].drain_messages())
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain_messages():

@@ -60,9 +60,8 @@ class TelemetryStreams:
     def _send_overview(self, rows: telemetry.Rows, last: bool = False) -> None:
         """Send a row for each second, some seconds at a time, and the band."""
         waiting_s = telemetry.get_column(self._rest, "mono_s")
-        fresh = telemetry.get_column(rows, "mono_s") > waiting_s.max(
-            initial=-math.inf
-        )  # not if sent again after a failure
+        # not if sent again after a failure
+        fresh = telemetry.get_column(rows, "mono_s") > waiting_s.max(initial=-math.inf)
         self._rest = rows = np.concatenate((self._rest, rows[fresh]))
         time_s = telemetry.get_column(rows, "mono_s")
         second = np.floor(time_s)

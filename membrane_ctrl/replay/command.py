@@ -381,9 +381,8 @@ def _make_input_rows(records: Records) -> telemetry.Rows:
 def _select_between(
     frames: inputs_file.InputsReader, begin: int, to_s: float
 ) -> Iterator[inputs_file.InputsFrame]:
-    before: dict[
-        float, shape_estimate.ShapeEstimate
-    ] = {}  # a shape may arrive a frame before the tick that used it
+    # a shape may arrive a frame before the tick that used it
+    before: dict[float, shape_estimate.ShapeEstimate] = {}
     for frame in frames:
         if len(frame.records) and frame.records["now_s"][0] > to_s:
             return

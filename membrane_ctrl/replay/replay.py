@@ -85,9 +85,8 @@ class Replay:
     compared: int = 0  # of these, bit by bit
     near: int = 0  # of these, with other last bits
     different: int = 0  # of these
-    different_rows: list[telemetry.TelemetryRow] = field(
-        default_factory=list
-    )  # today's, of the first of them
+    # today's, of the first of them
+    different_rows: list[telemetry.TelemetryRow] = field(default_factory=list)
     gaps: list[Gap] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     last_s: float = -math.inf

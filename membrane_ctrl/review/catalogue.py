@@ -50,9 +50,8 @@ class RunEntry:
     faults_s: float = math.nan
     paused_s: float = math.nan
     moving_s: float = math.nan
-    pump_scale: float = (
-        math.nan
-    )  # flow against its configured curve as last learned, and one standard error
+    # flow against its configured curve as last learned, and one standard error
+    pump_scale: float = math.nan
     pump_sigma: float = math.nan
     ended_in: str = ""  # name of the fault in which the run ended, or is; empty without one
 

@@ -51,9 +51,8 @@ def run_session(options: TuneOptions) -> int:
             progress.print_line(str(error))
             folder = measure_pump(folder, rig, options.limit_um, progress)
             _run_steps(list(STEPS), folder, rig, options, progress)
-        _note_verified(
-            folder, options.logs, options.reason
-        )  # if the session was killed before it did
+        # if the session was killed before it did
+        _note_verified(folder, options.logs, options.reason)
         page.write_report(folder)
     return conclude(folder, options)
 

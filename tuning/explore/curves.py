@@ -168,9 +168,8 @@ class Curves:
     load_um: arrays.FloatArray  # (n,): the centre after a step of the leak
     w_rad_per_s: arrays.FloatArray  # (m,)
     open_loop: arrays.ComplexArray  # (m,): L
-    centre_um2_s: (
-        arrays.FloatArray
-    )  # (m,): two-sided spectrum of the true centre in the recorded weather
+    # (m,): two-sided spectrum of the true centre in the recorded weather
+    centre_um2_s: arrays.FloatArray
 
 
 def curves(name: str, gains: closed_loop.Gains, of: Workpiece, duration_s: float) -> Curves:
@@ -215,9 +214,8 @@ def responded(
     smooth = -math.expm1(-dt_s / gains.filter_s) if gains.filter_s > 0 else 1.0
     count = max(2, round(duration_s / dt_s))
     whole = int(model.dead_time_s // dt_s)
-    early = 1.0 - (
-        model.dead_time_s / dt_s - whole
-    )  # share of a tick that the newer of two flows lasts
+    # share of a tick that the newer of two flows lasts
+    early = 1.0 - (model.dead_time_s / dt_s - whole)
     follow = -math.expm1(-dt_s / model.lag_s) if model.lag_s > 0 else 1.0
     flows = [0.0] * (whole + 2)
     centre = filtered = matched = integral = speed = 0.0

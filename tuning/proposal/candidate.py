@@ -65,9 +65,8 @@ def evaluate_candidate(
     found = compute_margins(gains, model, disturbance.rest.dt_s)
     predicted = prediction.predict_loop(gains, model, disturbance, loop) if found.stable else None
     if predicted is not None and predicted.flow_std_um_per_s > loop.flow_max_um_per_s:
-        predicted = replace(
-            predicted, std_um=math.nan
-        )  # the pump only switches: no linear loop describes that
+        # the pump only switches: no linear loop describes that
+        predicted = replace(predicted, std_um=math.nan)
     ratio = (
         predicted.std_um / lower_bound.compute_least_std_um(model, disturbance, loop)
         if predicted is not None

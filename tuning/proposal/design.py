@@ -141,9 +141,8 @@ def propose_gains(
         for name, gains in compute_designs(model, disturbance, settled, demands).items()
     ]
     chosen = designed[0]
-    if (
-        not chosen.margins.stable or chosen.margins.ms > 1.02 * demands.ms
-    ):  # the search's grid is good to 1 %
+    # the search's grid is good to 1 %
+    if not chosen.margins.stable or chosen.margins.ms > 1.02 * demands.ms:
         raise RefusedError(f"no gains achieve Ms <= {demands.ms:g} on this plant: reduce the delay")
     proposed = chosen.gains.applied_to(settled)
     return Proposal(

@@ -136,9 +136,8 @@ def estimate_sensitivity(
     w, power = w[used], power[used]
     model, moving = linearise_limits(gains, trial.model, weather, trial.after, w)
     s = np.abs(1 / (1 + closed_loop.compute_loop_response(gains, model, w, dt_s))) ** 2
-    peak = s >= min(
-        1.0, s.max()
-    )  # slower motion that exceeds the prediction is weather, or a limit of the pump
+    # slower motion that exceeds the prediction is weather, or a limit of the pump
+    peak = s >= min(1.0, s.max())
     excess, bands = power[peak] / (s * (moving + weather.rest.white_psd))[peak], w[peak]
     bands = np.floor(np.log(bands / w[0]) / math.log(_BAND)).astype(int)
     means = np.array([excess[bands == band].mean() for band in np.unique(bands)])

@@ -26,9 +26,8 @@ class TicksByFigures:
         self._zero_um = 1e3 * config.optics.mirror.sag_mm
         self._figure_interval_s = 1 / config.shape.track_rate_hz
         self._waiting: deque[telemetry.TelemetryRow] = deque()
-        self._shown: deque[tuple[float, float]] = deque(
-            [(-math.inf, math.nan)]
-        )  # time, displacement
+        # time, displacement
+        self._shown: deque[tuple[float, float]] = deque([(-math.inf, math.nan)])
         self._intervals_s: list[float] = []
 
     @property

@@ -125,9 +125,8 @@ def _survey_pump(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
     survey = pump_survey.PumpSurvey(holding, around.limit_um, around.laser_um)
     held = True
     while held and (steps := survey.steps()):
-        if flow_um_per_s := PumpCurve(rig.pump).flow(
-            survey.holding
-        ):  # none, on a curve far from the true
+        # none, on a curve far from the true
+        if flow_um_per_s := PumpCurve(rig.pump).flow(survey.holding):
             around = replace(around, holding_flow_um_per_s=flow_um_per_s)
         around = replace(around, late_s=max(around.late_s, survey.fit.delay_s + survey.fit.lag_s))
         spec = experiments.make_spec("pump_map", around, 600.0).model_copy(update={"steps": steps})
@@ -249,9 +248,8 @@ def make_pump_run(rows: Sequence[telemetry.TelemetryRow], dt_s: float) -> pump_r
     """The ticks of an experiment with pump commands; the hold before
     and after it does not count.
     """
-    tune = [row for row in rows if row.state == telemetry.State.TUNE][
-        1:
-    ]  # the first still has the loop's command
+    # the first still has the loop's command
+    tune = [row for row in rows if row.state == telemetry.State.TUNE][1:]
     columns = (
         [getattr(row, name) for row in tune]
         for name in ("pump_fraction", "displacement_um", "ambient_pressure_pa")

@@ -112,9 +112,8 @@ def _draw_weather(
         label="readings less pump",
     )
     blind = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
-    axes.loglog(
-        frequency_hz[1:], 2 * weather.psd(w, model, blind), label="fitted motion"
-    )  # one-sided
+    # one-sided
+    axes.loglog(frequency_hz[1:], 2 * weather.psd(w, model, blind), label="fitted motion")
     axes.loglog(
         frequency_hz[1:],
         2 * weather.rest.moving_psd(w),

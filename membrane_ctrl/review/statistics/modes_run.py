@@ -291,9 +291,8 @@ def _make_layout(count: int, picture: Path) -> "rrb.Blueprint":
     import rerun as rr
 
     end = rr.TimeRangeBoundary.infinite()
-    whole = rr.blueprint.TimeAxis(
-        view_range=rr.TimeRange(start=end, end=end)
-    )  # the default is a minute
+    # the default is a minute
+    whole = rr.blueprint.TimeAxis(view_range=rr.TimeRange(start=end, end=end))
     plots = (
         ("Change of the frequency, %", "change_percent"),
         ("Amplitude, nm RMS", "amplitude_nm"),

@@ -128,9 +128,8 @@ class ReviewBlueprint:
         )
 
     def _make_log_view(self, name: str, *paths: str) -> rrb.TextLogView:
-        hidden = TimelineColumn(
-            self.timeline, visible=False
-        )  # too narrow to read: the lines begin with it
+        # too narrow to read: the lines begin with it
+        hidden = TimelineColumn(self.timeline, visible=False)
         return rrb.TextLogView(
             name=name,
             origin="/",

@@ -182,9 +182,8 @@ class Layer:
                 times = np.append(
                     level["time_s"][[row for row, _ in found]], level["time_s"][-1] + 1.0
                 )
-                states = pa.array(
-                    [*(lane.name_code(code) for _, code in found), None]
-                )  # the lane ends with the run
+                # the lane ends with the run
+                states = pa.array([*(lane.name_code(code) for _, code in found), None])
                 self._send_columns(lane.path, times, rr.StateChange.columns(state=states))
 
     def _send_events(

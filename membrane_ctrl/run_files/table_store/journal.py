@@ -134,9 +134,8 @@ def read_batch(frame: JournalFrame, schema: pa.Schema) -> pa.RecordBatch:
         raise ValueError("a frame that no recorder writes")
     batch = pa.ipc.read_record_batch(message, schema)
     batch.validate(full=True)  # otherwise Arrow trusts lengths and offsets
-    for column in (
-        batch.columns
-    ):  # Arrow accepts longer lists than those of the schema, and cuts them at other places
+    # Arrow accepts longer lists than those of the schema, and cuts them at other places
+    for column in batch.columns:
         if (
             isinstance(column, pa.FixedSizeListArray)
             and len(column.values) != len(column) * column.type.list_size
