@@ -26,6 +26,7 @@ BENCHMARKS = {
     "ticks": "benchmarks.control",
     "snapshots": "benchmarks.control",
     "viewers": "benchmarks.interfaces",
+    "strangers": "benchmarks.interfaces",
     "live_cycle": "benchmarks.metrology",
     "tracking": "benchmarks.metrology",
     "measure_full": "benchmarks.metrology",

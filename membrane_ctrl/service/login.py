@@ -37,6 +37,10 @@ _FORM_BYTES_MAX = 4096
 _FORM_S = 5.0
 _TARGET_LENGTH_MAX = 4096
 _HEAD_BYTES_MAX = 32_768
+# Strangers who are refused wait so long for the answer, each on its connection. The event loop
+# serves in turn what is ready, and a STOP takes several turns: a hundred clients that try again at
+# once would make each turn long.
+_REFUSED_S = 1.0
 _BUSY_S = 1.0  # until passwords that wait have been evaluated
 
 Header = tuple[bytes, bytes]
@@ -127,6 +131,7 @@ class LoginMiddleware:
         elif user is not None:
             await self._serve(self._inside(scope, user), receive, send)
         elif scope["type"] == "websocket":
+            await asyncio.sleep(_REFUSED_S)
             await self._refuse(scope, send, Refusal(HTTPStatus.UNAUTHORIZED, "log in first"))
         else:
             await self._open_link(scope, send)
@@ -194,6 +199,7 @@ class LoginMiddleware:
         guess = self._accounts.guess_of(name, self._source(scope), device)
         admission = self._accounts.throttle.admit(guess)
         if not admission.granted:
+            await asyncio.sleep(_REFUSED_S)
             text = f"Too many tries. Wait {math.ceil(admission.wait_s)} s."
             await self._show_form(scope, send, HTTPStatus.TOO_MANY_REQUESTS, text, admission.wait_s)
             return
@@ -202,6 +208,7 @@ class LoginMiddleware:
             user = await pool.run(self._accounts.evaluate, guess, password, admission)
         except PoolFullError:
             self._accounts.throttle.withdraw(admission)
+            await asyncio.sleep(_REFUSED_S)
             text = "Too many people are logging in. Try again."
             await self._show_form(scope, send, HTTPStatus.SERVICE_UNAVAILABLE, text, _BUSY_S)
             return

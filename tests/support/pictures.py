@@ -24,7 +24,7 @@ import numpy as np
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.model.arrays import AnyArray
-from tests.support.browser import browser_tab
+from tests.support.browser import Tab, browser_tab
 from tests.support.recording_picture import screenshot
 from tests.support.review_runs import written
 from tests.web.test_page import PRESS, served
@@ -34,6 +34,7 @@ from tests.worlds.slowed_holds import slowed_holds
 from tests.worlds.virtual_record import kept_ticks, write_record
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
+EXAMPLES = Path(__file__).parents[2] / "membrane_ctrl" / "examples"
 _WIDTH_PX = 1280  # of a tab of the review, beside others on its page
 
 
@@ -128,8 +129,11 @@ def bowed_picture(folder: Path) -> dict[str, bytes]:
 
 
 def page_pictures(folder: Path) -> dict[str, bytes]:
-    """The page of a hold, in a control room and on a phone."""
+    """The page of a hold, in a control room and on a phone, and the editor of configurations."""
     (folder / "lab.toml").write_text("[twin]\nport = 0\n")
+    configurations = folder / "configurations"
+    configurations.mkdir()
+    shutil.copy(EXAMPLES / "paper-bench.toml", configurations / "bench.toml")
     words = ["hold", "--twin", "--config", folder / "lab.toml", "--name", "night", "--logs", folder]
     none = subprocess.DEVNULL
     run = [sys.executable, "-m", "membrane_ctrl", *map(str, words)]
@@ -144,7 +148,8 @@ def page_pictures(folder: Path) -> dict[str, bytes]:
 async def _page_pictures(folder: Path) -> dict[str, bytes]:
     socket, target = ("--socket", folder / "control.sock"), folder / "page.png"
     phone: list[AnyArray] = []
-    async with served(folder) as link, browser_tab(link, folder / "profile") as tab:
+    options = ("--configurations", str(folder / "configurations"))
+    async with served(folder, *options) as link, browser_tab(link, folder / "profile") as tab:
         for text, after_s in (("door opened", 90.0), ("lights off", 120.0)):
             await asyncio.sleep(after_s)
             await asyncio.to_thread(command, "ctl", "mark", text, *socket)
@@ -152,6 +157,7 @@ async def _page_pictures(folder: Path) -> dict[str, bytes]:
         await asyncio.sleep(20.0)
         await tab.screenshot(target, whole=False)
         room = await asyncio.to_thread(target.read_bytes)
+        configuration = await _configuration_picture(tab, target)
         steps = (
             "",
             "document.querySelector('canvas').scrollIntoView()",
@@ -173,7 +179,29 @@ async def _page_pictures(folder: Path) -> dict[str, bytes]:
                 await asyncio.sleep(5.0)
                 await tab.screenshot(target, whole=False)
                 phone += [cv2.imread(str(target)), np.full((844, 20, 3), 255, np.uint8)]
-    return {"web": room, "web-phone": cv2.imencode(".png", np.hstack(phone[:-1]))[1].tobytes()}
+    return {
+        "web": room,
+        "web-phone": cv2.imencode(".png", np.hstack(phone[:-1]))[1].tobytes(),
+        "web-configuration": configuration,
+    }
+
+
+async def _configuration_picture(tab: Tab, target: Path) -> bytes:
+    """The editor with a gain changed, its check, and the help of the key."""
+    await tab.show_as(1500, 1000)
+    await tab.value(f"{PRESS.format('CONFIGURATION')}; 0")
+    await tab.until("document.querySelector('.cm-content')?.innerText.length > 20")
+    await tab.value(
+        "(() => { const field = document.querySelector('[aria-label=\"search the keys\"]');"
+        "field.value = 'kp_per_s'; field.dispatchEvent(new Event('input')); })()"
+    )
+    await tab.until("document.body.innerText.includes('Proportional gain')")
+    await tab.click("ruleCheck")
+    await tab.until("document.body.innerText.includes('can be used')")
+    await asyncio.sleep(3.0)
+    await tab.screenshot(target, whole=False)
+    await tab.value(f"{PRESS.format('NOW')}; 0")
+    return await asyncio.to_thread(target.read_bytes)
 
 
 def fleet_picture(folder: Path) -> dict[str, bytes]:
@@ -236,7 +264,7 @@ MAKERS: dict[tuple[str, ...], Callable[[Path], dict[str, bytes]]] = {
     ("review-catalogue",): catalogue_picture,
     ("tutorial-fault",): tutorial_picture,
     ("calibration-bowed-screen",): bowed_picture,
-    ("web", "web-phone"): page_pictures,
+    ("web", "web-phone", "web-configuration"): page_pictures,
     ("web-fleet",): fleet_picture,
 }
 
