@@ -37,7 +37,7 @@ from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
 SERIES = "series.csv"  # its presence also distinguishes a result folder from a set
-_NAMED_BAD = 100  # bad sets listed in the table; all of them are in series.csv
+_LISTED_BAD = 100  # bad sets listed in the table; all of them are in series.csv
 _PAIR_HEAD = (
     "lag_s",
     "earlier",
@@ -52,9 +52,16 @@ _PAIR_HEAD = (
 class StabilityRun:
     """Statistics over the sets of a run.
 
-    `out` is an existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures;
-    `points_mm` are the tracked points; `geometry` is the file of the sets' geometry, with its
-    covariance.
+    Parameters
+    ----------
+    out : Path
+        Existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures.
+    points_mm : mapping of str to (float, float)
+        The points whose height is followed.
+    trials, seed : int
+        Monte Carlo trials of each set, and their seed.
+    geometry : Path, optional
+        File of the sets' geometry, with its covariance.
     """
 
     def __init__(
@@ -67,23 +74,32 @@ class StabilityRun:
     ) -> None:
         self._out = out
         self._points_mm = dict(points_mm)
-        self._trials, self._seed, self._geometry = trials, seed, geometry
+        self._trials = trials
+        self._seed = seed
+        self._geometry = geometry
         self._open = contextlib.ExitStack()
-        self._series = self._make_part(SERIES, stability_results.series_head(points_mm))
-        self._pair_rows = self._make_part("pairs.csv", _PAIR_HEAD)
+        self._series = self._open_table(SERIES, stability_results.series_head(points_mm))
+        self._pair_rows = self._open_table("pairs.csv", _PAIR_HEAD)
+
+        # From the first set: the map's points, and the spread of the geometry with its source.
         self._grid: height_map.HeightMap | None = None
         self._point_matrix: FloatArray = np.zeros((len(points_mm), PARAMETERS))
         self._spread: geometry_spread.GeometrySpread | None = None
         self._source = ""
         self._origin: dict[str, str | None] = {}
+
+        # Running statistics of all sets.
         self._parameters = running_statistics.RunningCovariance(PARAMETERS)
         self._heights = {name: running_statistics.Tally() for name in points_mm}
-        self._rmse, self._time = running_statistics.Tally(), running_statistics.Tally()
+        self._rmse = running_statistics.Tally()
+        self._time = running_statistics.Tally()
+
+        # Pairs of sets: change and RMSE by lag, and the first pair of each.
         self._finder = figure_pairs.PairFinder()
         self._pairs = {
             lag: (running_statistics.Tally(), running_statistics.Tally())
             for lag in figure_pairs.LAGS_S
-        }  # change, RMSE
+        }
         self._shown: dict[float, figure_pairs.FigurePair] = {}
         self._bad: list[dict[str, str]] = []
         self._bad_count = 0
@@ -101,10 +117,10 @@ class StabilityRun:
     ) -> None:
         self._open.close()
 
-    def _make_part(self, name: str, head: Sequence[str]) -> Any:
-        rows = csv.writer(
-            self._open.enter_context(files.fresh_text(self._out / name)), lineterminator="\n"
-        )
+    def _open_table(self, name: str, head: Sequence[str]) -> Any:
+        """A CSV writer of a new file, which stays open until the run is closed."""
+        file = self._open.enter_context(files.fresh_text(self._out / name))
+        rows = csv.writer(file, lineterminator="\n")
         rows.writerow(head)
         return rows
 
@@ -125,23 +141,30 @@ class StabilityRun:
     def skip_set(self, name: str, reason: str) -> None:
         """Count a bad set."""
         self._bad_count += 1
-        if len(self._bad) < _NAMED_BAD:
+        if len(self._bad) < _LISTED_BAD:
             self._bad.append({"set": name, "reason": reason})
         self._series.writerow((name, "rejected", reason))
 
     def add(self, name: str, number: int, one: measurement.SetFigure) -> None:
-        """Count a set; `number` is its place in the run, which seeds its noise."""
-        grid, spread = self._grid_for(one), self._spread_for(one)
+        """Add a set; `number` is its place in the run, which seeds its noise."""
+        grid = self._grid_for(one)
+        spread = self._spread_for(one)
         surface = one.figure.fit.surface
         parameters = surface.parameters
+
+        # Its uncertainty, by Monte Carlo.
         bench = one.make_trial_bench()
+        numbers_of_trials = range(self._trials)
         try:
-            trials = monte_carlo.run_trials(
-                [bench], spread, self._seed, range(self._trials), number
-            )[:, 0]
+            all_trials = monte_carlo.run_trials(
+                [bench], spread, self._seed, numbers_of_trials, number
+            )
         except ArithmeticError as error:
             raise errors.InputError(f"{one.head.folder}: uncertainty: {error}") from None
+        trials = all_trials[:, 0]
         rmse_um = float(1e3 * grid.sigma(monte_carlo.trial_covariance(trials)).mean())
+
+        # The running statistics.
         self._parameters.add(parameters)
         self.degraded += one.verdict == "degraded"
         self._rmse.add(rmse_um)
@@ -150,16 +173,21 @@ class StabilityRun:
         heights_um: list[float] = (1e3 * self._point_matrix @ parameters).tolist()
         for tally, height in zip(self._heights.values(), heights_um, strict=True):
             tally.add(height)
-        numbers = (
+
+        # The row of the set, and the pairs that end with it.
+        values = (
             one.time_s,
             one.displacement_um,
             1e3 * surface.sag_mm,
             one.figure.quality.residual_urad,
             rmse_um,
+            *heights_um,
+            *(1e3 * surface.coeffs_mm),
         )
-        cells = (f"{value:.12g}" for value in (*numbers, *heights_um, *(1e3 * surface.coeffs_mm)))
+        cells = [f"{value:.12g}" for value in values]
         self._series.writerow((name, one.verdict, one.reason, *cells))
-        for pair in self._finder.add(figure_pairs.Moment(name, one.time_s, parameters, trials)):
+        moment = figure_pairs.Moment(name, one.time_s, parameters, trials)
+        for pair in self._finder.add(moment):
             self._add_pair(grid, pair)
 
     def make_table(self) -> dict[str, Any]:
@@ -167,6 +195,14 @@ class StabilityRun:
         sd_um = self._sd_um()
         to_coeffs = parameter_to_coeffs()
         covariance = to_coeffs @ self._parameters.covariance @ to_coeffs.T
+        duration_s = None
+        if self._time.count:
+            duration_s = self._time.high - self._time.low
+        geometry: dict[str, Any] = {**self._origin, "names": [], "sigmas": []}
+        if self._spread is not None:
+            geometry["names"] = list(self._spread.names)
+            geometry["sigmas"] = self._spread.sigmas.tolist()
+        geometry["source"] = self._source
         return {
             "sets": {
                 "found": self.used_count + self._bad_count,
@@ -176,7 +212,7 @@ class StabilityRun:
                 "bad_sets": self._bad,
             },
             "first_set": None if self._stated is None else self._stated.table(),
-            "duration_s": self._time.high - self._time.low if self._time.count else None,
+            "duration_s": duration_s,
             "sd_um": {"mean": float(sd_um.mean()), "max": float(sd_um.max())},
             "points": self._point_table(),
             "pairs": [self._pair_table(lag) for lag in figure_pairs.LAGS_S],
@@ -189,12 +225,7 @@ class StabilityRun:
             },
             "trials": self._trials,
             "seed": self._seed,
-            "geometry": self._origin
-            | {
-                "names": list(self._spread.names) if self._spread else [],
-                "sigmas": self._spread.sigmas.tolist() if self._spread else [],
-                "source": self._source,
-            },
+            "geometry": geometry,
         }
 
     def format_lines(self) -> list[str]:
@@ -202,29 +233,37 @@ class StabilityRun:
         return stability_results.format_stability(self.make_table())
 
     def draw_pictures(self) -> list[Path]:
-        """Write the SD map and the pictures and return the latter; the series must be closed.
-        Raises OSError.
+        """Write the SD map and the pictures, and return the latter.
+
+        The series must be closed. Raises OSError.
         """
         grid = self._grid
         if grid is None:
             return []
-        axis, sd = grid.axis_mm, grid.picture(self._sd_um())
-        result_files.write_arrays(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
+        axis_mm = grid.axis_mm
+        sd_um = grid.picture(self._sd_um())
+        result_files.write_arrays(self._out / "sd.npz", x_mm=axis_mm, y_mm=axis_mm, sd_um=sd_um)
+
+        # Standard deviation, heights and terms over time.
         times, heights, coeffs = self._read_followed()
-        drawn = [self._out / f"{name}.png" for name in ("stability", "zernike", "pairs")]
-        stability_pictures.draw_stability(drawn[0], axis, sd, times, self._points_mm, heights)
-        stability_pictures.draw_zernike(drawn[1], times, coeffs)
+        stability = self._out / "stability.png"
+        stability_pictures.draw_stability(
+            stability, axis_mm, sd_um, times, self._points_mm, heights
+        )
+        zernike = self._out / "zernike.png"
+        stability_pictures.draw_zernike(zernike, times, coeffs)
         if not self._shown:
-            return drawn[:2]
-        maps = {
-            lag: (
-                grid.picture(1e3 * grid.matrix @ pair.change),
-                grid.picture(1e3 * grid.sigma(pair.covariance)),
-            )
-            for lag, pair in self._shown.items()
-        }
-        stability_pictures.draw_pairs(drawn[2], axis, maps)
-        return drawn
+            return [stability, zernike]
+
+        # Change and RMSE of the first pair of each lag.
+        maps = {}
+        for lag_s, pair in self._shown.items():
+            change_um = grid.picture(1e3 * grid.matrix @ pair.change)
+            rmse_um = grid.picture(1e3 * grid.sigma(pair.covariance))
+            maps[lag_s] = (change_um, rmse_um)
+        pairs = self._out / "pairs.png"
+        stability_pictures.draw_pairs(pairs, axis_mm, maps)
+        return [stability, zernike, pairs]
 
     def write_recording(self, pictures: list[Path]) -> None:
         """Write `stability.rrd`; the series must be closed. Raises OSError."""
@@ -246,6 +285,7 @@ class StabilityRun:
         return times, heights, coeffs
 
     def _grid_for(self, one: measurement.SetFigure) -> height_map.HeightMap:
+        """The points of the map, those of the first set."""
         if self._grid is None:
             mirror = one.head.optics.mirror
             self._grid = height_map.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
@@ -254,6 +294,7 @@ class StabilityRun:
         return self._grid
 
     def _spread_for(self, one: measurement.SetFigure) -> geometry_spread.GeometrySpread:
+        """The spread of the geometry, that of the first set."""
         if self._spread is None:
             self._spread, self._source = spread_file.geometry_spread(
                 one.head.optics, self._geometry
@@ -268,12 +309,12 @@ class StabilityRun:
         return 1e3 * self._grid.sigma(self._parameters.covariance)
 
     def _add_pair(self, grid: height_map.HeightMap, pair: figure_pairs.FigurePair) -> None:
+        """Count a pair, and write its row."""
         rmse_um = 1e3 * grid.sigma(pair.covariance)
         change_um = float(1e3 * np.sqrt(np.mean(np.square(grid.matrix @ pair.change))))
-        for tally, value in zip(
-            self._pairs[pair.lag_s], (change_um, float(rmse_um.mean())), strict=True
-        ):
-            tally.add(value)
+        changes, rmses = self._pairs[pair.lag_s]
+        changes.add(change_um)
+        rmses.add(float(rmse_um.mean()))
         self._shown.setdefault(pair.lag_s, pair)
         seconds = pair.later.time_s - pair.earlier.time_s
         numbers = (seconds, change_um, float(rmse_um.mean()), float(rmse_um.max()))
@@ -281,24 +322,30 @@ class StabilityRun:
         self._pair_rows.writerow((f"{pair.lag_s:g}", pair.earlier.name, pair.later.name, *cells))
 
     def _point_table(self) -> dict[str, dict[str, float]]:
+        """Height and its standard deviation at each point, by name."""
         table = {}
-        for row, (name, (x, y)) in zip(self._point_matrix, self._points_mm.items(), strict=True):
+        for row, (name, (x_mm, y_mm)) in zip(
+            self._point_matrix, self._points_mm.items(), strict=True
+        ):
             tally = self._heights[name]
-            sd_um = 1e3 * math.sqrt(row @ self._parameters.covariance @ row)
-            moved = {
+            table[name] = {
+                "x_mm": x_mm,
+                "y_mm": y_mm,
                 "mean_um": tally.mean,
-                "sd_um": sd_um,
+                "sd_um": 1e3 * math.sqrt(row @ self._parameters.covariance @ row),
                 "peak_to_peak_um": tally.high - tally.low,
             }
-            table[name] = {"x_mm": x, "y_mm": y} | moved
         return table
 
     def _pair_table(self, lag_s: float) -> dict[str, Any]:
+        """Change and RMSE of the pairs of one lag; None without pairs."""
         change, rmse = self._pairs[lag_s]
-        return {"lag_s": lag_s, "count": change.count} | {
-            name: {"mean": tally.mean, "min": tally.low, "max": tally.high} if tally.count else None
-            for name, tally in (("change_rms_um", change), ("rmse_um", rmse))
-        }
+        table: dict[str, Any] = {"lag_s": lag_s, "count": change.count}
+        for name, tally in (("change_rms_um", change), ("rmse_um", rmse)):
+            table[name] = None
+            if tally.count:
+                table[name] = {"mean": tally.mean, "min": tally.low, "max": tally.high}
+        return table
 
 
 @dataclass(frozen=True)

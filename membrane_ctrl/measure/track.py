@@ -35,9 +35,10 @@ from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.colours import DIVERGING_MAP
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS, zernike_labels
 
-_SAME_REGION = 1e-4  # of its side: rounding of written decimals
-_NAMED = 5  # reasons shown
-_SHOWN_FRAMES = 2000  # of a picture
+_SAME_REGION = 1e-4  # relative difference of the pattern's side: rounding of written decimals
+_SHOWN_REASONS = 5
+_SHOWN_FRAMES = 2000  # in a picture
+_COLOUR_QUANTILE = 0.995  # of the sizes, at which the colours end
 
 
 class CrossedConfig(Section):
@@ -82,6 +83,7 @@ class Track:
     Attributes
     ----------
     frames : tuple of TrackedFrame
+        Figures of the frames.
     reference : SetStatement
         What `measure` states of the set that anchors it.
     stepped : bool
@@ -97,7 +99,7 @@ class Track:
 
     def make_columns(self) -> dict[str, Any]:
         """The arrays of `track.npz`."""
-        numbers = (
+        names = (
             "time_s",
             "coeffs_um",
             "sigma_um",
@@ -105,24 +107,21 @@ class Track:
             "sag_um",
             "sag_sigma_um",
             "steady_sag_sigma_um",
+            "verdict",
+            "reason",
+            "steady_sigma_um",
         )
-        words = ("verdict", "reason")
-        columns: dict[str, Any] = {
-            name: np.array([getattr(frame, name) for frame in self.frames])
-            for name in (*numbers, *words)
-        }
-        columns["steady_sigma_um"] = np.array([frame.steady_sigma_um for frame in self.frames])
-        return columns
+        return {name: np.array([getattr(frame, name) for frame in self.frames]) for name in names}
 
 
 def track_command(
     folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool
 ) -> int:
     """Track a set, write the result and report it. Returns the exit code; raises CommandError."""
-    begin = time.perf_counter()
+    begin_s = time.perf_counter()
     given = None if geometry is None else read_geometry(geometry)
     track = track_set(folder, given, geometry)
-    passed_s = time.perf_counter() - begin
+    passed_s = time.perf_counter() - begin_s
     out = out.resolve() if out else folder / "result"
     table = _make_track_table(track)
     with errors.convert_write_errors(out):
@@ -139,73 +138,78 @@ def track_command(
 def track_set(
     folder: Path, geometry: GeometryFile | None = None, file: Path | None = None
 ) -> Track:
-    """The figures of a set's frames; `file` is the geometry's, with its covariance.
+    """Measure the figures of a set's frames; `file` is the geometry's, with its covariance.
 
     Raises InputError if the set or its reference is invalid, RejectedError if the reference gives
     no usable figure.
     """
     content = read_track(folder)
     path = folder / "capture.toml"
+
+    # The reference, and a tracker for the crossed pattern on it.
     reference = Figures(geometry).measure_folder(reference_of(content.reference, folder, path))
     _require_reference(content, reference, path)
     stated = state_set(reference.head.folder, geometry, file)
-    crossed, optics = content.pattern.crossed, reference.head.optics
-    size = (optics.camera.height_px, optics.camera.width_px)
+    crossed = content.pattern.crossed
+    optics = reference.head.optics
+    camera = optics.camera
+    size = (camera.height_px, camera.width_px)
+    figure = _measure_reference(reference)
     try:
-        scene = make_scene(
-            optics,
-            reference.checked,
-            _measure_reference(reference),
-            crossed.period_mm,
-            crossed.contrast,
-        )
-        tracker = Tracker(
-            scene,
-            size,
-            2**optics.camera.bits - 1,
-            optics.camera.noise_adu,
-            reference.displacement_um,
-        )
+        scene = make_scene(optics, reference.checked, figure, crossed.period_mm, crossed.contrast)
+        full_scale_adu = 2**camera.bits - 1
+        tracker = Tracker(scene, size, full_scale_adu, camera.noise_adu, reference.displacement_um)
     except ValueError as error:
         raise errors.InputError(f"{path}: pattern.crossed.period_mm: {error}") from None
-    shifts = np.array([(row.shift_x_rad, row.shift_y_rad) for row in content.frames])
-    pictures = _read_pictures(
-        content, folder, size, np.dtype(np.uint8 if optics.camera.bits == 8 else np.uint16)
-    )
-    times = np.array([row.time_s for row in content.frames])
-    readings = np.array(
+
+    # What the set states of each frame, and their pictures one after the other.
+    shifts_rad = np.array([(row.shift_x_rad, row.shift_y_rad) for row in content.frames])
+    times_s = np.array([row.time_s for row in content.frames])
+    readings_um = np.array(
         [math.nan if row.displacement_um is None else row.displacement_um for row in content.frames]
     )
+    depth = np.dtype(np.uint8 if camera.bits == 8 else np.uint16)
+    pictures = _read_pictures(content, folder, size, depth)
+
+    # The first five frames give light and phases of the bins, if they are readable steps.
     found: list[TrackedFrame] = []
-    first = list(
-        islice(pictures, ENOUGH_STEPS if are_steps_separable(shifts[:ENOUGH_STEPS]) else 0)
-    )
-    good = [picture for picture in first if not isinstance(picture, str)]
-    if stepped := bool(good) and len(good) == len(first):
-        part = slice(0, ENOUGH_STEPS)
-        found, first = tracker.anchor(good, shifts[part], times[part], readings[part]), []
-    rest = terminal.track_progress(chain(first, pictures), "frames", len(times) - len(found))
+    first: list[Image | str] = []
+    if are_steps_separable(shifts_rad[:ENOUGH_STEPS]):
+        first = list(islice(pictures, ENOUGH_STEPS))
+    steps = [picture for picture in first if not isinstance(picture, str)]
+    stepped = bool(steps) and len(steps) == len(first)
+    if stepped:
+        found = tracker.anchor(
+            steps,
+            shifts_rad[:ENOUGH_STEPS],
+            times_s[:ENOUGH_STEPS],
+            readings_um[:ENOUGH_STEPS],
+        )
+        first = []
+
+    # All others are followed.
+    rest = terminal.track_progress(chain(first, pictures), "frames", len(times_s) - len(found))
     for k, picture in enumerate(rest, start=len(found)):
-        at_s, reading = float(times[k]), float(readings[k])
+        at_s = float(times_s[k])
         if isinstance(picture, str):
             found.append(rejected_frame(at_s, picture))
-        else:
-            found.append(tracker.follow(picture, (shifts[k, 0], shifts[k, 1]), at_s, reading))
+            continue
+        shifts = (shifts_rad[k, 0], shifts_rad[k, 1])
+        found.append(tracker.follow(picture, shifts, at_s, float(readings_um[k])))
+    has_rejected_step = any(frame.verdict == "rejected" for frame in found[:ENOUGH_STEPS])
     return Track(
-        tuple(found),
-        stated,
-        stepped and not any(f.verdict == "rejected" for f in found[:ENOUGH_STEPS]),
-        tracker.mean_residual_adu(),
+        tuple(found), stated, stepped and not has_rejected_step, tracker.mean_residual_adu()
     )
 
 
 def _measure_reference(reference: SetFigure) -> BinFigure:
-    """The reference's bins on the surface that `measure` gives: its weights differ from those of
-    the bins' own fit.
+    """The reference's bins on the surface that `measure` finds.
 
-    Where the terms cannot represent the film, the two differ by more than the error bar of a frame.
+    Its weights differ from those of the bins' own fit. Where the terms cannot represent the film,
+    the two differ by more than the error bar of a frame.
     """
-    optics, checked = reference.head.optics, reference.checked
+    optics = reference.head.optics
+    checked = reference.checked
     found = reconstruct_full(optics, checked, measure_pixels(optics, checked)).fit
     checked.tracer.intersect(reference.figure.points, found.surface)
     return replace(reference.figure, fit=found)
@@ -230,8 +234,7 @@ def read_track(folder: Path) -> TrackFile:
         if not after.time_s > before.time_s:
             raise errors.InputError(
                 f"{path}: frames: time_s of {after.file} is {after.time_s:g}, not after "
-                f"{before.time_s:g} of the "
-                "frame before"
+                f"{before.time_s:g} of the frame before"
             )
     for name, times in Counter(row.file for row in content.frames).items():
         if times > 1:
@@ -243,47 +246,65 @@ def _require_reference(content: TrackFile, reference: SetFigure, path: Path) -> 
     """Raise InputError unless the reference is a full set with the region of this one."""
     if reference.head.kind != "full":
         raise errors.InputError(f"{path}: reference: {reference.head.folder} is not a full set")
-    ours, theirs = content.pattern, reference.head.optics.pattern
+    ours = content.pattern
+    theirs = reference.head.optics.pattern
     for key in ("periods", "period_mm"):
-        if getattr(ours, key) != getattr(theirs, key):
-            said = f"{getattr(ours, key)}, the reference has {getattr(theirs, key)}"
-            raise errors.InputError(f"{path}: pattern.{key} = {said}")
-    sides = [pattern.periods * pattern.period_mm for pattern in (ours.crossed, theirs)]
-    if abs(sides[0] - sides[1]) > _SAME_REGION * sides[1]:
+        own_value = getattr(ours, key)
+        their_value = getattr(theirs, key)
+        if own_value != their_value:
+            raise errors.InputError(
+                f"{path}: pattern.{key} = {own_value}, the reference has {their_value}"
+            )
+    side_mm = ours.crossed.periods * ours.crossed.period_mm
+    reference_side_mm = theirs.periods * theirs.period_mm
+    if abs(side_mm - reference_side_mm) > _SAME_REGION * reference_side_mm:
         raise errors.InputError(
-            f"{path}: pattern.crossed: periods * period_mm = {sides[0]:g} mm; it covers the "
-            "reference's region, "
-            f"{sides[1]:g} mm"
+            f"{path}: pattern.crossed: periods * period_mm = {side_mm:g} mm; it covers the "
+            f"reference's region, {reference_side_mm:g} mm"
         )
 
 
 def _read_pictures(
     content: TrackFile, folder: Path, size: tuple[int, int], depth: np.dtype[Any]
 ) -> Iterator[Image | str]:
-    """The frames one after the other; a text where there is none. Raises InputError for another
-    size or depth.
+    """The frames one after the other; a reason where there is no picture.
+
+    Raises InputError for a picture of another size or depth.
     """
     for row in content.frames:
         picture = read_image(folder / row.file)
-        if not isinstance(picture, str):
-            where = f"{folder / 'capture.toml'}: frames: {row.file} has"
-            if picture.shape != size:
-                seen = f"{picture.shape[1]} x {picture.shape[0]} pixels"
-                raise errors.InputError(f"{where} {seen}, the reference {size[1]} x {size[0]}")
-            if picture.dtype != depth:
-                raise errors.InputError(
-                    f"{where} {8 * picture.itemsize} bit pixels, the reference {8 * depth.itemsize}"
-                )
+        if isinstance(picture, str):
+            yield picture
+            continue
+        where = f"{folder / 'capture.toml'}: frames: {row.file} has"
+        if picture.shape != size:
+            seen = f"{picture.shape[1]} x {picture.shape[0]} pixels"
+            raise errors.InputError(f"{where} {seen}, the reference {size[1]} x {size[0]}")
+        if picture.dtype != depth:
+            raise errors.InputError(
+                f"{where} {8 * picture.itemsize} bit pixels, the reference {8 * depth.itemsize}"
+            )
         yield picture
 
 
 def _make_track_table(track: Track) -> dict[str, Any]:
     """The result in numbers."""
     used = [frame for frame in track.frames if frame.verdict != "rejected"]
-    sag, sigma, steady = (
-        np.array([getattr(frame, name) for frame in used])
-        for name in ("sag_um", "sag_sigma_um", "steady_sag_sigma_um")
+    figures: dict[str, float | None] = dict.fromkeys(
+        (
+            "sag_mean_um",
+            "sag_sd_um",
+            "sag_sigma_um",
+            "steady_sag_sigma_um",
+            "rest_share",
+        )
     )
+    if used:
+        sags_um = np.array([frame.sag_um for frame in used])
+        figures["sag_mean_um"] = float(sags_um.mean())
+        figures["sag_sd_um"] = float(sags_um.std())
+        for name in ("sag_sigma_um", "steady_sag_sigma_um", "rest_share"):
+            figures[name] = float(np.median([getattr(frame, name) for frame in used]))
     reasons = Counter(f"{frame.verdict}: {frame.reason}" for frame in track.frames if frame.reason)
     counts = Counter(frame.verdict for frame in track.frames)
     return {
@@ -294,11 +315,7 @@ def _make_track_table(track: Track) -> dict[str, Any]:
         "stepped": track.stepped,
         "reference": track.reference.table(),
         "seconds": track.frames[-1].time_s - track.frames[0].time_s,
-        "sag_mean_um": float(sag.mean()) if used else None,
-        "sag_sd_um": float(sag.std()) if used else None,
-        "sag_sigma_um": float(np.median(sigma)) if used else None,
-        "steady_sag_sigma_um": float(np.median(steady)) if used else None,
-        "rest_share": float(np.median([frame.rest_share for frame in used])) if used else None,
+        **figures,
         "reasons": dict(reasons.most_common()),
     }
 
@@ -309,9 +326,8 @@ def _format_track(table: dict[str, Any]) -> list[str]:
         f"{count} {verdict}" for verdict, count in table["verdicts"].items() if count
     )
     lines = [f"frames    {table['frames']} in {table['seconds']:.1f} s: {verdicts}"]
-    lines += [
-        f"          {count} x {reason}" for reason, count in list(table["reasons"].items())[:_NAMED]
-    ]
+    reasons = list(table["reasons"].items())[:_SHOWN_REASONS]
+    lines += [f"          {count} x {reason}" for reason, count in reasons]
     light = "five steps of the first frames" if table["stepped"] else "the reference"
     known = table["reference"]["geometry_known"]
     judged = table["reference"]
@@ -323,8 +339,8 @@ def _format_track(table: dict[str, Any]) -> list[str]:
     if table["usable"]:
         lines.append(
             f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation "
-            f"{table['sag_sd_um']:.3f} µm, "
-            f"1 sigma of a frame {table['steady_sag_sigma_um']:.3f} µm"
+            f"{table['sag_sd_um']:.3f} µm, 1 sigma of a frame "
+            f"{table['steady_sag_sigma_um']:.3f} µm"
         )
         lines.append(
             f"          1 sigma {table['sag_sigma_um']:.2g} µm, if the bench has moved since the "
@@ -341,26 +357,23 @@ def _write_pictures(out: Path, track: Track, lines: Sequence[str]) -> None:
     from membrane_ctrl.measure.rerun_recording import log_pictures, open_recording
 
     columns = track.make_columns()
-    time_s, sag_um = columns["time_s"], columns["sag_um"]
+    time_s = columns["time_s"]
+    sag_um = columns["sag_um"]
     sigma_um = columns["steady_sag_sigma_um"]
-    change_um = (
-        columns["coeffs_um"] - np.nanmean(columns["coeffs_um"], axis=0)
-        if np.isfinite(sag_um).any()
-        else None
-    )
+    change_um = None
+    if np.isfinite(sag_um).any():
+        change_um = columns["coeffs_um"] - np.nanmean(columns["coeffs_um"], axis=0)
     drawn = [_draw_track(out / "track.png", columns, change_um, track.residual_adu)]
     with open_recording(out / "track.rrd", "membrane_ctrl_track") as recording:
         recording.log("track/report", rr.TextDocument("\n".join(lines)), static=True)
         at = [rr.TimeColumn("run_time", duration=time_s)]
-        recording.send_columns(
-            "track/sag_um", at, rr.Measurements.columns(values=sag_um, variances=sigma_um**2)
-        )
+        sags = rr.Measurements.columns(values=sag_um, variances=sigma_um**2)
+        recording.send_columns("track/sag_um", at, sags)
         if change_um is not None:
             names = zernike_labels(first=2)
             recording.log("track/terms_um", rr.SeriesLines(names=names), static=True)
-            recording.send_columns(
-                "track/terms_um", at, rr.Scalars.columns(scalars=change_um[:, 1:])
-            )
+            terms = rr.Scalars.columns(scalars=change_um[:, 1:])
+            recording.send_columns("track/terms_um", at, terms)
         states = [f"{frame.verdict} {frame.reason}".strip() for frame in track.frames]
         for k, (frame, state) in enumerate(zip(track.frames, states, strict=True)):
             if k == 0 or state != states[k - 1]:
@@ -377,30 +390,35 @@ def _draw_track(
 
     figure, (terms, sag, left) = new_sheet(9, 13, 3, 1)
     every = max(1, len(columns["time_s"]) // _SHOWN_FRAMES)
-    time_s, sag_um, sigma_um = (
-        columns[name][::every] for name in ("time_s", "sag_um", "steady_sag_sigma_um")
-    )
+    time_s = columns["time_s"][::every]
+    sag_um = columns["sag_um"][::every]
+    sigma_um = columns["steady_sag_sigma_um"][::every]
     if change_um is not None:
+        # The terms over time, from astigmatism on.
         shown = change_um[::every, FIRST_FIGURE_INDEX - 1 :].T
-        most = float(np.nanquantile(np.abs(shown), 0.995)) or 1.0
         extent = (time_s[0], time_s[-1] + 1e-9, ZERNIKE_TERMS + 0.5, FIRST_FIGURE_INDEX - 0.5)
-        style: dict[str, Any] = {
-            "cmap": DIVERGING_MAP,
-            "vmin": -most,
-            "vmax": most,
-            "interpolation": "nearest",
-        }
-        bar = terms.imshow(shown, aspect="auto", extent=extent, **style)
-        figure.colorbar(bar, ax=terms)
-        middle = np.nanmean(sag_um)
-        sag.plot(time_s, sag_um - middle, linewidth=0.8)
-        sag.fill_between(time_s, sag_um - middle - sigma_um, sag_um - middle + sigma_um, alpha=0.3)
-        sag.set(title=f"sag less {middle / 1e3:.4f} mm (µm), band of 1 sigma")
+        style: dict[str, Any] = {"aspect": "auto", "extent": extent, "interpolation": "nearest"}
+        figure.colorbar(terms.imshow(shown, **style, **_diverging_colours(shown)), ax=terms)
+
+        # The sag about its mean.
+        middle_um = np.nanmean(sag_um)
+        about_um = sag_um - middle_um
+        sag.plot(time_s, about_um, linewidth=0.8)
+        sag.fill_between(time_s, about_um - sigma_um, about_um + sigma_um, alpha=0.3)
+        sag.set(title=f"sag less {middle_um / 1e3:.4f} mm (µm), band of 1 sigma")
     terms.set(title="terms less their means (µm RMS)", xlabel="time (s)", ylabel="Noll index")
     sag.set(xlabel="time (s)", ylabel="µm")
-    most = float(np.nanquantile(np.abs(residual_adu), 0.995)) or 1.0
-    figure.colorbar(left.imshow(residual_adu, cmap=DIVERGING_MAP, vmin=-most, vmax=most), ax=left)
+
+    # The mean residual.
+    image = left.imshow(residual_adu, **_diverging_colours(residual_adu))
+    figure.colorbar(image, ax=left)
     left.set(
         title="mean light that the fits leave (ADU)", xlabel="column of bins", ylabel="row of bins"
     )
     return write_picture(path, figure)
+
+
+def _diverging_colours(values: FloatArray) -> dict[str, Any]:
+    """Colours about 0 for values, of which a few of the largest are beyond their ends."""
+    most = float(np.nanquantile(np.abs(values), _COLOUR_QUANTILE)) or 1.0
+    return {"cmap": DIVERGING_MAP, "vmin": -most, "vmax": most}
