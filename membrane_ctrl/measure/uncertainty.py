@@ -91,7 +91,7 @@ class Spread:
     Attributes
     ----------
     covariance : (parameters, parameters) array
-        Of the parameters over the trials, mm^2.
+        Covariance of the parameters over the trials, mm^2.
     linear : (parameters, parameters) array
         The same from the Jacobian and the noise.
     noise : (parameters, parameters) array
@@ -99,22 +99,23 @@ class Spread:
     budget : (parameters, parameters) array
         The same from the budgets of `measure`, with film, light, blur and the remaining slopes of
         each set.
+    motion : MotionFinding or None
+        Motions of the bench between two sets.
     """
 
     covariance: FloatArray
     linear: FloatArray
     noise: FloatArray
     budget: FloatArray
-    motion: MotionFinding | None  # of the bench between two sets
+    motion: MotionFinding | None
 
 
 def uncertainty_command(options: UncertaintyOptions) -> int:
     """Run the trials, write map, table and picture, and report. Raises CommandError."""
+    # The sets, and the spread of their geometry.
     given = None if options.geometry is None else file.read_geometry(options.geometry)
-    figures, folders = (
-        Figures(given),
-        [folder for folder in (options.folder, options.against) if folder is not None],
-    )
+    folders = [folder for folder in (options.folder, options.against) if folder is not None]
+    figures = Figures(given)
     sets = [figures.measure_folder(folder) for folder in folders]
     spread, source = spread_file.geometry_spread(sets[0].head.optics, options.geometry)
     print(f"geometry: {source}", file=sys.stderr)
@@ -123,8 +124,10 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
         raise errors.InputError(
             f"{options.against}: geometry: differs from {options.folder}; a pair needs one bench"
         )
+
+    # The statements on both sets, the trials, and the budget.
     stated = [state_set(folder, given, options.geometry) for folder in folders]
-    begin = time.perf_counter()
+    begin_s = time.perf_counter()
     parameters = run_everywhere(
         benches,
         spread,
@@ -133,18 +136,20 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
         workers=options.workers,
         scheduler=options.scheduler,
     )
-    seconds = time.perf_counter() - begin
-    result = _compute_spread(benches, spread, parameters, *_combine_budgets(stated))
+    seconds = time.perf_counter() - begin_s
+    budget_mm2, motion = _combine_budgets(stated)
+    result = _compute_spread(benches, spread, parameters, budget_mm2, motion)
+
+    # The map, the table and the picture.
     mirror = sets[0].head.optics.mirror
     grid = height_map.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
-    table = _make_comparison_table(options, sets, stated, spread, source, result, grid) | {
-        "timing_s": {"trials": seconds}
-    }
+    table = _make_comparison_table(options, sets, stated, spread, source, result, grid)
+    table["timing_s"] = {"trials": seconds}
     out = options.out.resolve() if options.out else options.folder / "uncertainty"
-    own, *other = (one.figure.fit.surface.parameters for one in sets)
-    _write_comparison(
-        out, grid, result, 1e3 * grid.matrix @ (own - other[0] if other else own), table
-    )
+    shown_mm = sets[0].figure.fit.surface.parameters
+    if len(sets) > 1:
+        shown_mm = shown_mm - sets[1].figure.fit.surface.parameters
+    _write_comparison(out, grid, result, 1e3 * grid.matrix @ shown_mm, table)
     print(json.dumps(table) if options.as_json else "\n".join(_format_comparison(table)))
     return 0
 
@@ -153,7 +158,7 @@ def _combine_budgets(
     stated: Sequence[SetStatement],
 ) -> tuple[FloatArray, MotionFinding | None]:
     """Covariance (parameters, parameters), mm^2, of the only set by its budget, or of its change
-    since the second, and what it contains of motions of the bench.
+    since the second, and the motions of the bench in it.
     """
     own, *earlier = (each.budget for each in stated)
     if not earlier:
@@ -169,7 +174,9 @@ def _compute_spread(
     motion: MotionFinding | None,
 ) -> Spread:
     """Spread of the only set, or of the first minus the second, trial by trial."""
-    own = parameters[:, 0] if len(benches) == 1 else parameters[:, 0] - parameters[:, 1]
+    own = parameters[:, 0]
+    if len(benches) > 1:
+        own = own - parameters[:, 1]
     noise = np.sum([linear_covariance.noise_covariance(bench) for bench in benches], axis=0)
     return Spread(
         monte_carlo.trial_covariance(own),
@@ -189,15 +196,22 @@ def _make_comparison_table(
     result: Spread,
     grid: height_map.HeightMap,
 ) -> dict[str, Any]:
-    spreads = result.covariance, result.linear, result.noise, result.budget
-    rmse, linear, noise, budget = (1e3 * grid.sigma(c) for c in spreads)
-    coeffs = np.sqrt(np.diag(parameter_to_coeffs() @ result.covariance @ parameter_to_coeffs().T))
-    motion_um, moved = None, ""
+    """The content of `uncertainty.json`."""
+
+    def summarise(covariance_mm2: FloatArray) -> dict[str, float]:
+        """Mean and largest standard deviation of the height over the map, µm."""
+        sigma_um = 1e3 * grid.sigma(covariance_mm2)
+        return {"mean": float(sigma_um.mean()), "max": float(sigma_um.max())}
+
+    motion_um = None
+    moved = ""
     if result.motion is not None:
-        sigma_um = 1e3 * grid.sigma(result.motion.covariance_mm2)
-        motion_um = {"mean": float(sigma_um.mean()), "max": float(sigma_um.max())}
-        moved = result.motion.describe() if result.motion.is_sure else ""
+        motion_um = summarise(result.motion.covariance_mm2)
+        if result.motion.is_sure:
+            moved = result.motion.describe()
     sag = sag_gradient()
+    to_coeffs = parameter_to_coeffs()
+    coeffs_mm = np.sqrt(np.diag(to_coeffs @ result.covariance @ to_coeffs.T))
     return {
         **program.file_origin("membrane-uncertainty/1"),
         "set": str(options.folder),
@@ -210,14 +224,14 @@ def _make_comparison_table(
         "seed": options.seed,
         "geometry": sets[0].head.geometry.make_table()
         | {"names": list(spread.names), "sigmas": spread.sigmas.tolist(), "source": source},
-        "rmse_um": {"mean": float(rmse.mean()), "max": float(rmse.max())},
-        "linear_um": {"mean": float(linear.mean()), "max": float(linear.max())},
-        "noise_um": {"mean": float(noise.mean()), "max": float(noise.max())},
-        "budget_um": {"mean": float(budget.mean()), "max": float(budget.max())},
+        "rmse_um": summarise(result.covariance),
+        "linear_um": summarise(result.linear),
+        "noise_um": summarise(result.noise),
+        "budget_um": summarise(result.budget),
         "motion_um": motion_um,
         "moved": moved,
         "sag_sigma_um": 1e3 * float(np.sqrt(sag @ result.covariance @ sag)),
-        "coeffs_sigma_um": (1e3 * coeffs).tolist(),
+        "coeffs_sigma_um": (1e3 * coeffs_mm).tolist(),
     }
 
 
@@ -228,23 +242,26 @@ def _write_comparison(
     height_um: FloatArray,
     table: dict[str, Any],
 ) -> None:
+    """Write table, map and picture; `height_um` (points,) is the height, or its change."""
     from membrane_ctrl.measure.stability_pictures import draw_uncertainty
 
-    rmse, whole = (grid.picture(1e3 * grid.sigma(c)) for c in (result.covariance, result.budget))
+    axis_mm = grid.axis_mm
+    rmse_um = grid.picture(1e3 * grid.sigma(result.covariance))
+    budget_um = grid.picture(1e3 * grid.sigma(result.budget))
+    height = grid.picture(height_um)
+    is_change = table["against"] is not None
     with errors.convert_write_errors(out):
         files.make_folder(out)
         write_json(out / "uncertainty.json", table)
         write_arrays(
-            out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse, budget_um=whole
+            out / "rmse.npz", x_mm=axis_mm, y_mm=axis_mm, rmse_um=rmse_um, budget_um=budget_um
         )
-        height = grid.picture(height_um)
-        draw_uncertainty(
-            out / "uncertainty.png", grid.axis_mm, height, rmse, table["against"] is not None
-        )
+        draw_uncertainty(out / "uncertainty.png", axis_mm, height, rmse_um, is_change)
     print(f"written to {out}", file=sys.stderr)
 
 
 def _format_comparison(table: dict[str, Any]) -> list[str]:
+    """The result as lines of text."""
     what = "height" if table["against"] is None else "change of height"
     motion = []
     if table["motion_um"] is not None:

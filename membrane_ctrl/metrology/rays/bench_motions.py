@@ -24,33 +24,48 @@ from membrane_ctrl.model.arrays import FloatArray
 # Step of the central differences. 100 µm or 100 µrad: a motion so small is linear to 1e-4, and a
 # trace of 1e-9 mm is exact to 1e-8 of its effect.
 _STEP = 1e-1
-_MM_PER_UM, _RAD_PER_URAD = 1e-3, 1e-6
-# Largest motion that is considered, in µm, µrad or ppm
-LARGEST = 1500.0
+_MM_PER_UM = 1e-3
+_RAD_PER_URAD = 1e-6
+LARGEST = 1500.0  # motion that is considered, in µm, µrad or ppm
 _NEWTON_STEPS = 3  # from 0.1 mm off: below 1e-12 mm
 
 
 @dataclass(frozen=True)
 class MotionGroup:
-    """A motion whose direction is free: one or two components, in µm or µrad each."""
+    """A motion whose direction is free: one or two components, in µm or µrad each.
 
-    name: str  # for a person: what moved, and how
+    Attributes
+    ----------
+    name : str
+        What moved, and how, for people.
+    components : int
+        One or two.
+    unit : str
+        Of the components: "µm", "µrad", or "ppm" of the focal length.
+    allowance : float
+        How far a body may move between a reference and a frame without any sign of it, in `unit`. 3
+        µm: a steel mount of a metre in a quarter of a kelvin; 10 µm: the 2.7 m to the mirror. The
+        mirror has none: only the places of camera and screen relative to it count.
+    knock : float
+        Size of a knock, in `unit`: larger motions count as the cause only if they are well visible.
+    is_of_mirror : bool
+        Whether the figure relative to camera and screen changes as the mirror itself does.
+    is_hidden : bool
+        Whether the motion looks like a change of the bowl, or of the film within its ring, and
+        tilts the ring by less than a mirror that settles: only the ring's saddle shows it.
+    """
+
+    name: str
     components: int
-    unit: str  # of the components: "µm", "µrad", or "ppm" of the focal length
-    # How far a body may move between a reference and a frame without any sign of it, in `unit`.
-    # 3 µm: a steel mount of a metre in a quarter of a kelvin; 10 µm: the 2.7 m to the mirror. That
-    # of the mirror is in those of camera and screen: only their places relative to it count.
+    unit: str
     allowance: float = 3.0
-    # size of a knock, in `unit`: larger motions are taken for the cause only if they are seen well
     knock: float = 100.0
-    # the figure relative to camera and screen changes as the mirror itself does
     is_of_mirror: bool = False
-    # The motion looks like a change of the bowl, or of the film within its ring, and tilts the ring
-    # by less than a mirror that settles: only the ring's saddle shows it.
     is_hidden: bool = False
 
 
 def _hidden(name: str, unit: str, allowance: float = 10.0) -> MotionGroup:
+    """A hidden motion of one component."""
     return MotionGroup(name, 1, unit, allowance, knock=LARGEST, is_hidden=True)
 
 
@@ -70,23 +85,21 @@ GROUPS = (
     MotionGroup("the picture shifted on the sensor", 2, "µrad"),
     _hidden("the focal length changed", "ppm", allowance=1.0),
 )
+COMPONENTS = sum(group.components for group in GROUPS)
 
 
 def group_columns() -> list[slice]:
-    """Of each group, its columns among all components."""
+    """Columns of each group among all components."""
     ends = np.cumsum([group.components for group in GROUPS]).tolist()
     return [slice(end - group.components, end) for group, end in zip(GROUPS, ends, strict=True)]
 
 
-COMPONENTS = sum(group.components for group in GROUPS)
-
-
 @dataclass(frozen=True)
 class _Moved:
-    """A bench after a motion."""
+    """A bench after a motion: its geometry, and the rays (3, n) in world."""
 
     geometry: Geometry
-    rays: FloatArray  # (3, n) in world
+    rays: FloatArray
 
 
 def screen_changes(
@@ -127,29 +140,41 @@ def screen_changes(
 
 
 def _bench_after(geometry: Geometry, in_camera: FloatArray, components: FloatArray) -> _Moved:
-    """The bench after a motion; `in_camera` (3, n) are the rays in the camera's frame."""
-    camera_x, camera_y, camera_z, camera_rx, camera_ry, camera_rz = components[:6]
-    screen_x, screen_y, screen_z, screen_rx, screen_ry, screen_rz = components[6:12]
-    mirror_x, mirror_y, mirror_z, mirror_rx, mirror_ry, mirror_rz = components[12:18]
+    """The bench after a motion.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        The bench before.
+    in_camera : (3, n) array
+        Rays in the camera's frame.
+    components : (COMPONENTS,) array
+        The motion, in µm, µrad and ppm: shifts and turns of camera, screen and mirror, and the
+        lens.
+    """
+    camera_shift, camera_turn = components[0:3], components[3:6]
+    screen_shift, screen_turn = components[6:9], components[9:12]
+    mirror_shift, mirror_turn = components[12:15], components[15:18]
     image_x, image_y, focal = components[18:]
+
     # The lens: pixels see other directions.
     across = in_camera[:2] / in_camera[2] * (1 - 1e-6 * focal)
     across = across - _RAD_PER_URAD * np.array([[image_x], [image_y]])
     seen = np.vstack([across, np.ones(across.shape[1])])
     seen /= np.linalg.norm(seen, axis=0)
+
     # Camera and screen, about their own axes.
-    shift_mm = _MM_PER_UM * np.array([camera_x, camera_y, camera_z])
-    pinhole = geometry.pinhole_mm + geometry.rotation.T @ shift_mm
-    turn = _turn_matrix(camera_rx, camera_ry, camera_rz)
-    rotation = turn.T @ geometry.rotation
-    shift_mm = _MM_PER_UM * np.array([screen_x, screen_y, screen_z])
+    pinhole = geometry.pinhole_mm + geometry.rotation.T @ (_MM_PER_UM * camera_shift)
+    rotation = _turn_matrix(camera_turn).T @ geometry.rotation
     axes = geometry.screen_axes
-    origin = geometry.screen_origin_mm + axes.T @ shift_mm
-    axes = _turn_matrix(screen_rx, screen_ry, screen_rz).T @ axes
+    origin = geometry.screen_origin_mm + axes.T @ (_MM_PER_UM * screen_shift)
+    axes = _turn_matrix(screen_turn).T @ axes
+
     # The mirror: the others move the opposite way.
-    back = _turn_matrix(mirror_rx, mirror_ry, mirror_rz).T
-    shift_mm = _MM_PER_UM * np.array([mirror_x, mirror_y, mirror_z])
-    rotation, axes = rotation @ back.T, axes @ back.T
+    back = _turn_matrix(mirror_turn).T
+    shift_mm = _MM_PER_UM * mirror_shift
+    rotation = rotation @ back.T
+    axes = axes @ back.T
     moved = replace(
         geometry,
         pinhole_mm=back @ (pinhole - shift_mm),
@@ -161,8 +186,8 @@ def _bench_after(geometry: Geometry, in_camera: FloatArray, components: FloatArr
     return _Moved(moved, np.ascontiguousarray(rotation.T @ seen))
 
 
-def _turn_matrix(x_urad: float, y_urad: float, z_urad: float) -> FloatArray:
-    """Turn (3, 3) by a small vector of angles, exact to third order."""
-    x, y, z = _RAD_PER_URAD * np.array([x_urad, y_urad, z_urad])
+def _turn_matrix(turn_urad: FloatArray) -> FloatArray:
+    """Turn (3, 3) by a small vector (3,) of angles, exact to third order."""
+    x, y, z = _RAD_PER_URAD * turn_urad
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / 2)

@@ -26,12 +26,12 @@ from membrane_ctrl.metrology.rays.screen_face import BOW_RADIUS_MM
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
-OPTICAL = len(POSE) + len(
-    OPTIONAL
-)  # those that the fringes depend on; the laser's scale comes after them
-# numbers of a screen put elsewhere: its shift along s_x, s_y and normal, mm, turns about them,
-# degrees
+# Number of the parameters that the fringes depend on; the laser's scale follows them.
+OPTICAL = len(POSE) + len(OPTIONAL)
+# Numbers of a screen put elsewhere: its shift along s_x, s_y and normal, mm, and its turns about
+# them, degrees.
 SCREEN_MOVE = 6
+_LEAST_SINE = 1e-6  # between the directions of camera and screen, so that alpha is defined
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,18 @@ class BenchGeometry:
 
 @dataclass(frozen=True)
 class Poses:
-    """Pinhole (3,), camera rows (3, 3), screen origin (3,) and screen rows (3, 3): s_x, s_y,
-    normal.
+    """Poses of camera and screen, or derivatives of them.
+
+    Attributes
+    ----------
+    pinhole_mm : (3,) array
+        F.
+    camera : (3, 3) array
+        Rows C: axes of the camera in world.
+    origin_mm : (3,) array
+        O'.
+    screen : (3, 3) array
+        Rows X: s_x, s_y and normal in world.
     """
 
     pinhole_mm: AnyArray
@@ -66,19 +76,26 @@ def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
     """The bench whose parameters, in the order of `NAMES`, are `values`."""
     poses = poses_at(stated, values)
     focal, column, row, k1, k2, p1, p2, bow_mm, pitch = values[len(POSE) : OPTICAL]
-    lens = np.array((*stated.distortion, *[0.0] * 4)[: max(4, len(stated.distortion))])
+
+    # The stated lens has any number of coefficients; the first four change.
+    lens = np.zeros(max(4, len(stated.distortion)))
+    lens[: len(stated.distortion)] = stated.distortion
     lens[:4] += (k1, k2, p1, p2)
+    distortion: tuple[float, ...] = ()
+    if lens.any():
+        distortion = tuple(float(k) for k in lens)
+    bow_per_mm = stated.face.bow_per_mm + bow_mm / BOW_RADIUS_MM**2
     geometry = replace(
         stated,
         pinhole_mm=poses.pinhole_mm,
         rotation=poses.camera,
         focal_px=stated.focal_px * float(np.exp(focal)),
         principal_px=(stated.principal_px[0] + column, stated.principal_px[1] + row),
-        distortion=tuple(float(k) for k in lens) if lens.any() else (),
+        distortion=distortion,
         screen_origin_mm=poses.origin_mm,
         screen_s_x=poses.screen[0],
         screen_s_y=poses.screen[1],
-        face=stated.face._replace(bow_per_mm=stated.face.bow_per_mm + bow_mm / BOW_RADIUS_MM**2),
+        face=stated.face._replace(bow_per_mm=bow_per_mm),
     )
     return BenchGeometry(geometry, 1 + pitch)
 
@@ -89,14 +106,17 @@ def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     """
     in_radians = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
     a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = values[: len(POSE)] * in_radians
-    f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
-    hinge = _hinge_axis(f0, o0)
-    up, back = _turn_matrix(hinge, alpha), _turn_matrix(hinge, -alpha)
+    f0 = stated.pinhole_mm
+    o0 = stated.screen_origin_mm
     rows = stated.screen_axes
+    hinge = _hinge_axis(f0, o0)
+    up = _turn_matrix(hinge, alpha)
+    back = _turn_matrix(hinge, -alpha)
+    shifted_origin = (1 + b / np.linalg.norm(o0)) * o0 + x * rows[0] + y * rows[1]
     return Poses(
         pinhole_mm=(1 + a / np.linalg.norm(f0)) * (up @ f0),
         camera=_combine_turns(pitch, yaw, roll) @ stated.rotation @ up.T,
-        origin_mm=back @ ((1 + b / np.linalg.norm(o0)) * o0 + x * rows[0] + y * rows[1]),
+        origin_mm=back @ shifted_origin,
         screen=_combine_turns(turn_x, turn_y, turn_z) @ rows @ back.T,
     )
 
@@ -120,40 +140,63 @@ def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
 def screen_elsewhere(
     bench: BenchGeometry, turns: list[Poses], move: FloatArray
 ) -> tuple[BenchGeometry, list[Poses]]:
-    """The bench with its screen moved by `move` (6,), and d poses by the parameters of `turns` and
-    by the six.
+    """Move the screen of a bench.
+
+    Parameters
+    ----------
+    bench : BenchGeometry
+        The bench.
+    turns : list of Poses
+        Derivatives of its poses by their parameters.
+    move : (6,) array
+        The move, as `SCREEN_MOVE`.
+
+    Returns
+    -------
+    bench : BenchGeometry
+        With the screen moved.
+    derivatives : list of Poses
+        Of its poses by the parameters of `turns`, and by the six numbers of the move.
     """
-    there, rows = bench.geometry, bench.geometry.screen_axes
-    origin_mm, screen = _move_screen(there.screen_origin_mm, rows, move)
+    geometry = bench.geometry
+    rows = geometry.screen_axes
+    origin_mm, screen = _move_screen(geometry.screen_origin_mm, rows, move)
+
+    # By the bench's own parameters: the move goes with the screen.
     by_turn = screen @ rows.T
-    derivatives = [
-        replace(
-            turn, origin_mm=turn.origin_mm + turn.screen.T @ move[:3], screen=by_turn @ turn.screen
-        )
-        for turn in turns
-    ]
+    derivatives = []
+    for turn in turns:
+        moved_origin = turn.origin_mm + turn.screen.T @ move[:3]
+        derivatives.append(replace(turn, origin_mm=moved_origin, screen=by_turn @ turn.screen))
+
+    # By the move, with a complex step.
     for step in 1j * _COMPLEX_STEP * np.eye(SCREEN_MOVE):
-        parts = (
-            part.imag / _COMPLEX_STEP
-            for part in _move_screen(there.screen_origin_mm, rows, move + step)
-        )
-        derivatives.append(Poses(np.zeros(3), np.zeros((3, 3)), *parts))
-    moved = replace(there, screen_origin_mm=origin_mm, screen_s_x=screen[0], screen_s_y=screen[1])
+        by_origin, by_screen = _move_screen(geometry.screen_origin_mm, rows, move + step)
+        by_origin = np.asarray(by_origin.imag / _COMPLEX_STEP)
+        by_screen = np.asarray(by_screen.imag / _COMPLEX_STEP)
+        derivatives.append(Poses(np.zeros(3), np.zeros((3, 3)), by_origin, by_screen))
+    moved = replace(
+        geometry, screen_origin_mm=origin_mm, screen_s_x=screen[0], screen_s_y=screen[1]
+    )
     return replace(bench, geometry=moved), derivatives
 
 
 def _move_screen(
     origin_mm: FloatArray, rows: FloatArray, move: AnyArray
 ) -> tuple[AnyArray, AnyArray]:
-    """A screen's origin and rows after a move."""
-    return origin_mm + rows.T @ move[:3], _combine_turns(*np.pi / 180 * move[3:]) @ rows
+    """Origin (3,) and rows (3, 3) of a screen after a move (6,)."""
+    turns_rad = np.pi / 180 * move[3:]
+    return origin_mm + rows.T @ move[:3], _combine_turns(*turns_rad) @ rows
 
 
 def _hinge_axis(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
-    """Unit vector about which alpha turns."""
+    """Unit vector (3,) about which alpha turns.
+
+    Raises ValueError if camera and screen are in one direction from the vertex.
+    """
     across = np.cross(pinhole_mm, origin_mm)
     length = float(np.linalg.norm(across))
-    if length < 1e-6 * float(np.linalg.norm(pinhole_mm) * np.linalg.norm(origin_mm)):
+    if length < _LEAST_SINE * float(np.linalg.norm(pinhole_mm) * np.linalg.norm(origin_mm)):
         raise ValueError("camera and screen are in line with the vertex: alpha is undefined")
     return across / length
 

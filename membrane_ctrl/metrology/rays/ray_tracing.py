@@ -13,7 +13,8 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 HeightFunction = Callable[[FloatArray, FloatArray], FloatArray]  # x_mm, y_mm -> h_mm
-_EXCESS = hencky_bowl.excess_series() / hencky_bowl.excess_rms()
+_EXCESS = hencky_bowl.excess_series() / hencky_bowl.excess_rms()  # of unit RMS
+_START_STEPS = 12  # towards a starting shape
 
 
 @dataclass
@@ -41,12 +42,13 @@ class Points:
     def of(
         cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None
     ) -> "Points":
-        """Points with unit weights unless given."""
+        """Points at the pinhole, with unit weights unless given; shapes as the attributes'."""
         count = rays.shape[1]
-        weights = np.ones(count) if weights is None else weights
-        return cls(
-            np.ascontiguousarray(rays), np.ascontiguousarray(screen_mm), weights, np.zeros(count)
-        )
+        if weights is None:
+            weights = np.ones(count)
+        rays = np.ascontiguousarray(rays)
+        screen_mm = np.ascontiguousarray(screen_mm)
+        return cls(rays, screen_mm, weights, np.zeros(count))
 
     def subset(self, keep: BoolArray | IntArray) -> "Points":
         """Those points where `keep` is set, or those at these places."""
@@ -59,7 +61,17 @@ class Points:
 
 
 class Tracer:
-    """A geometry with the vertex at a height, over a disc: runs the kernels on points."""
+    """Traces rays on a bench: runs the kernels on points, in threads.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        Camera and screen.
+    radius_mm : float
+        Radius of the Zernike disc.
+    vertex_z_mm : float
+        Height of the vertex in world.
+    """
 
     def __init__(self, geometry: Geometry, radius_mm: float, vertex_z_mm: float = 0.0) -> None:
         self.geometry = geometry
@@ -72,12 +84,13 @@ class Tracer:
     def start(self, points: Points, height: HeightFunction) -> None:
         """Put the points on a starting shape, by t <- (vertex_z + h - F_z) / d_z.
 
-        Contracts by slope times inclination of the ray (below 0.1), so that kinks of a cone do no
-        harm.
+        Each step contracts by slope times inclination of the ray (below 0.1), also at the kink of a
+        cone.
         """
-        f, d = self._pinhole, points.rays
+        f = self._pinhole
+        d = points.rays
         points.t_mm[:] = (self.vertex_z_mm - f[2]) / d[2]
-        for _ in range(12):
+        for _ in range(_START_STEPS):
             h = height(f[0] + points.t_mm * d[0], f[1] + points.t_mm * d[1])
             points.t_mm[:] = (self.vertex_z_mm + h - f[2]) / d[2]
 
@@ -86,6 +99,7 @@ class Tracer:
         shape = surface.polynomial, surface.excess, 1.0, self.radius_mm
 
         def run(start: int, stop: int) -> None:
+            """Move a range of the points."""
             kernels.intersect_surface(
                 points.rays,
                 points.t_mm,
@@ -106,13 +120,20 @@ class Tracer:
         shape = self._shape(surface)
 
         def run(start: int, stop: int) -> FloatArray:
-            rays, t = points.rays, points.t_mm
+            """Sums over a range of the points."""
             kernels.intersect_surface(
-                rays, t, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop
+                points.rays,
+                points.t_mm,
+                self._pinhole,
+                *shape,
+                self.vertex_z_mm,
+                newton,
+                start,
+                stop,
             )
             fixed = (
-                rays,
-                t,
+                points.rays,
+                points.t_mm,
                 points.screen_mm,
                 points.weights,
                 self._pinhole,
@@ -121,14 +142,14 @@ class Tracer:
             )
             return np.asarray(kernels.residual_sums(*fixed, *shape, start, stop))
 
-        return np.asarray(
-            np.sum(threads.split_over_threads(run, points.t_mm.size, threads.FEW), axis=0)
-        )
+        parts = threads.split_over_threads(run, points.t_mm.size, threads.FEW)
+        return np.asarray(np.sum(parts, axis=0))
 
     def product_sums(self, points: Points) -> FloatArray:
         """Moments (PRODUCTS,) of the slope basis at the points (see `kernels.product_sums`)."""
 
         def run(start: int, stop: int) -> FloatArray:
+            """Sums over a range of the points."""
             fixed = (
                 points.rays,
                 points.t_mm,
@@ -143,11 +164,12 @@ class Tracer:
         return np.asarray(np.sum(parts, axis=0))
 
     def slope_field(self, points: Points, surface: Surface) -> FloatArray:
-        """(6, n): x, y in mm, measured dh/dx, dh/dy, fitted dh/dx, dh/dy at the points."""
+        """x and y in mm, measured dh/dx and dh/dy, fitted dh/dx and dh/dy at the points, (6, n)."""
         shape = self._shape(surface)
         out = np.empty((6, points.t_mm.size))
 
         def run(start: int, stop: int) -> None:
+            """Slopes of a range of the points."""
             fixed = (
                 points.rays,
                 points.t_mm,
@@ -169,6 +191,7 @@ class Tracer:
         out = np.empty((2, points.t_mm.size))
 
         def run(start: int, stop: int) -> None:
+            """Screen points of a range of the points."""
             fixed = (points.rays, points.t_mm, self._pinhole, self._plane, self._face)
             kernels.predict_screen(*fixed, *shape, out, start, stop)
 
@@ -180,12 +203,9 @@ class Tracer:
         return np.asarray(self._pinhole[:2, None] + points.t_mm * points.rays[:2])
 
     def _shape(self, surface: Surface) -> tuple[FloatArray, FloatArray, float, float]:
-        return (
-            surface.polynomial,
-            _EXCESS,
-            surface.hencky_mm * hencky_bowl.excess_rms(),
-            self.radius_mm,
-        )
+        """Arguments of the kernels for a surface: `poly`, `excess`, `amplitude` and `radius`."""
+        amplitude_mm = surface.hencky_mm * hencky_bowl.excess_rms()
+        return surface.polynomial, _EXCESS, amplitude_mm, self.radius_mm
 
 
 def make_parabola(sag_mm: float, radius_mm: float) -> HeightFunction:
