@@ -12,11 +12,7 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure.set_motion import FilmMotion, combine_axis_steps
 from membrane_ctrl.metrology.figure.set_quality import set_quality
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
-from membrane_ctrl.metrology.phase import (
-    phase_change,
-    phase_steps,
-    screen_scale,
-)
+from membrane_ctrl.metrology.phase import phase_change, phase_steps, screen_scale
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.reconstruction import slope_noise, surface_fit
 from membrane_ctrl.model.arrays import FloatArray, IntArray
@@ -91,8 +87,8 @@ def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None =
     noise_adu = slope_noise.pixel_sigma_adu(optics.camera.noise_adu) / checked.binned.bin_px
     sigma_rad = np.empty_like(swing_adu)
     for axis, used in enumerate(checked.view.used):
+        # That of fringes of amplitude 1, over the amplitude.
         shifts_rad = checked.stack.shifts_rad(used)
-        # of fringes of amplitude 1
         unit_sigma_rad = phase_steps.phase_sigma_rad(shifts_rad, noise_adu, 1.0)
         sigma_rad[axis] = unit_sigma_rad / swing_adu[axis]
     quality = set_quality(optics, checked, fit, float(np.median(swing_adu.min(axis=0))))

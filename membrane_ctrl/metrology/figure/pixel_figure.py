@@ -11,12 +11,7 @@ from membrane_ctrl.metrology.figure.set_motion import FilmMotion, combine_axis_s
 from membrane_ctrl.metrology.figure.set_quality import set_quality
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
-from membrane_ctrl.metrology.phase import (
-    full_decoder,
-    pattern_sequence,
-    phase_steps,
-    screen_scale,
-)
+from membrane_ctrl.metrology.phase import full_decoder, pattern_sequence, phase_steps, screen_scale
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.phase.pixel_phases import PixelPhases, pixel_phases
 from membrane_ctrl.metrology.rays import ray_tracing
@@ -119,11 +114,10 @@ class FullResult:
 
     def map(self) -> SurfaceMap:
         """The height with the slopes that were measured, as means over the cells."""
-        height, slope_x, slope_y = self.surface.on_grid(self.grid.axis_mm)
         grid = self.grid
-        return SurfaceMap(
-            grid.axis_mm, height + self.residual_mm, slope_x + grid.slope_x, slope_y + grid.slope_y
-        )
+        height, slope_x, slope_y = self.surface.on_grid(grid.axis_mm)
+        height = height + self.residual_mm
+        return SurfaceMap(grid.axis_mm, height, slope_x + grid.slope_x, slope_y + grid.slope_y)
 
 
 @dataclass(frozen=True)
@@ -194,11 +188,11 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     if moved:
         sensitivity_mm_per_um = film_motion.sensitivity_mm_per_um(tracer, points, surface)
         sensitivity_rad_per_um = sensitivity_mm_per_um / screen_scale.mm_per_rad(optics.pattern)
-    x_phases, y_phases = axes = [
+    x_phases, y_phases = (
         _axis_phases(checked, k, index, in_bin, sensitivity_rad_per_um[k], motion_um[k])
         for k in range(2)
-    ]
-    phase_rad = np.stack([each.phase_rad for each in axes])
+    )
+    phase_rad = np.stack([x_phases.phase_rad, y_phases.phase_rad])
     points.screen_mm[:] = screen_scale.screen_mm(phase_rad, optics.pattern)
 
     # Without pixels beyond the analysed radius, with a clipped frame or with too weak fringes.
@@ -212,7 +206,7 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     swing_adu = swing_adu[keep]
 
     # The copies of the points take the most memory of a measurement: free what is not needed.
-    del axes, x_phases, y_phases, phase_rad, x_mm, y_mm, in_bin, sensitivity_rad_per_um
+    del x_phases, y_phases, phase_rad, x_mm, y_mm, in_bin, sensitivity_rad_per_um
     return PixelPoints(index, points.subset(keep), swing_adu, rest_adu, moved)
 
 
@@ -233,7 +227,21 @@ def _axis_phases(
     sensitivity_rad_per_um: FloatArray,
     motion_um: FloatArray | None,
 ) -> PixelPhases:
-    """Phases of one axis at the pixels `index` (n,), which are in the bins `in_bin` (n,)."""
+    """Phases of one axis at some pixels, in the period of their bins.
+
+    Parameters
+    ----------
+    checked : Checked
+        The set.
+    axis : int
+        0 for x, 1 for y.
+    index, in_bin : (n,) int arrays
+        The pixels, and the bins that they are in.
+    sensitivity_rad_per_um : (n,) array
+        Change of the phase per µm of the film's displacement.
+    motion_um : (N,) array or None
+        Displacement of the film at the frames; None: it is not corrected.
+    """
     stack = checked.stack
     used = checked.view.used[axis]
     combined = combine_axis_steps(checked, axis, motion_um)

@@ -118,10 +118,10 @@ def _third_estimate(
     stack: FrameStack, binned: Binned, excluded: Collection[int]
 ) -> FloatArray | None:
     """White minus black; None unless both are usable."""
-    white = stack.single("white")
-    black = stack.single("black")
-    if white is None or black is None or {white, black} & set(excluded):
+    pair = stack.white_and_black(excluded)
+    if pair is None:
         return None
+    white, black = pair
     return np.asarray(binned.means[white].astype(float) - binned.means[black])
 
 

@@ -105,10 +105,8 @@ def closure_with_phase(
 
     Parameters
     ----------
-    frames : (N, ...) array
-        Intensities, N >= 4.
-    shifts_rad : (N,) array
-        Phase steps.
+    frames, shifts_rad
+        As those of `compute_closure`.
     phase_rad : (...) array
         Known phase of each pixel.
 
@@ -147,11 +145,9 @@ def closure_with_level(
 
     Parameters
     ----------
-    frames : (N, ...) array
-        Intensities, N >= 4.
-    shifts_rad : (N,) array
-        Phase steps.
-    mean_adu, amplitude_adu : (...) array
+    frames, shifts_rad
+        As those of `compute_closure`.
+    mean_adu, amplitude_adu : (...) arrays
         Known mean and amplitude of each pixel.
 
     Returns

@@ -31,6 +31,7 @@ _SAMPLED_PX = 96_000
 _SEVERAL_RAD = 6.0
 _SMOOTH_ORDER = 4  # powers of the smooth deviations over the mirror with several fringes
 _FLAT_ORDER = 1  # with fewer: a constant alone
+_COLUMNS_ORDER = 2  # of the polynomials of `SampledBins.smooth_columns`
 # Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred µm, stay
 # inside.
 _EDGE_RAD = 0.5
@@ -75,6 +76,19 @@ class SampledBins:
             self.phase_rad[:, which],
             self.sensitivity_rad_per_um[:, which],
         )
+
+    def smooth_columns(self) -> FloatArray:
+        """Polynomials (k, n) in the phases, which are about proportional to the place on the
+        mirror; the constant first.
+
+        Light and contrast of one frame may differ over the mirror by these.
+        """
+        spread_rad = np.maximum(self.phase_rad.std(axis=1), _TINY)
+        centred_rad = self.phase_rad - self.phase_rad.mean(axis=1)[:, None]
+        u, v = centred_rad / spread_rad[:, None]
+        orders = range(_COLUMNS_ORDER + 1)
+        powers = [(p, q) for p in orders for q in range(_COLUMNS_ORDER + 1 - p)]
+        return np.stack([u**p * v**q for p, q in powers])
 
 
 @dataclass(frozen=True)

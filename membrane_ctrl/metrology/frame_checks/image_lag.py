@@ -26,7 +26,7 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
 # phases by a large share, stay inside.
 _EDGE_RAD = 0.7
 _HARMONICS = range(2, 7)  # of a sinusoid: the response of panel and camera
-_SMOOTH_ORDER = 2  # of the polynomials by which light and contrast may differ over the mirror
+
 # Least power of the change from the previous frame that the frame's own pattern does not explain,
 # over the whole power of that change.
 _LEAST_DETERMINED = 0.05
@@ -116,7 +116,7 @@ def estimate_image_lag(
     scene = scene.thinned()
     means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
     clipped = binned.saturated.reshape(len(stack.patterns), -1)[:, scene.index]
-    smooth = _smooth_columns(scene)
+    smooth = scene.smooth_columns()
 
     # The shares that each frame shows.
     rises: list[ShareOfFrame] = []
@@ -312,17 +312,6 @@ def describe_image_lag(lag: ImageLag) -> str:
         f"each frame shows {lag.share:.1%} of the previous picture: the panel is slow, or the "
         "frames come too early after it: wait longer"
     )
-
-
-def _smooth_columns(scene: SampledBins) -> FloatArray:
-    """Polynomials (k, n) in the phases, which are about the place on the mirror; the constant
-    first.
-    """
-    spread_rad = np.maximum(scene.phase_rad.std(axis=1), _LEAST_AMPLITUDE)
-    centred_rad = scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]
-    u, v = centred_rad / spread_rad[:, None]
-    powers = [(p, q) for p in range(_SMOOTH_ORDER + 1) for q in range(_SMOOTH_ORDER + 1 - p)]
-    return np.stack([u**p * v**q for p, q in powers])
 
 
 def _own_columns(

@@ -80,10 +80,10 @@ def estimate_response(
     mean_of_axes = [stack.weights(frames)[0] @ means[frames] for frames in used]
     mean_of_fringes = np.mean(mean_of_axes, axis=0)
     edge_loss, side_loss = _find_losses(mean_of_fringes, position)
-    white = stack.single("white")
-    black = stack.single("black")
-    if white is None or black is None or {white, black} & set(excluded):
+    pair = stack.white_and_black(excluded)
+    if pair is None:
         return LightResponse(math.nan, edge_loss, side_loss)
+    white, black = pair
     span = np.maximum(means[white] - means[black], 1e-9)
     share = float(np.median((mean_of_fringes - means[black]) / span))
     return LightResponse(_invert_share(share), edge_loss, side_loss)

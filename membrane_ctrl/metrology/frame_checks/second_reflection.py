@@ -28,7 +28,7 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray
 _BINS = 800  # that are compared
 _LEAST_SURE = 0.2  # share of the bins that a Gray frame must show
 HIDDEN_RAD = 0.4  # from a Gray bit's edge: blur and the size of a bin
-_SMOOTH_ORDER = 3  # powers by which light and contrast may differ over the mirror
+
 
 # The places that are searched: scales a, and shifts d in steps.
 _SCALES = (1.0, 0.95, 1.05, 0.9, 1.1, 0.75, 1.25, 0.5, 1.5, -0.5, -0.75, -1.0, -1.3)
@@ -202,7 +202,7 @@ def _search_axis(
 ) -> _Place | None:
     """The place that explains the Gray frames of an axis best; None without usable frames."""
     phase_rad = scene.phase_rad[axis]
-    smooth = _smooth_columns(scene)
+    smooth = scene.smooth_columns()
     frames = []
     for k in stack.gray(AXES[axis]):
         if k in excluded:
@@ -307,10 +307,10 @@ def _white_light(
     stack: FrameStack, binned: Binned, scene: SampledBins, excluded: Collection[int]
 ) -> FloatArray:
     """Light (n,) of a white screen less that of a black one."""
-    white = stack.single("white")
-    black = stack.single("black")
-    if white is None or black is None or {white, black} & set(excluded):
+    pair = stack.white_and_black(excluded)
+    if pair is None:
         return 2 * scene.light  # of fringes with full contrast
+    white, black = pair
     more = binned.means[white].astype(float) - binned.means[black]
     return scene.light * float(np.median(more.reshape(-1)[scene.index] / scene.light))
 
@@ -371,12 +371,3 @@ def _score_places(
         scales = np.full(shifts_rad.size, scale)
         rows.append(np.stack([score, product / power, power, scales, shifts_rad]))
     return _PlaceScores(*np.concatenate(rows, axis=1))
-
-
-def _smooth_columns(scene: SampledBins) -> FloatArray:
-    """Polynomials (k, n) in the phases, which are about the place on the mirror."""
-    spread_rad = np.maximum(scene.phase_rad.std(axis=1), 1e-9)
-    centred_rad = scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]
-    u, v = centred_rad / spread_rad[:, None]
-    powers = [(p, q) for p in range(_SMOOTH_ORDER) for q in range(_SMOOTH_ORDER - p)]
-    return np.stack([u**p * v**q for p, q in powers])

@@ -1,5 +1,6 @@
 """The frames of one capture set in memory, and their means over bins."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -65,10 +66,22 @@ class FrameStack:
         """The white or the black frame."""
         return next((k for k, p in enumerate(self.patterns) if p.role == role), None)
 
+    def white_and_black(self, excluded: Collection[int]) -> tuple[int, int] | None:
+        """The white and the black frame; None unless the set has both and neither is excluded."""
+        white = self.single("white")
+        black = self.single("black")
+        if white is None or black is None or white in excluded or black in excluded:
+            return None
+        return white, black
+
     def before_of(self, frame: int) -> int:
         """The frame that was taken before this one; -1: none of the set, or no picture."""
-        before = frame - 1 if self.before is None else self.before[frame]
-        return -1 if before in self.unusable else before
+        before = frame - 1
+        if self.before is not None:
+            before = self.before[frame]
+        if before in self.unusable:
+            return -1
+        return before
 
     @property
     def last_taken(self) -> int:
@@ -98,8 +111,8 @@ class FrameStack:
         """Return the set with pictures exchanged: frame k shows what `order[k]` did."""
         gain = None if self.gain is None else self.gain[order]
         new_place = {taken: frame for frame, taken in enumerate(order)}
-        old_before = [self.before_of(taken) for taken in order]
-        before = tuple(new_place[taken] if taken >= 0 else -1 for taken in old_before)
+        new_place[-1] = -1  # no frame before
+        before = tuple(new_place[self.before_of(taken)] for taken in order)
         return replace(self, frames=self.frames[order], light=None, gain=gain, before=before)
 
     @property
@@ -154,13 +167,13 @@ class Binned:
     def reordered(self, order: list[int]) -> "Binned":
         """As `FrameStack.reordered`."""
         black = None if self.black is None else self.black[order]
-        means, saturated = self.means[order], self.saturated[order]
-        return replace(self, means=means, saturated=saturated, black=black)
+        return replace(self, means=self.means[order], saturated=self.saturated[order], black=black)
 
 
 def bin_side_px(size_px: tuple[int, int]) -> int:
-    """The largest bin that leaves enough of them."""
-    return int(np.clip((size_px[0] * size_px[1] / _ENOUGH_BINS) ** 0.5, 1, _LARGEST_BIN_PX))
+    """Side of the largest bins of which there are enough, in a picture of this height and width."""
+    pixels = size_px[0] * size_px[1]
+    return int(np.clip((pixels / _ENOUGH_BINS) ** 0.5, 1, _LARGEST_BIN_PX))
 
 
 def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
@@ -184,7 +197,8 @@ def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
     clip = find_clip_levels([stack.frames[k] for k in sinusoids], full_scale_adu)
     binner = Binner(*stack.size_px, bin_px, clip.white_adu, 1)
     shape = (len(stack.patterns), *binner.saturated.shape)
-    means, saturated = np.empty(shape, np.float32), np.empty(shape, bool)
+    means = np.empty(shape, np.float32)
+    saturated = np.empty(shape, bool)
     for k, frame in enumerate(stack.frames):
         binner.clear()
         binner.add([frame], [0])
@@ -199,7 +213,8 @@ def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
 def _find_black_bins(frames: Image, bin_px: int, black_adu: int) -> BoolArray:
     """Return the bins (frames, rows, columns) with a pixel at this level or below."""
     count, height, width = frames.shape
-    rows, columns = height // bin_px, width // bin_px
+    rows = height // bin_px
+    columns = width // bin_px
     black = np.empty((count, rows, columns), bool)
     for k, frame in enumerate(frames):
         blocks = frame[: rows * bin_px, : columns * bin_px].reshape(rows, bin_px, columns, bin_px)

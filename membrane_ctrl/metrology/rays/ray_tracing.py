@@ -13,6 +13,8 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 HeightFunction = Callable[[FloatArray, FloatArray], FloatArray]  # x_mm, y_mm -> h_mm
+# Arguments `poly`, `excess`, `amplitude` and `radius` of the kernels.
+_Shape = tuple[FloatArray, FloatArray, float, float]
 _EXCESS = hencky_bowl.excess_series() / hencky_bowl.excess_rms()  # of unit RMS
 _START_STEPS = 12  # towards a starting shape
 
@@ -100,16 +102,7 @@ class Tracer:
 
         def run(start: int, stop: int) -> None:
             """Move a range of the points."""
-            kernels.intersect_surface(
-                points.rays,
-                points.t_mm,
-                self._pinhole,
-                *shape,
-                self.vertex_z_mm,
-                newton,
-                start,
-                stop,
-            )
+            self._move_range(points, shape, newton, start, stop)
 
         threads.split_over_threads(run, points.t_mm.size, threads.FEW)
 
@@ -121,16 +114,7 @@ class Tracer:
 
         def run(start: int, stop: int) -> FloatArray:
             """Sums over a range of the points."""
-            kernels.intersect_surface(
-                points.rays,
-                points.t_mm,
-                self._pinhole,
-                *shape,
-                self.vertex_z_mm,
-                newton,
-                start,
-                stop,
-            )
+            self._move_range(points, shape, newton, start, stop)
             fixed = (
                 points.rays,
                 points.t_mm,
@@ -202,8 +186,23 @@ class Tracer:
         """x and y (2, n) of the points."""
         return np.asarray(self._pinhole[:2, None] + points.t_mm * points.rays[:2])
 
-    def _shape(self, surface: Surface) -> tuple[FloatArray, FloatArray, float, float]:
-        """Arguments of the kernels for a surface: `poly`, `excess`, `amplitude` and `radius`."""
+    def _move_range(
+        self, points: Points, shape: _Shape, newton: int, start: int, stop: int
+    ) -> None:
+        """Newton steps of a range of the points towards a surface."""
+        kernels.intersect_surface(
+            points.rays,
+            points.t_mm,
+            self._pinhole,
+            *shape,
+            self.vertex_z_mm,
+            newton,
+            start,
+            stop,
+        )
+
+    def _shape(self, surface: Surface) -> _Shape:
+        """Arguments of the kernels for a surface."""
         amplitude_mm = surface.hencky_mm * hencky_bowl.excess_rms()
         return surface.polynomial, _EXCESS, amplitude_mm, self.radius_mm
 

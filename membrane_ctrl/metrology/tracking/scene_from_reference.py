@@ -268,11 +268,10 @@ def _measure_response(
     stack = checked.stack
     index = figure.index
     straight = np.zeros(len(RESPONSE_POWERS))
-    white = stack.single("white")
-    black = stack.single("black")
-    bad = {flag.frame for flag in checked.flags} | set(stack.unusable)
-    if white is None or black is None or {white, black} & bad:
+    pair = stack.white_and_black({flag.frame for flag in checked.flags} | set(stack.unusable))
+    if pair is None:
         return straight, None
+    white, black = pair
     low = checked.binned.means[black].reshape(-1)[index].astype(float)
     high = checked.binned.means[white].reshape(-1)[index].astype(float)
 
