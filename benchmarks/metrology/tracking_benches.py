@@ -247,7 +247,7 @@ def answer(number: int) -> dict[str, Any]:
 def judged(found: TrackedErrors, plan: Run) -> dict[str, Any]:
     """Shares, errors over sigmas, and what is wrong."""
     errors = np.column_stack([found.sag_um, found.terms_um])
-    ratio = errors / np.column_stack([found.steady_sag_sigma_um, found.steady_terms_sigma_um])
+    ratio = errors / np.column_stack([found.sag_change_sigma_um, found.steady_terms_sigma_um])
     far = np.any((np.abs(ratio) > FAR_SIGMAS) & (np.abs(errors) > FAR_UM), axis=1)
     frames = np.flatnonzero(found.given)
     good = np.array([found.verdicts[k] == "ok" for k in frames], bool)

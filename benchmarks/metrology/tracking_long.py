@@ -83,7 +83,7 @@ def _judged(name: str, found: TrackedErrors) -> list[Figure]:
             "um",
             0.05,
             "1 sigma",
-            rms(found.steady_sag_sigma_um),
+            rms(found.sag_change_sigma_um),
         ),
         within,
         at_most(f"{name}: error / sigma of the sag", rms(found.sag), ""),

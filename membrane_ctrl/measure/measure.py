@@ -246,7 +246,7 @@ def _format_measurement(outcome: _Outcome) -> list[str]:
     bars = outcome.bars
     if full is None or profile is None or bars is None:
         return lines
-    noise_um, geometry_um = bars.sag_um
+    noise_um, geometry_um = bars.sag_sigma_um
     total = bars.budget.total()
     largest = ", ".join(
         f"{row['name']} {row['height_rms_um']:.3g}" for row in bars.budget.rows()[:_NAMED]

@@ -16,6 +16,7 @@ from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
 from membrane_ctrl.measure.result_files import number_or_null, write_arrays, write_json
 from membrane_ctrl.metrology.figure import radial_profile
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.reconstruction import slope_noise
@@ -65,42 +66,56 @@ class ErrorBars:
         return self.budget.covariance(common=True)
 
     @property
-    def sag_um(self) -> tuple[float, float]:
-        """1 sigma of the sag: noise, geometry."""
+    def sag_sigma_um(self) -> tuple[float, float]:
+        """1 sigma of the sag from noise, and from the geometry."""
         gradient = surface.sag_gradient()
-        of_noise, of_geometry = (
-            1e3 * float(np.sqrt(gradient @ c @ gradient)) for c in (self.noise, self.geometry)
-        )
-        return of_noise, of_geometry
+        of_noise_um = 1e3 * float(np.sqrt(gradient @ self.noise @ gradient))
+        of_geometry_um = 1e3 * float(np.sqrt(gradient @ self.geometry @ gradient))
+        return of_noise_um, of_geometry_um
 
     def maps_um(self) -> tuple[FloatArray, FloatArray]:
-        """1 sigma (n, n) of the height on `grid.axis_mm`: noise, geometry; NaN outside the analysis
-        radius.
+        """1 sigma (n, n) of the height on `grid.axis_mm`, from noise and from the geometry; NaN
+        outside the analysis radius.
         """
-        of_noise, of_geometry = (
-            self.grid.picture(1e3 * self.grid.sigma(c)) for c in (self.noise, self.geometry)
-        )
-        return np.hypot(of_noise, self.zonal_um), of_geometry
+        of_noise_um = self.grid.picture(1e3 * self.grid.sigma(self.noise))
+        of_geometry_um = self.grid.picture(1e3 * self.grid.sigma(self.geometry))
+        return np.hypot(of_noise_um, self.zonal_um), of_geometry_um
 
 
 def error_bars(
     measurement: Measurement, geometry: Path | None, outline: Outline | None = None
 ) -> ErrorBars | None:
-    """Error bars of a measurement; None if it has no figure.
+    """Compute the error bars of a measurement.
 
-    Raises InputError if the covariance is invalid or for the other form of geometry, or too wide to
-    propagate. `geometry` is the file with the covariance, `outline` the rim in the picture, which
-    checks the geometry.
+    Parameters
+    ----------
+    measurement : Measurement
+        The measured set.
+    geometry : Path or None
+        File with the covariance of the geometry.
+    outline : Outline, optional
+        The rim in the picture, which checks the geometry.
+
+    Returns
+    -------
+    ErrorBars or None
+        None if the set has no figure.
+
+    Raises
+    ------
+    InputError
+        If the covariance is invalid or for the other form of geometry, or too wide to propagate.
     """
-    full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
+    full = measurement.full
+    checked = measurement.checked
+    optics = measurement.head.optics
     if full is None or checked is None:
         return None
     spread, source = geometry_spread(optics, geometry)
-    noise_adu = float(
-        np.nanmax(
-            [slope_noise.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)]
-        )
-    )
+
+    # Noise of a pixel: as stated, or as the frames show it, if that is larger.
+    stated_adu = slope_noise.pixel_sigma_adu(optics.camera.noise_adu)
+    noise_adu = float(np.nanmax([stated_adu, noise_seen_adu(measurement)]))
     try:
         seen = set_budget.assemble_budget(optics, checked, full, spread, noise_adu, outline)
     except ArithmeticError:
@@ -108,11 +123,12 @@ def error_bars(
             f"{source}: too wide: the figure does not follow from such a geometry"
         ) from None
     grid = height_map.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
+
+    # Noise of the zonal map: that of a pixel's slope, averaged over the pixels of a cell.
     shifts_rad = [checked.stack.shifts_rad(used) for used in checked.view.used]
     variance = full.slope_variance(optics, shifts_rad, noise_adu)
-    cell_slope = math.sqrt(
-        float(variance.mean()) / float(np.median(full.grid.count[full.grid.count > 0]))
-    )
+    pixels_in_cell = float(np.median(full.grid.count[full.grid.count > 0]))
+    cell_slope = math.sqrt(float(variance.mean()) / pixels_in_cell)
     zonal_um = 1e3 * full.grid.noise_mm(cell_slope)
     statement = GeometryStatement.of(find_known_by(optics, geometry), source, seen.rim, seen.slopes)
     return ErrorBars(seen.budget, statement, seen.doubts, grid, cell_slope, zonal_um)
@@ -122,7 +138,7 @@ def apply_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measuremen
     """The measurement with the verdict that its error bars allow.
 
     A doubt degrades an `ok`, and so does a geometry that rim or slopes contradict. Slopes that
-    belong to no surface and that nothing stated explains make the figure unusable.
+    belong to no surface, and that no stated uncertainty explains, make the figure unusable.
     """
     if bars is None or measurement.verdict == "rejected":
         return measurement
@@ -143,48 +159,54 @@ def result_table(
     `figure` is its block of that name (`figure_results.figure_table`).
     """
     full = measurement.full
-    radius_mm = measurement.head.optics.mirror.radius_mm
-    coeffs = (
-        [None] * zernike_terms.ZERNIKE_TERMS
-        if full is None
-        else (1e3 * full.surface.coeffs_mm).tolist()
-    )
-    full_scale = 2**measurement.head.optics.camera.bits - 1
+    optics = measurement.head.optics
+    if full is None:
+        coeffs_um: list[Any] = [None] * zernike_terms.ZERNIKE_TERMS
+        valid_fraction = 0.0
+        modulation_adu = None
+        saturated_fraction = measurement.rejected_saturated_fraction
+    else:
+        coeffs_um = (1e3 * full.surface.coeffs_mm).tolist()
+        valid_fraction = full.quality.valid_fraction
+        modulation_adu = full.quality.modulation_share * (2**optics.camera.bits - 1)
+        saturated_fraction = full.quality.saturated_fraction
     quality: dict[str, Any] = {
         "verdict": measurement.verdict,
         "reason": measurement.reason,
-        "valid_fraction": 0.0 if full is None else full.quality.valid_fraction,
-        "modulation_median_adu": None
-        if full is None
-        else full.quality.modulation_share * full_scale,
-        "saturated_fraction": number_or_null(
-            measurement.rejected_saturated_fraction
-            if full is None
-            else full.quality.saturated_fraction
-        ),
+        "valid_fraction": valid_fraction,
+        "modulation_median_adu": modulation_adu,
+        "saturated_fraction": number_or_null(saturated_fraction),
         "flagged_frames": measurement.flagged_files(),
     }
+    uncertainty = None
+    budget: list[dict[str, Any]] = []
+    geometry_known = None
+    if bars is not None:
+        uncertainty = bars.budget.total() | {"coverage_factor": 1}
+        budget = bars.budget.rows()
+        geometry_known = bars.statement.table()
     return {
         **program.file_origin("membrane-result/1"),
         "zernike": {
             "index": "noll",
             "first": 1,
             "normalisation": "rms",
-            "radius_mm": radius_mm,
-            "coeffs_um": coeffs,
+            "radius_mm": optics.mirror.radius_mm,
+            "coeffs_um": coeffs_um,
         },
         "fit": _fit_table(full),
         "quality": quality,
-        "uncertainty": None if bars is None else bars.budget.total() | {"coverage_factor": 1},
-        "budget": [] if bars is None else bars.budget.rows(),
+        "uncertainty": uncertainty,
+        "budget": budget,
         "geometry": measurement.head.geometry.make_table(),
-        "geometry_known": None if bars is None else bars.statement.table(),
+        "geometry_known": geometry_known,
         "timing_s": measurement.timing_s,
         "figure": figure,
     }
 
 
 def _fit_table(full: FullResult | None) -> dict[str, Any]:
+    """The block `fit` of `result.json`."""
     if full is None:
         return {
             "iterations": 0,
@@ -217,27 +239,7 @@ def details_table(
         "noise_seen_adu": number_or_null(noise_seen_adu(measurement)),
     }
     if measurement.checked is not None:
-        clip = measurement.checked.binned.clip
-        black_adu = None if clip.black_adu < 0 else clip.black_adu
-        lag = measurement.checked.lag
-        table["image_lag_share"] = {
-            "rise": number_or_null(lag.rise),
-            "fall": number_or_null(lag.fall),
-            "sigma": number_or_null(lag.sigma),
-            "taken_out": lag.corrected,
-        }
-        response, second = measurement.checked.response, measurement.checked.second
-        table["response_exponent"] = number_or_null(response.exponent)
-        table["light_loss"] = {
-            "edge": number_or_null(response.edge_loss),
-            "side": number_or_null(response.side_loss),
-        }
-        table["second_image"] = {
-            "share": number_or_null(second.share),
-            "sigma": number_or_null(second.sigma),
-            "shift_mm": [number_or_null(second.mm_per_rad * s) for s in second.shift_rad],
-        }
-        table["clip_levels_adu"] = {"white": clip.white_adu, "black": black_adu}
+        table |= _light_table(measurement.checked)
     if full is not None:
         residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
         table |= {
@@ -251,10 +253,10 @@ def details_table(
     if profile is not None:
         table |= {"hencky_sag_mm": profile.sag_mm, "pressure_equivalent_pa": profile.pressure_pa}
     if bars is not None:
-        of_noise, of_geometry = bars.sag_um
+        of_noise_um, of_geometry_um = bars.sag_sigma_um
         table["sag_sigma_um"] = {
-            "noise": number_or_null(of_noise),
-            "geometry": number_or_null(of_geometry),
+            "noise": number_or_null(of_noise_um),
+            "geometry": number_or_null(of_geometry_um),
             "geometry_spread": bars.statement.source,
         }
     if outline is not None:
@@ -265,6 +267,36 @@ def details_table(
             "size_ratio": outline.size_ratio,
         }
     return table
+
+
+def _light_table(checked: Checked) -> dict[str, Any]:
+    """What the frames of a set show of its light."""
+    clip = checked.binned.clip
+    lag = checked.lag
+    response = checked.response
+    second = checked.second
+    return {
+        "image_lag_share": {
+            "rise": number_or_null(lag.rise),
+            "fall": number_or_null(lag.fall),
+            "sigma": number_or_null(lag.sigma),
+            "taken_out": lag.corrected,
+        },
+        "response_exponent": number_or_null(response.exponent),
+        "light_loss": {
+            "edge": number_or_null(response.edge_loss),
+            "side": number_or_null(response.side_loss),
+        },
+        "second_image": {
+            "share": number_or_null(second.share),
+            "sigma": number_or_null(second.sigma),
+            "shift_mm": [number_or_null(second.mm_per_rad * s) for s in second.shift_rad],
+        },
+        "clip_levels_adu": {
+            "white": clip.white_adu,
+            "black": None if clip.black_adu < 0 else clip.black_adu,
+        },
+    }
 
 
 def write_result(
@@ -278,13 +310,19 @@ def write_result(
     make_folder(out)
     write_json(out / "result.json", result)
     write_json(out / "details.json", details)
-    if measurement.full is not None and measurement.verdict != "rejected":
-        axis = measurement.full.grid.axis_mm
-        write_arrays(out / "height.npz", x_mm=axis, y_mm=axis, h_mm=measurement.full.height_mm())
-        if bars is not None:
-            axis, (of_noise, of_geometry) = bars.grid.axis_mm, bars.maps_um()
-            file = out / "sigma.npz"
-            maps = {"sigma_noise_um": of_noise, "sigma_geometry_um": of_geometry}
-            write_arrays(
-                file, x_mm=axis, y_mm=axis, sigma_um=np.hypot(of_noise, of_geometry), **maps
-            )
+    full = measurement.full
+    if full is None or measurement.verdict == "rejected":
+        return
+    axis_mm = full.grid.axis_mm
+    write_arrays(out / "height.npz", x_mm=axis_mm, y_mm=axis_mm, h_mm=full.height_mm())
+    if bars is not None:
+        axis_mm = bars.grid.axis_mm
+        of_noise_um, of_geometry_um = bars.maps_um()
+        write_arrays(
+            out / "sigma.npz",
+            x_mm=axis_mm,
+            y_mm=axis_mm,
+            sigma_um=np.hypot(of_noise_um, of_geometry_um),
+            sigma_noise_um=of_noise_um,
+            sigma_geometry_um=of_geometry_um,
+        )

@@ -106,10 +106,10 @@ class Track:
             "hencky_um",
             "sag_um",
             "sag_sigma_um",
-            "steady_sag_sigma_um",
+            "sag_change_sigma_um",
             "verdict",
             "reason",
-            "steady_sigma_um",
+            "change_sigma_um",
         )
         return {name: np.array([getattr(frame, name) for frame in self.frames]) for name in names}
 
@@ -295,7 +295,7 @@ def _make_track_table(track: Track) -> dict[str, Any]:
             "sag_mean_um",
             "sag_sd_um",
             "sag_sigma_um",
-            "steady_sag_sigma_um",
+            "sag_change_sigma_um",
             "rest_share",
         )
     )
@@ -303,7 +303,7 @@ def _make_track_table(track: Track) -> dict[str, Any]:
         sags_um = np.array([frame.sag_um for frame in used])
         figures["sag_mean_um"] = float(sags_um.mean())
         figures["sag_sd_um"] = float(sags_um.std())
-        for name in ("sag_sigma_um", "steady_sag_sigma_um", "rest_share"):
+        for name in ("sag_sigma_um", "sag_change_sigma_um", "rest_share"):
             figures[name] = float(np.median([getattr(frame, name) for frame in used]))
     reasons = Counter(f"{frame.verdict}: {frame.reason}" for frame in track.frames if frame.reason)
     counts = Counter(frame.verdict for frame in track.frames)
@@ -340,7 +340,7 @@ def _format_track(table: dict[str, Any]) -> list[str]:
         lines.append(
             f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation "
             f"{table['sag_sd_um']:.3f} µm, 1 sigma of a frame "
-            f"{table['steady_sag_sigma_um']:.3f} µm"
+            f"{table['sag_change_sigma_um']:.3f} µm"
         )
         lines.append(
             f"          1 sigma {table['sag_sigma_um']:.2g} µm, if the bench has moved since the "
@@ -359,7 +359,7 @@ def _write_pictures(out: Path, track: Track, lines: Sequence[str]) -> None:
     columns = track.make_columns()
     time_s = columns["time_s"]
     sag_um = columns["sag_um"]
-    sigma_um = columns["steady_sag_sigma_um"]
+    sigma_um = columns["sag_change_sigma_um"]
     change_um = None
     if np.isfinite(sag_um).any():
         change_um = columns["coeffs_um"] - np.nanmean(columns["coeffs_um"], axis=0)
@@ -392,7 +392,7 @@ def _draw_track(
     every = max(1, len(columns["time_s"]) // _SHOWN_FRAMES)
     time_s = columns["time_s"][::every]
     sag_um = columns["sag_um"][::every]
-    sigma_um = columns["steady_sag_sigma_um"][::every]
+    sigma_um = columns["sag_change_sigma_um"][::every]
     if change_um is not None:
         # The terms over time, from astigmatism on.
         shown = change_um[::every, FIRST_FIGURE_INDEX - 1 :].T

@@ -46,11 +46,11 @@ def test_every_frame_has_a_figure(demo: Path, capsys: pytest.CaptureFixture[str]
             "time_s",
             "coeffs_um",
             "sigma_um",
-            "steady_sigma_um",
+            "change_sigma_um",
             "hencky_um",
             "sag_um",
             "sag_sigma_um",
-            "steady_sag_sigma_um",
+            "sag_change_sigma_um",
             "verdict",
             "reason",
         }
@@ -58,7 +58,7 @@ def test_every_frame_has_a_figure(demo: Path, capsys: pytest.CaptureFixture[str]
         truth = np.load(demo / "track/truth.npz")
         assert np.array_equal(found["time_s"], np.round(truth["time_s"], 9))
         moved = found["sag_um"] - truth["sag_um"]
-        assert np.abs(moved - moved.mean()).max() < 4 * found["steady_sag_sigma_um"].max()
+        assert np.abs(moved - moved.mean()).max() < 4 * found["sag_change_sigma_um"].max()
     for name in ("track.png", "track.rrd"):
         assert (demo / "track/result" / name).stat().st_size > 10_000
 

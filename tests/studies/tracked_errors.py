@@ -36,13 +36,13 @@ class TrackedErrors:
     """Errors of the m frames that have a figure, and their error bars;
     a verdict for every frame.
 
-    The steady bars are those of a bench that does not move.
+    The bars for changes are those of a bench that does not move.
     """
 
     time_s: Array  # (m,)
     sag_um: Array  # (m,)
     sag_sigma_um: Array
-    steady_sag_sigma_um: Array
+    sag_change_sigma_um: Array
     terms_um: Array  # (m, terms - 1): all terms but piston
     terms_sigma_um: Array
     steady_terms_sigma_um: Array
@@ -58,7 +58,7 @@ class TrackedErrors:
     @property
     def sag(self) -> Array:
         """Errors of the sag in their own steady sigmas."""
-        return np.asarray(self.sag_um / self.steady_sag_sigma_um)
+        return np.asarray(self.sag_um / self.sag_change_sigma_um)
 
     @property
     def terms(self) -> Array:
@@ -113,10 +113,10 @@ def compared(world: CrossedWorld, folder: Path) -> TrackedErrors:
         found["time_s"][given],
         (found["sag_um"] - 1e3 * details["sag_mm"] - rim_um.mean(axis=1))[given],
         found["sag_sigma_um"][given],
-        found["steady_sag_sigma_um"][given],
+        found["sag_change_sigma_um"][given],
         error_um[given, 1:],
         found["sigma_um"][given, 1:],
-        found["steady_sigma_um"][given, 1:],
+        found["change_sigma_um"][given, 1:],
         tuple(found["verdict"].tolist()),
         tuple(found["reason"].tolist()),
         given,

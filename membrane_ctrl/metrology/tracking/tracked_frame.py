@@ -44,10 +44,10 @@ class TrackedFrame:
         Share of the bins with a saturated pixel.
     lost : bool
         The mirror may be elsewhere than in the last good frame: a new reference is needed.
-    steady_sag_sigma_um : float
+    sag_change_sigma_um : float
         Standard deviation of the sag without motions of the bench that frames do not show: that of
         changes from frame to frame.
-    steady_sigma_um : (terms,) array
+    change_sigma_um : (terms,) array
         The same of the terms.
     """
 
@@ -64,8 +64,8 @@ class TrackedFrame:
     swing_adu: float = math.nan
     saturated_share: float = 0.0
     lost: bool = False
-    steady_sag_sigma_um: float = math.nan
-    steady_sigma_um: FloatArray = field(default_factory=_NONE.copy)
+    sag_change_sigma_um: float = math.nan
+    change_sigma_um: FloatArray = field(default_factory=_NONE.copy)
 
     @property
     def sigma_um(self) -> FloatArray:

@@ -599,6 +599,6 @@ class Tracker:
             swing_adu=self._swing_adu * (1 + float(fit.light[1, 0])),
             saturated_share=saturated_share,
             lost=finding.lost,
-            steady_sag_sigma_um=1e3 * math.sqrt(gradient @ change_mm2 @ gradient),
-            steady_sigma_um=1e3 * np.sqrt(np.diag(to_coeffs @ change_mm2 @ to_coeffs.T)),
+            sag_change_sigma_um=1e3 * math.sqrt(gradient @ change_mm2 @ gradient),
+            change_sigma_um=1e3 * np.sqrt(np.diag(to_coeffs @ change_mm2 @ to_coeffs.T)),
         )

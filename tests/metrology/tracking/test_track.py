@@ -126,13 +126,13 @@ def test_every_frame_gives_the_figure_within_its_error_bar(bench: Bench) -> None
     assert [frame.verdict for frame in frames] == ["ok"] * len(moved), frames
     truth = np.array([FILM.sag_at_mm(um) for um in moved]) * 1e3
     error = np.array([frame.sag_um for frame in frames]) - truth
-    sigma = frames[0].steady_sag_sigma_um
+    sigma = frames[0].sag_change_sigma_um
     assert 0.01 < sigma < 0.15
     assert frames[0].sag_sigma_um > 3 * sigma  # motions along an axis, which no frame shows
     assert np.abs(error - error.mean()).max() < 4 * sigma  # the anchor's own error is common
     change_um = frames[3].coeffs_um - frames[0].coeffs_um  # a bowl deeper by 3.2 µm has only m = 0
     odd = [j for j in NOLL_INDICES[1:] if noll_orders(j)[1] != 0]
-    ratio = np.abs(change_um / frames[0].steady_sigma_um)
+    ratio = np.abs(change_um / frames[0].change_sigma_um)
     assert (ratio[[j - 1 for j in odd]] < 5 * math.sqrt(2)).all()
 
 
@@ -192,13 +192,13 @@ def test_a_hand_makes_the_error_bars_larger_while_it_is_there(bench: Bench) -> N
         ]
         assert covered.verdict == "degraded", covered.reason
         moved_um = (covered.coeffs_um - before.coeffs_um)[1:]
-        assert np.abs(moved_um / covered.steady_sigma_um[1:]).max() < 5
-        terms = np.median(covered.steady_sigma_um[1:] / before.steady_sigma_um[1:])
+        assert np.abs(moved_um / covered.change_sigma_um[1:]).max() < 5
+        terms = np.median(covered.change_sigma_um[1:] / before.change_sigma_um[1:])
         grown.append(
             [
-                covered.steady_sag_sigma_um / before.steady_sag_sigma_um,
+                covered.sag_change_sigma_um / before.sag_change_sigma_um,
                 terms,
-                after.steady_sag_sigma_um / before.steady_sag_sigma_um,
+                after.sag_change_sigma_um / before.sag_change_sigma_um,
             ]
         )
     sag, terms, back = np.mean(
@@ -268,7 +268,7 @@ def test_a_hand_in_one_of_the_first_five_steps_does_not_change_the_light_of_the_
     assert later.verdict == "ok"
     assert np.all(tracker._fitter.scene.edge == bench.scene.edge)
     for frame in (found[0], found[1], found[3], found[4], later):
-        assert abs(frame.sag_um - 1e3 * bench.scene.surface.sag_mm) < 4 * frame.steady_sag_sigma_um
+        assert abs(frame.sag_um - 1e3 * bench.scene.surface.sag_mm) < 4 * frame.sag_change_sigma_um
 
 
 def dusty(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
