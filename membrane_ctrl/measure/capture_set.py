@@ -178,6 +178,8 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
     if geometry is not None:
         tables["geometry"] = geometry.geometry.model_dump(exclude_none=True)
     bits_stated = isinstance(tables.get("camera"), dict) and "bits" in tables["camera"]
+
+    # The frames in order, all of them in the folder, and the reference.
     content = toml_file.parse_tables(tables, CaptureFile, str(path))
     rows = _order_rows(content, path)
     reference = None
@@ -187,21 +189,26 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         if content.reference is None:
             raise InputError(f"{path}: reference: a fringes set names the full set that anchors it")
         reference = reference_of(content.reference, folder, path)
+
+    # The bench. If screen and pattern are incompatible, the error names the geometry's file.
     sections = ("geometry", "camera", "pattern", "mirror")
-    blamed = (
-        path if geometry is None else geometry.path
-    )  # the screen and the pattern may be incompatible
-    optics = toml_file.parse_tables(
-        {name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed)
-    )
+    bench_tables = {name: getattr(content, name) for name in sections}
+    bench_path = path if geometry is None else geometry.path
+    optics = toml_file.parse_tables(bench_tables, schema.OpticsConfig, str(bench_path))
     if geometry is not None:
         optics = geometry.apply_to_optics(optics)
-    optics = _with_reference_displacement(
-        optics, content.frames[0].displacement_um if reference is None else None
-    )
-    before, moved = optics.geometry, content.screen_moved
+    if reference is None:
+        optics = _with_reference_displacement(optics, content.frames[0].displacement_um)
+
+    # A screen that was moved, and an artefact in the mirror's place.
+    before = optics.geometry
+    moved = content.screen_moved
     if moved is not None:
         optics = optics.model_copy(update={"geometry": move_screen(before, moved.shift_mm)})
+    origin = stated_origin(optics) if geometry is None else geometry.origin
+    artefact = None
+    if content.artefact is not None:
+        artefact = content.artefact.make_artefact(content.mirror.radius_mm, path)
     return CaptureHead(
         folder=folder,
         kind=content.kind,
@@ -214,10 +221,8 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         displacement_um=_to_number_column([row.displacement_um for row, _ in rows]),
         pressure_pa=math.nan if content.pressure_pa is None else content.pressure_pa,
         ignored=ignored,
-        geometry=stated_origin(optics) if geometry is None else geometry.origin,
-        artefact=None
-        if content.artefact is None
-        else content.artefact.make_artefact(content.mirror.radius_mm, path),
+        geometry=origin,
+        artefact=artefact,
         screen_moved=moved,
         before_move=before,
         turned=None if content.mirror_turned is None else content.mirror_turned.make_turn(),
@@ -233,10 +238,8 @@ def read_set(folder: str | Path, geometry: GeometryFile | None = None) -> Captur
     if len(head.files) * camera.width_px * camera.height_px > _PIXELS_MAX:
         raise InputError(
             f"{head.folder / 'capture.toml'}: camera.width_px, height_px: {len(head.files)} "
-            "frames of "
-            f"{camera.width_px} x {camera.height_px} pixels exceed the limit of "
-            f"{_PIXELS_MAX / 1e6:.0f} million "
-            "for a set"
+            f"frames of {camera.width_px} x {camera.height_px} pixels exceed the limit of "
+            f"{_PIXELS_MAX / 1e6:.0f} million for a set"
         )
     with ThreadPoolExecutor(_READERS) as pool:
         images = list(pool.map(read_image, [head.folder / name for name in head.files]))
@@ -244,10 +247,19 @@ def read_set(folder: str | Path, geometry: GeometryFile | None = None) -> Captur
 
 
 def assemble_set(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
-    """Collect frames of one size and depth in one array; a text in place of an image is the reason
-    for its absence.
+    """Collect the frames of one size and depth in one array.
 
-    Raises InputError if no frame is readable, or if most contradict the camera in the file.
+    Parameters
+    ----------
+    head : CaptureHead
+        The set's `capture.toml`.
+    images : sequence of images or str
+        Its frames; a text is the reason for the absence of an image.
+
+    Raises
+    ------
+    InputError
+        If no frame is readable, or if most contradict the camera in the file.
     """
     path = head.folder / "capture.toml"
     good = [image for image in images if not isinstance(image, str)]
@@ -255,17 +267,20 @@ def assemble_set(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet
         raise InputError(
             f"{path}: frames: none of the {len(images)} images is readable ({images[0]})"
         )
+
+    # Size and depth that most frames have.
     camera = head.optics.camera
-    size, depth = (
-        (camera.height_px, camera.width_px),
-        _find_most_common([image.dtype for image in good]),
-    )
+    size = (camera.height_px, camera.width_px)
+    depth = _find_most_common([image.dtype for image in good])
     seen = _find_most_common([image.shape for image in good])
     if seen != size:
-        said = f"{size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
+        problem = f"{size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
         packing = find_size_mistake(seen, size, depth)
-        cause = f"; {packing}, have this size: unpack them to one value a pixel" if packing else ""
-        raise InputError(f"{path}: camera.width_px, height_px: {said}{cause}")
+        if packing:
+            problem += f"; {packing}, have this size: unpack them to one value a pixel"
+        raise InputError(f"{path}: camera.width_px, height_px: {problem}")
+
+    # The frames that have them, and why others are unusable.
     frames: Image = np.zeros((len(images), *size), depth)
     unusable: dict[int, str] = {}
     for k, image in enumerate(images):
@@ -299,21 +314,22 @@ def anchor_head(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
 
     Raises InputError if the two cannot belong together.
     """
-    ours, theirs = head.optics, reference.optics
+    ours = head.optics
+    theirs = reference.optics
     where = head.folder / "capture.toml"
     if reference.kind == "fringes":
         raise InputError(f"{where}: reference: {reference.folder} is a set of fringes alone")
     for section in ("camera", "pattern"):
-        a, b = getattr(ours, section), getattr(theirs, section)
+        a = getattr(ours, section)
+        b = getattr(theirs, section)
         for key in ("width_px", "height_px", "periods", "period_mm"):
             if getattr(a, key, None) != getattr(b, key, None):
                 raise InputError(
                     f"{where}: {section}.{key} = {getattr(a, key)}, the reference has "
                     f"{getattr(b, key)}"
                 )
-    return replace(
-        head, optics=_with_reference_displacement(ours, theirs.geometry.reference_displacement_um)
-    )
+    displacement_um = theirs.geometry.reference_displacement_um
+    return replace(head, optics=_with_reference_displacement(ours, displacement_um))
 
 
 def _with_reference_displacement(
@@ -333,8 +349,10 @@ def read_image(path: Path) -> Image | str:
         image = decoded_image(read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_UNCHANGED)
     except FileNotFoundError:
         return "missing: no such file"
-    except (OSError, ValueError) as error:
-        return f"unreadable: {(error.strerror if isinstance(error, OSError) else None) or error}"
+    except OSError as error:
+        return f"unreadable: {error.strerror or error}"
+    except ValueError as error:
+        return f"unreadable: {error}"
     if image.ndim != 2:
         return f"unreadable: {image.shape[2]} colour channels instead of one"
     if image.dtype not in (np.uint8, np.uint16):
@@ -343,14 +361,12 @@ def read_image(path: Path) -> Image | str:
 
 
 def _find_sensor_bits(head: CaptureHead, frames: Image, path: Path) -> int:
-    """Bits of the sensor: as stated, else the smallest usual depth
-    that holds the brightest pixel.
-    """
+    """Bits of the sensor: as stated, or the smallest usual depth that holds the brightest pixel."""
     bits = head.optics.camera.bits
     if not head.bits_stated:
-        return (
-            8 if frames.dtype == np.uint8 else next(b for b in _DEPTHS if int(frames.max()) < 2**b)
-        )
+        if frames.dtype == np.uint8:
+            return 8
+        return next(depth for depth in _DEPTHS if int(frames.max()) < 2**depth)
     if (bits == 8) != (frames.dtype == np.uint8):
         raise InputError(
             f"{path}: camera.bits = {bits}, but the images have {8 * frames.itemsize} bit pixels"
@@ -371,8 +387,9 @@ def require_inside(name: str, folder: Path, path: Path) -> None:
 
 
 def reference_of(name: str, folder: Path, path: Path) -> Path:
-    """The folder of the set that anchors this one. Raises InputError
-    for a name that cannot be one.
+    """The folder of the set that anchors this one.
+
+    Raises InputError for a name that cannot be a folder.
     """
     try:
         return (folder / name).resolve()
@@ -381,33 +398,33 @@ def reference_of(name: str, folder: Path, path: Path) -> Path:
 
 
 def _order_rows(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]:
-    """Rows with their patterns in the order of the sequence. Raises InputError for missing or
-    duplicate ones.
+    """Rows with their patterns in the order of the sequence.
+
+    Raises InputError for missing, duplicate or surplus ones.
     """
+    # The pattern of each row.
     found: dict[str, tuple[FrameRow, Pattern]] = {}
     for row in content.frames:
         if row.role in ("sin", "gray") and row.axis is None:
             raise InputError(f"{path}: frames: {row.file} has role {row.role} and no axis")
-        pattern = Pattern(row.role, row.axis or "", row.index if row.axis else 0)
+        axis = row.axis or ""
+        pattern = Pattern(row.role, axis, row.index if row.axis else 0)
         if row.role == "sin":
-            shift = (
-                2 * math.pi * row.index / content.pattern.steps
-                if row.shift_rad is None
-                else row.shift_rad
-            )
-            pattern = Pattern(
-                row.role, row.axis or "", row.index, shift, _coarser_mm(row, content, path)
-            )
+            shift_rad = row.shift_rad
+            if shift_rad is None:
+                shift_rad = 2 * math.pi * row.index / content.pattern.steps
+            period_mm = _coarser_mm(row, content, path)
+            pattern = Pattern(row.role, axis, row.index, shift_rad, period_mm)
         if pattern.name in found:
             raise InputError(
                 f"{path}: frames: {pattern.name} appears twice "
                 f"({found[pattern.name][0].file}, {row.file})"
             )
         found[pattern.name] = (row, pattern)
-    names = [
-        p.name
-        for p in (full_sequence if content.kind == "full" else fringe_sequence)(content.pattern)
-    ]
+
+    # The patterns that a set of this kind has.
+    sequence = full_sequence if content.kind == "full" else fringe_sequence
+    names = [pattern.name for pattern in sequence(content.pattern)]
     if content.kind == "frequencies":
         coarser = sorted({pattern.period_mm for _, pattern in found.values()} - {0.0})
         if not coarser:
@@ -447,8 +464,10 @@ def _coarser_mm(row: FrameRow, content: CaptureFile, path: Path) -> float:
 
 
 def _to_number_column(values: list[float | None]) -> FloatArray:
+    """Numbers (n,); NaN for None."""
     return np.array([math.nan if value is None else value for value in values])
 
 
 def _find_most_common(values: list[Any]) -> Any:
+    """The value that occurs most often."""
     return Counter(values).most_common(1)[0][0]

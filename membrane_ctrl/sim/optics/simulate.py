@@ -19,9 +19,8 @@ from membrane_ctrl.sim.optics.screen_face import project_onto_face
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
 from membrane_ctrl.sim.optics.trace import Trace
 
-# The `capture.toml` of a simulated set, and its truth.
-_GRID = 201  # odd, so that the vertex is a point of the truth's map
-# noise does not compress: higher levels cost time and save nothing
+_GRID = 201  # points of the truth's map along its side: odd, so that the vertex is one
+# Noise does not compress: higher levels cost time and save nothing.
 _PNG_SPEED = (
     cv2.IMWRITE_PNG_COMPRESSION,
     1,
@@ -29,12 +28,13 @@ _PNG_SPEED = (
     cv2.IMWRITE_PNG_STRATEGY_RLE,
 )
 _CROSSED_PERIODS = 32
-_STEPS = 5  # of the first frames: 72 degrees in x, twice that in y
+_STEPS = 5  # of the first frames of a tracking set: 72 degrees in x, twice that in y
 
 
 def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, Any]:
-    """The content of `capture.toml` (schema membrane-capture/1); `readings_um` (frames,) are the
-    laser's readings.
+    """The content of `capture.toml` (schema membrane-capture/1).
+
+    `readings_um` (frames,) are the laser's readings.
     """
     geometry = _make_config_table(spec.stated_geometry or spec.optics.geometry)
     if spec.laser:
@@ -53,14 +53,16 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
         "geometry": geometry,
         "camera": camera,
         "mirror": _make_config_table(spec.optics.mirror),
-        **({"artefact": dict(spec.artefact)} if spec.artefact else {}),
-        **({"screen_moved": dict(spec.screen_moved)} if spec.screen_moved else {}),
-        **({"mirror_turned": dict(spec.mirror_turned)} if spec.mirror_turned else {}),
-        "frames": [
-            _frame_row(spec, frame, float(readings_um[frame]))
-            for frame in range(len(spec.patterns))
-        ],
     }
+    if spec.artefact:
+        table["artefact"] = dict(spec.artefact)
+    if spec.screen_moved:
+        table["screen_moved"] = dict(spec.screen_moved)
+    if spec.mirror_turned:
+        table["mirror_turned"] = dict(spec.mirror_turned)
+    table["frames"] = [
+        _frame_row(spec, frame, float(readings_um[frame])) for frame in range(len(spec.patterns))
+    ]
     return table
 
 
@@ -81,6 +83,8 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     displacement_um = np.array([spec.displacement_um(frame) for frame in range(len(spec.patterns))])
     mean_um = _mean_um(spec)
     coeffs_um = spec.film.coeffs_um(mean_um)
+
+    # The maps: height, and its change for 1 mm of sag.
     radius_mm = spec.film.radius_mm
     axis_mm = np.linspace(-radius_mm, radius_mm, _GRID)
     x_mm, y_mm = np.meshgrid(axis_mm, axis_mm)
@@ -99,6 +103,8 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     np.savez_compressed(
         folder / "truth.npz", origin=origin, displacement_um=displacement_um, **maps
     )
+
+    # The numbers, and what was requested.
     film = {name: value for name, value in asdict(spec.film).items() if name != "terms"}
     truth = {
         **file_origin("membrane-simulation/1"),
@@ -119,10 +125,13 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
 
 
 def _mean_um(spec: SimulationSpec) -> float:
-    """Mean displacement of the sinusoids."""
-    shown = enumerate(spec.patterns)
-    fringes = [spec.displacement_um(k) for k, p in shown if p.role == "sin" and not p.period_mm]
-    return float(np.mean(fringes))
+    """Mean displacement of the sinusoids, without those of coarser fringes."""
+    displacements_um = [
+        spec.displacement_um(frame)
+        for frame, pattern in enumerate(spec.patterns)
+        if pattern.role == "sin" and not pattern.period_mm
+    ]
+    return float(np.mean(displacements_um))
 
 
 def _make_config_table(section: settings.Section) -> dict[str, Any]:
@@ -135,6 +144,7 @@ def _make_config_table(section: settings.Section) -> dict[str, Any]:
 
 
 def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str, Any]:
+    """One row `[[frames]]` of `capture.toml`."""
     pattern = spec.patterns[frame]
     row: dict[str, Any] = {"file": f"{pattern.name}.png", "role": pattern.role}
     if pattern.axis:
@@ -151,7 +161,7 @@ def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str,
 
 @dataclass(frozen=True, slots=True)
 class _Exposure:
-    """The true exposure behind one file."""
+    """The true exposure of one file: pattern, place of the film, time and factor of the light."""
 
     pattern: roles.Pattern
     displacement_um: float
@@ -173,12 +183,27 @@ def simulate_run(
     interval_s: float = 4.0,
     on_set: Callable[[int], None] | None = None,
 ) -> None:
-    """Write a run: `0000` is the full set, the others are fringes anchored to it; one clock and one
-    motion for all.
+    """Write a run of sets: `0000` is the full set, the others are fringes that refer to it.
 
-    Each set has a folder. The first set's motion continues through the others, its faults do not;
-    sets start `interval_s` apart. `on_set` gets the number of sets written, after each. Raises
-    ValueError if the first set is not full, lists its displacements, or the sets overlap in time.
+    All share one clock. The first set's motion continues through the others, its faults do not.
+
+    Parameters
+    ----------
+    folder : path
+        New folder; each set has one in it.
+    spec : SimulationSpec
+        The first set.
+    sets : int
+        Number of sets.
+    interval_s : float
+        From the start of one set to that of the next.
+    on_set : callable, optional
+        Gets the number of sets written, after each.
+
+    Raises
+    ------
+    ValueError
+        If the first set is not full or lists its displacements, or if the sets overlap in time.
     """
     if spec.kind != "full" or spec.displacements_um:
         raise ValueError(
@@ -194,14 +219,17 @@ def simulate_run(
     spec = _anchor_specification(spec)
     renderer = _make_renderer(spec)
     for number in range(sets):
-        if number == 0:
-            this = spec
-        else:
-            start_s, seed = spec.start_s + number * interval_s, spec.seed + number
-            this = replace(
-                spec, kind="fringes", reference="../0000", start_s=start_s, seed=seed, faults=()
+        spec_of_set = spec
+        if number > 0:
+            spec_of_set = replace(
+                spec,
+                kind="fringes",
+                reference="../0000",
+                start_s=spec.start_s + number * interval_s,
+                seed=spec.seed + number,
+                faults=(),
             )
-        _write_set(Path(folder) / f"{number:04d}", this, renderer)
+        _write_set(Path(folder) / f"{number:04d}", spec_of_set, renderer)
         if on_set is not None:
             on_set(number + 1)
 
@@ -213,60 +241,91 @@ def simulate_track(
     rate_hz: float = 20.0,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
-    """Write a tracking set: `full`, and `track` with frames of a crossed pattern; both share clock
-    and motion.
+    """Write a tracking set: `full`, and `track` with frames of a crossed pattern.
 
-    The first five frames step the pattern. `truth.npz` in `track` has `time_s`, `displacement_um`,
-    `sag_um` (frames,) and, if these represent the film, `coeffs_um` (frames, ZERNIKE_TERMS), all
-    without the vibrations, `drum_um` (frames, modes): RMS over the mirror. `on_frame` gets the
-    number of frames written. Raises ValueError for frames or a rate that are not above 0, and for a
-    specification that is not of a full set.
+    Both share clock and motion. The first five frames step the pattern. `truth.npz` in `track` has
+    `time_s`, `displacement_um`, `sag_um` (frames,) and, if these represent the film, `coeffs_um`
+    (frames, ZERNIKE_TERMS), all without the vibrations, `drum_um` (frames, modes): RMS over the
+    mirror.
+
+    Parameters
+    ----------
+    folder : path
+        New folder.
+    spec : SimulationSpec
+        The full set.
+    frames : int
+        Number of frames of the crossed pattern.
+    rate_hz : float
+        Frames per second.
+    on_frame : callable, optional
+        Gets the number of frames written, after each.
+
+    Raises
+    ------
+    ValueError
+        For frames or a rate that are not above 0, and for a specification that is not of a full
+        set.
     """
     if spec.kind != "full" or spec.displacements_um or frames < 1 or not rate_hz > 0:
         raise ValueError(
             "track: one frame or more, at a rate above 0, of a film that moves by motion"
         )
+
+    # The reference.
     spec = _anchor_specification(spec)
-    renderer, target = _make_renderer(spec), Path(folder) / "track"
+    renderer = _make_renderer(spec)
+    target = Path(folder) / "track"
     _write_set(Path(folder) / "full", spec, renderer)
     target.mkdir(parents=True, exist_ok=True)
+
+    # The frames of the crossed pattern.
     start_s = spec.start_s + len(spec.patterns) * spec.frame_interval_s
     time_s = start_s + np.arange(frames) / rate_hz
     displacement_um = np.array([spec.motion.at_um(float(t)) for t in time_s])
     noise_um = np.random.default_rng(spec.seed + 1).normal(0.0, spec.laser_noise_um, frames)
     rows = []
     for k in range(frames):
-        shift_x, shift_y = (
-            turns * 2 * np.pi * (k % _STEPS) / _STEPS if k < _STEPS else 0.0 for turns in (1, 2)
+        shift_x_rad = 0.0
+        shift_y_rad = 0.0
+        if k < _STEPS:
+            shift_x_rad = 1 * 2 * np.pi * (k % _STEPS) / _STEPS
+            shift_y_rad = 2 * 2 * np.pi * (k % _STEPS) / _STEPS
+        pattern = roles.Pattern(
+            "crossed", "", _CROSSED_PERIODS, shift_x_rad, shift_y_rad=shift_y_rad
         )
-        pattern = roles.Pattern("crossed", "", _CROSSED_PERIODS, shift_x, shift_y_rad=shift_y)
-        row: dict[str, Any] = {"file": f"t_{k:05d}.png", "role": "crossed"}
-        row |= {
-            "shift_x_rad": shift_x,
-            "shift_y_rad": shift_y,
+        row: dict[str, Any] = {
+            "file": f"t_{k:05d}.png",
+            "role": "crossed",
+            "shift_x_rad": shift_x_rad,
+            "shift_y_rad": shift_y_rad,
             "time_s": round(float(time_s[k]), 9),
         }
         if spec.laser:
             row["displacement_um"] = float(displacement_um[k] + noise_um[k])
-        _write_png(
-            target / row["file"],
-            renderer.render_picture(pattern, float(displacement_um[k]), time_s=float(time_s[k])),
-        )
+        at_um = float(displacement_um[k])
+        picture = renderer.render_picture(pattern, at_um, time_s=float(time_s[k]))
+        _write_png(target / row["file"], picture)
         rows.append(row)
         if on_frame is not None:
             on_frame(k + 1)
-    pattern_mm = spec.optics.pattern
+
+    # Their `capture.toml`.
+    stated = spec.optics.pattern
     crossed = {
         "periods": _CROSSED_PERIODS,
-        "period_mm": pattern_mm.periods * pattern_mm.period_mm / _CROSSED_PERIODS,
+        "period_mm": stated.periods * stated.period_mm / _CROSSED_PERIODS,
     }
     table: dict[str, Any] = {
         **file_origin("membrane-capture/1"),
         "kind": "track",
         "reference": "../full",
+        "pattern": _make_config_table(stated) | {"crossed": crossed},
+        "frames": rows,
     }
-    table |= {"pattern": _make_config_table(pattern_mm) | {"crossed": crossed}, "frames": rows}
     (target / "capture.toml").write_bytes(tomli_w.dumps(table).encode())
+
+    # Their truth.
     sag_um = np.array([1e3 * spec.film.sag_at_mm(float(d)) for d in displacement_um])
     truth: dict[str, Any] = {"time_s": time_s, "displacement_um": displacement_um, "sag_um": sag_um}
     coeffs = [spec.film.coeffs_um(float(d)) for d in displacement_um]
@@ -274,20 +333,17 @@ def simulate_track(
         truth["coeffs_um"] = np.array(coeffs)
     if renderer.modes:
         truth["drum_um"] = np.stack([mode.swing_um(time_s) for mode in renderer.modes], axis=1)
-    np.savez_compressed(
-        target / "truth.npz", origin=np.array(describe_origin("membrane-truth/1")), **truth
-    )
+    origin = np.array(describe_origin("membrane-truth/1"))
+    np.savez_compressed(target / "truth.npz", origin=origin, **truth)
 
 
 def _anchor_specification(spec: SimulationSpec) -> SimulationSpec:
     """The specification with an explicit reference displacement of the geometry, common to all sets
     of a run.
     """
-    stated = spec.stated_geometry or spec.optics.geometry
-    return replace(
-        spec,
-        stated_geometry=stated.model_copy(update={"reference_displacement_um": spec.reference_um}),
-    )
+    geometry = spec.stated_geometry or spec.optics.geometry
+    stated = geometry.model_copy(update={"reference_displacement_um": spec.reference_um})
+    return replace(spec, stated_geometry=stated)
 
 
 class _SeenDirectly(OpticsRenderer):
@@ -296,21 +352,23 @@ class _SeenDirectly(OpticsRenderer):
     def _trace_film(
         self, directions: FloatArray, displacement_um: float, film: Any = None
     ) -> Trace:
+        """The rays meet the screen's plane, and then its face."""
         screen = self._screen_pose
         axes = np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)])
-        start, along = (
-            axes @ (self._camera_pose.position_mm - screen.origin_mm),
-            directions @ axes.T,
-        )
+        start = axes @ (self._camera_pose.position_mm - screen.origin_mm)
+        along = directions @ axes.T
         tangents = along[:, :2].T / along[:, 2]
-        seen_mm = project_onto_face(
-            start[:2, None] - start[2] * tangents, tangents, screen.bow_per_mm, screen.height_map
-        )
-        return Trace(np.zeros(len(along)), np.zeros(len(along)), *seen_mm)
+        on_plane_mm = start[:2, None] - start[2] * tangents
+        seen_mm = project_onto_face(on_plane_mm, tangents, screen.bow_per_mm, screen.height_map)
+        zeros = np.zeros(len(along))
+        return Trace(zeros, zeros.copy(), *seen_mm)
 
 
 def _make_renderer(spec: SimulationSpec) -> OpticsRenderer:
-    kind = _SeenDirectly if spec.artefact.get("form") == "screen" else OpticsRenderer
+    """The renderer of a specification: of the film, or of the screen itself."""
+    kind = OpticsRenderer
+    if spec.artefact.get("form") == "screen":
+        kind = _SeenDirectly
     return kind(
         spec.optics,
         spec.film,
@@ -325,6 +383,7 @@ def _make_renderer(spec: SimulationSpec) -> OpticsRenderer:
 
 
 def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> None:
+    """Write one set with its faults. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     noise = np.random.default_rng(spec.seed).normal(0.0, spec.laser_noise_um, len(spec.patterns))
     readings_um = noise + [spec.displacement_um(frame) for frame in range(len(spec.patterns))]
@@ -334,9 +393,11 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
         if ("stale", pattern.name) in faults and before is not None:
             picture = before
         else:
-            um, gain = exposure.displacement_um, exposure.gain
             picture = renderer.render_picture(
-                exposure.pattern, um, gain=gain, time_s=exposure.time_s
+                exposure.pattern,
+                exposure.displacement_um,
+                gain=exposure.gain,
+                time_s=exposure.time_s,
             )
         before = picture
         if ("wrong_size", pattern.name) in faults:
@@ -369,11 +430,13 @@ def _list_exposures(spec: SimulationSpec) -> list[_Exposure]:
 
 
 def _other_depth(picture: roles.Pixels) -> roles.Pixels:
+    """The picture with the other number of bytes a pixel."""
     if picture.dtype == np.uint8:
         return picture.astype(np.uint16)
     return picture.astype(np.uint8)
 
 
 def _write_png(path: Path, picture: roles.Pixels) -> None:
+    """Write a picture. Raises OSError."""
     if not cv2.imwrite(str(path), picture, _PNG_SPEED):
         raise OSError(f"{path}: cannot be written")
