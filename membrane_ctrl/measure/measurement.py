@@ -127,8 +127,8 @@ def read_anchor(
 def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
     """The frames for the metrology.
 
-    Raises RejectedSetError if a picture is missing or unreadable. The rest would often suffice, but
-    an incomplete set deserves no trust.
+    Raises RejectedSetError if a picture is missing or unreadable. The others would often suffice,
+    but an incomplete set is not reliable.
     """
     if capture.lost:
         flags = tuple(frame_faults.flag_unreadable(k, capture.unusable[k]) for k in capture.lost)
@@ -145,24 +145,24 @@ def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
 
 def checked_set(capture: CaptureSet, anchor: Anchor | None) -> Checked:
     """Check the frames and fit the bins. Raises RejectedSetError if they give no figure."""
-    stack, optics = stack_of(capture), capture.head.optics
-    return (
-        check_frequencies(stack, optics)
-        if capture.head.kind == "frequencies"
-        else check_set(stack, optics, anchor)
-    )
+    stack = stack_of(capture)
+    optics = capture.head.optics
+    if capture.head.kind == "frequencies":
+        return check_frequencies(stack, optics)
+    return check_set(stack, optics, anchor)
 
 
 def noise_seen_adu(measurement: Measurement) -> float:
-    """Pixel noise estimated from the phase steps; NaN for three steps, which always agree."""
+    """Noise of a pixel, ADU, estimated from the phase steps; NaN for three steps, which always
+    agree.
+    """
     if measurement.checked is None or measurement.full is None:
         return float("nan")
-    free = sum(len(used) - 3 for used in measurement.checked.view.used)
-    return (
-        float(np.sqrt(np.median(np.square(measurement.full.rest_adu)) / free))
-        if free
-        else float("nan")
-    )
+    freedom = sum(len(used) - 3 for used in measurement.checked.view.used)
+    if freedom == 0:
+        return float("nan")
+    squares = np.square(measurement.full.rest_adu)
+    return float(np.sqrt(np.median(squares) / freedom))
 
 
 @dataclass(frozen=True)
@@ -191,8 +191,10 @@ class SetFigure:
 
     @property
     def artefact(self) -> Artefact | None:
-        """What stood in the mirror's place; None: the film."""
-        return None if self.head.artefact == "screen" else self.head.artefact
+        """The known surface in the mirror's place; None: the film, or the screen itself."""
+        if self.head.artefact == "screen":
+            return None
+        return self.head.artefact
 
     def make_trial_bench(self) -> TrialBench:
         """The set's bench for Monte Carlo trials."""
@@ -239,6 +241,7 @@ class Figures:
         return SetFigure(head, checked, figure, verdict, reason, middle_s, head.mean_reading_um)
 
     def _anchored_by(self, reference: Path) -> tuple[CaptureHead, Anchor]:
+        """A reference, read once; a failure is raised again for each set that names it."""
         if reference != self._reference:
             self._reference = reference
             try:

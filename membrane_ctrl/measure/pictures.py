@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import SymLogNorm
@@ -21,15 +21,14 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.colours import DIVERGING_MAP, SEQUENTIAL_MAP
 from membrane_ctrl.model.terminal import escape_controls
 
-if TYPE_CHECKING:  # half a second to load, and most measurements make no recording
-    pass
-
-
 _SHOWN_PX = 600  # side of pixel maps
-_MAP_CELLS = 450
-# largest value over what 99 % of a map need: beyond it a linear scale would hide the rest
+_MAP_CELLS = 450  # side of other maps
+# Largest value of a map over that of 99 % of it, beyond which a linear scale would hide the rest.
 _STEEP = 3.0
-_SHOWN_ROWS = 16  # of the budget: the rest adds nothing
+_TYPICAL_PERCENTILES = (0.5, 99.5)
+_LEAST_SCALE = 1e-12
+_SHOWN_ROWS = 16  # of the budget: further ones add nothing
+_LONGEST_TITLE = 110
 
 
 def draw_measurement(
@@ -41,33 +40,43 @@ def draw_measurement(
     bars: ErrorBars | None,
     figure: MeasuredFigure | None,
 ) -> list[Path]:
-    """Draw all pictures; returns the files. `light` (H, W), of any size, is the white frame or the
-    fringes' mean.
+    """Draw all pictures of a measurement.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the pictures.
+    measurement : Measurement
+        The measured set.
+    light : (H, W) array
+        The white frame, or the fringes' mean; of any size.
+    profile, outline, bars, figure
+        Further results, as far as there are any.
+
+    Returns
+    -------
+    list of Path
+        The files.
     """
-    files = [write_picture(out / "frames.png", _draw_frames(measurement))]
+    drawn = {"frames": _draw_frames(measurement)}
     full = measurement.full
-    if full is None or profile is None:
-        return files
-    axis, height = full.grid.axis_mm, full.height_mm()
-    residual_um = 1e3 * full.residual_mm
-    files += [
-        write_picture(out / "sag.png", _map_axes("height (mm)", axis, height, SEQUENTIAL_MAP)),
-        write_picture(
-            out / "residual.png",
-            _map_axes("height over the fit (µm)", axis, residual_um, DIVERGING_MAP, even=True),
-        ),
-        write_picture(
-            out / "slopes.png", _draw_slopes(full, full.map() if figure is None else figure.seen)
-        ),
-        write_picture(out / "modulation.png", _draw_modulation(measurement, full, light, outline)),
-        write_picture(out / "profile.png", _draw_profile(profile)),
-        write_picture(out / "convergence.png", _draw_convergence(full)),
-    ]
-    if bars is not None:
-        files.append(write_picture(out / "uncertainty.png", _draw_uncertainty(bars)))
-    if figure is not None:
-        files.append(write_picture(out / "figure.png", _draw_figure(figure)))
-    return files
+    if full is not None and profile is not None:
+        axis_mm = full.grid.axis_mm
+        residual_um = 1e3 * full.residual_mm
+        seen = full.map() if figure is None else figure.seen
+        drawn["sag"] = _draw_map("height (mm)", axis_mm, full.height_mm(), SEQUENTIAL_MAP)
+        drawn["residual"] = _draw_map(
+            "height over the fit (µm)", axis_mm, residual_um, DIVERGING_MAP, even=True
+        )
+        drawn["slopes"] = _draw_slopes(full, seen)
+        drawn["modulation"] = _draw_modulation(measurement, full, light, outline)
+        drawn["profile"] = _draw_profile(profile)
+        drawn["convergence"] = _draw_convergence(full)
+        if bars is not None:
+            drawn["uncertainty"] = _draw_uncertainty(bars)
+        if figure is not None:
+            drawn["figure"] = _draw_figure(figure)
+    return [write_picture(out / f"{name}.png", picture) for name, picture in drawn.items()]
 
 
 def new_sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
@@ -76,8 +85,14 @@ def new_sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> t
     """
     figure = Figure(figsize=(width, height))
     axes = figure.subplots(rows, columns)
-    left, right, low, high = 0.8 / width, 1 - 0.35 / width, 0.6 / height, 1 - 0.4 / height
-    figure.subplots_adjust(left=left, right=right, bottom=low, top=high, wspace=0.25, hspace=0.28)
+    figure.subplots_adjust(
+        left=0.8 / width,
+        right=1 - 0.35 / width,
+        bottom=0.6 / height,
+        top=1 - 0.4 / height,
+        wspace=0.25,
+        hspace=0.28,
+    )
     return figure, axes
 
 
@@ -91,45 +106,39 @@ def _plain_powers(*axes: Any) -> None:
 def _draw_figure(found: MeasuredFigure) -> Figure:
     """Draw what deviates from the best sphere, its spectrum, and the encircled energy."""
     figure, ((whole, rest), (spectrum, energy)) = new_sheet(12, 10, 2, 2)
-    axis, deviation_um = found.seen.axis_mm, found.figure.deviation_um
-    radius_mm = found.figure.numbers.radius_of_curvature_mm
-    show_map(
-        whole,
-        f"less the best sphere, R = {radius_mm:.1f} mm (µm)",
-        axis,
-        deviation_um,
-        DIVERGING_MAP,
-        even=True,
-    )
+    numbers = found.figure.numbers
+
+    # The deviation, and its part that is not rotationally invariant.
+    axis_mm = found.seen.axis_mm
+    deviation_um = found.figure.deviation_um
     asymmetry_um = deviation_um - found.figure.rotational_um
-    show_map(
-        rest,
-        "and less its rotationally invariant part (µm)",
-        axis,
-        asymmetry_um,
-        DIVERGING_MAP,
-        even=True,
-    )
+    title = f"less the best sphere, R = {numbers.radius_of_curvature_mm:.1f} mm (µm)"
+    show_map(whole, title, axis_mm, deviation_um, DIVERGING_MAP, even=True)
+    title = "and less its rotationally invariant part (µm)"
+    show_map(rest, title, axis_mm, asymmetry_um, DIVERGING_MAP, even=True)
+
+    # The spectrum with its band of 1 sigma.
     psd = found.spectrum
-    low = np.maximum(psd.density_um2_mm2 - psd.sigma_um2_mm2, psd.density_um2_mm2 / 10)
-    spectrum.fill_between(
-        psd.frequency_per_mm, low, psd.density_um2_mm2 + psd.sigma_um2_mm2, alpha=0.3
-    )
-    spectrum.loglog(psd.frequency_per_mm, psd.density_um2_mm2)
+    density = psd.density_um2_mm2
+    low = np.maximum(density - psd.sigma_um2_mm2, density / 10)
+    spectrum.fill_between(psd.frequency_per_mm, low, density + psd.sigma_um2_mm2, alpha=0.3)
+    spectrum.loglog(psd.frequency_per_mm, density)
     spectrum.set(title="spectral density", xlabel="spatial frequency (1/mm)", ylabel="um^2 mm^2")
     _plain_powers(spectrum.xaxis, spectrum.yaxis)
-    if found.figure.numbers.best_focus_mm > 0:
+
+    # The encircled energy, of a mirror that focuses.
+    if numbers.best_focus_mm > 0:
         energy.plot(np.quantile(found.figure.spot_mm, ENERGY_SHARES), 100 * ENERGY_SHARES)
-        numbers, noise, geometry_part = (
-            found.figure.numbers,
-            found.noise.numbers,
-            found.geometry.numbers,
-        )
-        for name in ("spot_50_mm", "spot_80_mm", "spot_95_mm"):
-            bar = np.nan_to_num(np.hypot(getattr(noise, name), getattr(geometry_part, name)))
-            share = float(name.split("_")[1])
+        for percent, name in ((50, "spot_50_mm"), (80, "spot_80_mm"), (95, "spot_95_mm")):
+            of_noise = getattr(found.noise.numbers, name)
+            of_geometry = getattr(found.geometry.numbers, name)
             energy.errorbar(
-                getattr(numbers, name), share, xerr=bar, fmt="o", capsize=4, color="tab:red"
+                getattr(numbers, name),
+                float(percent),
+                xerr=np.nan_to_num(np.hypot(of_noise, of_geometry)),
+                fmt="o",
+                capsize=4,
+                color="tab:red",
             )
         energy.set(title=f"encircled energy, {numbers.best_focus_mm:.1f} mm from the vertex")
     energy.set(xlabel="radius (mm)", ylabel="% of the rays", ylim=(0, 101))
@@ -139,20 +148,20 @@ def _draw_figure(found: MeasuredFigure) -> Figure:
 def _draw_uncertainty(bars: ErrorBars) -> Figure:
     """Draw 1 sigma from the set itself and from the geometry, and the budget."""
     figure, (left, middle, right) = new_sheet(17, 4.8, 1, 3)
-    of_noise, of_geometry = bars.maps_um()
-    show_map(
-        left, "1 sigma from this set: noise, film, light (µm)", bars.grid.axis_mm, of_noise, "magma"
-    )
-    show_map(middle, "1 sigma from the geometry (µm)", bars.grid.axis_mm, of_geometry, "magma")
-    rows = [row for row in bars.budget.rows() if row["height_rms_um"] > 0][:_SHOWN_ROWS][::-1]
+    of_noise_um, of_geometry_um = bars.maps_um()
+    axis_mm = bars.grid.axis_mm
+    title = "1 sigma from this set: noise, film, light (µm)"
+    show_map(left, title, axis_mm, of_noise_um, "magma")
+    show_map(middle, "1 sigma from the geometry (µm)", axis_mm, of_geometry_um, "magma")
+
+    # The largest rows of the budget, the largest at the top.
+    rows = [row for row in bars.budget.rows() if row["height_rms_um"] > 0]
+    rows = list(reversed(rows[:_SHOWN_ROWS]))
     places = np.arange(len(rows))
-    right.barh(places + 0.2, [row["height_rms_um"] for row in rows], 0.4, label="height")
-    right.barh(
-        places - 0.2,
-        [row["figure_rms_um"] for row in rows],
-        0.4,
-        label="figure (without its plane)",
-    )
+    heights_um = [row["height_rms_um"] for row in rows]
+    figures_um = [row["figure_rms_um"] for row in rows]
+    right.barh(places + 0.2, heights_um, 0.4, label="height")
+    right.barh(places - 0.2, figures_um, 0.4, label="figure (without its plane)")
     right.set_yticks(places, [row["name"] for row in rows], fontsize=8)
     right.set(xscale="log", xlabel="µm RMS", title="budget: contribution of each input, 1 sigma")
     right.legend(loc="lower right")
@@ -160,9 +169,10 @@ def _draw_uncertainty(bars: ErrorBars) -> Figure:
     return figure
 
 
-def _map_axes(
+def _draw_map(
     title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False
 ) -> Figure:
+    """Draw one map, as `show_map`."""
     figure, axes = new_sheet(6.4, 5.4)
     show_map(axes, title, axis, values, colours, even)
     return figure
@@ -173,24 +183,32 @@ def show_map(
 ) -> None:
     """Draw a map with its colour scale, its peak to valley, and its RMS about its mean.
 
-    `even` centres the scale on 0; a dent far beyond what the rest of the map needs makes it
-    logarithmic out there.
+    Parameters
+    ----------
+    axes : matplotlib axes
+        Where to draw.
+    title : str
+        Title, with the unit of the values.
+    axis : (n,) array
+        Coordinates along both sides, mm.
+    values : (n, n) array
+        The map; NaN where nothing is known.
+    colours : str
+        Name of the colour map.
+    even : bool
+        Centre the scale on 0; values far beyond those of the rest of the map make it logarithmic
+        beyond these.
     """
-    every = max(
-        1, values.shape[0] // _MAP_CELLS
-    )  # no panel has more pixels, and each cell costs time
-    low, high = np.nanpercentile(values[::every, ::every], [0.5, 99.5])
+    every = max(1, values.shape[0] // _MAP_CELLS)
+    low, high = np.nanpercentile(values[::every, ::every], _TYPICAL_PERCENTILES)
     scale: dict[str, Any] = {"vmin": low, "vmax": high}
     if even:
-        high = max(abs(low), abs(high), 1e-12)
+        high = max(abs(low), abs(high), _LEAST_SCALE)
         most = max(high, float(np.nanmax(np.abs(_local_mean(values)))))
-        steep = most > _STEEP * high
-        scale = (
-            {"norm": SymLogNorm(high, vmin=-most, vmax=most)}
-            if steep
-            else {"vmin": -most, "vmax": most}
-        )
-        title += f", linear to +-{high:.2g}" if steep else ""
+        scale = {"vmin": -most, "vmax": most}
+        if most > _STEEP * high:
+            scale = {"norm": SymLogNorm(high, vmin=-most, vmax=most)}
+            title += f", linear to +-{high:.2g}"
     extent = (axis[0], axis[-1], axis[0], axis[-1])
     shown = axes.imshow(
         values[::every, ::every],
@@ -218,18 +236,18 @@ def _draw_slopes(full: FullResult, seen: SurfaceMap) -> Figure:
     """Draw the measured slopes and the residuals of the fit."""
     figure, axes = new_sheet(11, 9, 2, 2)
     grid = full.grid
-    for place, slope, name in (
-        (axes[0, 0], seen.slope_x, "dh/dx"),
-        (axes[0, 1], seen.slope_y, "dh/dy"),
-    ):
-        milli = np.where(grid.count > 0, 1e3 * slope, np.nan)
-        show_map(place, f"{name} measured (mrad)", grid.axis_mm, milli, DIVERGING_MAP, even=True)
-    for place, slope, name in (
-        (axes[1, 0], grid.slope_x, "dh/dx"),
-        (axes[1, 1], grid.slope_y, "dh/dy"),
-    ):
-        left = np.where(grid.count > 0, 1e6 * slope, np.nan)
-        show_map(place, f"{name} less the fit (µrad)", grid.axis_mm, left, DIVERGING_MAP, even=True)
+    is_seen = grid.count > 0
+    columns = (
+        ("dh/dx", seen.slope_x, grid.slope_x),
+        ("dh/dy", seen.slope_y, grid.slope_y),
+    )
+    for column, (name, measured, residual) in enumerate(columns):
+        measured_mrad = np.where(is_seen, 1e3 * measured, np.nan)
+        title = f"{name} measured (mrad)"
+        show_map(axes[0, column], title, grid.axis_mm, measured_mrad, DIVERGING_MAP, even=True)
+        residual_urad = np.where(is_seen, 1e6 * residual, np.nan)
+        title = f"{name} less the fit (µrad)"
+        show_map(axes[1, column], title, grid.axis_mm, residual_urad, DIVERGING_MAP, even=True)
     return figure
 
 
@@ -271,12 +289,14 @@ def _draw_frames(measurement: Measurement) -> Figure:
     axes.invert_yaxis()
     axes.set(xticks=[], xlim=(0, 1))
     axes.set_title(
-        escape_controls(f"{measurement.verdict} {measurement.reason}")[:110], parse_math=False
+        escape_controls(f"{measurement.verdict} {measurement.reason}")[:_LONGEST_TITLE],
+        parse_math=False,
     )
     return figure
 
 
 def _draw_profile(profile: radial_profile.RadialProfile) -> Figure:
+    """Draw the mean height over azimuth, and its difference from Hencky's film."""
     figure, (upper, lower) = new_sheet(7, 6, 2, 1)
     upper.fill_between(
         profile.radius_mm, profile.low_mm, profile.high_mm, alpha=0.4, label="95 % of the ring"
@@ -290,17 +310,17 @@ def _draw_profile(profile: radial_profile.RadialProfile) -> Figure:
         title=f"radial profile; pressure equivalent {profile.pressure_pa:.0f} Pa",
     )
     upper.legend(loc="best")
-    low, mean, high = (
-        1e3 * (row - profile.hencky_mm)
-        for row in (profile.low_mm, profile.mean_mm, profile.high_mm)
-    )
-    lower.fill_between(profile.radius_mm, low, high, alpha=0.4)
-    lower.plot(profile.radius_mm, mean)
+    low_um = 1e3 * (profile.low_mm - profile.hencky_mm)
+    mean_um = 1e3 * (profile.mean_mm - profile.hencky_mm)
+    high_um = 1e3 * (profile.high_mm - profile.hencky_mm)
+    lower.fill_between(profile.radius_mm, low_um, high_um, alpha=0.4)
+    lower.plot(profile.radius_mm, mean_um)
     lower.set(xlabel="radius (mm)", ylabel="less Hencky (µm)")
     return figure
 
 
 def _draw_convergence(full: FullResult) -> Figure:
+    """Draw the largest change of height of each iteration."""
     figure, axes = new_sheet(6, 4)
     changes = full.fit.changes_mm
     axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), "o-")
