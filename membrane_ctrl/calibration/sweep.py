@@ -1,5 +1,6 @@
-"""A running hold controlled by a calibration: observe, move, settle, take a set. The supervisor
-stays in charge.
+"""A running hold controlled by a calibration: observe, move, settle, take a set.
+
+The hold's own supervisor still judges every command, and its safety rules stay in effect.
 """
 
 import math
@@ -8,22 +9,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from membrane_ctrl.calibration.setpoints import (
-    SETTLE_S,
-    HeldMirror,
-)
+from membrane_ctrl.calibration.setpoints import SETTLE_S, HeldMirror
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.model import acquisition_events, errors, events, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
 
 WHY = "calibration of the optics"
-_LOOK_S = 10.0  # averaging time for pressure and leak, which are noisy
+_OBSERVE_S = 10.0  # averaging time for pressure and leak, which are noisy
 _SHAPE_WITHIN_S = 90.0  # a rejected cycle pauses up to a minute
 _SET_WITHIN_S = 180.0  # likewise, and a slow machine reconstructs for seconds
 _ARRIVED_UM = 0.5  # the ramp's end is exponential
 _MEAN_S = 5.0  # the mirror must be inside the band for this long
-_LATE = 2.0, 300.0  # factor on the planned time, and seconds more: then something else is wrong
+# A motion that takes longer than this factor of its planned time, and these seconds more, has
+# another fault than a slow pump.
+_PATIENCE_FACTOR = 2.0
+_PATIENCE_MORE_S = 300.0
 
 
 class CaptureLink(HoldLink, Protocol):
@@ -44,22 +45,30 @@ class Sweep:
     def __init__(
         self, link: CaptureLink, limits: LimitsConfig, progress: Callable[[float], None]
     ) -> None:
-        self._link, self._limits, self._progress = link, limits, progress
-        self._last_s = math.nan
-        self._why = ""
+        self._link = link
+        self._limits = limits
+        self._progress = progress
+        self._last_s = math.nan  # time of the newest tick that was read
+        self._why = ""  # of the newest change of state, in brackets
 
     def observe_hold(self) -> HeldMirror:
-        """Observe the held mirror for some seconds and a shape. Raises HoldError, or DeviceError
-        without a camera.
+        """Observe the held mirror for some seconds, until a figure has come too.
+
+        Raises
+        ------
+        HoldError
+            If the mirror is no longer held.
+        DeviceError
+            If no usable figure comes, for example without a camera.
         """
         rows: deque[telemetry.TelemetryRow] = deque()
         shape = None
-        while shape is None or rows[-1].mono_s - rows[0].mono_s < _LOOK_S:
+        while shape is None or rows[-1].mono_s - rows[0].mono_s < _OBSERVE_S:
             news = self._read_news()
             rows.extend(news.rows)
-            shape = next(
-                (each for each in reversed(news.shapes) if each.verdict != "rejected"), shape
-            )
+            for each in news.shapes:
+                if each.verdict != "rejected":
+                    shape = each
             if shape is None and rows and rows[-1].mono_s - rows[0].mono_s > _SHAPE_WITHIN_S:
                 raise errors.DeviceError(
                     f"{self._link.name}: no shape within {_SHAPE_WITHIN_S:.0f} s; "
@@ -82,31 +91,42 @@ class Sweep:
         self._send_command("setpoint", setpoint_um)
 
     def go_to_setpoint(self, setpoint_um: float, expected_s: float) -> None:
-        """Ramp to a setpoint and settle.
+        """Ramp to a setpoint and settle there.
 
-        Raises HoldError if the mirror is no longer held or someone else moves it; DeviceError if it
-        does not arrive.
+        Parameters
+        ----------
+        setpoint_um : float
+            Reading of the laser to go to.
+        expected_s : float
+            Planned duration of ramp and settling.
+
+        Raises
+        ------
+        HoldError
+            If the mirror is no longer held, or someone else moves the setpoint.
+        DeviceError
+            If the mirror does not settle in time.
         """
         self._send_command("setpoint", setpoint_um)
-        patience_s = _LATE[0] * expected_s + _LATE[1]
-        there: deque[telemetry.TelemetryRow] = deque()
-        begin_s, obeyed = math.nan, False
+        patience_s = _PATIENCE_FACTOR * expected_s + _PATIENCE_MORE_S
+        # Ticks since the ramp ended.
+        arrived: deque[telemetry.TelemetryRow] = deque()
+        begin_s = math.nan
+        is_commanded = False  # whether a tick has shown the new target
         while True:
             for row in self._read_news().rows:
-                obeyed = obeyed or row.target_um == setpoint_um
-                if obeyed and row.target_um != setpoint_um:
+                if row.target_um == setpoint_um:
+                    is_commanded = True
+                elif is_commanded:
                     raise HoldError(f"someone else moved the setpoint to {row.target_um:g} µm")
-                begin_s = row.mono_s if math.isnan(begin_s) else begin_s
-                ramping = abs(row.setpoint_um - row.trim_um - setpoint_um) > _ARRIVED_UM
-                if not obeyed or ramping:
-                    there.clear()
-                    continue
-                there.append(row)
-            if (
-                there
-                and there[-1].mono_s - there[0].mono_s >= SETTLE_S
-                and self._are_within_band(there)
-            ):
+                if math.isnan(begin_s):
+                    begin_s = row.mono_s
+                is_ramping = abs(row.setpoint_um - row.trim_um - setpoint_um) > _ARRIVED_UM
+                if is_commanded and not is_ramping:
+                    arrived.append(row)
+                else:
+                    arrived.clear()
+            if self._are_settled(arrived):
                 return
             if self._last_s - begin_s > patience_s:
                 raise errors.DeviceError(
@@ -117,8 +137,12 @@ class Sweep:
     def take_set(self) -> acquisition_events.Capture:
         """Request a set; repeat a bad one once.
 
-        Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both
-        are bad.
+        Raises
+        ------
+        HoldError
+            If the hold refuses, or the mirror is no longer held.
+        RejectedError
+            If both sets are bad.
         """
         first = self._request_capture()
         event = first if first.set else self._request_capture()
@@ -133,21 +157,25 @@ class Sweep:
         self._send_command("shape_on" if on else "shape_off")
 
     def _request_capture(self) -> acquisition_events.Capture:
+        """Request a set and wait for the event that reports it, or for the time-out."""
         self._send_command("capture")
         begin_s = self._last_s
         while self._last_s - begin_s < _SET_WITHIN_S:
-            told = [
+            captures = [
                 event
                 for event in self._read_news().events
                 if isinstance(event, acquisition_events.Capture)
             ]
-            if told:
-                return told[-1]
+            if captures:
+                return captures[-1]
         return acquisition_events.Capture(failed=f"no set within {_SET_WITHIN_S:.0f} s")
 
-    def _are_within_band(self, rows: deque[telemetry.TelemetryRow]) -> bool:
-        last = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]
-        return abs(_mean_of_finite(last)) < self._limits.band_um
+    def _are_settled(self, rows: deque[telemetry.TelemetryRow]) -> bool:
+        """Whether these ticks last long enough, and their newest errors average within the band."""
+        if not rows or rows[-1].mono_s - rows[0].mono_s < SETTLE_S:
+            return False
+        newest = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]
+        return abs(_mean_of_finite(newest)) < self._limits.band_um
 
     def _send_command(self, kind: Kind, value: float = math.nan) -> None:
         self._link.send_command(Command(kind, "calibration", WHY, value=value))
@@ -173,5 +201,6 @@ class Sweep:
 
 
 def _mean_of_finite(values: list[float]) -> float:
+    """Mean of the finite values; nan if there are none."""
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else math.nan
