@@ -1,4 +1,8 @@
-"""`calibrate --live`: plan, ask, take the sets, return, solve, show, ask, adopt."""
+"""`calibrate --live`: takes sets at several setpoints of a running hold, solves and adopts them.
+
+The plan is confirmed by a person before the mirror moves, and so is the new geometry before it
+replaces the old one.
+"""
 
 import contextlib
 import sys
@@ -51,7 +55,16 @@ class LiveOptions:
 def calibrate_live(options: LiveOptions) -> int:
     """Take a session's missing sets, solve, and adopt the result if a person agrees.
 
-    Returns the exit code."""
+    Returns
+    -------
+    int
+        The exit code of the command.
+
+    Raises
+    ------
+    InputError
+        If the options do not fit one another, or nobody agrees to move the mirror.
+    """
     parse_freed(options.solving.free)  # check these before the mirror moves
     for path in options.solving.priors:
         read_prior(path)
@@ -76,8 +89,19 @@ def take_sets(
 ) -> CalibrationSession:
     """Take the missing sets, if a person agrees, and move the mirror back.
 
-    Raises InputError, DeviceError, RejectedError or KeyboardInterrupt; the session's folder keeps
-    the sets so far.
+    The session's folder keeps the sets that were taken before an error.
+
+    Parameters
+    ----------
+    link : CaptureLink
+        The running hold.
+    session : CalibrationSession or None
+        The session to continue; None begins a new one.
+    options : LiveOptions
+
+    Raises
+    ------
+    InputError, DeviceError, RejectedError, KeyboardInterrupt
     """
     progress = Progress()
     sweep = Sweep(link, link.config.limits, progress)
@@ -86,11 +110,14 @@ def take_sets(
         procedure = Procedure(link, sweep, held, progress)
         if session is not None:
             head, missing = session.head, session.missing_indices
-            _same_bench(link, session)
+            _check_same_bench(link, session)
         else:
-            reach, sets = setpoint_reach(held, link.config), options.sets or USUAL_SETS
-            wanted = plan_setpoints_um(held, reach, options.range_um, sets)
-            head = CalibrationHead(link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
+            sets = options.sets or USUAL_SETS
+            reach = setpoint_reach(held, link.config)
+            setpoints_um = plan_setpoints_um(held, reach, options.range_um, sets)
+            head = CalibrationHead(
+                link.name, now_utc(), held.setpoint_um, held.shape_on, setpoints_um
+            )
             missing = tuple(range(sets))
         procedure.check_setpoints(head)
         minutes = sum(procedure.times_s(head, missing)) / 60
@@ -109,24 +136,24 @@ def take_sets(
 
 
 def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
-    """Solve a session's sets, show old and new geometry,
-    and adopt the new one if a person agrees.
+    """Solve a session's sets, and adopt the new geometry if a person agrees.
+
+    Old and new geometry are printed before. Returns the exit code of the command.
     """
-    start_um = session.head.start_um
-    code = calibrate_command(
-        replace(
-            options.solving,
-            folders=session.set_folders,
-            out=session.geometry_path,
-            reference_um=start_um,
-        )
+    solving = replace(
+        options.solving,
+        folders=session.set_folders,
+        out=session.geometry_path,
+        reference_um=session.head.start_um,
     )
+    code = calibrate_command(solving)
     if code != Exit.DONE:
         return code
-    optics, place = read_head(session.set_folders[0]).optics, session.config.optics.geometry_file
-    for line in compare_geometries(
-        optics, _set_origin(session, place), read_geometry(session.geometry_path)
-    ):
+
+    place = session.config.optics.geometry_file
+    old = read_head(session.set_folders[0]).optics
+    new = read_geometry(session.geometry_path)
+    for line in compare_geometries(old, _set_origin(session, place), new):
         _print_progress(line)
     if place is None:
         _print_progress(
@@ -145,30 +172,33 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     return code
 
 
-def _same_bench(link: CaptureLink, session: CalibrationSession) -> None:
-    """Raises InputError if the hold's geometry differs from that of the sets so far."""
+def _check_same_bench(link: CaptureLink, session: CalibrationSession) -> None:
+    """Raise InputError if the hold's geometry differs from that of the sets so far."""
     now = read_run_geometry(link.run_dir, link.config).optics
     for folder in session.set_folders:
         if not folder.exists():
             continue
         then = read_head(folder).optics
-        if _written_out(then) != _written_out(now):
+        if _geometry_and_camera(then) != _geometry_and_camera(now):
             raise InputError(
                 f"{folder}: camera or geometry differs from that of {link.name}; start a new "
                 "session"
             )
 
 
-def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
-    """Spell out defaults that one file may omit; the reference is not compared, the principal point
-    is.
+def _geometry_and_camera(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
+    """The parts of a bench that two sets must share.
+
+    The principal point is written out, since one file may omit it; the reference may differ.
     """
     camera = optics.camera.model_copy(update={"principal_px": optics.camera.principal})
     return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
 
 def _format_plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float) -> str:
-    low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
+    """Number of sets, range and duration, as a sentence."""
+    low_um = min(head.setpoints_um)
+    high_um = max(head.setpoints_um)
     return (
         f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} µm "
         f"(sag {held.sag_at_mm(low_um):.1f} to {held.sag_at_mm(high_um):.1f} mm; now "
@@ -188,16 +218,16 @@ def _format_forecast(
         f"a figure after these sets: sag +- {here.sag_um:.1f} µm, figure +- "
         f"{here.figure_rms_um:.1f} µm RMS"
     )
-    low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
+    low_um = min(head.setpoints_um)
+    high_um = max(head.setpoints_um)
     if high_um - low_um >= _NEARLY_ALL * verdict.GOOD_SPREAD_UM:
         return line
-    ends = (
-        (low_um + high_um - verdict.GOOD_SPREAD_UM) / 2,
-        (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2,
-    )
-    best = _forecast_figure(
-        link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options
-    )
+
+    # As many sets over the good range, with the same middle.
+    wide_low_um = (low_um + high_um - verdict.GOOD_SPREAD_UM) / 2
+    wide_high_um = (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2
+    wide_um = np.linspace(wide_low_um, wide_high_um, len(head.setpoints_um)).tolist()
+    best = _forecast_figure(link, held, wide_um, options)
     reach = setpoint_reach(held, link.config)
     return (
         f"{line}; {verdict.GOOD_SPREAD_UM:.0f} µm of range would give {best.sag_um:.1f} and "
@@ -207,14 +237,18 @@ def _format_forecast(
 
 
 def _forecast_figure(
-    link: CaptureLink, held: HeldMirror, setpoints: Sequence[float], options: LiveOptions
+    link: CaptureLink, held: HeldMirror, setpoints_um: Sequence[float], options: LiveOptions
 ) -> figure_uncertainty.Propagated:
+    """Uncertainty of a figure that is measured with the geometry from sets at these setpoints.
+
+    Raises InputError if the stated bench does not show the mirror.
+    """
     optics = read_run_geometry(link.run_dir, link.config).optics
     solving = options.solving
     if solving.geometry is not None:
         optics = read_geometry(solving.geometry).apply_to_optics(optics)
     known = bench_parameters.prior_sigmas(known_sigmas(optics, parse_freed(solving.free)))
-    sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints)]
+    sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints_um)]
     try:
         return foresight.forecast_figure(
             optics, known, sags_mm, held.swing_adu, solving.laser_sigma_um
@@ -224,7 +258,7 @@ def _forecast_figure(
 
 
 def _set_origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
-    """Origin of the sets' geometry: the file if it is unchanged, else the numbers' hash."""
+    """Origin of the sets' geometry: the file at `place` if unchanged, else the numbers' hash."""
     optics = read_head(session.set_folders[0]).optics
     if place is not None and place.exists():
         with contextlib.suppress(InputError):  # a damaged file does no harm here
@@ -235,7 +269,7 @@ def _set_origin(session: CalibrationSession, place: Path | None) -> GeometryOrig
 
 
 def _require_agreement(question: str, yes: bool) -> None:
-    """Raises InputError unless a person agrees."""
+    """Raise InputError unless a person agrees, or `yes` was given on the command line."""
     if not yes and not sys.stdin.isatty():
         raise InputError(f"{question} Not a terminal: confirm with --yes")
     if not _ask_person(question, yes):
@@ -243,6 +277,7 @@ def _require_agreement(question: str, yes: bool) -> None:
 
 
 def _ask_person(question: str, yes: bool) -> bool:
+    """Whether `yes` was given, or a person at a terminal answers yes."""
     if yes:
         return True
     if not sys.stdin.isatty():

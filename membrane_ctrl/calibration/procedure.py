@@ -1,6 +1,7 @@
 """The procedure of a live calibration: moves the mirror and takes a set at each setpoint."""
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -38,16 +39,22 @@ class Procedure:
     progress: Progress
 
     def times_s(self, head: CalibrationHead, missing: tuple[int, ...]) -> list[float]:
-        """Duration of each step: the missing sets, and the return."""
+        """Duration of each step in s: the missing sets, and the return."""
         stops = [self.held.setpoint_um, *(head.setpoints_um[k] for k in missing), head.start_um]
         return [move_and_set_s(self.held, a, b, self.link.config) for a, b in pairwise(stops)]
 
     def check_setpoints(self, head: CalibrationHead) -> None:
-        """Raises InputError if the setpoints are out of reach, or the mirror cannot be moved both
-        ways.
+        """Check that the mirror can be moved to all setpoints and back.
+
+        Raises
+        ------
+        InputError
+            If setpoints are out of reach, or the mirror cannot be moved both ways.
         """
-        held, config = self.held, self.link.config
-        low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
+        held = self.held
+        config = self.link.config
+        low_um = min(head.setpoints_um)
+        high_um = max(head.setpoints_um)
         reach = setpoint_reach(held, config)
         if low_um < reach.low_um or high_um > reach.high_um:
             raise errors.InputError(
@@ -55,9 +62,9 @@ class Procedure:
                 f"to {reach.high_um:.0f}, "
                 f"which {reach.low_why} and {reach.high_why} allow"
             )
-        if ramp_s(held, low_um, high_um, config) + ramp_s(held, high_um, low_um, config) == float(
-            "inf"
-        ):
+        up_s = ramp_s(held, low_um, high_um, config)
+        down_s = ramp_s(held, high_um, low_um, config)
+        if math.isinf(up_s + down_s):
             raise errors.InputError(
                 f"the mirror loses {held.leak_um_per_s:.2f} µm/s: it cannot be moved both ways; "
                 "open the bleed (loop.bleed_fraction), or give the pump more reserve"
@@ -66,10 +73,14 @@ class Procedure:
     def take_sets(self, session: CalibrationSession) -> None:
         """Take the missing sets and move the mirror back.
 
-        Raises HoldError if the mirror is no longer held or someone else moves it (it is then left
-        alone); DeviceError, RejectedError or KeyboardInterrupt after the mirror has moved back.
+        Raises
+        ------
+        HoldError
+            If the mirror is no longer held or someone else moves it: it is then left alone.
+        DeviceError, RejectedError, KeyboardInterrupt
+            After the mirror has moved back.
         """
-        with self.progress.catch_signals(), self._coming_back(session):
+        with self.progress.catch_signals(), self._returning(session):
             self.sweep.shape_loop(False)
             times_s = self.times_s(session.head, session.missing_indices)
             for number, index in enumerate(session.missing_indices):
@@ -78,41 +89,46 @@ class Procedure:
     def _take_set(
         self, session: CalibrationSession, index: int, expected_s: float, after_s: float
     ) -> None:
+        """Move to the setpoint of the set with this index, take the set and keep it.
+
+        `expected_s` is the duration of this step, `after_s` that of all later ones.
+        """
         setpoint_um = session.head.setpoints_um[index]
-        what = f"set {index + 1} of {len(session.set_folders)} at {setpoint_um:+g} µm"
-        self.progress.begin_step(what, expected_s, after_s)
+        step = f"set {index + 1} of {len(session.set_folders)} at {setpoint_um:+g} µm"
+        self.progress.begin_step(step, expected_s, after_s)
         self.sweep.go_to_setpoint(setpoint_um, expected_s)
         event = self.sweep.take_set()
         session.keep_set(index, self.link.run_dir / str(event.set))
-        self.progress.print_line(
-            f"{what}: {event.verdict}" + (f" ({event.reason})" if event.reason else "")
-        )
+        reason = f" ({event.reason})" if event.reason else ""
+        self.progress.print_line(f"{step}: {event.verdict}{reason}")
 
     @contextlib.contextmanager
-    def _coming_back(self, session: CalibrationSession) -> Iterator[None]:
-        say = self.progress.print_line
+    def _returning(self, session: CalibrationSession) -> Iterator[None]:
+        """Move the mirror back at the end, also after an error or Ctrl-C, unless the hold ended."""
         try:
             yield
         except HoldError:
             off = "; the shape loop is off (ctl shape on)" if session.head.shape_on else ""
-            say(
-                f"the mirror is left to whoever has command{off}; continue with --session "
+            self.progress.print_line(
+                f"the mirror is left to the client in command{off}; continue with --session "
                 f"{session.path}"
             )
             raise
         except BaseException:
             self.progress.interrupted = False
             missing_count = len(session.missing_indices)
-            say(
+            self.progress.print_line(
                 f"stopped with {missing_count} sets missing; continue with --session {session.path}"
             )
             with contextlib.suppress(HoldError, errors.DeviceError):
-                self._come_back(session)
+                self._return_to_start(session)
             raise
-        self._come_back(session)
+        self._return_to_start(session)
 
-    def _come_back(self, session: CalibrationSession) -> None:
+    def _return_to_start(self, session: CalibrationSession) -> None:
+        """Move the mirror to where it was held, and restore the shape loop."""
         head = session.head
+        # The mirror may be at any of the setpoints: the farthest gives the longest way.
         far_um = max(head.setpoints_um, key=lambda each: abs(each - head.start_um))
         back_s = move_and_set_s(self.held, far_um, head.start_um, self.link.config)
         self.progress.begin_step(

@@ -11,12 +11,13 @@ from membrane_ctrl.control.setpoint_ramp import RAMP_SHARE
 from membrane_ctrl.metrology.calibration.verdict import GOOD_SPREAD_UM, LEAST_SPREAD_UM
 from membrane_ctrl.model import errors
 
-# Of the limiting pressure: it gives the sag of a Hencky bowl to a per cent, and a sag gives the
-# pressure to three; a pretensioned film needs less extra pressure than this for more depth
+# Share of the limiting pressure that is used: a pressure gives the sag of a Hencky bowl to 1 %, and
+# a sag the pressure to 3 %. A pretensioned film needs less extra pressure than this for more depth.
 _PRESSURE_SHARE = 0.95
-# at a setpoint: the gas is back at the air's temperature (12 s), and the ramp has no more effect
+# Stay at a setpoint: the gas is back at the air's temperature (12 s), and the ramp has no more
+# effect.
 SETTLE_S = 15.0
-# The current cycle ends first, then 18 frames, their reconstruction and writing
+# The current cycle ends first, then come 18 frames, their reconstruction and writing.
 _SET_S = 15.0
 _PIECES = 8  # to integrate a move's duration: the leak grows with the cube of the depth
 
@@ -70,18 +71,24 @@ class Reach:
 
 
 def setpoint_reach(held: HeldMirror, config: schema.Config) -> Reach:
-    """The safety table's limits less a margin: a lagging mirror must
-    not trip them during a move.
+    """Where the mirror may be moved: the safety table's limits less a margin.
+
+    The margin is the largest following error, so that a mirror that lags behind its setpoint trips
+    no limit during a move. The pressure of a Hencky bowl grows with the cube of its sag.
     """
-    limits, margin_um = config.limits, config.limits.following_error_max_um
-    high_um, why = limits.displacement_max_um - margin_um, "limits.displacement_max_um"
-    if held.pressure_pa > 0:
-        share = _PRESSURE_SHARE * limits.gauge_pressure_max_pa / held.pressure_pa
-        by_pressure_um = held.setpoint_um + 1e3 * held.sag_mm * (share ** (1 / 3) - 1)
-        if by_pressure_um < high_um:
-            high_um, why = by_pressure_um, "limits.gauge_pressure_max_pa"
+    limits = config.limits
+    margin_um = limits.following_error_max_um
     low_um = limits.displacement_min_um + margin_um
-    return Reach(math.ceil(low_um), math.floor(high_um), "limits.displacement_min_um", why)
+    high_um = limits.displacement_max_um - margin_um
+    high_why = "limits.displacement_max_um"
+    if held.pressure_pa > 0:
+        pressure_factor = _PRESSURE_SHARE * limits.gauge_pressure_max_pa / held.pressure_pa
+        sag_factor = pressure_factor ** (1 / 3)
+        pressure_high_um = held.setpoint_um + 1e3 * held.sag_mm * (sag_factor - 1)
+        if pressure_high_um < high_um:
+            high_um = pressure_high_um
+            high_why = "limits.gauge_pressure_max_pa"
+    return Reach(math.ceil(low_um), math.floor(high_um), "limits.displacement_min_um", high_why)
 
 
 def plan_setpoints_um(
@@ -89,16 +96,21 @@ def plan_setpoints_um(
 ) -> tuple[float, ...]:
     """Setpoints of the sets, evenly spaced about where the mirror is held, nearer end first.
 
-    Raises errors.InputError if there is no room for what is asked, or for less than 1 mm.
-
     Parameters
     ----------
+    held : HeldMirror
+        The mirror before any move.
     reach : Reach
         The range is shifted to fit into it.
     range_um : float or None
         From the first to the last; None: 8 mm, or less if limited.
     sets : int
         Number of sets.
+
+    Raises
+    ------
+    InputError
+        If there is no room for the given range, or for 1 mm.
     """
     room_um = reach.high_um - reach.low_um
     allowed = f"{reach.low_why} and {reach.high_why} leave {max(room_um, 0.0):.0f} µm"
@@ -106,32 +118,44 @@ def plan_setpoints_um(
         raise errors.InputError(
             f"--range-um {range_um:g}: {allowed}; reduce it, or widen the limits if the film allows"
         )
-    wide_um = min(GOOD_SPREAD_UM, room_um) if range_um is None else range_um
+    if range_um is None:
+        wide_um = min(GOOD_SPREAD_UM, room_um)
+        cause = allowed
+    else:
+        wide_um = range_um
+        cause = f"--range-um {range_um:g}"
     if wide_um < LEAST_SPREAD_UM:
-        what = allowed if range_um is None else f"--range-um {range_um:g}"
         raise errors.InputError(
-            f"{what}: sets closer together than {LEAST_SPREAD_UM:.0f} µm add nothing to one set; "
+            f"{cause}: sets closer together than {LEAST_SPREAD_UM:.0f} µm add nothing to one set; "
             f"{GOOD_SPREAD_UM:.0f} µm is good"
         )
+    # The range is centred on the mirror, then shifted into the reach.
     low_um = min(max(held.setpoint_um - wide_um / 2, reach.low_um), reach.high_um - wide_um)
     ascending = [float(each) for each in np.round(np.linspace(low_um, low_um + wide_um, sets), 1)]
-    return tuple(sorted(ascending, reverse=held.setpoint_um - low_um > wide_um / 2))
+    is_upper_end_nearer = held.setpoint_um - low_um > wide_um / 2
+    return tuple(sorted(ascending, reverse=is_upper_end_nearer))
 
 
 def ramp_s(held: HeldMirror, from_um: float, to_um: float, config: schema.Config) -> float:
-    """Duration of the setpoint's ramp; inf if the mirror does not sink,
-    or the pump has no reserve.
+    """Duration of the setpoint's ramp, in s.
+
+    It is inf if the mirror does not sink for want of a leak, or does not rise for want of pump.
     """
-    loop, most_um_per_s = config.loop, config.loop.flow_most_um_per_s(config.pump)
+    loop = config.loop
+    pump_um_per_s = loop.flow_most_um_per_s(config.pump)
     total_s = 0.0
     for a_um, b_um in pairwise(np.linspace(from_um, to_um, _PIECES + 1).tolist()):
         leak_um_per_s = held.leak_at_um_per_s((a_um + b_um) / 2)
-        free_um_per_s = most_um_per_s - leak_um_per_s if b_um > a_um else leak_um_per_s
+        free_um_per_s = leak_um_per_s  # the mirror sinks by its leak
+        if b_um > a_um:
+            free_um_per_s = pump_um_per_s - leak_um_per_s
         speed_um_per_s = min(loop.setpoint_ramp_um_per_s, RAMP_SHARE * free_um_per_s)
-        total_s += abs(b_um - a_um) / speed_um_per_s if speed_um_per_s > 0 else float("inf")
+        if not speed_um_per_s > 0:  # also nan
+            return math.inf
+        total_s += abs(b_um - a_um) / speed_um_per_s
     return total_s
 
 
 def move_and_set_s(held: HeldMirror, from_um: float, to_um: float, config: schema.Config) -> float:
-    """Duration of the move, of settling and of the set."""
+    """Duration of the move, of settling and of the set, in s."""
     return ramp_s(held, from_um, to_um, config) + SETTLE_S + _SET_S

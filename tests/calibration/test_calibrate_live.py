@@ -134,7 +134,7 @@ def test_a_fault_on_the_way_is_left_to_the_safety_table(
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 4
     said = capsys.readouterr().err
     assert "the mirror is not held, but in state fault (" in said
-    assert "the mirror is left to whoever has command; the shape loop is off" in said
+    assert "the mirror is left to the client in command; the shape loop is off" in said
     assert (
         bench.asked[-1].value == 500.0
     )  # on its way to the second set; no command after the fault
