@@ -44,10 +44,20 @@ class CameraOptions:
 
 
 def calibrate_camera(options: CameraOptions) -> int:
-    """Find the corners, fit the lens, write the prior and report the improvement. Raises
-    CommandError.
+    """Find the corners, fit the lens, write the prior and report the improvement.
+
+    Returns
+    -------
+    int
+        The exit code of the command.
+
+    Raises
+    ------
+    CommandError
+        If a photograph is not usable, or the photographs do not determine the lens.
     """
-    board, camera = _parse_board(options.board), options.config.optics.camera
+    board = _parse_board(options.board)
+    camera = options.config.optics.camera
     paths = _list_photographs(options.folder)
     views = [_read_view(path, board, camera) for path in paths]
     _refuse_mirrored(paths, views, board, camera)
@@ -68,17 +78,17 @@ def calibrate_camera(options: CameraOptions) -> int:
         "camera": tables["camera"],
         "sigmas": lens.sigmas,
     }
-    print(
-        json.dumps(report)
-        if options.as_json
-        else "\n".join(_format_lens(camera, lens, options.out))
-    )
+    if options.as_json:
+        print(json.dumps(report))
+    else:
+        print("\n".join(_format_lens(camera, lens, options.out)))
     return int(errors.Exit.DONE)
 
 
 def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height_px: int) -> int:
-    """Write the board as a picture for a screen of the given size in pixels. Raises
-    errors.InputError.
+    """Write the board as a picture for a screen of the given size in pixels.
+
+    Raises InputError if it does not fit, or cannot be written.
     """
     try:
         levels = on_screen(_parse_board(board_text), square_px, width_px, height_px)
@@ -101,6 +111,7 @@ def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height
 
 
 def _parse_board(text: str) -> Board:
+    """The board of option `--board`. Raises InputError."""
     try:
         return Board.parse(text)
     except ValueError as error:
@@ -108,6 +119,7 @@ def _parse_board(text: str) -> Board:
 
 
 def _list_photographs(folder: Path) -> list[Path]:
+    """The images of a folder by name. Raises InputError if there are none."""
     if not folder.is_dir():
         raise errors.InputError(f"{folder}: no such folder of photographs")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in _IMAGES)
@@ -125,15 +137,21 @@ def _explain_unseen_board(
     ]
     if 2 * len(unseen) <= len(views):
         return ""
-    spread = unseen[:: max(1, len(unseen) // _TRIED_BOARDS)][:_TRIED_BOARDS]
-    other = find_other_board(board, [_read_photograph(path, camera) for path in spread])
+
+    # Try photographs that are spread over the folder.
+    every = max(1, len(unseen) // _TRIED_BOARDS)
+    tried = unseen[::every][:_TRIED_BOARDS]
+    other = find_other_board(board, [_read_photograph(path, camera) for path in tried])
     if other is None:
-        whole = "; a chessboard must be whole in the picture" if board.kind == "chessboard" else ""
-        return f" (no board of another size is found either; cause unknown: {_UNSEEN}{whole})"
+        causes = _UNSEEN
+        if board.kind == "chessboard":
+            causes += "; a chessboard must be whole in the picture"
+        return f" (no board of another size is found either; cause unknown: {causes})"
     return f" (they show a board of {other}, squares, not corners: give --board {other})"
 
 
 def _read_view(path: Path, board: Board, camera: CameraConfig) -> BoardView:
+    """The board's corners in one photograph. Raises InputError."""
     place, seen_px = board.corners(_read_photograph(path, camera))
     return BoardView(path.name, place, seen_px)
 
@@ -145,7 +163,8 @@ def _refuse_mirrored(
     mirrored = []
     for path, view in zip(paths, views, strict=True):
         if board.kind == "charuco" and len(view.place) < LEAST_CORNERS:
-            place, _ = board.corners(np.ascontiguousarray(_read_photograph(path, camera)[:, ::-1]))
+            flipped = np.ascontiguousarray(_read_photograph(path, camera)[:, ::-1])
+            place, _ = board.corners(flipped)
             if len(place) >= LEAST_CORNERS:
                 mirrored.append(path.name)
     if mirrored:
@@ -156,25 +175,29 @@ def _refuse_mirrored(
 
 
 def _read_photograph(path: Path, camera: CameraConfig) -> NDArray[np.uint8]:
+    """A photograph (rows, columns) in gray, with 8 bits. Raises InputError."""
     try:
-        image = decoded_image(
-            files.read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-        )
-    except (OSError, ValueError) as error:
-        reason = (error.strerror if isinstance(error, OSError) else None) or error
-        raise errors.InputError(f"{path}: {reason}") from None
-    if image.shape != (camera.height_px, camera.width_px):
+        data = files.read_bytes(path, IMAGE_BYTES_MAX)
+        image = decoded_image(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    except OSError as error:
+        raise errors.InputError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise errors.InputError(f"{path}: {error}") from None
+    rows, columns = image.shape
+    if (rows, columns) != (camera.height_px, camera.width_px):
         raise errors.InputError(
-            f"{path}: {image.shape[1]} x {image.shape[0]} pixels, but the configuration's "
-            "optics.camera has "
+            f"{path}: {columns} x {rows} pixels, but the configuration's optics.camera has "
             f"{camera.width_px} x {camera.height_px}"
         )
-    if image.dtype != np.uint8:  # the detectors take 8 bits only, which suffice for corners
-        image = (np.asarray(image, float) * (255.0 / max(1, int(image.max())))).astype(np.uint8)
+    if image.dtype != np.uint8:
+        # The detectors take 8 bits only, which suffice for corners.
+        scale = 255.0 / max(1, int(image.max()))
+        image = (np.asarray(image, float) * scale).astype(np.uint8)
     return np.asarray(image, np.uint8)
 
 
 def _camera_table(camera: CameraConfig, lens: Lens) -> dict[str, Any]:
+    """Table `optics.camera` of the prior's file."""
     return {
         "width_px": camera.width_px,
         "height_px": camera.height_px,
@@ -186,14 +209,18 @@ def _camera_table(camera: CameraConfig, lens: Lens) -> dict[str, Any]:
 
 
 def _format_lens(camera: CameraConfig, lens: Lens, out: Path) -> list[str]:
-    found = _camera_table(camera, lens)
-    stated = (camera.focal_mm, *camera.principal, *(*camera.distortion, 0.0, 0.0, 0.0, 0.0)[:4])
-    values = (found["focal_mm"], *lens.principal_px, *lens.distortion)
-    scales = (found["focal_mm"], *[1.0] * 6)
+    """The table of the lens, and how well it fits, for a terminal."""
+    focal_mm = _camera_table(camera, lens)["focal_mm"]
+    # In the order of the sigmas: focal length, principal point, four terms of distortion.
+    stated_distortion = (*camera.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
+    stated = (camera.focal_mm, *camera.principal, *stated_distortion)
+    values = (focal_mm, *lens.principal_px, *lens.distortion)
+    scales = (focal_mm, *[1.0] * 6)
     lines = ["what              stated       found        +-           known before"]
     for name, before, value, scale in zip(lens.sigmas, stated, values, scales, strict=True):
         label = "focal_mm" if name == "focal_relative" else name
-        sigma, usual = lens.sigmas[name] * scale, usual_sigma(name) * scale
+        sigma = lens.sigmas[name] * scale
+        usual = usual_sigma(name) * scale
         lines.append(f"{label:<16}{before:>10.5g}{value:>13.6g}  {sigma:<11.2g}  {usual:.2g}")
     lines.append(
         f"corner residuals {lens.rms_px:.3f} px RMS in {len(lens.used)} photographs; "

@@ -36,8 +36,17 @@ class PoseOptions:
 
 
 def calibrate_pose(options: PoseOptions) -> int:
-    """Measure the set, find the rim, fit the pose, write the prior and report.
-    Raises CommandError.
+    """Find the rim in a set, fit the camera's pose, write the prior and report.
+
+    Returns
+    -------
+    int
+        The exit code of the command.
+
+    Raises
+    ------
+    CommandError
+        If a file is not usable, the set has no figure, or the rim is not in the picture.
     """
     geometry = None if options.geometry is None else read_geometry(options.geometry)
     capture = capture_set.read_set(options.folder, geometry)
@@ -46,7 +55,8 @@ def calibrate_pose(options: PoseOptions) -> int:
         optics = read_prior(path).apply_to_optics(optics)
     capture = replace(capture, head=replace(capture.head, optics=optics))
     stated = Geometry.from_config(optics)
-    light, (rim_z, rim_mean_mm) = _white_minus_black(capture), _rim_height(capture)
+    light = _white_minus_black(capture)
+    rim_z, rim_mean_mm = _rim_height(capture)
     radius_mm = optics.mirror.radius_mm
     outline = find_outline(light, stated, radius_mm, rim_mean_mm)
     if outline is None:
@@ -78,7 +88,10 @@ def calibrate_pose(options: PoseOptions) -> int:
 
 
 def _white_minus_black(capture: capture_set.CaptureSet) -> FloatArray:
-    """White minus black. Raises errors.InputError for a set without them."""
+    """White minus black frame (rows, columns).
+
+    Raises InputError for a set without them, RejectedError if one is not usable.
+    """
     names = [pattern.name for pattern in capture.head.patterns]
     if "white" not in names:
         raise errors.InputError(
@@ -86,49 +99,46 @@ def _white_minus_black(capture: capture_set.CaptureSet) -> FloatArray:
             "white frame"
         )
     for name in ("white", "black"):
-        if (k := names.index(name)) in capture.unusable:
+        k = names.index(name)
+        if k in capture.unusable:
             raise errors.RejectedError(
                 f"{capture.head.folder}: {capture.head.files[k]}: {capture.unusable[k]}"
             )
-    white, black = (capture.frames[names.index(name)].astype(float) for name in ("white", "black"))
+    white = capture.frames[names.index("white")].astype(float)
+    black = capture.frames[names.index("black")].astype(float)
     return np.asarray(white - black)
 
 
 def _rim_height(capture: capture_set.CaptureSet) -> tuple[ray_tracing.HeightFunction, float]:
-    """Height of the film at the rim in world, and its mean. Raises RejectedError for a set without
-    a figure.
+    """Height of the film at the rim in world in mm, as a function of x and y, and its mean.
+
+    Raises RejectedError for a set without a figure.
     """
     optics = capture.head.optics
     try:
         checked = check_set(measurement.stack_of(capture), optics)
     except RejectedSetError as error:
         raise errors.RejectedError(f"{capture.head.folder}: rejected: {error}") from None
-    surface, vertex_mm = (
-        bin_figure.bin_figure(optics, checked).fit.surface,
-        checked.tracer.vertex_z_mm,
-    )
+    surface = bin_figure.bin_figure(optics, checked).fit.surface
+    vertex_mm = checked.tracer.vertex_z_mm
 
     def height(x: FloatArray, y: FloatArray) -> FloatArray:
-        share = surface.radius_mm / np.maximum(
-            np.hypot(x, y), 1.0
-        )  # the terms diverge beyond the rim
-        return np.asarray(vertex_mm + surface.height(x * share, y * share))
+        # Of the point of the rim with the same azimuth: the terms diverge beyond the rim.
+        to_rim = surface.radius_mm / np.maximum(np.hypot(x, y), 1.0)
+        return np.asarray(vertex_mm + surface.height(x * to_rim, y * to_rim))
 
     return height, vertex_mm + surface.sag_mm
 
 
 def _format_pose(pose: ring_pose.RingPose, out: Path) -> list[str]:
+    """The table of the pose, and how well it fits, for a terminal."""
     lines = ["what              stated wrong by   +-        known before"]
-    lines += [
-        f"{name:<18}{value:>+13.4f}  {sigma:<9.4f} {usual_sigma(name):.3g}"
-        for name, value, sigma in zip(ring_pose.POSE_NAMES, pose.values, pose.sigmas, strict=True)
-    ]
-    better = max(
-        usual_sigma(name) / sigma
-        for name, sigma in zip(ring_pose.POSE_NAMES, pose.sigmas, strict=True)
-    )
+    improvements = []
+    for name, value, sigma in zip(ring_pose.POSE_NAMES, pose.values, pose.sigmas, strict=True):
+        lines.append(f"{name:<18}{value:>+13.4f}  {sigma:<9.4f} {usual_sigma(name):.3g}")
+        improvements.append(usual_sigma(name) / sigma)
     lines.append(
-        f"edges left {pose.rms_px:.3f} px RMS at {pose.points} points, at best {better:.0f} "
-        "times better"
+        f"edges left {pose.rms_px:.3f} px RMS at {pose.points} points, at best "
+        f"{max(improvements):.0f} times better"
     )
     return [*lines, f"written: {out}; use it with calibrate --prior {out}"]

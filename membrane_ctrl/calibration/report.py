@@ -21,9 +21,10 @@ from membrane_ctrl.model import program
 
 _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
 _SCREENS = {
-    "screen": "stand the screen itself {:.0f} mm before the camera, tilted by {:.0f} degrees to two "  # noqa: E501
-    "sides",
-    "screen_moved": "see a film again with the screen {:.0f} mm further from the mirror, known to {:g} mm",  # noqa: E501
+    "screen": "stand the screen itself {:.0f} mm before the camera, "
+    "tilted by {:.0f} degrees to two sides",
+    "screen_moved": "see a film again with the screen {:.0f} mm further from the mirror, "
+    "known to {:g} mm",
 }
 _SCREEN_KNOWN = {"screen": screen_advice.TILT_DEG, "screen_moved": screen_advice.RAIL_SIGMA_MM}
 
@@ -33,7 +34,17 @@ def calibration_report(
     findings: Sequence[verdict.CalibrationFinding],
     analysis_radius_mm: float,
 ) -> dict[str, Any]:
-    """The report, schema membrane-calibration/1; without a solution only the findings."""
+    """The report, schema membrane-calibration/1; without a solution only the findings.
+
+    Parameters
+    ----------
+    solution : Solution or None
+        None if the sets were rejected before a solution.
+    findings : sequence of CalibrationFinding
+        What the tests of the solution found.
+    analysis_radius_mm : float
+        The figure's errors are stated within this radius.
+    """
     table: dict[str, Any] = {
         **program.file_origin("membrane-calibration/1"),
         "verdict": "rejected" if any(finding.fatal for finding in findings) else "ok",
@@ -43,7 +54,8 @@ def calibration_report(
         return table
     middle = solution.problem.middle
     claim = figure_uncertainty.propagate_to_figure(solution, middle, analysis_radius_mm)
-    scale, number = model_tests.laser_scale(solution), advice.number_advice(solution, middle)
+    scale = model_tests.laser_scale(solution)
+    number = advice.number_advice(solution, middle)
     artefact = artefact_advice.artefact_advice(solution, middle)
     return table | {
         "iterations": len(solution.changes),
@@ -75,6 +87,7 @@ def calibration_report(
 
 
 def _parameter_row(solution: solver.Solution, name: str) -> dict[str, Any]:
+    """One free parameter: its value, and its sigma after and before the calibration."""
     k = bench_parameters.NAMES.index(name)
     return {
         "name": name,
@@ -88,30 +101,31 @@ def _set_rows(solution: solver.Solution) -> list[dict[str, Any]]:
     """Per set: its noise relative to the camera's, its residuals, and the test against the other
     sets.
     """
-    return [
-        {
-            "name": phases.name,
-            "surface": "film" if phases.artefact is None else phases.artefact.name,
-            "displacement_um": phases.displacement_um
-            if np.isfinite(phases.displacement_um)
-            else None,
-            "sag_mm": state.surface.sag_mm,
-            "noise_ratio": float(np.sqrt(linear.variance)),
-            "screen_residual_um": 1e3 * linear.residual_rms_mm,
-            "left_out_fall": out.fall,
-            "left_out_freedom": out.freedom,
-            "turned": _turn_row(solution, k),
-        }
-        for k, (phases, state, linear, out) in enumerate(
-            zip(
-                solution.problem.sets,
-                solution.states,
-                solution.equations,
-                model_tests.compare_left_out_sets(solution),
-                strict=True,
-            )
+    rows = []
+    for k, (phases, state, linear, out) in enumerate(
+        zip(
+            solution.problem.sets,
+            solution.states,
+            solution.equations,
+            model_tests.compare_left_out_sets(solution),
+            strict=True,
         )
-    ]
+    ):
+        has_reading = np.isfinite(phases.displacement_um)
+        rows.append(
+            {
+                "name": phases.name,
+                "surface": "film" if phases.artefact is None else phases.artefact.name,
+                "displacement_um": phases.displacement_um if has_reading else None,
+                "sag_mm": state.surface.sag_mm,
+                "noise_ratio": float(np.sqrt(linear.variance)),
+                "screen_residual_um": 1e3 * linear.residual_rms_mm,
+                "left_out_fall": out.fall,
+                "left_out_freedom": out.freedom,
+                "turned": _turn_row(solution, k),
+            }
+        )
+    return rows
 
 
 def _turn_row(solution: solver.Solution, index: int) -> dict[str, float] | None:
@@ -132,76 +146,106 @@ def _turn_row(solution: solver.Solution, index: int) -> dict[str, float] | None:
 
 
 def format_report(report: dict[str, Any]) -> list[str]:
-    """Format the report for a terminal."""
+    """Format the report of `calibration_report` for a terminal."""
     lines = [f"verdict: {report['verdict']}"]
-    lines += [
-        ("  ! " if finding["fatal"] else "  note: ") + finding["says"]
-        for finding in report["findings"]
-    ]
+    for finding in report["findings"]:
+        mark = "  ! " if finding["fatal"] else "  note: "
+        lines.append(mark + finding["says"])
     if "parameters" not in report:
         return lines
-    lines.append("what           stated wrong by   +-        known before")
-    for row in report["parameters"]:
-        says = bench_parameters.ALL[bench_parameters.NAMES.index(row["name"])].says
-        lines.append(
-            f"{row['name']:<18}{row['value']:>+11.4f}  {row['sigma']:<9.4f} "
-            f"{row['sigma_before']:<8.4g} {says}"
-        )
-    lines.append(
-        "set                 reading µm   sag mm    noise  residual µm  against the others"
-    )
-    for row in report["sets"]:
-        reading = "-" if row["displacement_um"] is None else f"{row['displacement_um']:.1f}"
-        reading = reading if row["surface"] == "film" else row["surface"]
-        lines.append(
-            f"{row['name']:<18}{reading:>12}{row['sag_mm']:>10.4f}{row['noise_ratio']:>8.2f}"
-            f"{row['screen_residual_um']:>12.2f}  {row['left_out_fall']:.0f} of "
-            f"{row['left_out_freedom']} expected"
-        )
-    for row in report["sets"]:
-        if (turn := row["turned"]) is not None:
-            lines.append(
-                f"{row['name']}: mirror turned by {turn['found_deg']:.2f} +- "
-                f"{turn['sigma_deg']:.2f} degrees ({turn['angle_deg']:g} stated), its axis at "
-                f"({turn['x_mm']:+.2f}, {turn['y_mm']:+.2f}) +- {turn['seat_sigma_mm']:.2f} mm"
-            )
+
+    lines += _format_parameters(report["parameters"])
+    lines += _format_sets(report["sets"])
     claim = report["uncertainty"]
     lines.append(
         f"figure with this geometry: sag +- {claim['sag_um']:.2f} µm, figure +- "
         f"{claim['figure_rms_um']:.2f} µm RMS, "
         f"with its tilt +- {claim['height_rms_um']:.1f} µm RMS"
     )
-    if (number := report["advice"]) is not None:
+    lines += _format_advice(report)
+
+    laser = report["laser"]
+    if laser["sigma"] < _SOME_LASER:
+        lines.append(f"laser against optics: {laser['scale']:.5f} +- {laser['sigma']:.5f}")
+    lines.append(f"condition number {report['condition']:.2g}; not determined by the sets:")
+    for each in report["not_determined"]:
+        lines.append(f"  {each['sigma_left']:.0%} left: {each['says']}")
+    if not report["not_determined"]:
+        lines.append("  nothing")
+    if report.get("out"):
+        lines.append(f"written: {report['out']} (hash {report['hash']})")
+    return lines
+
+
+def _format_parameters(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """The table of the free parameters."""
+    lines = ["what           stated wrong by   +-        known before"]
+    for row in rows:
+        says = bench_parameters.ALL[bench_parameters.NAMES.index(row["name"])].says
+        lines.append(
+            f"{row['name']:<18}{row['value']:>+11.4f}  {row['sigma']:<9.4f} "
+            f"{row['sigma_before']:<8.4g} {says}"
+        )
+    return lines
+
+
+def _format_sets(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """The table of the sets, then what was found of turned ones.
+
+    An artefact has its name in place of the reading.
+    """
+    lines = ["set                 reading µm   sag mm    noise  residual µm  against the others"]
+    for row in rows:
+        if row["surface"] != "film":
+            reading = row["surface"]
+        elif row["displacement_um"] is None:
+            reading = "-"
+        else:
+            reading = f"{row['displacement_um']:.1f}"
+        lines.append(
+            f"{row['name']:<18}{reading:>12}{row['sag_mm']:>10.4f}{row['noise_ratio']:>8.2f}"
+            f"{row['screen_residual_um']:>12.2f}  {row['left_out_fall']:.0f} of "
+            f"{row['left_out_freedom']} expected"
+        )
+    for row in rows:
+        turn = row["turned"]
+        if turn is not None:
+            lines.append(
+                f"{row['name']}: mirror turned by {turn['found_deg']:.2f} +- "
+                f"{turn['sigma_deg']:.2f} degrees ({turn['angle_deg']:g} stated), its axis at "
+                f"({turn['x_mm']:+.2f}, {turn['y_mm']:+.2f}) +- {turn['seat_sigma_mm']:.2f} mm"
+            )
+    return lines
+
+
+def _format_advice(report: dict[str, Any]) -> list[str]:
+    """What to measure next: a number of the bench, a sphere, or sets of the screen."""
+    lines = []
+    number = report["advice"]
+    if number is not None:
         unit = bench_parameters.ALL[bench_parameters.NAMES.index(number["name"])].unit
         known = f"{number['sigma']:.2g} {unit}".strip()
         lines.append(
             f"best next: {number['name']} known to {known} would give sag +- "
             f"{number['sag_um']:.2g} µm"
         )
-    if (sphere := report["artefact_advice"]) is not None:
-        together = " and ".join(sphere["together"][:2])
+
+    sphere = report["artefact_advice"]
+    if sphere is not None:
+        confused = " and ".join(sphere["together"][:2])
+        why = f"not told apart here: {confused}; put" if confused else "better: put"
         lines.append(
-            (f"not told apart here: {together}; put" if together else "better: put")
-            + f" a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
+            f"{why} a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
             f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to "
             f"{sphere['vertex_sigma_mm']:.2g} mm, "
             f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- "
             f"{sphere['sag_um']:.2g} µm"
         )
-    for where, each in zip(
+
+    for order, each in zip(
         ("with the screen alone", "and then"), report["screen_advice"], strict=False
     ):
-        do = _SCREENS[each["sets"]].format(abs(each["distance_mm"]), _SCREEN_KNOWN[each["sets"]])
-        lines.append(f"{where}: {do}: sag +- {each['sag_um']:.2g} µm")
-    if report["laser"]["sigma"] < _SOME_LASER:
-        lines.append(
-            f"laser against optics: {report['laser']['scale']:.5f} +- "
-            f"{report['laser']['sigma']:.5f}"
-        )
-    lines.append(f"condition number {report['condition']:.2g}; not determined by the sets:")
-    lines += [
-        f"  {each['sigma_left']:.0%} left: {each['says']}" for each in report["not_determined"]
-    ] or ["  nothing"]
-    if report.get("out"):
-        lines.append(f"written: {report['out']} (hash {report['hash']})")
+        distance_mm = abs(each["distance_mm"])
+        action = _SCREENS[each["sets"]].format(distance_mm, _SCREEN_KNOWN[each["sets"]])
+        lines.append(f"{order}: {action}: sag +- {each['sag_um']:.2g} µm")
     return lines
