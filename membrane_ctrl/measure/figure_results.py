@@ -187,24 +187,27 @@ def figure_lines(found: MeasuredFigure) -> list[str]:
     """The numbers as lines of text; +- is 1 sigma of noise and geometry together."""
     numbers = found.figure.numbers
 
-    def told(name: str, unit: str, scale: float = 1.0) -> str:
-        bars = (getattr(of.numbers, name) for of in (found.noise, found.geometry))
-        return f"{with_bar(scale * getattr(numbers, name), scale * math.hypot(*bars))} {unit}"
+    def quantity(name: str, unit: str) -> str:
+        """The number of this name with its sigma and unit."""
+        sigma = math.hypot(
+            getattr(found.noise.numbers, name), getattr(found.geometry.numbers, name)
+        )
+        return f"{with_bar(getattr(numbers, name), sigma)} {unit}"
 
     lines = [
-        f"sphere    radius {told('radius_of_curvature_mm', 'mm')}, focal length "
-        f"{told('focal_length_mm', 'mm')}",
-        f"irregular PV {told('irregularity_pv_um', 'µm')}, RMS "
-        f"{told('irregularity_rms_um', 'µm')}, "
-        f"PVr {told('pvr_um', 'µm')}; slope {told('slope_rms_urad', 'µrad')} RMS",
-        f"          rotationally invariant PV {told('rotational_pv_um', 'µm')}, "
-        f"the rest {told('asymmetry_rms_um', 'µm')} RMS",
+        f"sphere    radius {quantity('radius_of_curvature_mm', 'mm')}, focal length "
+        f"{quantity('focal_length_mm', 'mm')}",
+        f"irregular PV {quantity('irregularity_pv_um', 'µm')}, RMS "
+        f"{quantity('irregularity_rms_um', 'µm')}, "
+        f"PVr {quantity('pvr_um', 'µm')}; slope {quantity('slope_rms_urad', 'µrad')} RMS",
+        f"          rotationally invariant PV {quantity('rotational_pv_um', 'µm')}, "
+        f"the rest {quantity('asymmetry_rms_um', 'µm')} RMS",
     ]
     if numbers.best_focus_mm > 0:
         lines.append(
-            f"spot      {told('best_focus_mm', 'mm')} from the vertex: 80 % of the rays within "
-            f"{told('spot_80_mm', 'mm')}, 50 % {told('spot_50_mm', 'mm')}, 95 % "
-            f"{told('spot_95_mm', 'mm')} (radius)"
+            f"spot      {quantity('best_focus_mm', 'mm')} from the vertex: 80 % of the rays within "
+            f"{quantity('spot_80_mm', 'mm')}, 50 % {quantity('spot_50_mm', 'mm')}, 95 % "
+            f"{quantity('spot_95_mm', 'mm')} (radius)"
         )
     return lines
 

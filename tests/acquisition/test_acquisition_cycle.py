@@ -171,7 +171,7 @@ def test_numerics_that_raise_are_an_event(bench: Bench) -> None:
     assert (failure.stage, failure.message) == ("reconstruction", "LinAlgError: singular matrix")
 
 
-def test_a_failure_ahead_of_a_cycle_is_told_by_the_cycle(bench: Bench) -> None:
+def test_a_failure_before_a_cycle_is_reported_by_the_cycle(bench: Bench) -> None:
     bench.reconstructor.singular = True
     bench.cycle.prepare_next()
     assert bench.reconstructor.prepared == 1

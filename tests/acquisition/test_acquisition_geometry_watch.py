@@ -48,7 +48,7 @@ def in_force(calibration: CalibrationTable | None = CALIBRATION) -> RunGeometry:
     return RunGeometry(OPTICS, stated_origin(OPTICS), calibration)
 
 
-def test_a_residual_that_has_grown_is_said_once_and_its_end_too() -> None:
+def test_a_residual_that_has_grown_is_reported_once_and_its_end_too() -> None:
     drift = GeometryWatch(in_force(), 4)
     told = []
     for residual_urad in (2.9, 4.5, 2.9):

@@ -65,7 +65,7 @@ def test_a_slow_loop_has_readings_enough(
         assert [laser.at(moment_s) for moment_s in moments_s] == [1.0] * 7
 
 
-def test_nothing_known_before_the_first_row(laser: LaserHistory) -> None:
+def test_nothing_is_known_before_the_first_row(laser: LaserHistory) -> None:
     assert math.isnan(laser.at(0.0))
 
 

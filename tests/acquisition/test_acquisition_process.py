@@ -112,7 +112,7 @@ def stack() -> Iterator[ExitStack]:
         yield stack
 
 
-def test_measures_the_twin_follows_a_jump_and_stops_when_told(stack: ExitStack) -> None:
+def test_measures_the_twin_follows_a_jump_and_stops_on_command(stack: ExitStack) -> None:
     run = Run(stack)
     run.until(lambda: len(run.estimates) >= 4)
     assert run.states()[0] == "preparing"
@@ -167,7 +167,7 @@ def test_pause_resume_full_and_sigterm(stack: ExitStack) -> None:
     assert run.process.exitcode == 0
 
 
-def test_without_a_camera_it_says_so_and_ends(stack: ExitStack) -> None:
+def test_without_a_camera_the_process_reports_it_and_ends(stack: ExitStack) -> None:
     run = Run(stack, twin=False)
     run.until(lambda: not run.process.is_alive())
     run.until(lambda: "failed" in run.states())

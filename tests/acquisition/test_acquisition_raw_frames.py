@@ -179,7 +179,7 @@ def test_a_set_has_to_leave_the_disk_to_the_telemetry(
     assert bool(keeping.told) == (not kept)
 
 
-def test_what_the_disk_did_not_take_whole_goes_and_is_told_once(
+def test_frames_that_the_disk_did_not_take_whole_are_removed_and_reported_once(
     stack: ExitStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real_write = Path.write_bytes

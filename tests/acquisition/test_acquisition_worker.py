@@ -169,7 +169,7 @@ def test_a_set_of_a_turned_mirror_is_kept_with_its_angle() -> None:
         (CycleDone(estimate("full"), 0.0), "No space left on device"),
     ],
 )
-def test_a_set_that_cannot_be_had_says_why(
+def test_a_set_that_cannot_be_taken_gives_the_reason(
     result: CycleDone | CycleFailed | None, failed: str
 ) -> None:
     loop = Loop({1.0: "capture", 3.0: "stop"})

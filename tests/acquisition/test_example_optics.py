@@ -121,7 +121,9 @@ async def test_the_example_passes_check_with_camera_and_screen(
 
 
 @pytest.mark.campaign  # test_acquisition_display_test.py tests the findings about a display
-async def test_too_bright_a_picture_is_told(devices: DevicesConfig, tmp_path: Path) -> None:
+async def test_a_picture_that_is_too_bright_is_reported(
+    devices: DevicesConfig, tmp_path: Path
+) -> None:
     assert devices.camera is not None
     assert devices.screen is not None
     bright = devices.camera.model_copy(update={"exposure_ms": 200.0})

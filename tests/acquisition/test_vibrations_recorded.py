@@ -201,7 +201,7 @@ def minutes(hold: Hold, at_s: float, count: int, line_hz: float) -> None:
         hold.settle(HandClock.moment_s + 0.1)
 
 
-def test_a_shift_over_a_restart_of_the_hold_is_told_everywhere(
+def test_a_shift_over_a_restart_of_the_hold_is_reported_everywhere(
     tmp_path: Path, stack: ExitStack, capsys: pytest.CaptureFixture[str], undrawn: None
 ) -> None:
     """Five minutes of one run, and of the next, a week later."""
@@ -277,7 +277,7 @@ MINUTES = (3, 2, 1, 1, 1, 1, 2, 3)  # of each day
 @pytest.mark.campaign
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("change", [0.01, -0.01, 0.003, 0.0])
-def test_of_a_week_of_pictures_a_shift_of_a_per_cent_is_told_everywhere(
+def test_a_shift_of_a_per_cent_within_a_week_of_pictures_is_reported_everywhere(
     change: float,
     tmp_path: Path,
     stack: ExitStack,

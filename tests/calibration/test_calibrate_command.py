@@ -149,7 +149,7 @@ def test_uncertainty_draws_from_the_file(
     assert where.is_dir()
 
 
-def test_the_ring_says_where_the_camera_stands(
+def test_the_ring_in_the_picture_gives_the_pose_of_the_camera(
     folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pose, out = tmp_path / "pose.toml", tmp_path / "geometry.toml"

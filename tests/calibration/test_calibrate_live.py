@@ -162,7 +162,7 @@ def test_setpoints_that_are_out_of_reach_now_are_refused(
     assert "the sets from -1000 to 1000 µm are beyond -4440 to 440" in capsys.readouterr().err
 
 
-def test_nothing_moves_unless_somebody_says_yes(
+def test_nothing_moves_without_a_confirmation(
     bench: LiveBench,
     live: list[str],
     tmp_path: Path,

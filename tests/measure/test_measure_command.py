@@ -176,7 +176,7 @@ def test_a_missing_picture_is_a_rejection_that_names_it(
     ]
 
 
-def test_a_picture_in_colour_is_a_rejection_that_says_so(capture_set: Path, tmp_path: Path) -> None:
+def test_a_picture_in_colour_is_rejected_with_the_reason(capture_set: Path, tmp_path: Path) -> None:
     assert cv2.imwrite(str(capture_set / "y_sin_1.png"), np.zeros((256, 306, 3), np.uint8))
     code, result = measured(capture_set, tmp_path / "out")
     assert code == 3
@@ -325,7 +325,7 @@ def test_a_geometry_that_cannot_be_is_refused_with_the_file_that_states_it(
     )
 
 
-def test_unknown_keys_are_said_and_ignored(
+def test_unknown_keys_are_reported_and_ignored(
     capture_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rewrite(capture_set, lambda t: t["camera"].update(gain_db=3))

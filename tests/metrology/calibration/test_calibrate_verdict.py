@@ -223,7 +223,7 @@ def test_the_monitor_waits_for_many_cycles_and_forgives_one() -> None:
     assert monitor.says.endswith("predicts 1.00")
 
 
-def test_the_monitor_tells_the_cameras_noise_from_the_film() -> None:
+def test_the_monitor_distinguishes_the_cameras_noise_from_the_film() -> None:
     noisy = DriftMonitor(1.0, 0.6)
     for _ in range(CYCLES):
         noisy.add(2.15, 2.0)  # 0.8 of film and 2.0 of noise

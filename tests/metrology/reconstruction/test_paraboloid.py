@@ -27,7 +27,7 @@ def test_exact_slopes_give_the_paraboloid(loss):
     assert surface.tilt_y == pytest.approx(-2e-3, rel=1e-9)
 
 
-def test_robust_fits_shrug_off_a_turned_down_edge():
+def test_a_turned_down_edge_hardly_changes_robust_fits():
     x, y = grid()
     rng = np.random.default_rng(1)
     slopes = TRUE.slopes(x, y) + rng.normal(0, 2e-4, (2, x.size))

@@ -35,5 +35,5 @@ def test_a_film_that_moves_without_a_laser_leaves_the_vertex_unknown_by_half_its
     assert beyond_um == pytest.approx(set_motion.X_TO_Y * 100.0 / 2)
 
 
-def test_a_laser_tells_where_the_vertex_was() -> None:
+def test_a_laser_reading_gives_the_place_of_the_vertex() -> None:
     assert vertex_sigma_um(100.0, 3.0) == pytest.approx(1 / math.sqrt(FRAMES))

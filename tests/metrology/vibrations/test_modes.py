@@ -168,7 +168,7 @@ def test_too_short(seconds: float) -> None:
 
 
 @pytest.mark.campaign
-def test_a_night_of_steps_and_outliers_tells_no_line() -> None:
+def test_a_night_of_steps_and_outliers_shows_no_vibration() -> None:
     listener = VibrationFollower()
     for seed in range(1000, 1480):
         time_s, coeffs_um, _ = watched(seed, lines_hz=())
