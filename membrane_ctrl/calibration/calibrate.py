@@ -11,7 +11,8 @@ from typing import Any
 
 from membrane_ctrl.calibration.calibrate_options import CalibrateOptions, parse_freed
 from membrane_ctrl.calibration.geometry_writer import write_geometry
-from membrane_ctrl.calibration.report import calibration_report, format_report
+from membrane_ctrl.calibration.report import calibration_report
+from membrane_ctrl.calibration.report_text import format_report
 from membrane_ctrl.calibration.residual_picture import draw_residuals
 from membrane_ctrl.calibration.sets import Bundle, read_sets, with_priors
 from membrane_ctrl.calibration.stated_problem import problem_of
