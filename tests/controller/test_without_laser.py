@@ -609,11 +609,11 @@ class Growing:
 
 
 def _warmed(
-    um_per_k: float, told_um_per_k: float, hours: float
+    um_per_k: float, stated_um_per_k: float, hours: float
 ) -> tuple[list[VirtualTick], Growing]:
     """Hours of hold at 10 Hz in air that becomes 1 K warmer in each."""
     growing = Growing(um_per_k, 1800.0, lambda now_s: max(0.0, now_s - 60.0) / 3600)
-    estimator = EstimatorConfig(process_value="estimate", camera_mount_um_per_k=told_um_per_k)
+    estimator = EstimatorConfig(process_value="estimate", camera_mount_um_per_k=stated_um_per_k)
     config = BY_ALL.model_copy(update={"estimator": estimator, "loop": LoopConfig(rate_hz=10.0)})
     warming = AirTemperatureChange(60.0, hours, 3600.0 * hours)
     return held(60.0 + 3600.0 * hours, growing, config, warming, shape_s=1.0), growing
@@ -621,13 +621,13 @@ def _warmed(
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    ("told_um_per_k", "most_um"), [(0.0, 0.9), (0.34, 0.25)], ids=["unknown", "taken out"]
+    ("stated_um_per_k", "most_um"), [(0.0, 0.9), (0.34, 0.25)], ids=["unknown", "taken out"]
 )
 def test_a_camera_mount_warming_by_1_k_per_hour_is_reported_and_bounded(
-    told_um_per_k: float, most_um: float
+    stated_um_per_k: float, most_um: float
 ) -> None:
     """It truly grows by 0.44 µm/K: what is known of it is 30 % wrong."""
-    ticks, growing = _warmed(0.44, told_um_per_k, 2.5)
+    ticks, growing = _warmed(0.44, stated_um_per_k, 2.5)
     assert not told(ticks, Fault)
     moved_um = (
         true_um(ticks, ticks[-1].row.mono_s - 60.0).mean() - true_um(ticks, 30.0, 60.0).mean()

@@ -30,7 +30,7 @@ BEFORE_S, AFTER_S, TOLD_S = (
     10.0,
     120.0,
 )  # of a change: means before it, its bump, what is told of it
-STAND_UM_PER_K, STAND_TOLD_UM_PER_K, STAND_S = (
+CAMERA_MOUNT_UM_PER_K, STATED_MOUNT_UM_PER_K, CAMERA_MOUNT_S = (
     0.44,
     0.34,
     1800.0,
@@ -108,7 +108,7 @@ def config_of(seed: int) -> Config:
     return Config(
         loop=LoopConfig(rate_hz=RATE_HZ),
         estimator=EstimatorConfig(
-            process_value="estimate", camera_mount_um_per_k=STAND_TOLD_UM_PER_K
+            process_value="estimate", camera_mount_um_per_k=STATED_MOUNT_UM_PER_K
         ),
         twin=TwinConfig(seed=seed, start_error_um=-1.0),
     )
@@ -161,7 +161,7 @@ class _Week:
         )
         self.run._shape_period_s = TRACK_S
         self.day, self._rng = Day(), np.random.default_rng([23, seed])
-        self._stand_k = [0.0, 0.0]
+        self._camera_mount_k = [0.0, 0.0]
         self._first_k = self.bench.truth.air_temperature_c
         self._recent: list[float] = []  # true centre
         self._hour: list[float] = []
@@ -171,9 +171,11 @@ class _Week:
     def tick(self) -> VirtualTick | None:
         """A tick, in which the stand follows the air."""
         given_k = self.bench.truth.air_temperature_c - self._first_k
-        for place, now_k in enumerate(self._stand_k):
-            given_k = self._stand_k[place] = now_k + (given_k - now_k) / (RATE_HZ * STAND_S / 2)
-        self.bench.wrong.camera_offset_um = STAND_UM_PER_K * given_k
+        for place, now_k in enumerate(self._camera_mount_k):
+            given_k = self._camera_mount_k[place] = now_k + (given_k - now_k) / (
+                RATE_HZ * CAMERA_MOUNT_S / 2
+            )
+        self.bench.wrong.camera_offset_um = CAMERA_MOUNT_UM_PER_K * given_k
         commands, self._pending = tuple(self._pending), []
         tick = self.run.run_tick(commands)
         if tick is not None:

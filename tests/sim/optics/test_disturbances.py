@@ -148,7 +148,7 @@ def test_dust_lies_still_and_then_elsewhere(film: FilmShape) -> None:
     assert 0.002 < np.mean(first < 0.9) < 0.1
 
 
-def test_a_stand_that_grows_takes_the_camera_along(film: FilmShape) -> None:
+def test_a_camera_mount_that_grows_moves_the_camera(film: FilmShape) -> None:
     """A quarter of the swing's period after the start it is warmest: 2 K of 60 µm each."""
     seen = (
         bench(film, camera_mount_k=2.0).render_picture(crossed(), 0.0, time_s=300.0).astype(float)
