@@ -13,21 +13,28 @@ from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 Levels = AnyArray
 # A marker of 4 x 4 bits has a border of one: 6 modules; with a margin of one on each side a square
-# has 8, so that squares of a multiple of 8 pixels have every edge on a pixel's edge
+# has 8, so that squares of a multiple of 8 pixels have every edge on a pixel's edge.
 MODULES = 8
-_MARKER_SHARE = 6 / MODULES
-_MARKERS = 1000  # of the dictionary
+_MARKER_SHARE = 6 / MODULES  # side of a marker over that of its square
+_MARKERS = 1000  # markers in the dictionary
 DICTIONARY = cv2.aruco.DICT_4X4_1000
 
 
 @dataclass(frozen=True)
 class Board:
-    """A board."""
+    """A board of squares.
 
-    # "charuco" or "chessboard": with markers (OpenCV's DICT_4X4_1000), of which a part is enough,
-    # or plain
+    Attributes
+    ----------
+    kind : str
+        "charuco", with markers (OpenCV's DICT_4X4_1000), of which a part is enough, or
+        "chessboard", which is plain.
+    columns, rows : int
+        Numbers of squares.
+    """
+
     kind: str
-    columns: int  # squares
+    columns: int
     rows: int
 
     @classmethod

@@ -63,12 +63,22 @@ class Lens:
 
 
 def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
-    """Fit the lens.
+    """Fit focal length, principal point and distortion of the lens.
 
-    Raises ValueError with fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, if nothing
-    fits, or if the views do not determine the lens. `stated` is where the fit begins, and what the
-    result is compared with.
+    Parameters
+    ----------
+    views : sequence of BoardView
+        The corners in each photograph.
+    stated : CameraConfig
+        Where the fit begins, and what the result is compared with.
+
+    Raises
+    ------
+    ValueError
+        With fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, if nothing fits, or if the
+        views do not determine the lens.
     """
+    # Fit without the worst view, until no view is much worse than the others.
     seen = [view for view in views if len(view.place) >= LEAST_CORNERS]
     bent = [view.name for view in seen if _plane_misfit(view) > _OF_ANOTHER_BOARD]
     good = [view for view in seen if view.name not in bent]
@@ -88,7 +98,9 @@ def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
     focal_px = float(matrix[0, 0])
     names = {view.name for view in good}
     found = _parameters(matrix, lens)
-    # OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2
+
+    # Sigmas: those of independent corners (in OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2) or of
+    # the scatter between the views, the larger one, and the effect of a board that is not flat.
     independent = np.array([sigmas[1] / focal_px, *sigmas[2:8]])
     scatter = _jackknife_sigmas(good, stated)
     flatness = _parameters(*_fit_camera(_bowed_views(good), stated)[1:3]) - found

@@ -25,18 +25,18 @@ from membrane_ctrl.metrology.phase.gray_code import gray_bit
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
-_BINS = 800  # that are compared
-_LEAST_SURE = 0.2  # share of the bins that a Gray frame must show
-HIDDEN_RAD = 0.4  # from a Gray bit's edge: blur and the size of a bin
-
+_BINS = 800  # number of bins that are compared
+_LEAST_SURE = 0.2  # share of these bins in which a Gray frame must show its bit
+# Phase from the edge of a Gray bit within which blur and the size of a bin hide a second image.
+HIDDEN_RAD = 0.4
 
 # The places that are searched: scales a, and shifts d in steps.
 _SCALES = (1.0, 0.95, 1.05, 0.9, 1.1, 0.75, 1.25, 0.5, 1.5, -0.5, -0.75, -1.0, -1.3)
 _SAME_SCALE = 0.06  # scales as near to 1 as this may show the first image itself
-_STEP_RAD = 0.4
-_SHIFT_RANGE = 1.5  # shifts go this far, over half the pattern's phase
+_STEP_RAD = 0.4  # of the shifts
+_SHIFT_RANGE = 1.5  # largest shift, over half the pattern's phase
 _EVERY = 7  # steps between the places that show what chance explains
-_CELL_RAD = 0.05  # of the table of bits, and the step of the finer search
+_CELL_RAD = 0.05  # cells of the table of bits, and steps of the finer search
 
 # Least power of a second image that a frame's own pattern does not explain, over its whole power.
 _LEAST_DETERMINED = 0.02

@@ -36,9 +36,13 @@ class GridFit:
         self._terms = np.stack(
             [to_legendre.T @ radial_polynomial(n, m, degree) @ to_legendre for n, m in orders]
         )
-        self._x, self._y = legvander(x, degree), legvander(x if y is None else y, degree)
+        # Legendre polynomials (points, degree + 1) along the columns and the rows.
+        self._x = legvander(x, degree)
+        self._y = legvander(x if y is None else y, degree)
         self._mask = mask
-        pairs_y, pairs_x = (np.einsum("ia,ib->iab", along, along) for along in (self._y, self._x))
+        # The Gram matrix of the terms over the mask, from moments of products of polynomials.
+        pairs_x = np.einsum("ia,ib->iab", self._x, self._x)
+        pairs_y = np.einsum("ia,ib->iab", self._y, self._y)
         moments = np.einsum("iac,ij,jbd->acbd", pairs_y, mask.astype(float), pairs_x, optimize=True)
         self._gram = np.einsum("kba,acbd,ldc->kl", self._terms, moments, self._terms, optimize=True)
 
