@@ -37,7 +37,7 @@ def keep_cycling(
     due_s = clock.now()
     while not remote.stop:
         if remote.paused:
-            remote.report_state("paused", "until told to resume")
+            remote.report_state("paused", "until the command to resume")
             while remote.paused and not remote.stop:
                 remote.take_commands(math.inf)
             due_s = clock.now()

@@ -104,7 +104,7 @@ def _format_advice(report: dict[str, Any]) -> list[str]:
     sphere = report["artefact_advice"]
     if sphere is not None:
         confused = " and ".join(sphere["together"][:2])
-        why = f"not told apart here: {confused}; put" if confused else "better: put"
+        why = f"not separable with these sets: {confused}; put" if confused else "better: put"
         lines.append(
             f"{why} a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
             f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to "

@@ -126,7 +126,7 @@ def test_pause_and_resume() -> None:
     loop = Loop({1.0: "pause", 7.3: "resume", 8.0: "stop"})
     loop.run()
     assert loop.cycle.started_s == [0, 7.3]
-    assert ("paused", "until told to resume") in loop.remote.told
+    assert ("paused", "until the command to resume") in loop.remote.told
 
 
 def test_full_on_request_goes_to_the_next_cycle() -> None:

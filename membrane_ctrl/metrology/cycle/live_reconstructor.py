@@ -376,7 +376,7 @@ class LiveReconstructor:
         self._doubt = band_removal.describe_bands(stack.gain)
         if known.size and not found.size:
             self._doubt = (
-                "bands of the backlight could not be told from what else changed in this cycle"
+                "bands of the backlight could not be separated from other changes in this cycle"
             )
         elif found.size:
             self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
