@@ -7,7 +7,15 @@ from membrane_ctrl.model.state_tree import StateNode
 
 
 def lag_step_fraction(dt_s: float, time_constant_s: float) -> float:
-    """Step fraction of a first-order lag, 1 - exp(-dt / T); 1 without a lag."""
+    """Return the share of a step that a first-order lag follows in one tick, 1 - exp(-dt / T).
+
+    Parameters
+    ----------
+    dt_s : float
+        Duration of the tick.
+    time_constant_s : float
+        T; 0 means no lag, and a share of 1.
+    """
     return -math.expm1(-dt_s / time_constant_s) if time_constant_s > 0 else 1.0
 
 

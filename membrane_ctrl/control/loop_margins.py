@@ -24,6 +24,17 @@ _ALIASES = 3  # they fall with the third power of the frequency
 def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
     """Return L of the sampled loop: PID and filter as difference equations, hold, dead time, pump
     lag, mirror.
+
+    Parameters
+    ----------
+    loop : LoopConfig
+        Gains, filter and tick rate.
+    omega : (n,) array
+        Angular frequencies in rad/s, below the sampling limit.
+
+    Returns
+    -------
+    (n,) complex array
     """
     dt_s = 1 / loop.rate_hz
     z = np.exp(1j * omega * dt_s)

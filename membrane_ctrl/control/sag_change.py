@@ -43,11 +43,23 @@ def compute_sag_change(
     covariance_um2: FloatArray,
     sensitivity: FloatArray,
 ) -> SagChange:
-    """Sag now minus sag at the reference, from coefficients (terms,) and their covariance (terms,
-    terms).
+    """Return the sag now minus the sag at the reference.
 
-    The reference is constant, hence no noise of the change. `sensitivity` (terms,) is the
-    coefficients' change per µm of sag.
+    Parameters
+    ----------
+    coeffs_um : (terms,) array
+        Zernike coefficients now, in µm.
+    reference_um : (terms,) array
+        Those at the reference; it is constant, so it adds no noise to a change.
+    covariance_um2 : (terms, terms) array
+        Covariance of the coefficients now.
+    sensitivity : (terms,) array
+        Change of the coefficients in µm per µm of sag.
+
+    Returns
+    -------
+    SagChange
+        By the equations of the module.
     """
     s = sensitivity[MEASURED]
     covariance = covariance_um2[MEASURED, MEASURED] + MODEL_FLOOR_UM**2 * np.eye(s.size)
