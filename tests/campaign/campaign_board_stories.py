@@ -12,10 +12,39 @@ from campaign_times import BOARD_PRESSURE_MAX_PA, TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant
 
 from firmware_iface.emulators.modbus_pdu import RegisterRefusal
+from firmware_iface.emulators.pump_board import StoredSettings
 from firmware_iface.register_map import load_default_map
 from firmware_iface.roles import BenchCommand, LinkError
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.sim.virtual_bench import VirtualBench, at_once
+from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong, at_once
+
+_GAUGE_TIMEOUT_S, _GAUGE_FROZEN_S = 4.0, 6.0  # of the boards of these stories
+_DOOR = 0b100  # bit of the interlock input that is fitted
+
+
+class GuardedBoard(Stage):
+    """A board with a fitted gauge and a fitted interlock input, unknown to the controller."""
+
+    def make_bench(self) -> VirtualBench:
+        stored = StoredSettings(
+            gauge_timeout_s=_GAUGE_TIMEOUT_S,
+            gauge_frozen_s=_GAUGE_FROZEN_S,
+            interlocks_fitted=_DOOR,
+        )
+        return VirtualBench(self.plant, WATCHDOG_S, stored)
+
+    def pump_without_a_controller(self, seconds: float, check: Callable[[], str]) -> None:
+        """A program writes a little flow again and again, whatever is read."""
+        for _ in range(round(seconds / TICK_S)):
+            self.bench.advance(TICK_S)
+            self.bench.write(BenchCommand(0.3, 0.0))
+            self.bench.drive_actuators()
+            if wrong := check():
+                self.must(False, wrong)
+
+
+def _must_pump(stage: Stage) -> str:
+    return "" if stage.plant.pump_given > 0 else "the board stops a pump that nothing forbids"
 
 
 def counters_wrap() -> list[str]:
@@ -293,6 +322,54 @@ def the_board_alone_keeps_its_limit() -> list[str]:
     return stage.violations
 
 
+def the_board_alone_stops_without_its_gauge() -> list[str]:
+    """The gauge has no value, or repeats one, and a program pumps on: the board stops the pump
+    after its own times, and not before.
+    """
+    violations: list[str] = []
+    for fault, limit_s in (("gauge_lost", _GAUGE_TIMEOUT_S), ("gauge_stuck", _GAUGE_FROZEN_S)):
+        stage = GuardedBoard()
+        stage.pump_without_a_controller(2.0, lambda stage=stage: _must_pump(stage))  # type: ignore[misc]
+        setattr(stage.bench.wrong, fault, True)
+        stage.pump_without_a_controller(limit_s - 1.0, lambda stage=stage: _must_pump(stage))  # type: ignore[misc]
+        stage.pump_without_a_controller(1.0 + 3 * TICK_S, lambda: "")
+        stage.pump_without_a_controller(5.0, stage.still)
+        stage.bench.wrong = Wrong()
+        stage.pump_without_a_controller(5.0, stage.still)  # a person must clear it
+        violations += stage.violations
+    return violations
+
+
+def the_board_alone_stops_at_an_open_interlock() -> list[str]:
+    """A circuit opens for a moment, while the pump runs or stands: the board keeps the pump off
+    until a person clears the fault.
+    """
+    violations: list[str] = []
+    for runs in (True, False):
+        stage = GuardedBoard()
+        if runs:
+            stage.pump_without_a_controller(2.0, lambda stage=stage: _must_pump(stage))  # type: ignore[misc]
+        stage.bench.wrong.open_interlocks = _DOOR
+        stage.bench.advance(TICK_S)
+        stage.must(not stage.still(), "the pump runs beside an open circuit")
+        stage.bench.wrong.open_interlocks = 0
+        stage.pump_without_a_controller(5.0, stage.still)
+        stage.bench.clear_faults(0xFFFF)
+        stage.must(not stage.still(), "clearing the fault starts the pump")
+        stage.pump_without_a_controller(1.0, lambda: "")
+        stage.must(stage.plant.pump_given > 0, "the board stops a pump that nothing forbids")
+        violations += stage.violations
+    return violations
+
+
+def other_inputs_of_the_board_stop_nothing() -> list[str]:
+    """A circuit that is not fitted opens in a hold: nothing happens."""
+    stage = GuardedBoard().held()
+    stage.bench.wrong.open_interlocks = 0xFFFF & ~_DOOR
+    stage.wait(5.0, lambda: "" if stage.state == State.HOLD else "the hold was lost")
+    return stage.violations
+
+
 STORIES: Sequence[Callable[[], list[str]]] = (
     counters_wrap,
     a_gateway_repeats_the_last_write,
@@ -308,4 +385,7 @@ STORIES: Sequence[Callable[[], list[str]]] = (
     hold_is_asked_of_a_latched_board,
     what_is_read_is_true,
     the_board_alone_keeps_its_limit,
+    the_board_alone_stops_without_its_gauge,
+    the_board_alone_stops_at_an_open_interlock,
+    other_inputs_of_the_board_stop_nothing,
 )

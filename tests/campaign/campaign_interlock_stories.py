@@ -155,6 +155,18 @@ def an_interlock_during_a_fault_that_may_resume() -> list[str]:
     return stage.violations
 
 
+def an_interlock_opens_on_the_way_down() -> list[str]:
+    """A circuit opens while the mirror is vented on command: a fault, and the vent stays open."""
+    stage = InterlockStage()
+    stage.held()
+    stage.ask("vent")
+    stage.until(State.LOWER)
+    stage.wait(1.0)
+    stage.circuits.open_names = {"stop"}
+    stage.must_become_safe(SafeLevel.VENT, 2 * TICK_S)
+    return stage.violations
+
+
 def a_door_that_is_open_while_the_program_ends() -> list[str]:
     """A stop in standby with an open door ends the run without a fault, and with the pump off."""
     stage = InterlockStage()
@@ -173,5 +185,6 @@ STORIES: Sequence[Callable[[], list[str]]] = (
     an_interlock_that_closes_again_resumes_nothing,
     an_open_interlock_forbids_the_hold,
     an_interlock_during_a_fault_that_may_resume,
+    an_interlock_opens_on_the_way_down,
     a_door_that_is_open_while_the_program_ends,
 )

@@ -42,6 +42,7 @@ _GAUGE_SLACK_PA = 2.0  # four sigma of the gauge
 _SLACK_S = 0.25  # six ticks
 _HELD_UM = 10.0  # an undisturbed mirror, in the strongest weather
 _STEADY = 0.02
+_REPEATED_TICKS = 5  # an event that is raised in so many ticks in a row floods alarms and record
 
 
 class Watch:
@@ -83,6 +84,7 @@ class Watch:
         self._vented = self._board_vents = self._ended = False
         self._restarts = self._held_ticks = 0
         self._held_pump = 0.0
+        self._ticks_in_a_row: dict[str, int] = {}  # by the kind of the event
         self.wrong_s = math.nan
         self.names: dict[float, str] = {0.0: ""}
         self.violations: list[str] = []
@@ -161,6 +163,7 @@ class Watch:
     def _look_at_tick(self, tick: VirtualTick, now_s: float) -> None:
         row, before = tick.row, self.state
         self.state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
+        self._look_for_repeated_events({event.kind for event in tick.events}, now_s)
         for event in tick.events:
             if isinstance(event, Fault):
                 self.names[float(event.code)] = event.name
@@ -183,6 +186,12 @@ class Watch:
         self.deepest = max(self.deepest, safe_level)
         if not self.code and not math.isnan(self._begun_s):
             self.code = row.fault
+
+    def _look_for_repeated_events(self, kinds: set[str], now_s: float) -> None:
+        self._ticks_in_a_row = {kind: self._ticks_in_a_row.get(kind, 0) + 1 for kind in kinds}
+        for kind, ticks in self._ticks_in_a_row.items():
+            if ticks == _REPEATED_TICKS:
+                self._say(now_s, f"an event of kind {kind} is raised in each tick")
 
     def _look_at_fault(self, before: State, code: float, now_s: float) -> None:
         """In `fault` the first cause stays; without a person, only the resume rule leads out."""

@@ -174,3 +174,24 @@ def test_if_the_gauge_lies_between_laser_and_camera_the_verdict_is_unsure() -> N
     for second in range(1, 121):  # it is not settled: a later verdict of the gauge counts
         said = shown(judge, time_s + second, 20.0, 0.0, 0.0)
     assert said == FaultySensor.LASER
+
+
+@pytest.mark.parametrize("speed_um_per_s", [-4.0, 4.0])
+@pytest.mark.parametrize("lag_s", [0.0, 4.5])
+def test_figures_that_lag_behind_a_moving_film_are_not_found_wrong(
+    lag_s: float, speed_um_per_s: float
+) -> None:
+    """The film moves for a minute, and each figure shows it as it was 4.5 s before: a check that
+    knows this lag finds nothing wrong, one that takes the figures for present blames the optics.
+    """
+    check = PlausibilityCheck(10.0, SAG_UM, figure_lag_s=lag_s)
+    verdicts = set()
+    for tick in range(round(260.0 * RATE_HZ)):
+        time_s = tick / RATE_HZ
+        film_um, shown_um = (
+            speed_um_per_s * min(max(at_s - 200.0, 0.0), 60.0) for at_s in (time_s, time_s - 4.5)
+        )
+        gauge_pa = PRESSURE_PA * (1 + film_um / SAG_UM) ** 3
+        figure = estimate(time_s, SAG_UM + shown_um) if tick % 20 == 0 else None
+        verdicts.add(check.step(1 / RATE_HZ, film_um, gauge_pa, figure))
+    assert verdicts == ({FaultySensor.NONE} if lag_s else {FaultySensor.NONE, FaultySensor.OPTICS})
