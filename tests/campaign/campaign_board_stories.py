@@ -5,14 +5,16 @@ and latches.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
-from campaign_stage import OldBoard, Stage, another_client
+from campaign_stage import OldBoard, Stage, another_client, sensors_say
 from campaign_times import BOARD_PRESSURE_MAX_PA, TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant
 
 from firmware_iface.emulators.modbus_pdu import RegisterRefusal
-from firmware_iface.emulators.pump_board import StoredSettings
+from firmware_iface.emulators.pump_board import BoardSample, StoredSettings
 from firmware_iface.register_map import load_default_map
 from firmware_iface.roles import BenchCommand, LinkError
 from membrane_ctrl.model.telemetry import State
@@ -25,8 +27,13 @@ _DOOR = 0b100  # bit of the interlock input that is fitted
 class GuardedBoard(Stage):
     """A board with a fitted gauge and a fitted interlock input, unknown to the controller."""
 
+    def __init__(self, gauge_fitted: bool = True) -> None:
+        self._gauge_fitted = gauge_fitted
+        super().__init__()
+
     def make_bench(self) -> VirtualBench:
         stored = StoredSettings(
+            gauge_fitted=self._gauge_fitted,
             gauge_timeout_s=_GAUGE_TIMEOUT_S,
             gauge_frozen_s=_GAUGE_FROZEN_S,
             interlocks_fitted=_DOOR,
@@ -340,6 +347,46 @@ def the_board_alone_stops_without_its_gauge() -> list[str]:
     return violations
 
 
+def a_board_without_the_value_of_its_gauge_never_pumps() -> list[str]:
+    """Switched on without a value of the gauge, or cleared while it is missing: no command drives
+    the pump, not even up to the next sample.
+    """
+    stage = GuardedBoard()
+    stage.bench.wrong.gauge_lost = True
+    stage.bench.advance(TICK_S)
+    stage.bench.power_cycle()
+    stage.bench.open()
+    stage.pump_without_a_controller(5.0, stage.still)
+    for _ in range(3):
+        stage.bench.clear_faults(0xFFFF)
+        stage.pump_without_a_controller(2.0, stage.still)
+    return stage.violations
+
+
+def a_gauge_that_repeats_its_value_with_gaps() -> list[str]:
+    """A frozen gauge is missing in every other second: the board stops the pump none the later."""
+    stage = GuardedBoard()
+    stage.pump_without_a_controller(2.0, lambda: _must_pump(stage))
+    frozen_pa = stage.bench.read().gauge_pressure_pa
+
+    def freeze(sample: BoardSample) -> BoardSample:
+        missing = round(sample.device_time_s) % 2
+        return replace(sample, gauge_pressure_pa=math.nan if missing else frozen_pa)
+
+    sensors_say(stage, freeze)
+    stage.pump_without_a_controller(_GAUGE_FROZEN_S + 1.0, lambda: "")
+    stage.pump_without_a_controller(5.0, stage.still)
+    return stage.violations
+
+
+def a_board_without_a_gauge_pumps() -> list[str]:
+    """Its stored settings say that no gauge is fitted: that it has no value stops nothing."""
+    stage = GuardedBoard(gauge_fitted=False)
+    stage.bench.wrong.gauge_lost = True
+    stage.pump_without_a_controller(2 * _GAUGE_FROZEN_S, lambda: _must_pump(stage))
+    return stage.violations
+
+
 def the_board_alone_stops_at_an_open_interlock() -> list[str]:
     """A circuit opens for a moment, while the pump runs or stands: the board keeps the pump off
     until a person clears the fault.
@@ -386,6 +433,9 @@ STORIES: Sequence[Callable[[], list[str]]] = (
     what_is_read_is_true,
     the_board_alone_keeps_its_limit,
     the_board_alone_stops_without_its_gauge,
+    a_board_without_the_value_of_its_gauge_never_pumps,
+    a_gauge_that_repeats_its_value_with_gaps,
+    a_board_without_a_gauge_pumps,
     the_board_alone_stops_at_an_open_interlock,
     other_inputs_of_the_board_stop_nothing,
 )
