@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import pytest
+
 from firmware_iface.roles import BenchReading
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, EstimatorConfig, ShapeConfig
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.safety import Observation
 from membrane_ctrl.controller.tick import TickInputs
+from tests.worlds.sound_figure import SOUND_FIGURE
 
 
 def look(
@@ -89,3 +92,27 @@ def test_a_read_back_of_nan_counts_as_a_mismatch() -> None:
         inputs = TickInputs(0.02 * tick, 0.02, replace(reading, pump_fraction=pump))
         observer.observe_inputs(inputs)
         assert observer.make_observation(inputs, math.nan).pump_mismatch == mismatch
+
+
+@pytest.mark.parametrize("may_follow_optics", [True, False])
+def test_figures_replace_a_lost_laser_only_if_the_estimate_uses_them(
+    may_follow_optics: bool,
+) -> None:
+    config = Config(
+        estimator=EstimatorConfig(process_value="estimate"),
+        shape=ShapeConfig(mode="track", track_rate_hz=10.0),
+    )
+    observer = Observer(config)
+    lit = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, 0, 0.0, False, 0)
+    for tick in range(1, 200):
+        now_s = 0.1 * tick
+        laser_um = math.nan if tick > 150 else 0.01 * (tick % 2)
+        reading = replace(lit, displacement_um=laser_um, sample_counter=tick, device_time_s=now_s)
+        figure = replace(SOUND_FIGURE, time_s=now_s, sag_um=SOUND_FIGURE.sag_um + 0.01 * (tick % 3))
+        inputs = TickInputs(now_s=now_s, dt_s=0.1, reading=reading, link_up=True, estimate=figure)
+        observer.observe_inputs(inputs, may_follow_optics)
+        if tick == 150:
+            assert not observer.optics_replace_laser
+    assert observer.optics_replace_laser is may_follow_optics
+    assert math.isfinite(observer.displacement_um) is may_follow_optics
+    assert math.isfinite(observer.optics_guard_um) is may_follow_optics

@@ -382,6 +382,24 @@ def test_a_wrong_laser_ends_an_experiment(process_value: str) -> None:
     assert held.moved_um < 65.0
 
 
+def test_an_experiment_ends_when_the_laser_that_it_measures_with_is_outvoted() -> None:
+    """The laser moves slowly and within the experiment's own limit: only optics and gauge show it,
+    and what it measures must not count.
+    """
+    held = settled(config_of("estimate"))
+    slow = RELAY.model_copy(update={"duration_s": 200.0, "limit_um": 30.0})
+    held.command(Command("tune", "a test", experiment=slow))
+
+    def drift(wrong: Wrong, since_s: float) -> None:
+        wrong.laser_offset_um = 0.3 * since_s
+
+    held.fail(150.0, drift)
+    assert "laser" in [event.faulty for event in held.told(Plausibility)]  # type: ignore[attr-defined]
+    (ended,) = held.told(ExperimentEnded)
+    assert ended.end == "reading_lost"  # type: ignore[attr-defined]
+    assert held.faults == []
+
+
 def test_figures_of_another_mirror_count_as_missing() -> None:
     held = settled(
         config_of("estimate"), lambda since_s, figure: replace(figure, sag_um=-figure.sag_um)
