@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -141,6 +142,24 @@ def a_camera_lost_on_a_bench_without_a_laser() -> list[str]:
     return stage.violations
 
 
+def figures_without_a_usable_sigma() -> list[str]:
+    """No laser, and the figures have no standard deviation, or one as large as the film's sag: they
+    hold nothing, and the pump stops.
+    """
+    violations = []
+    for sigma_um in (math.nan, 1e4, -1.0):
+        stage = by_optics()
+        stage.wait(10.0)
+        stage.change_figure = lambda figure, sigma_um=sigma_um: replace(  # type: ignore[misc]
+            figure, sag_sigma_um=sigma_um
+        )
+        stage.until(State.FAULT, 20.0)
+        stage.wait(8.0)
+        stage.wait(5.0, stage.still)
+        violations += stage.violations
+    return violations
+
+
 def optics_that_creep_without_a_laser() -> list[str]:
     """The stand sinks and the sag seems to shrink by 1 µm/s; the gauge alone detects it."""
     stage = by_optics()
@@ -188,7 +207,9 @@ def dead_actuators_are_found() -> list[str]:
         stage = Stage(config=config.model_copy(update={"states": timed}))
         setattr(stage.bench.wrong, name, 0.0)
         stage.ask("hold")
-        stage.wait(90.0, lambda at=stage: "held" if at.state == State.HOLD else "")
+        stage.wait(30.0)
+        stage.must(stage.state != State.CHECK, f"{name}: the start test does not end")
+        stage.wait(60.0, lambda at=stage: "held" if at.state == State.HOLD else "")
         stage.must(stage.state == State.FAULT, f"{name}: no fault")
         if name == "vent_stuck_fraction":
             stage.must(stage.plant.truth().displacement_um < 0.0, "inflated without a vent")
@@ -261,6 +282,7 @@ STORIES: Sequence[Callable[[], list[str]]] = (
     a_stuck_gauge_and_a_creeping_laser,
     a_creeping_laser_without_a_camera,
     a_camera_lost_on_a_bench_without_a_laser,
+    figures_without_a_usable_sigma,
     optics_that_creep_without_a_laser,
     a_seam_that_opens,
     a_setpoint_is_reached,

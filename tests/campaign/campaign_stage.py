@@ -16,6 +16,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.virtual_bench import MemoryLink, VirtualBench
 
@@ -36,8 +37,15 @@ class Stage:
         self.config = self.config or config_of(1, self.world, self.resumes)
         self.plant = WatchedPlant(self.world, self.config.twin, self.config.pump)
         self.bench = self.make_bench()
-        shape = TruthShape(self.bench, self.config, 1) if self.camera else None
-        self.run = VirtualRun(self.config, self.bench, zernike_projection(), shape)
+        self.change_figure: Callable[[ShapeEstimate], ShapeEstimate] = lambda figure: figure
+        true_shape = TruthShape(self.bench, self.config, 1)
+
+        def measure(now_s: float) -> ShapeEstimate | None:
+            figure = true_shape(now_s)
+            return None if figure is None else self.change_figure(figure)
+
+        source = measure if self.camera else None
+        self.run = VirtualRun(self.config, self.bench, zernike_projection(), source)
         self.state = State.STANDBY
 
     def make_bench(self) -> VirtualBench:
