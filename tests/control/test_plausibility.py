@@ -195,3 +195,20 @@ def test_figures_that_lag_behind_a_moving_film_are_not_found_wrong(
         figure = estimate(time_s, SAG_UM + shown_um) if tick % 20 == 0 else None
         verdicts.add(check.step(1 / RATE_HZ, film_um, gauge_pa, figure))
     assert verdicts == ({FaultySensor.NONE} if lag_s else {FaultySensor.NONE, FaultySensor.OPTICS})
+
+
+@pytest.mark.parametrize("moved_um", [-60.0, 60.0])
+def test_a_laser_after_a_gap_is_compared_by_its_new_readings(moved_um: float) -> None:
+    """The film moves by some tens of micrometres while the laser is lost; optics and gauge have
+    followed when it comes back. Its mean of before the gap would accuse it.
+    """
+    check = PlausibilityCheck(10.0, SAG_UM)
+    verdicts = set()
+    for tick in range(round(400.0 * RATE_HZ)):
+        time_s = tick / RATE_HZ
+        film_um = moved_um * min(max((time_s - 200.0) / 60.0, 0.0), 1.0)
+        laser_um = math.nan if 200.0 <= time_s < 330.0 else film_um
+        gauge_pa = PRESSURE_PA * (1 + film_um / SAG_UM) ** 3
+        figure = estimate(time_s, SAG_UM + film_um) if tick % 20 == 0 else None
+        verdicts.add(check.step(1 / RATE_HZ, laser_um, gauge_pa, figure))
+    assert verdicts == {FaultySensor.NONE}
