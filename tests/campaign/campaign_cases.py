@@ -175,7 +175,7 @@ CASES: tuple[Case, ...] = (
         wrong={"samples_frozen": 1},
         laser_lies=True,
         gauge_lies=True,
-        moving=Reaction(SafeLevel.HOLD_FLOW, 6 * TICK_S),
+        moving=Reaction(SafeLevel.HOLD_FLOW, STALE_S + _SOON),
     ),
     _case(
         "gauge lost",

@@ -178,6 +178,17 @@ def test_something_in_the_beam_is_no_response(ends_s: float) -> None:
     assert len(bench.failures(60)) >= 58
 
 
+@pytest.mark.parametrize("jump_um", [-60.0, -20.0, -8.0, 8.0, 20.0, 60.0])
+@pytest.mark.parametrize("rate_hz", [10.0, 25.0, 50.0])
+def test_one_jump_of_the_laser_is_no_failure(rate_hz: float, jump_um: float) -> None:
+    """Taken for noise, a jump would make every later response unclear."""
+    failures = []
+    for at_s in np.arange(0.05, 3.0, 0.15):
+        bench = Bench(rate_hz, error_um=lambda t, at_s=at_s: jump_um * (t > at_s))  # type: ignore[misc]
+        failures += bench.failures(3)
+    assert failures == []
+
+
 def test_a_film_that_jumps_with_everything_off_is_named() -> None:
     bench = Bench(error_um=lambda time_s: 20.0 * (math.fmod(time_s, 0.6) < 0.3))
     assert bench.failures(5) == ["its readings jump by micrometres with pump and vent off"] * 5
