@@ -75,6 +75,14 @@ def hold(
             "--autotune", help="Tune the loop on trial once the mirror is held; ten minutes."
         ),
     ] = False,
+    observe: Annotated[
+        bool,
+        typer.Option(
+            "--observe",
+            help="Read, estimate, measure and record; never command pump or vent. For the first "
+            "day on real hardware, or beside another controller.",
+        ),
+    ] = False,
     service: Annotated[
         bool,
         typer.Option(
@@ -86,6 +94,12 @@ def hold(
 ) -> int:
     """Hold the mirror until stopped."""
     settings = _start_from_flat(_with_devices(config, devices, twin), from_flat)
+    if observe:
+        settings = _make_observing(settings)
+    if settings.states.observe and (autotune or clear_faults):
+        raise errors.InputError(
+            "a hold that observes writes nothing: start it without --autotune and --clear-faults"
+        )
     duration_s = None if duration is None else durations.parse_duration_s(duration)
     terminal.print_progress("loading the control program")
     from membrane_ctrl.hold.hold_options import HoldOptions
@@ -100,7 +114,7 @@ def hold(
         logs_dir=logs,
         clear_faults=clear_faults,
         json=json,
-        standby=standby,
+        standby=standby or settings.states.observe,
         autotune=autotune,
         lab=devices is not None,
         configuration=devices or config,
@@ -108,6 +122,12 @@ def hold(
     )
     with errors.name_source_in_errors(devices or config):
         return hold_mirror(options)
+
+
+def _make_observing(settings: "Config") -> "Config":
+    """The configuration of a hold that commands nothing."""
+    states = settings.states.model_copy(update={"observe": True})
+    return settings.model_copy(update={"states": states})
 
 
 @twin_app.callback()

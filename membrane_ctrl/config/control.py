@@ -231,6 +231,10 @@ class StatesConfig(Section):
     actuator_test: bool = True
     """Try vent and pump before a hold: the film must respond within 3 s and 5 s. Leave it on,
     except to debug a bench."""
+    observe: bool = False
+    """Read, estimate, measure and record, and never command pump or vent. `hold --observe` sets it,
+    for the first day on real hardware, or beside another controller. Set it to true for a bench
+    that this program must not drive."""
     inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0
     """Longest inflation; a fill from flat takes two hours. Change it to twice the fill time of your
     mirror.

@@ -353,6 +353,10 @@ class InnerLoop:
         output = replace(output, feedforward_um_per_s=0.0, leak_um_per_s=math.nan)
         return replace(output, flow_um_per_s=self._pump_flow(fraction), pump_fraction=fraction)
 
+    def follow_pump(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
+        """`follow_flow` behind a pump that another controller drives, by its read-back."""
+        return self.follow_flow(given, self._pump_flow(fraction), dt_s)
+
     def set_gains(self, loop: LoopConfig) -> None:
         """Take new settings without a bump in the flow."""
         flow_max_um_per_s = min(loop.flow_max_um_per_s, self._flow_full_um_per_s)

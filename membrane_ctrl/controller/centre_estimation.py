@@ -129,7 +129,8 @@ class CentreEstimation:
         """One tick, after the sensors were judged; returns what is news."""
         flow_um_per_s, seen_um = last.flow_um_per_s, context.observer.displacement_um
         figures = context.observer.figures
-        if not self._wanted or state not in safety.ESTIMATED or not math.isfinite(flow_um_per_s):
+        is_moved = state in safety.ESTIMATED or context.config.states.observe
+        if not self._wanted or not is_moved or not math.isfinite(flow_um_per_s):
             self._stop_estimate()
             if self._by_optics and state not in safety.MOVING:
                 self._mount_drift.start(0.0)  # a resumed hold judges the optics by itself

@@ -143,6 +143,10 @@ TABLE: dict[Kind, CommandRule] = {
 }
 
 
+# Allowed in a run that only observes
+_OBSERVING: frozenset[Kind] = frozenset({"mark", "stop", "latch", "unlock"})
+
+
 def sort_commands(commands: Iterable[Command]) -> list[Command]:
     """Commands of a tick, safest first, the others in order of arrival."""
     return sorted(
@@ -167,6 +171,8 @@ def explain_refusal(command: Command, state: State, config: Config) -> str:
             if command.who == AT_START
             else "only the start of a run may report earlier resumes and faults"
         )
+    if config.states.observe and command.kind not in _OBSERVING:
+        return "this run only observes (states.observe): it commands neither pump nor vent"
     rule = TABLE[command.kind]
     if state not in rule.states:
         where = ", ".join(sorted(s.name.lower() for s in rule.states))

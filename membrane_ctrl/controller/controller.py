@@ -193,6 +193,8 @@ class Controller:
                 fresh=observation.advance_age_s == 0.0,
             )
         verdict = self._safety.judge(self.state, observation)
+        if self._config.states.observe:  # whoever drives the pump protects the mirror
+            verdict = safety.Verdict(None)
         self._apply_verdict(verdict, events)
         self._consider_resuming(observation)
         shape = self._step_shape(inputs, events)
@@ -200,7 +202,8 @@ class Controller:
         if (estimate := self._estimation.estimate) is not None:
             shape = replace(shape, trim_um=estimate.mount_um)
         context.laser_doubted = bool(consistency.laser_fault_text)
-        context.estimate = estimate if self.state in (State.SETTLE, State.HOLD) else None
+        is_held = self.state in (State.SETTLE, State.HOLD) or self._config.states.observe
+        context.estimate = estimate if is_held else None
         if math.isnan(self.memory.state_since_s):  # the verdict has just changed the state
             self.memory.state_since_s = inputs.now_s
             context.state_age_s = 0.0

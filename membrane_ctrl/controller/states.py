@@ -324,10 +324,26 @@ HANDLERS: dict[State, Callable[[TickContext], State]] = {
 }
 
 
+def observe(context: TickContext) -> State:
+    """Follow a pump that others drive, by its read-back; command nothing."""
+    reading = context.observer.reading
+    context.hold_wanted = False
+    context.explain(WhyCode.OBSERVING, "observing: this run commands neither pump nor vent")
+    if reading is not None and math.isfinite(reading.pump_fraction):
+        context.output = context.loop.follow_pump(
+            _make_loop_input(context, context.setpoint_um), reading.pump_fraction, context.dt_s
+        )
+    if context.way_down is not None:
+        context.finished = context.stop_exit
+    return State.STANDBY
+
+
 def run_state(state: State, context: TickContext) -> State:
     """Run the state's handler and return the next state; a request for another state takes
     precedence.
     """
+    if context.config.states.observe:
+        return observe(context)
     if context.way_down is not None and state not in (State.LOWER, State.FAULT):
         _explain_way_down(context)
         return State.LOWER

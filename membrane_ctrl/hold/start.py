@@ -70,13 +70,16 @@ def hold_mirror(options: HoldOptions) -> int:
         )
         config = twin.config if twin else options.config
         assert config.devices is not None
-        # one with other folders ends here
-        stack.enter_context(claim_devices(list_device_names(config.devices)))
+        observe = config.states.observe
+        # A hold with other folders ends here; a board behind a network may be read beside one
+        if not (observe and (config.devices.board or "").startswith("tcp://")):
+            stack.enter_context(claim_devices(list_device_names(config.devices)))
         lock_storage = find_locks(config, options)  # before anything is cleared
         latched = open_latched_fault(config, logs_dir, options)
         resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)
         terminal.print_progress(f"connecting to {config.devices.name}")
-        board = asyncio.run(identify_board(make_bench(config.devices), config, options, resumes))
+        found = make_bench(config.devices, observe)
+        board = asyncio.run(identify_board(found, config, options, resumes))
         run_dir = run_folder.create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         geometry.copy_to_run(run_dir)
         rings = child_processes.make_rings(config, twin.truth if twin else None, stack)
@@ -95,7 +98,9 @@ def hold_mirror(options: HoldOptions) -> int:
         link = _start_service(options, logs_dir, stack)
         if options.autotune:
             stack.callback(start_autotune(listeners.path, run_dir))
-        bench = make_bench(config.devices)  # a link belongs to the event loop that opened it
+        bench = make_bench(
+            config.devices, observe
+        )  # a link belongs to the event loop that opened it
         parts = HoldResources(
             bench=bench,
             config=config,

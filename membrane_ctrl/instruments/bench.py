@@ -7,6 +7,7 @@ from typing import TypeVar
 from firmware_iface import interlocks, role_bench, roles, settings
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.links import modbus_rtu
+from firmware_iface.observed_board import ObservedBoard
 from membrane_ctrl.config import device_places
 from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import interlock_sources
@@ -22,15 +23,24 @@ _LAPSE_S = 1.0  # beyond the longest life of an abandoned claim
 T = TypeVar("T")
 
 
-def make_bench(devices: DevicesConfig) -> roles.Bench:
-    """The configured bench, not yet connected. Raises InputError for impossible devices."""
+def make_bench(devices: DevicesConfig, observe: bool = False) -> roles.Bench:
+    """The configured bench, not yet connected; one that is only read if it is to `observe`.
+
+    Raises InputError for impossible devices.
+    """
     require_separate_ports(devices)
     links = modbus_rtu.ModbusLinks()
     made: roles.Bench
+    if devices.board is None and observe:
+        raise InputError(
+            "devices: --observe needs a pump board; single instruments are set up when they are "
+            "opened, and their ports cannot be shared"
+        )
     if devices.board is None:
         made = role_bench.RoleBench(make_role_devices(devices, links), devices.watchdog_s)
     else:
-        made = make_pump_board(devices, devices.board, links)
+        board = make_pump_board(devices, devices.board, links)
+        made = ObservedBoard(board) if observe else board
     if not devices.interlocks:
         return made
     return interlocks.InterlockBench(

@@ -12,6 +12,7 @@ class WhyCode(StrEnum):
     """Why the pump is as it is, and the mirror not held; more words may follow after a point."""
 
     STANDBY = "standby"
+    OBSERVING = "observing"
     LOCKED = "locked"
     INTERLOCK_OPEN = "interlock_open"
     FAULT_LATCHED = "fault_latched"
