@@ -125,9 +125,9 @@ async def identify_board(
         vented = reading.vent_fraction > safe_levels.VENTED_FRACTION
         if (
             faults == safe_levels.WATCHDOG_MASK
-            and not config.states.observe
             and not vented
             and _may_resume("watchdog_tripped", config, resumes)
+            and not config.states.observe
         ):
             await bench.clear_faults(safe_levels.WATCHDOG_MASK)
             return BoardAtStart(
