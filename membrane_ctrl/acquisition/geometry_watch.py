@@ -5,6 +5,7 @@ import numpy as np
 from membrane_ctrl.geometry.run_geometry import RunGeometry
 from membrane_ctrl.metrology.cycle.geometry_monitors import DriftMonitor, RingMonitor, noise_urad
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
+from membrane_ctrl.metrology.rays.bench_motions import describe_hidden_allowance
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction import slope_noise
@@ -38,6 +39,7 @@ class StatementWatch:
         return acquisition_events.GeometryKnown(
             state=table["state"],
             source=table["source"],
+            assumed=describe_hidden_allowance(),
             next_step=table["next_step"] or None,
             why="; ".join(statement.doubts) or None,
         )

@@ -26,6 +26,7 @@ from membrane_ctrl.measure.result_files import write_arrays, write_picture
 from membrane_ctrl.measure.set_statement import SetStatement, state_set
 from membrane_ctrl.metrology.figure.bin_figure import BinFigure
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.rays.bench_motions import describe_hidden_allowance
 from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
 from membrane_ctrl.metrology.tracking.step_solution import ENOUGH_STEPS, are_steps_separable
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame, rejected_frame
@@ -314,6 +315,7 @@ def _make_track_table(track: Track) -> dict[str, Any]:
         "usable": len(used),
         "stepped": track.stepped,
         "reference": track.reference.table(),
+        "assumed": describe_hidden_allowance(),
         "seconds": track.frames[-1].time_s - track.frames[0].time_s,
         **figures,
         "reasons": dict(reasons.most_common()),
@@ -344,7 +346,7 @@ def _format_track(table: dict[str, Any]) -> list[str]:
         )
         lines.append(
             f"          1 sigma {table['sag_sigma_um']:.2g} µm, if the bench has moved since the "
-            "reference in ways that frames do not show"
+            f"reference in ways that frames do not show (1 sigma: {table['assumed']})"
         )
         lines.append(f"fit       leaves {table['rest_share']:.2%} of the fringes' swing")
     return lines

@@ -43,13 +43,15 @@ class GeometryInUse(
 class GeometryKnown(
     Event,
     kind="geometry_known",
-    sentence="Geometry {state}: {source}[; {why}][; {next_step}]",
+    sentence="Geometry {state}: {source}[; {why}][; {next_step}]; the bars allow since the "
+    "reference cycle, at 1 sigma: {assumed}",
     notable=True,
 ):
     """How well the geometry is known: calibrated, uncalibrated, or contradicted by full cycles."""
 
     state: str
     source: str
+    assumed: str
     next_step: str | None = None
     why: str | None = None
 

@@ -94,6 +94,12 @@ def group_columns() -> list[slice]:
     return [slice(end - group.components, end) for group, end in zip(GROUPS, ends, strict=True)]
 
 
+def describe_hidden_allowance() -> str:
+    """What the bars allow of hidden motions, for a person: bodies and 1 sigma of each motion."""
+    hidden = [group for group in GROUPS if group.is_hidden and group.allowance > 0]
+    return "; ".join(f"{group.name} by {group.allowance:g} {group.unit}" for group in hidden)
+
+
 @dataclass(frozen=True)
 class _Moved:
     """A bench after a motion: its geometry, and the rays (3, n) in world."""

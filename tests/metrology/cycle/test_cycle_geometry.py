@@ -90,6 +90,8 @@ def test_a_geometry_that_the_frames_contradict_degrades_both_kinds_of_cycle(
     assert statement.state is GeometryState.CONTRADICTED
     event = StatementWatch().check_statement(statement)
     assert isinstance(event, acquisition_events.GeometryKnown)
+    assert "the camera shifted along its axis by 10 µm" in event.assumed
+    assert "the focal length changed by 1 ppm" in event.assumed
     assert event.level is LogLevel.WARNING
     assert event.why is not None
 
