@@ -58,6 +58,7 @@ class ConfigurationPanel:
             self._choice = ui.select([], label="configuration", on_change=self._load)
             self._choice.style("min-width: 12rem").props('aria-label="configuration to edit"')
             self._new = ui.input("save under another name").props('aria-label="new name"')
+            self._new.style("min-width: 14rem")
         with ui.row().classes("w-full items-start no-wrap max-lg:flex-wrap"):
             with ui.column().classes("col-grow min-w-0"):
                 self._text = ui.codemirror("", language="TOML", line_wrapping=True)
