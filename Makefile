@@ -70,6 +70,7 @@ campaign: $(STAMP)  ## all faults, in virtual time and with real processes; docs
 
 mutants: $(STAMP)  ## code made wrong on purpose: what the fast tests notice, and what the campaign alone; under an hour
 	$(BIN)/python tests/mutants/mutants.py
+	$(BIN)/python tests/mutants/numerics.py
 
 BOARD := $(MAKE) --no-print-directory -C firmware_iface/board PYTHON=$(CURDIR)/$(BIN)/python OUT=$(CURDIR)/build/board
 

@@ -76,9 +76,11 @@ def _error_mm(surface: Surface, film: TrueFilm) -> np.ndarray:
 
 
 def test_shape_of_the_fitted_terms_is_exact() -> None:
-    fit = fit_surface(TRACER, _points(_seen("terms")), START)
+    points = _points(_seen("terms"))
+    fit = fit_surface(TRACER, points, START)
     assert fit.converged
     assert len(fit.changes_mm) <= 5
+    assert fit.weight_sum == pytest.approx(points.weights.sum())
     assert np.abs(_error_mm(fit.surface, TERMS)).max() <= 1e-6
     assert fit.surface.hencky_mm == pytest.approx(0, abs=1e-3)
 
