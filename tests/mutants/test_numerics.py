@@ -6,6 +6,7 @@ import ast
 from collections import Counter
 
 import numerics
+from mutants import ROOT
 
 APPLIES = 0.8  # of the list: statements change; a new draw replaces those that are gone
 
@@ -31,7 +32,7 @@ def test_most_mutations_apply_and_no_two_have_the_same_words() -> None:
     assert len(mutants) >= 40
     assert {mutant.area for mutant in mutants} == set(numerics.PACKAGES) == tests.keys()
     assert max(Counter(mutant.what for mutant in mutants).values()) == 1
-    paths = (numerics.ROOT / numerics.METROLOGY).rglob("*.py")
+    paths = (ROOT / numerics.METROLOGY).rglob("*.py")
     product = "\n".join(path.read_text(encoding="utf-8") for path in paths)
     applies = [mutant for mutant in mutants if product.count(mutant.find) == 1]
     assert len(applies) >= APPLIES * len(mutants)
@@ -39,7 +40,7 @@ def test_most_mutations_apply_and_no_two_have_the_same_words() -> None:
 
 def test_the_tests_that_run_exist() -> None:
     _, tests = numerics.load()
-    assert all((numerics.ROOT / file).exists() for files in tests.values() for file in files)
+    assert all((ROOT / file).exists() for files in tests.values() for file in files)
 
 
 def test_the_page_shows_the_stored_results() -> None:

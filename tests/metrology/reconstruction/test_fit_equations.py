@@ -46,7 +46,8 @@ def test_right_side_and_residual_are_those_of_sums_over_the_points() -> None:
     slopes, weights = 1e-3 * rng.standard_normal((2, POINTS)), rng.uniform(0.2, 1.0, POINTS)
     designs = [part / RADIUS_MM for part in evaluate_basis(x, y)[1:]]
     of_axes = [(design * weights) @ design.T for design in designs]
-    normal = NormalMatrix(of_axes[0], of_axes[1], np.linalg.inv(of_axes[0] + of_axes[1]))
+    inverse = np.asarray(np.linalg.inv(of_axes[0] + of_axes[1]), float)
+    normal = NormalMatrix(of_axes[0], of_axes[1], inverse)
 
     sums = residual_moments(x, y, slopes, weights)
     right = right_side(sums, RADIUS_MM)
