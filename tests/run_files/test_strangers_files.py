@@ -178,6 +178,7 @@ _OWN = {
     "control_port/sockets.py",
     "sessions/folder.py",
     "sessions/live_log.py",
+    "alarms/sent_log.py",
     "web/tuning_panel.py",
     # the user's own folder of compiled code, made if it is missing
     "model/kernel_cache.py",
@@ -203,6 +204,8 @@ _OWN = {
     "geometry/prior_file.py",
     "commissioning/first_config.py",
     "commissioning/new_driver.py",
+    # former configurations beside the one that a person edits, the oldest removed
+    "service/configuration_editor.py",
     # shared memory
     "processes/frames.py",
     "processes/ring.py",
