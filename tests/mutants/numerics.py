@@ -242,7 +242,13 @@ def page(mutants: Sequence[Mutant]) -> str:
     examined = current_results(mutants)
     killed = sum(bool(found) for _, found in examined)
     share = 100 * killed / max(len(examined), 1)
-    met = "met" if share >= 100 * GOAL else "**missed**"
+    goal = f"the goal of {100 * GOAL:.0f} % is {'met' if share >= 100 * GOAL else '**missed**'}"
+    if len(examined) < len(mutants):
+        goal = (
+            f"whether the goal of {100 * GOAL:.0f} % is met is not known. A mutation that survives "
+            "takes longest to examine, so that the share of some is too high: at least "
+            f"{100 * killed / len(mutants):.0f} % of all are killed"
+        )
     lines = [
         "# Mutants of the numerics",
         "",
@@ -251,7 +257,7 @@ def page(mutants: Sequence[Mutant]) -> str:
         "of the package run.",
         "",
         f"{len(mutants)} mutations are listed, {len(examined)} were examined. **The tests kill "
-        f"{killed} of {len(examined)} ({share:.0f} %)**; the goal of {100 * GOAL:.0f} % is {met}.",
+        f"{killed} of {len(examined)} ({share:.0f} %)**; {goal}.",
         "",
         "| mutation | killed by |",
         "|---|---|",
