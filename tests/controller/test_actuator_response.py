@@ -183,7 +183,9 @@ def test_something_in_the_beam_is_no_response(ends_s: float) -> None:
 def test_one_jump_of_the_laser_is_no_failure(rate_hz: float, jump_um: float) -> None:
     """Taken for noise, a jump would make every later response unclear."""
     failures = []
-    for at_s in np.arange(0.05, 3.0, 0.15):
+    # At 10 Hz a jump in the middle of the part `vent` leaves too little of it
+    until_s = 3.0 if rate_hz == 10.0 else 4.0
+    for at_s in np.arange(0.05, until_s, 0.15):
         bench = Bench(rate_hz, error_um=lambda t, at_s=at_s: jump_um * (t > at_s))  # type: ignore[misc]
         failures += bench.failures(3)
     assert failures == []
