@@ -118,6 +118,15 @@ def services_of(logs: Path) -> list[psutil.Process]:
     return found
 
 
+def wait_for_one_service(logs: Path) -> psutil.Process:
+    """The only service of a folder; a child that it has just forked has its words until it runs a
+    program of its own.
+    """
+    until(lambda: len(services_of(logs)) == 1)
+    (service,) = services_of(logs)
+    return service
+
+
 @contextmanager
 def holding(folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A hold of the twin that may start a service."""
@@ -148,8 +157,8 @@ def test_a_page_is_there_during_and_after_a_killed_hold_and_a_hold_outlives_it(
         with holding(tmp_path) as hold:
             until(lambda: find_service(logs))
             link = str(find_service(logs))
-            services += services_of(logs)
-            (service,) = services
+            service = wait_for_one_service(logs)
+            services.append(service)
             assert os.getsid(service.pid) == service.pid
             with httpx.Client(follow_redirects=True, timeout=60.0) as browser:
                 until(lambda: "membrane_ctrl" in _text_of(browser, link))
@@ -160,7 +169,7 @@ def test_a_page_is_there_during_and_after_a_killed_hold_and_a_hold_outlives_it(
         with holding(tmp_path) as hold:
             until(lambda: find_service(logs))
             assert find_service(logs) == link, "a bookmark stays valid"
-            services += services_of(logs)
+            services.append(wait_for_one_service(logs))
             hold.send_signal(signal.SIGINT)
             _, said = hold.communicate(timeout=120.0)
             assert hold.returncode in (Exit.DONE, Exit.INTERRUPTED)
