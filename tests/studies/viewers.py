@@ -266,7 +266,11 @@ def measure_viewers(
         at_most(
             "viewers lost", sum(bool(failed) for _, failed in gaps), "", 0, "viewers", len(gaps)
         ),
-        at_most("stalled viewers not hung up on", cycles - hung_up, "", 0, "stalled", cycles),
+        # One viewer of each cycle is stalled; whoever else was hung up on had read
+        at_most(
+            "stalled viewers not hung up on", max(0, cycles - hung_up), "", 0, "stalled", cycles
+        ),
+        at_most("reading viewers hung up on", max(0, hung_up - cycles), "", 0, "viewers", count),
         at_most("processor of the page", 100 * share, "%", 50.0),
         at_most("memory of the page, growth", grown_mb, "MB", 200.0),
     ]

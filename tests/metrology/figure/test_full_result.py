@@ -169,14 +169,14 @@ def test_noisy_pictures_move_no_film_and_hide_no_motion(
                 checked.stack, displacement_um=place_um + rng.standard_normal(place_um.size)
             )
             film = FilmMotion.of(replace(checked, stack=noisy))
-            motion_um = [axis_um * film.is_worth_correcting for axis_um in film.motion_um]
+            found_um = [axis_um * film.is_worth_correcting for axis_um in film.motion_um]
             off = [
-                told - place_um[used]
-                for told, used in zip(motion_um, checked.view.used, strict=True)
+                axis_um - place_um[used]
+                for axis_um, used in zip(found_um, checked.view.used, strict=True)
             ]
             off_um.append(off[0].mean() - off[1].mean())
             sigma_um.append(
-                math.hypot(film.x_to_y_sigma_um, motion_um[0].mean() - film.motion_um[0].mean())
+                math.hypot(film.x_to_y_sigma_um, found_um[0].mean() - film.motion_um[0].mean())
             )
             left_um += [np.std(one) for one in off]
         budget = measured_sets.measured(stack, optics)[1].budget
