@@ -62,9 +62,11 @@ class RunEnd:
 
     def handle_tick(self, outputs: TickOutputs) -> None:
         """Note a tick's state and events."""
-        if outputs.finished is None:
-            self.state = State(int(outputs.row.state))
-            self.has_held |= self.state is State.HOLD
+        state = State(int(outputs.row.state))
+        # When the duration is over, the pump is taken off: the state before is what counts
+        if outputs.finished is None and state is not State.LOWER:
+            self.state = state
+            self.has_held |= state is State.HOLD
         for event in outputs.events:
             if isinstance(event, events.Fault):
                 self.fault_s = outputs.row.mono_s
