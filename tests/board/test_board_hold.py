@@ -21,7 +21,7 @@ from tests.board.qemu_board import built_image
 
 pytestmark = [pytest.mark.campaign, pytest.mark.real_time]
 
-_HOLD_S = float(os.environ.get("BOARD_HOLD_S", "25"))
+_HOLD_S = float(os.environ.get("BOARD_HOLD_S", "45"))
 _LONG_S = 300.0  # from here on the two are compared
 _SETTLE_S = 60.0
 _CONFIG = """
