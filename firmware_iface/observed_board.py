@@ -32,7 +32,7 @@ class ObservedBoard:
         """Drop the command."""
 
     async def clear_faults(self, mask: int) -> None:
-        """Leave the faults: whoever drives the board clears them."""
+        """Leave the faults to the program that drives the board."""
 
     def dead_guards(self) -> tuple[str, ...]:
         """None: nothing is guarded."""

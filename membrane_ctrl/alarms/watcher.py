@@ -89,7 +89,7 @@ class Watcher:
         self._status = self._status.after_event(event)
         match event:
             case port_events.AlarmsAcknowledged() | CommandTaken(command="ack"):
-                # whoever sends `ack` has seen the alarms, even if the hold refuses it
+                # the person who sends `ack` has seen the alarms, even if the hold refuses
                 self._book.acknowledge_all(now_s)
         for sign in signs:
             self._book.take_sign(sign, now_s)

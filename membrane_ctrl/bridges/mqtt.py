@@ -317,7 +317,7 @@ async def _publish(
                 **bridge.values(),
             }
             await client.publish(f"{base}/values", json.dumps(message))
-        if due:  # after the values: whoever sees `online` has them
+        if due:  # after the values: a client that sees `online` has them
             availability.note_published(now)
             await client.publish(f"{base}/availability", now, qos=1, retain=True)
         await asyncio.sleep(min(_LOOK_S, max(0.0, next_s - time.monotonic())))

@@ -193,7 +193,7 @@ class Controller:
                 fresh=observation.advance_age_s == 0.0,
             )
         verdict = self._safety.judge(self.state, observation)
-        if self._config.states.observe:  # whoever drives the pump protects the mirror
+        if self._config.states.observe:  # the program that drives the pump protects the mirror
             verdict = safety.Verdict(None)
         self._apply_verdict(verdict, events)
         self._consider_resuming(observation)

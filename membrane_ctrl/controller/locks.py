@@ -86,7 +86,7 @@ def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
     """Decide on an `unlock`.
 
     Without a word it removes the sender's own lock, if there is exactly one. With a word it removes
-    the lock of that word, whoever its author is. A bridge removes none: no person has read the
+    the lock of that word, of any author. A bridge removes none: no person has read the
     word.
 
     Parameters

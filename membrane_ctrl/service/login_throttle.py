@@ -117,7 +117,7 @@ class LoginThrottle:
                 budget.give_back(key, now_s)
 
     def note_success(self, guess: Guess, admission: Admission) -> None:
-        """Restore the budget of whoever gave the right password."""
+        """Restore the budget of a client that gave the right password."""
         self.withdraw(admission)
         with self._lock:
             self._device.forget((guess.device,))

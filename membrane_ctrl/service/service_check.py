@@ -59,7 +59,7 @@ def check_service(page: ServiceConfig, send: bool) -> list[str]:
     require_usable_files(page)
     lines = [
         f"page: {public_address(page).base_url}",
-        f"users: {', '.join(sorted(users)) or 'whoever has the link'}",
+        f"users: {', '.join(sorted(users)) or 'everybody who has the link'}",
         f"heartbeat: {_describe_heartbeat(page)}",
     ]
     if send and page.heartbeat.is_wanted:
