@@ -40,7 +40,7 @@ from membrane_ctrl.instruments import (
 )
 from membrane_ctrl.model import errors, plain_json, run_status, terminal
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.optional import describe_missing, is_installed
+from membrane_ctrl.model.optional import describe_missing, find_missing_page_library
 
 _READS = 100
 _LONGEST_S = 2.0  # slow devices get fewer reads
@@ -242,8 +242,8 @@ def _describe_page(config: Config) -> str:
     """Where the page would be."""
     if not config.port.enabled:
         return "none: port.enabled = false"
-    if not is_installed("nicegui"):
-        return f"none: {describe_missing('it', 'nicegui', 'web')}"
+    if (missing := find_missing_page_library()) is not None:
+        return f"none: {describe_missing('it', missing, 'web')}"
     return "of the service, which the hold starts if none follows its runs"
 
 

@@ -19,7 +19,7 @@ from membrane_ctrl.config.port import LOCAL
 from membrane_ctrl.config.service import DEFAULT_PORT
 from membrane_ctrl.control_port import service_link
 from membrane_ctrl.model import errors
-from membrane_ctrl.model.optional import describe_missing, is_installed
+from membrane_ctrl.model.optional import describe_missing, find_missing_page_library
 from membrane_ctrl.processes.command_process import CommandProcess
 
 LOG_NAME = "service.log"
@@ -52,8 +52,8 @@ def start_page_service(
     """
     if (link := service_link.find_service(logs)) is not None:
         return link
-    if not is_installed("nicegui"):
-        warn(f"no page: {describe_missing('it', 'nicegui', 'web')}")
+    if (missing := find_missing_page_library()) is not None:
+        warn(f"no page: {describe_missing('it', missing, 'web')}")
         return ""
     port = _find_free_port()
     folder = Path() if configuration is None else configuration.resolve().parent

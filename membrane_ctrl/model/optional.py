@@ -6,10 +6,18 @@ from types import ModuleType
 
 from membrane_ctrl.model import errors
 
+# What the page's service imports from the extra `web`
+PAGE_LIBRARIES = ("nicegui", "fastapi_offline", "argon2", "prometheus_client")
+
 
 def is_installed(name: str) -> bool:
     """Whether a library can be imported; does not import it."""
     return importlib.util.find_spec(name) is not None
+
+
+def find_missing_page_library() -> str | None:
+    """The first library of the page that is not installed; None if all are."""
+    return next((name for name in PAGE_LIBRARIES if not is_installed(name)), None)
 
 
 def describe_missing(user: str, name: str, extra: str) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from membrane_ctrl.model import durations, errors, files
-from membrane_ctrl.model.optional import require_installed
+from membrane_ctrl.model.optional import PAGE_LIBRARIES, require_installed
 
 app = typer.Typer(
     invoke_without_command=True,
@@ -85,7 +85,8 @@ def serve(
     from membrane_ctrl.control_port import ctl
     from membrane_ctrl.processes.command_process import end_with_parent
 
-    require_installed("nicegui", "web", "`serve`")
+    for library in PAGE_LIBRARIES:
+        require_installed(library, "web", "`serve`")
     from membrane_ctrl.web.server import serve
 
     given: dict[str, Any] = {
