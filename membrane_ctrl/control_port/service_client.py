@@ -204,7 +204,8 @@ class ServiceClient:
         """Return status and body of an answer. Raises DeviceError."""
         connection = self._connect()
         # a service that sends a byte a second must not take longer than one that is silent
-        timer = threading.Timer(self._answer_s, _hang_up, [connection])
+        is_over = threading.Event()
+        timer = threading.Timer(self._answer_s, _hang_up, [connection, is_over])
         timer.daemon = True
         timer.start()
         try:
@@ -226,7 +227,7 @@ class ServiceClient:
             raise errors.DeviceError(f"{self._where}: no service is listening") from None
         except (TimeoutError, http.client.HTTPException, OSError, ValueError) as error:
             reason = errors.os_reason(error) if isinstance(error, OSError) else "no HTTP answer"
-            if not timer.is_alive():
+            if is_over.is_set():
                 reason = f"no answer within {self._answer_s:g} s"
             raise errors.DeviceError(f"{self._where}: {reason or 'no answer'}") from None
         finally:
@@ -282,8 +283,9 @@ class ServiceClient:
         return errors.DeviceError(f"{self._where}: not an answer of a service ({shown})")
 
 
-def _hang_up(connection: http.client.HTTPConnection) -> None:
-    """End a connection at its deadline: a thread that waits for it returns."""
+def _hang_up(connection: http.client.HTTPConnection, is_over: threading.Event) -> None:
+    """End a connection at its deadline: a thread that waits for it returns, and finds why."""
+    is_over.set()
     if connection.sock is not None:
         with contextlib.suppress(OSError):
             connection.sock.shutdown(socket.SHUT_RDWR)
