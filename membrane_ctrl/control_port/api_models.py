@@ -178,6 +178,14 @@ class StartBody(BaseModel):
     clear_faults: bool = False
 
 
+class RestartBody(BaseModel):
+    """The configuration of the next hold."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    configuration: Annotated[str, Field(max_length=64)]
+
+
 class CommandAnswer(_Answer):
     """What became of a command: `text` is one line for people."""
 

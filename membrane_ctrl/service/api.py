@@ -26,6 +26,7 @@ from membrane_ctrl.control_port.api_models import (
     ConfigurationTextAnswer,
     HistoryAnswer,
     Reading,
+    RestartBody,
     RunAnswer,
     RunEndAnswer,
     SafetyBody,
@@ -48,6 +49,7 @@ from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.ended_run import REPORT_NAME, EndedRun
 from membrane_ctrl.service.feed import SIGNALS, HoldFeed, history
 from membrane_ctrl.service.hold_command import SendLimits
+from membrane_ctrl.service.hold_restart import begin_restart
 from membrane_ctrl.service.hold_seen import HoldSeen
 from membrane_ctrl.service.hold_starter import HoldStarter, StartOptions
 from membrane_ctrl.service.metrics import METRICS_TYPE, render_metrics
@@ -236,9 +238,24 @@ def make_api(
             raise HTTPException(HTTPStatus.CONFLICT, "; ".join(error.lines)) from None
         return CommandAnswer(done=True, text=f"start of {body.configuration}: begun")
 
+    @api.post("/api/restart", status_code=HTTPStatus.ACCEPTED)
+    async def restart_hold(body: RestartBody, user: User, feed: Feed) -> CommandAnswer:
+        """Stop the hold and start the next with a configuration; 409 if this is refused, and
+        nothing is stopped. Follow `/api/state` and `/api/start` to see what becomes of it.
+        """
+        _require_role(user, "operate", "restart")
+        stop = {
+            "do": "stop",
+            "why": f"{user.via}: {user.name} restarts with {body.configuration}",
+            "on_behalf": on_behalf(user, user.via),
+        }
+        with _refused_as_409():
+            await begin_restart(feed, starter, body.configuration, user.name, stop)
+        return CommandAnswer(done=True, text=f"restart with {body.configuration}: begun")
+
     @api.get("/api/start")
     async def get_start_failure() -> CommandAnswer:
-        """Why the last start failed; `done` if it did not."""
+        """Why the last start or restart failed; `done` if it did not."""
         failure = starter.failure
         return CommandAnswer(done=not failure, text=failure)
 

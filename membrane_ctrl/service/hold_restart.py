@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import Any
 
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.model import errors
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter, StartOptions
-from membrane_ctrl.service.work_pools import PoolFullError, pool_of_command
+from membrane_ctrl.service.work_pools import RUN_LISTS, PoolFullError, pool_of_command
 
 # A pump that does not obey takes 15 s, and the recording closes within 30 s
 _ENDS_S = 120.0
 _LOOK_S = 0.5
+_EXPERIMENT = State.TUNE.name.lower()
+
+_under_way: set[asyncio.Task[Outcome]] = set()
 
 
-async def restart_hold(
+async def begin_restart(
     feed: HoldFeed, starter: HoldStarter, name: str, who: str, stop: dict[str, Any]
-) -> Outcome:
-    """Stop the hold, wait for its end, and start one.
+) -> asyncio.Task[Outcome]:
+    """Begin to stop the hold, to wait for its end, and to start one.
 
     Parameters
     ----------
@@ -35,29 +40,61 @@ async def restart_hold(
 
     Returns
     -------
-    Outcome
-        What became of it; the start itself goes on, and its failure is in `starter.failure`.
+    Task of Outcome
+        It goes on without the viewer who asked. A failure is also in `starter.failure`, and so is
+        that of the start, which continues after it.
+
+    Raises
+    ------
+    InputError
+        The hold must not be stopped, or could not be started again: nothing is done.
+    PoolFullError
+        Too many requests wait: nothing is done.
     """
-    if starter.can_start():
-        return _start(starter, name, who)
+    if feed.logs != starter.logs:
+        raise errors.InputError("the service starts no holds in the folder of this one")
+    if not feed.seen.silent and feed.seen.state_name == _EXPERIMENT:
+        raise errors.InputError(
+            "the hold is in an experiment; wait for its end, or stop the hold first"
+        )
+    await RUN_LISTS.run(starter.find_configuration, name)
+    if _under_way:
+        raise errors.InputError("a restart is under way already")
+    task = asyncio.create_task(_restart(feed, starter, name, who, stop), name="restart of a hold")
+    _under_way.add(task)
+    task.add_done_callback(_under_way.discard)
+    return task
+
+
+async def _restart(
+    feed: HoldFeed, starter: HoldStarter, name: str, who: str, stop: dict[str, Any]
+) -> Outcome:
     try:
-        stopped = await pool_of_command("stop").run(feed.ask, stop)
+        reason = await _stop_and_start(feed, starter, name, who, stop)
     except PoolFullError as error:
-        return Outcome.failed("restart", f"not stopped: {error}")
-    if not stopped.done:
-        return Outcome.failed("restart", stopped.text)
-    for _ in range(round(_ENDS_S / _LOOK_S)):
-        if starter.can_start():
-            return _start(starter, name, who)
-        await asyncio.sleep(_LOOK_S)
-    return Outcome.failed(
-        "restart", f"stopped, but the hold has not ended within {_ENDS_S:.0f} s; start it by hand"
-    )
-
-
-def _start(starter: HoldStarter, name: str, who: str) -> Outcome:
-    try:
-        starter.start_hold(name, who, StartOptions())
+        reason = str(error)
     except errors.CommandError as error:
-        return Outcome.failed("restart", "; ".join(error.lines))
-    return Outcome.succeeded("restart")
+        reason = "; ".join(error.lines)
+    if not reason:
+        return Outcome.succeeded("restart")
+    starter.note_failure(f"restart: {reason}")
+    return Outcome.failed("restart", reason)
+
+
+async def _stop_and_start(
+    feed: HoldFeed, starter: HoldStarter, name: str, who: str, stop: dict[str, Any]
+) -> str:
+    """Stop the hold if one runs, wait for its end, and begin the start; returns why it was not
+    started. Raises InputError, PoolFullError.
+    """
+    if not starter.can_start():
+        stopped = await pool_of_command("stop").run(feed.ask, stop)
+        if not stopped.done:
+            return stopped.text
+    give_up_s = time.monotonic() + _ENDS_S
+    while not starter.can_start():
+        if time.monotonic() > give_up_s:
+            return f"stopped, but the hold has not ended within {_ENDS_S:.0f} s; start it by hand"
+        await asyncio.sleep(_LOOK_S)
+    await RUN_LISTS.run(starter.start_hold, name, who, StartOptions())
+    return ""

@@ -84,7 +84,7 @@ class HoldStarter:
     """
 
     def __init__(self, logs: Path, configurations: Path, units: bool) -> None:
-        self._logs, self._configurations, self._units = logs, configurations, units
+        self.logs, self._configurations, self._units = logs, configurations, units
         # On Linux each thread has a niceness, and a program inherits that of the thread that
         # starts it. This thread begins before the service lowers its own priority.
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="hold starter")
@@ -104,6 +104,18 @@ class HoldStarter:
                 _read_configuration(file) for file in paths if is_configuration_name(file.stem)
             ]
         return [each for each in found if each.has_devices or each.problem or not self._units]
+
+    def find_configuration(self, name: str) -> Configuration:
+        """Return a configuration that a hold can be started with. Raises InputError."""
+        known = {each.name: each for each in self.list_configurations()}
+        chosen = known.get(name)
+        if chosen is None:
+            raise errors.InputError(
+                f"{name}: no such configuration; known: {', '.join(known) or 'none'}"
+            )
+        if chosen.problem:
+            raise errors.InputError(chosen.problem)
+        return chosen
 
     def is_running(self) -> bool:
         """Whether the program that was started last still runs; False for a unit."""
@@ -127,7 +139,7 @@ class HoldStarter:
 
     def can_start(self) -> bool:
         """Whether no hold runs, also none that is about to listen or to end."""
-        return not self.is_running() and not sockets.is_listening(self._logs / SOCKET_NAME)
+        return not self.is_running() and not sockets.is_listening(self.logs / SOCKET_NAME)
 
     def start_hold(self, name: str, who: str, options: StartOptions) -> Future[None]:
         """Start a hold with a configuration.
@@ -150,14 +162,7 @@ class HoldStarter:
         InputError
             No such configuration, or it cannot be used; or a hold runs.
         """
-        known = {each.name: each for each in self.list_configurations()}
-        chosen = known.get(name)
-        if chosen is None:
-            raise errors.InputError(
-                f"{name}: no such configuration; known: {', '.join(known) or 'none'}"
-            )
-        if chosen.problem:
-            raise errors.InputError(chosen.problem)
+        chosen = self.find_configuration(name)
         if not self.can_start():
             raise errors.InputError("a hold runs already; stop it before")
         words = " ".join([name, *options.words])
@@ -176,9 +181,9 @@ class HoldStarter:
 
     def _start_unit(self, chosen: Configuration, options: StartOptions) -> None:
         unit = f"{UNIT_PREFIX}{chosen.name}.service"
-        self._set_failure("")
+        self.note_failure("")
         words = ["systemctl", "--no-ask-password", "start", unit]
-        given = options_file(self._logs, chosen.name)
+        given = options_file(self.logs, chosen.name)
         try:
             # read by the unit at this start only: a restart by systemd has no options
             files.write_text_atomic(given, f"HOLD_OPTIONS={' '.join(options.words)}\n")
@@ -186,27 +191,27 @@ class HoldStarter:
                 words, capture_output=True, text=True, check=False, timeout=_SYSTEMCTL_S
             )
         except (OSError, subprocess.TimeoutExpired) as error:
-            self._set_failure(f"systemctl start {unit}: {error}")
+            self.note_failure(f"systemctl start {unit}: {error}")
             return
         finally:
             given.unlink(missing_ok=True)
         if done.returncode != 0:
             reason = terminal.one_line(done.stderr.strip() or "no reason given")
-            self._set_failure(f"{reason} See `journalctl -u {unit}`")
+            self.note_failure(f"{reason} See `journalctl -u {unit}`")
 
     def _start_program(self, chosen: Configuration, options: StartOptions) -> None:
-        words = [sys.executable, "-m", "membrane_ctrl", "hold", "--logs", str(self._logs)]
+        words = [sys.executable, "-m", "membrane_ctrl", "hold", "--logs", str(self.logs)]
         words += ["--name", chosen.name, *options.words]
         if chosen.file is not None:
             words += ["--config", str(chosen.file)]
         if not chosen.has_devices:
             words.append("--twin")
-        self._set_failure("")
+        self.note_failure("")
         try:
-            self._logs.mkdir(parents=True, exist_ok=True)
+            self.logs.mkdir(parents=True, exist_ok=True)
             # appended, so that `limit_log` may cut it while the hold writes
             flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW
-            handle = os.open(self._logs / LOG_NAME, flags, 0o600)
+            handle = os.open(self.logs / LOG_NAME, flags, 0o600)
             with os.fdopen(handle, "wb") as log:
                 process = subprocess.Popen(
                     words,
@@ -216,26 +221,27 @@ class HoldStarter:
                     start_new_session=True,
                 )
         except OSError as error:
-            self._set_failure(f"the hold was not started: {errors.os_reason(error)}")
+            self.note_failure(f"the hold was not started: {errors.os_reason(error)}")
             return
         with self._lock:
             self._process = process
 
     def limit_log(self) -> None:
         """Empty the log of a hold that was started, if it has become long: a line a second."""
-        path = self._logs / LOG_NAME
+        path = self.logs / LOG_NAME
         with suppress(OSError):
             if path.stat().st_size > _LOG_BYTES_MAX:
                 os.truncate(path, 0)
 
-    def _set_failure(self, text: str) -> None:
+    def note_failure(self, text: str) -> None:
+        """Keep why the last start or restart failed; empty: it has not."""
         with self._lock:
             self._failure = text
 
     def _read_tail(self) -> str:
         """Return the last lines of the hold's log, in one."""
         try:
-            with (self._logs / LOG_NAME).open("rb") as file:
+            with (self.logs / LOG_NAME).open("rb") as file:
                 file.seek(0, os.SEEK_END)
                 file.seek(max(0, file.tell() - _TAIL_BYTES))
                 text = file.read().decode("utf-8", "replace")

@@ -5,10 +5,11 @@ Only the role `tune` sees it.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from typing import Any
 
-from nicegui import background_tasks, ui
+from nicegui import ui
 
 from membrane_ctrl.config.reference import Key, TableHelp, list_tables
 from membrane_ctrl.control_port.protocol import role_includes
@@ -21,7 +22,7 @@ from membrane_ctrl.service.configuration_editor import (
     ConfigurationText,
 )
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.service.hold_restart import restart_hold
+from membrane_ctrl.service.hold_restart import begin_restart
 from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.work_pools import CONFIGURATIONS, RUN_LISTS, PoolFullError
 from membrane_ctrl.web.messages import show_message
@@ -69,14 +70,19 @@ class ConfigurationPanel:
                 self._build_help()
 
     async def load_list(self) -> None:
-        """List the configurations; keeps what is being edited."""
+        """List the configurations; keeps what is being edited, else shows that of the newest run,
+        which has its name.
+        """
         try:
             listed = await RUN_LISTS.run(self._starter.list_configurations)
         except PoolFullError as error:
             show_message(str(error), good=False)
             return
         names = [each.name for each in listed if each.file is not None]
-        chosen = self._choice.value if self._choice.value in names else next(iter(names), None)
+        of_run = [name for name in names if self._feed.seen.name.endswith(f"-{name}")]
+        chosen = next(iter(of_run or names), None)
+        if self._choice.value in names:
+            chosen = self._choice.value
         self._choice.set_options(names, value=chosen)
 
     def _build_buttons(self) -> None:
@@ -178,12 +184,17 @@ class ConfigurationPanel:
         assert self._loaded is not None
         stop = request(STOP, f"web: {self._user.name} restarts with {self._loaded.name}", "")
         stop["on_behalf"] = self._on_behalf()
-        # a viewer who leaves must not end it between stop and start
-        background_tasks.create(self._restart(self._loaded.name, stop), name="restart of a hold")
-        show_message("Restarting; the state is above.")
+        await self._restart(self._loaded.name, stop)
 
     async def _restart(self, name: str, stop: dict[str, Any]) -> None:
-        outcome = await restart_hold(self._feed, self._starter, name, self._user.name, stop)
+        """Restart the hold; show why it failed."""
+        try:
+            restart = await begin_restart(self._feed, self._starter, name, self._user.name, stop)
+        except (errors.InputError, PoolFullError) as error:
+            show_message(f"{name} is saved, but the hold is not restarted: {error}", good=False)
+            return
+        show_message("Restarting; the state is above.")
+        outcome = await asyncio.shield(restart)
         if not outcome.done and not self._findings.is_deleted:
             with self._findings:
                 ui.label(outcome.text).classes("text-negative")
