@@ -131,17 +131,21 @@ def screen_changes(
     """
     out = np.empty((COMPONENTS, 2, rays.shape[1]))
     in_camera = geometry.rotation @ rays
+    step = _STEP / _MM_PER_UM
     for k in range(COMPONENTS):
-        seen = []
+        # Trace the rays of the bench moved by one step to either side.
+        screen_mm = []
         for sign in (1.0, -1.0):
             components = np.zeros(COMPONENTS)
-            components[k] = sign * _STEP / _MM_PER_UM
+            components[k] = sign * step
             moved = _bench_after(geometry, in_camera, components)
             points = ray_tracing.Points(moved.rays, out[k], np.ones(t_mm.size), t_mm.copy())
             tracer = ray_tracing.Tracer(moved.geometry, surface.radius_mm, vertex_z_mm)
             tracer.intersect(points, surface, newton=_NEWTON_STEPS)
-            seen.append(tracer.predict_screen(points, surface))
-        out[k] = (seen[0] - seen[1]) / (2 * _STEP / _MM_PER_UM)
+            screen_mm.append(tracer.predict_screen(points, surface))
+
+        # Central difference.
+        out[k] = (screen_mm[0] - screen_mm[1]) / (2 * step)
     return out
 
 
@@ -158,9 +162,12 @@ def _bench_after(geometry: Geometry, in_camera: FloatArray, components: FloatArr
         The motion, in µm, µrad and ppm: shifts and turns of camera, screen and mirror, and the
         lens.
     """
-    camera_shift, camera_turn = components[0:3], components[3:6]
-    screen_shift, screen_turn = components[6:9], components[9:12]
-    mirror_shift, mirror_turn = components[12:15], components[15:18]
+    camera_shift = components[0:3]
+    camera_turn = components[3:6]
+    screen_shift = components[6:9]
+    screen_turn = components[9:12]
+    mirror_shift = components[12:15]
+    mirror_turn = components[15:18]
     image_x, image_y, focal = components[18:]
 
     # The lens: pixels see other directions.

@@ -138,33 +138,55 @@ def residual_mm(
     """
     out = np.empty_like(phases.screen_mm)
     for _, there, _, some in screen_views(bench, [], phases, elsewhere):
-        part = phases.subset(some)
+        # The points that were seen with the screen in this place, and their rays.
+        seen = phases.subset(some)
         shape = None if isinstance(phases.artefact, SeenScreen) else surface
-        points = place_rays(there, part, surface, vertex_z_mm)
-        met = [
+        points = place_rays(there, seen, surface, vertex_z_mm)
+
+        # Where the rays meet the screen, from mm on the panel to stated mm.
+        met_mm = [
             _intersect_screen(there, points, shape, part).screen_mm
             for part in _split_points(points.t_mm.size)
         ]
-        out[:, some] = part.screen_mm - np.concatenate(met, axis=1) / bench.pitch
+        out[:, some] = seen.screen_mm - np.concatenate(met_mm, axis=1) / bench.pitch
     return out
 
 
 def screen_views(
     bench: BenchGeometry, turns: list[Poses], phases: SetPhases, moves: Sequence[FloatArray]
 ) -> Iterator[tuple[int, BenchGeometry, list[Poses], BoolArray]]:
-    """Each place of the screen: its number, the bench and its `turns` there, and which points (n,)
-    were seen so.
+    """Go through the places of the screen in a set.
+
+    Parameters
+    ----------
+    bench : BenchGeometry
+    turns : list of Poses
+        Derivatives of its poses.
+    phases : SetPhases
+        The set of n bins.
+    moves : sequence of (MOVED,) arrays
+        Moves of the screen, one for each further place of it.
+
+    Yields
+    ------
+    place : int
+        0: where the bench has the screen; k: after move k - 1.
+    bench : BenchGeometry
+        With the screen there.
+    turns : list of Poses
+        Derivatives there; of a moved screen also those by the six numbers of the move.
+    seen : (n,) bool array
+        The points seen with the screen there.
     """
     if isinstance(phases.artefact, SeenScreen):
-        # The screen stands somewhere before the camera: the bench's poses do not matter.
+        # The screen is somewhere in front of the camera: the bench's poses do not matter.
         camera = bench.geometry
         s_x, s_y, _ = phases.artefact.axes @ camera.rotation
         origin_mm = camera.pinhole_mm + camera.rotation.T @ phases.artefact.origin_mm
         there = replace(camera, screen_origin_mm=origin_mm, screen_s_x=s_x, screen_s_y=s_y)
-        still = Poses(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)))
-        moved = screen_elsewhere(
-            replace(bench, geometry=there), [still] * len(turns), moves[0][:SCREEN_MOVE]
-        )
+        at_rest = Poses(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)))
+        before_move = replace(bench, geometry=there)
+        moved = screen_elsewhere(before_move, [at_rest] * len(turns), moves[0][:SCREEN_MOVE])
         yield 1, *moved, phases.seen_with(0)
         return
     yield 0, bench, turns, phases.seen_with(0)
@@ -204,19 +226,18 @@ def linearise_points(
     points = place_rays(bench, phases, surface, vertex_z_mm)
     shape = None if isinstance(phases.artefact, SeenScreen) else surface
     for part in _split_points(points.t_mm.size):
-        meet = _intersect_screen(bench, points, shape, part)
-        lens = lens_derivatives(
-            bench.geometry, phases.column_px[part], phases.row_px[part], meet.ray
-        )
-        derivatives = _compute_derivatives(bench, turns, shape, meet, lens)
+        meeting = _intersect_screen(bench, points, shape, part)
+        column_px = phases.column_px[part]
+        row_px = phases.row_px[part]
+        by_lens = lens_derivatives(bench.geometry, column_px, row_px, meeting.ray)
+        derivatives = _compute_derivatives(bench, turns, shape, meeting, by_lens)
+
         # Motion and depth are small enough to be linear.
         by_motion = derivatives[:, MOTION]
-        predicted = (
-            meet.screen_mm / bench.pitch
-            + motion_mm * by_motion
-            + deeper_mm * depth_derivative(by_motion)
-        )
-        yield Chunk(part, phases.screen_mm[:, part] - predicted, derivatives)
+        by_depth = depth_derivative(by_motion)
+        at_rest_mm = meeting.screen_mm / bench.pitch
+        predicted_mm = at_rest_mm + motion_mm * by_motion + deeper_mm * by_depth
+        yield Chunk(part, phases.screen_mm[:, part] - predicted_mm, derivatives)
 
 
 def _split_points(count: int) -> Iterator[slice]:
@@ -225,146 +246,241 @@ def _split_points(count: int) -> Iterator[slice]:
 
 @dataclass(frozen=True)
 class _Meeting:
-    """Points where rays meet film and screen; vectors are (3, m)."""
+    """Points where rays meet film and screen, in the symbols of the module's text.
+
+    Attributes
+    ----------
+    ray : (3, m) array
+        Unit vectors d.
+    t_mm : (m,) array
+        Length t of the ray to the film; 0 without a film.
+    film_point : (3, m) array
+        P, in world.
+    normal : (3, m) array
+        n of the film, with n_z = 1.
+    reflected : (3, m) array
+        Unit vectors u.
+    reach_mm : (m,) array
+        Length k from the film to the screen.
+    from_origin : (3, m) array
+        S - O', in world.
+    face_normal : (3, m) array
+        N of the screen's face, of length 1 along the plane's normal.
+    screen_mm : (2, m) array
+        s_x and s_y of S.
+    """
 
     ray: FloatArray
     t_mm: FloatArray
-    place: FloatArray
+    film_point: FloatArray
     normal: FloatArray
-    leaves: FloatArray
+    reflected: FloatArray
     reach_mm: FloatArray
     from_origin: FloatArray
-    face: FloatArray
+    face_normal: FloatArray
     screen_mm: FloatArray
 
 
 def _intersect_screen(
     bench: BenchGeometry, points: Points, surface: Surface | None, part: slice
 ) -> _Meeting:
-    """Reflect the rays and follow them to the face, by Newton's steps from the plane unless it is
-    one.
+    """Reflect the rays of some points at the film, and follow them to the face of the screen.
+
+    Without a surface the rays reach the screen directly.
     """
-    # The ray P = F + t d, reflected at the film; without a film it reaches the screen directly.
     geometry = bench.geometry
     d = points.rays[:, part]
     if surface is None:
         t = np.zeros(d.shape[1])
-        place = geometry.pinhole_mm[:, None] + t * d
+        film_point = geometry.pinhole_mm[:, None] + t * d
         n = d
         u = d
     else:
+        # P = F + t d, and u = d - 2 (d n) / (n n) n.
         t = points.t_mm[part]
-        place = geometry.pinhole_mm[:, None] + t * d
-        hx, hy = surface.slopes(place[0], place[1])
+        film_point = geometry.pinhole_mm[:, None] + t * d
+        hx, hy = surface.slopes(film_point[0], film_point[1])
         n = np.stack([-hx, -hy, np.ones_like(hx)])
-        u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
+        turn = 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0)
+        u = d - turn * n
 
-    # S = P + k u on the screen, in its own axes: on the plane, then by Newton's steps on the face.
+    # P and u along the screen's axes s_x, s_y and normal. The ray meets the plane at k = -P / u.
     axes = geometry.screen_axes
-    start = axes @ (place - geometry.screen_origin_mm[:, None])
+    start = axes @ (film_point - geometry.screen_origin_mm[:, None])
     along = axes @ u
     k = -start[2] / along[2]
+
+    # From there to a face that is no plane, by Newton's steps on (P + k u)_normal = w.
     steps = 0 if geometry.face.is_plane else kernels.FACE_STEPS
     for _ in range(steps):
-        at = start + k * along
-        w, by_x, by_y = geometry.face.heights(at[:2])
-        k = k - (at[2] - w) / (along[2] - by_x * along[0] - by_y * along[1])
-    at = start + k * along
-    _w, by_x, by_y = geometry.face.heights(at[:2])
-    face = axes[2][:, None] - by_x * axes[0][:, None] - by_y * axes[1][:, None]
-    return _Meeting(d, t, place, n, u, k, axes.T @ at, face, at[:2])
+        place = start + k * along
+        w, by_x, by_y = geometry.face.heights(place[:2])
+        approach = along[2] - by_x * along[0] - by_y * along[1]
+        k = k - (place[2] - w) / approach
+
+    # S, and the normal N = normal - w_x s_x - w_y s_y there.
+    screen_point = start + k * along
+    _w, by_x, by_y = geometry.face.heights(screen_point[:2])
+    s_x, s_y, plane_normal = axes
+    face_normal = plane_normal[:, None] - by_x * s_x[:, None] - by_y * s_y[:, None]
+    return _Meeting(
+        ray=d,
+        t_mm=t,
+        film_point=film_point,
+        normal=n,
+        reflected=u,
+        reach_mm=k,
+        from_origin=axes.T @ screen_point,
+        face_normal=face_normal,
+        screen_mm=screen_point[:2],
+    )
 
 
 def _compute_derivatives(
-    bench: BenchGeometry, turns: list[Poses], surface: Surface | None, m: _Meeting, lens: FloatArray
+    bench: BenchGeometry,
+    turns: list[Poses],
+    surface: Surface | None,
+    meeting: _Meeting,
+    by_lens: FloatArray,
 ) -> FloatArray:
-    """(2, COLUMNS + further poses, m) by the formulas above, right to left: the effect of a change
-    of P, u, n, d.
+    """Derivatives of the screen points, by the chain rule of the module's text from right to left.
+
+    First the effect of a change of each intermediate vector (S, u, n, P, d) on the screen point,
+    then that of each parameter, which changes some of these vectors.
+
+    Parameters
+    ----------
+    bench : BenchGeometry
+    turns : list of Poses
+        Derivatives of the poses by their parameters, and by any further ones.
+    surface : Surface or None
+        The film; None without one.
+    meeting : _Meeting
+        m points where rays meet film and screen.
+    by_lens : (7, 3, m) array
+        Derivatives of the rays by the parameters of the lens.
+
+    Returns
+    -------
+    (2, COLUMNS + further poses, m) array
+        In stated mm of the screen, by the unit of each parameter.
     """
     geometry = bench.geometry
     axes = geometry.screen_axes
-    across = axes[:2] @ m.leaves  # E u
-    onto = np.sum(m.face * m.leaves, axis=0)  # N u
-    by_point = axes[:2, :, None] - across[:, None] * (m.face / onto)  # T
-    out = np.zeros((2, COLUMNS + len(turns) - len(POSE), m.t_mm.size))
+    out = np.zeros((2, COLUMNS + len(turns) - len(POSE), meeting.t_mm.size))
+
+    # T = E (1 - u N^T / (N u)): a change of the screen point, as the ray runs on to the face.
+    along_axes = axes[:2] @ meeting.reflected  # E u
+    onto_face = np.sum(meeting.face_normal * meeting.reflected, axis=0)  # N u
+    by_point = axes[:2, :, None] - along_axes[:, None] * (meeting.face_normal / onto_face)
 
     # The surface's own columns, and the effect of the pinhole and of the ray (equations 1 to 3).
     if surface is None:
         by_pinhole = by_point
-        by_ray = by_point * m.reach_mm
+        by_ray = by_point * meeting.reach_mm
     else:
-        by_pinhole, by_ray = _by_surface(surface, m, by_point, out)
+        by_pinhole, by_ray = _fill_surface_columns(surface, meeting, by_point, out)
 
-    # Poses of camera and screen (equation 4).
-    in_camera = geometry.rotation @ m.ray
+    # Poses of camera and screen (equation 4): each moves the pinhole, turns the ray, and moves the
+    # face under the screen point.
+    in_camera = geometry.rotation @ meeting.ray
     for j, turn in enumerate(turns):
-        moved = axes.T @ (turn.screen @ m.from_origin) - turn.origin_mm[:, None]
-        of_ray = turn.camera.T @ in_camera
+        ray_change = turn.camera.T @ in_camera
+        face_change = axes.T @ (turn.screen @ meeting.from_origin) - turn.origin_mm[:, None]
         column = np.einsum("acm,c->am", by_pinhole, turn.pinhole_mm)
-        column += np.einsum("acm,cm->am", by_ray, of_ray) + np.einsum("acm,cm->am", by_point, moved)
-        place = LOCAL + j if j < len(POSE) else COLUMNS + j - len(POSE)
+        column += np.einsum("acm,cm->am", by_ray, ray_change) + np.einsum(
+            "acm,cm->am", by_point, face_change
+        )
+        if j < len(POSE):
+            place = LOCAL + j
+        else:
+            place = COLUMNS + j - len(POSE)
         out[:, place] = column
 
-    # Lens, bow of the screen, and glass over its pixels, which bends oblique rays: by 1 mm of it.
+    # The lens turns the ray.
     first = LOCAL + len(POSE)
-    out[:, first : first + len(lens)] = np.einsum("acm,lcm->alm", by_ray, lens)
-    square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
-    out[:, COLUMNS - 2] = across * square / onto / BOW_RADIUS_MM**2
+    out[:, first : first + len(by_lens)] = np.einsum("acm,lcm->alm", by_ray, by_lens)
+
+    # A bow of the screen moves the face by s^2 dc along its normal: (E u) s^2 dc / (N u).
+    square = meeting.screen_mm[0] ** 2 + meeting.screen_mm[1] ** 2
+    out[:, COLUMNS - 2] = along_axes * square / onto_face / BOW_RADIUS_MM**2
+
+    # Without a film the column of motion is that of 1 mm of glass over the pixels, which bends
+    # oblique rays (Snell): tangent of the angle inside the glass.
     if surface is None:
-        sine = across / np.linalg.norm(m.leaves, axis=0) / _GLASS_INDEX
+        sine = along_axes / np.linalg.norm(meeting.reflected, axis=0) / _GLASS_INDEX
         tangent = sine / np.sqrt(1 - np.sum(sine**2, axis=0))
         out[:, MOTION] = depth_derivative(tangent) / 4
 
     # From mm on the panel to stated mm, and the scale itself.
     out /= bench.pitch
-    out[:, COLUMNS - 1] = -m.screen_mm / bench.pitch**2
+    out[:, COLUMNS - 1] = -meeting.screen_mm / bench.pitch**2
     return out
 
 
-def _by_surface(
-    surface: Surface, m: _Meeting, by_point: FloatArray, out: FloatArray
+def _fill_surface_columns(
+    surface: Surface, meeting: _Meeting, by_point: FloatArray, out: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fill in the surface's own columns; returns the effect of a change of the pinhole and of the
-    ray, (2, 3, m).
+    """Fill in the columns of the surface's own unknowns.
+
+    Parameters
+    ----------
+    surface : Surface
+        The film.
+    meeting : _Meeting
+        m points on it.
+    by_point : (2, 3, m) array
+        T: change of the screen point by a change of S.
+    out : (2, columns, m) array
+        Derivatives; the first `LOCAL` columns are filled in.
+
+    Returns
+    -------
+    by_pinhole, by_ray : (2, 3, m) arrays
+        Change of the screen point by a change of F and of d.
     """
-    d = m.ray
-    n = m.normal
-    nn = np.sum(n * n, axis=0)
-    nd = np.sum(n * d, axis=0)
+    d = meeting.ray
+    n = meeting.normal
+    n_n = np.sum(n * n, axis=0)
+    n_d = np.sum(n * d, axis=0)
 
-    # By the reflected ray, T k, and by the normal, T k B (equation 3).
-    ray = by_point * m.reach_mm
-    along = np.einsum("acm,cm->am", ray, n)
-    by_normal = -2 / nn * (along[:, None] * d + nd * ray - 2 * nd / nn * along[:, None] * n)
+    # By the reflected ray u: T k. By the normal n: T k B (equation 3).
+    by_reflected = by_point * meeting.reach_mm
+    along_normal = np.einsum("acm,cm->am", by_reflected, n)[:, None]
+    by_normal = (
+        -2 / n_n * (along_normal * d + n_d * by_reflected - 2 * n_d / n_n * along_normal * n)
+    )
 
-    # By the point on the film, whose normal turns with it (equation 2).
-    hxx, hxy, hyy = surface.curvatures(m.place[0], m.place[1])
-    by_place = by_point.copy()
-    by_place[:, 0] -= by_normal[:, 0] * hxx + by_normal[:, 1] * hxy
-    by_place[:, 1] -= by_normal[:, 0] * hxy + by_normal[:, 1] * hyy
+    # By the point P on the film, where the normal turns with the curvatures: T - T k B H
+    # (equation 2).
+    hxx, hxy, hyy = surface.curvatures(meeting.film_point[0], meeting.film_point[1])
+    by_film_point = by_point.copy()
+    by_film_point[:, 0] -= by_normal[:, 0] * hxx + by_normal[:, 1] * hxy
+    by_film_point[:, 1] -= by_normal[:, 0] * hxy + by_normal[:, 1] * hyy
 
-    # By the film's height, the pinhole and the ray (equation 1).
-    by_height = np.einsum("acm,cm->am", by_place, d) / nd
-    by_pinhole = by_place - by_height[:, None] * n  # by_place G
-    by_ray = by_pinhole * m.t_mm + ray - 2 / nn * along[:, None] * n
+    # By the film's height: P moves by d / (n d). By the pinhole: P moves by G = 1 - d n^T / (n d).
+    # By the ray d: P moves by t G, and u turns (equations 1 and 3).
+    by_height = np.einsum("acm,cm->am", by_film_point, d) / n_d
+    by_pinhole = by_film_point - by_height[:, None] * n
+    by_ray = by_pinhole * meeting.t_mm + by_reflected - 2 / n_n * along_normal * n
 
     # By the parameters: each changes height and slopes by those of its term.
-    x = m.place[0] / surface.radius_mm
-    y = m.place[1] / surface.radius_mm
-    scale = 1 / surface.radius_mm
+    x = meeting.film_point[0] / surface.radius_mm
+    y = meeting.film_point[1] / surface.radius_mm
     bases = zip(evaluate_basis(x, y), evaluate_beyond_basis(x, y), strict=True)
     height, height_x, height_y = (np.vstack(parts) for parts in bases)
+    per_mm = 1 / surface.radius_mm
     for axis in range(2):
-        slope = (by_normal[axis, 0] * height_x + by_normal[axis, 1] * height_y) * scale
-        by_terms = by_height[axis] * height - slope
+        by_slopes = by_normal[axis, 0] * height_x + by_normal[axis, 1] * height_y
+        by_terms = by_height[axis] * height - by_slopes * per_mm
         out[axis, :PARAMETERS] = by_terms[:PARAMETERS]
         out[axis, BEYOND] = by_terms[PARAMETERS:]
     out[:, PARAMETERS] = by_height
 
     # By the film's motion from the x frames to the y frames: half of it to each side.
-    deeper = np.einsum("j,ajm->am", _sag_direction(), out[:, :PARAMETERS]) - by_height
-    out[0, MOTION] = deeper[0] / 2
-    out[1, MOTION] = -deeper[1] / 2
+    by_sag = np.einsum("j,ajm->am", _sag_direction(), out[:, :PARAMETERS]) - by_height
+    out[0, MOTION] = by_sag[0] / 2
+    out[1, MOTION] = -by_sag[1] / 2
     return by_pinhole, by_ray
 
 

@@ -27,8 +27,14 @@ from membrane_ctrl.metrology.numerics.compiled import compile_kernel, compile_st
 from membrane_ctrl.metrology.rays import screen_face
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
-FACE_STEPS = 6  # see `_onto_face`
+FACE_STEPS = 6  # see `_move_to_face`
 _BLOCK = 256  # points whose intermediate values stay in the first-level cache
+
+# Rows of `plane`.
+_ORIGIN = 0
+_S_X = 1
+_S_Y = 2
+_NORMAL = 3
 
 # Numbers that `residual_sums` returns: moments x^p y^q, p + q < degree, of r_x and of r_y, then two
 # for the excess, sum w r_x^2, sum w r_y^2 and sum w.
@@ -93,12 +99,20 @@ def _newton_step(block, count, pinhole, poly, excess, amplitude, radius, vertex_
     The derivative along the ray is d_z - h_x d_x - h_y d_y: never 0 for a ray that is steeper than
     the film.
     """
-    fx, fy, fz = pinhole[0], pinhole[1], pinhole[2]
+    fx = pinhole[0]
+    fy = pinhole[1]
+    fz = pinhole[2]
     for p in range(count):
-        dx, dy, dz, t = block[0, p], block[1, p], block[2, p], block[3, p]
+        # The surface where the ray is, above the same x and y.
+        dx = block[0, p]
+        dy = block[1, p]
+        dz = block[2, p]
+        t = block[3, p]
         x = (fx + t * dx) / radius
         y = (fy + t * dy) / radius
         h, hx, hy, _ev = evaluate_surface(poly, excess, amplitude, x, y)
+
+        # t <- t - f / f', with f the height of the ray over the surface.
         above = fz + t * dz - vertex_z - h
         approach = dz - (hx * dx + hy * dy) / radius
         block[3, p] = t - above / approach
@@ -132,20 +146,40 @@ def bisector_slopes(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
 
 
 @compile_step
+def component_along(vx, vy, vz, axes, row):  # type: ignore[no-untyped-def]
+    """Scalar product of a vector with a row of `axes`."""
+    return vx * axes[row, 0] + vy * axes[row, 1] + vz * axes[row, 2]
+
+
+@compile_step
+def _film_point(rays, t, pinhole, p):  # type: ignore[no-untyped-def]
+    """P = F + t d of ray p."""
+    x = pinhole[0] + t[p] * rays[0, p]
+    y = pinhole[1] + t[p] * rays[1, p]
+    z = pinhole[2] + t[p] * rays[2, p]
+    return x, y, z
+
+
+@compile_step
+def _screen_coordinate(plane, axis, a, b, w):  # type: ignore[no-untyped-def]
+    """World coordinate `axis` of the screen point S = O' + a s_x + b s_y + w n."""
+    in_plane = plane[_ORIGIN, axis] + a * plane[_S_X, axis] + b * plane[_S_Y, axis]
+    return in_plane + w * plane[_NORMAL, axis]
+
+
+@compile_step
 def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-untyped-def]
     """x, y and both measured slopes at point p; the screen point is w off the plane."""
-    # P = F + t d on the film
-    dx, dy, dz = rays[0, p], rays[1, p], rays[2, p]
-    x = pinhole[0] + t[p] * dx
-    y = pinhole[1] + t[p] * dy
-    z = pinhole[2] + t[p] * dz
+    # From P on the film to S on the screen.
+    x, y, z = _film_point(rays, t, pinhole, p)
+    a = screen[0, p]
+    b = screen[1, p]
+    qx = _screen_coordinate(plane, 0, a, b, w) - x
+    qy = _screen_coordinate(plane, 1, a, b, w) - y
+    qz = _screen_coordinate(plane, 2, a, b, w) - z
 
-    # S - P with S = O' + a s_x + b s_y + w n on the screen
-    a, b = screen[0, p], screen[1, p]
-    qx = plane[0, 0] + a * plane[1, 0] + b * plane[2, 0] + w * plane[3, 0] - x
-    qy = plane[0, 1] + a * plane[1, 1] + b * plane[2, 1] + w * plane[3, 1] - y
-    qz = plane[0, 2] + a * plane[1, 2] + b * plane[2, 2] + w * plane[3, 2] - z
-    gx, gy = bisector_slopes(dx, dy, dz, qx, qy, qz)
+    # The mirror there turns the ray d into that direction.
+    gx, gy = bisector_slopes(rays[0, p], rays[1, p], rays[2, p], qx, qy, qz)
     return x, y, gx, gy
 
 
@@ -201,8 +235,13 @@ def residual_sums(  # type: ignore[no-untyped-def]
     w r_y y e'(v) for the excess, sum w r_x^2, sum w r_y^2, sum w.
     """
     sums = np.zeros(SUMS)
+    # Memory of a block: x, y, weighted residuals of both slopes, deviation of the face.
     block = np.empty((5, _BLOCK))
-    xs, ys, rx, ry, off = block[0], block[1], block[2], block[3], block[4]
+    xs = block[0]
+    ys = block[1]
+    rx = block[2]
+    ry = block[3]
+    off = block[4]
     powers_y = np.empty((ZERNIKE_DEGREE, _BLOCK))
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
@@ -211,7 +250,8 @@ def residual_sums(  # type: ignore[no-untyped-def]
         x_square = 0.0
         y_square = 0.0
         w_sum = 0.0
-        # The residual of each point, measured less fitted slope, times its weight.
+        # The residual of each point, measured less fitted slope, times its weight; and the sums
+        # over the block that are no moments.
         _look_up_face(screen, face, first, count, off)
         for k in range(count):
             x, y, gx, gy = measured_slope(rays, t, screen, off[k], pinhole, plane, first + k)
@@ -249,28 +289,39 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
     y^q with SLOPE_MONOMIALS each, sum w (e' x)^2, sum w (e' y)^2.
     """
     sums = np.zeros(PRODUCTS)
+    first_of_x = PRODUCT_MONOMIALS
+    first_of_y = PRODUCT_MONOMIALS + SLOPE_MONOMIALS
+    # Memory of a block: x, y, weight, and weight times the excess' slopes e' x and e' y.
     block = np.empty((5, _BLOCK))
-    xs, ys, ws, ex, ey = block[0], block[1], block[2], block[3], block[4]
+    xs = block[0]
+    ys = block[1]
+    ws = block[2]
+    ex = block[3]
+    ey = block[4]
     powers_y = np.empty((PRODUCT_DEGREE + 1, _BLOCK))
+    # e'(v) depends on the excess alone: the Zernike part is 0.
     flat = np.zeros((ZERNIKE_DEGREE + 1, ZERNIKE_DEGREE + 1))
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
+        # Values of each point, and the sums of the excess' squares.
         for k in range(count):
             p = first + k
-            xs[k] = (pinhole[0] + t[p] * rays[0, p]) / radius
-            ys[k] = (pinhole[1] + t[p] * rays[1, p]) / radius
+            x, y, _z = _film_point(rays, t, pinhole, p)
+            xs[k] = x / radius
+            ys[k] = y / radius
             _h, _hx, _hy, ev = evaluate_surface(flat, excess, 0.0, xs[k], ys[k])
             ws[k] = weights[p]
             ex[k] = weights[p] * ev * xs[k]
             ey[k] = weights[p] * ev * ys[k]
             sums[PRODUCTS - 2] += ex[k] * ev * xs[k]
             sums[PRODUCTS - 1] += ey[k] * ev * ys[k]
+
+        # Moments of the weights, and of the excess' slopes with the terms' slopes.
         _compute_powers(ys, powers_y, count)
+        slope_powers = powers_y[:ZERNIKE_DEGREE]
         _add_moments(ws, xs, powers_y, count, sums, 0)
-        _add_moments(ex, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS)
-        _add_moments(
-            ey, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS + SLOPE_MONOMIALS
-        )
+        _add_moments(ex, xs, slope_powers, count, sums, first_of_x)
+        _add_moments(ey, xs, slope_powers, count, sums, first_of_y)
     return sums
 
 
@@ -307,37 +358,46 @@ def predict_screen(  # type: ignore[no-untyped-def]
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
         for k in range(count):
+            # P = F + t d on the film, and the film's normal n = (n_x, n_y, 1) there.
             p = first + k
-            # P = F + t d on the film, and the film's normal n = (n_x, n_y, 1) there
-            dx, dy, dz = rays[0, p], rays[1, p], rays[2, p]
-            x = pinhole[0] + t[p] * dx
-            y = pinhole[1] + t[p] * dy
-            z = pinhole[2] + t[p] * dz
+            x, y, z = _film_point(rays, t, pinhole, p)
             _h, hx, hy, _ev = evaluate_surface(poly, excess, amplitude, x / radius, y / radius)
-            nx, ny = -hx / radius, -hy / radius
+            nx = -hx / radius
+            ny = -hy / radius
 
-            # u = d - 2 (d n) / (n n) n
-            turn = 2 * (dx * nx + dy * ny + dz) / (nx * nx + ny * ny + 1)
-            ux, uy, uz = dx - turn * nx, dy - turn * ny, dz - turn
+            # The reflected ray u = d - 2 (d n) / (n n) n.
+            dx = rays[0, p]
+            dy = rays[1, p]
+            dz = rays[2, p]
+            d_n = dx * nx + dy * ny + dz
+            n_n = nx * nx + ny * ny + 1
+            turn = 2 * d_n / n_n
+            ux = dx - turn * nx
+            uy = dy - turn * ny
+            uz = dz - turn
 
-            # S = P + k u on the screen's plane, with N its normal: k = N (O' - P) / (N u)
-            across = 1 / (ux * plane[3, 0] + uy * plane[3, 1] + uz * plane[3, 2])
-            ox, oy, oz = plane[0, 0] - x, plane[0, 1] - y, plane[0, 2] - z
-            reach = (ox * plane[3, 0] + oy * plane[3, 1] + oz * plane[3, 2]) * across
+            # It meets the plane at S = P + k u, k = N (O' - P) / (N u), with N the plane's normal.
+            ox = plane[_ORIGIN, 0] - x
+            oy = plane[_ORIGIN, 1] - y
+            oz = plane[_ORIGIN, 2] - z
+            across = 1 / component_along(ux, uy, uz, plane, _NORMAL)
+            reach = component_along(ox, oy, oz, plane, _NORMAL) * across
 
-            # S - O' along s_x and s_y
-            fx, fy, fz = reach * ux - ox, reach * uy - oy, reach * uz - oz
-            out[0, p] = fx * plane[1, 0] + fy * plane[1, 1] + fz * plane[1, 2]
-            out[1, p] = fx * plane[2, 0] + fy * plane[2, 1] + fz * plane[2, 2]
+            # Its coordinates: S - O' along s_x and s_y.
+            sx = reach * ux - ox
+            sy = reach * uy - oy
+            sz = reach * uz - oz
+            out[0, p] = component_along(sx, sy, sz, plane, _S_X)
+            out[1, p] = component_along(sx, sy, sz, plane, _S_Y)
 
-            # Tangents of the angles between u and N along s_x and s_y
-            tangents[0, k] = (ux * plane[1, 0] + uy * plane[1, 1] + uz * plane[1, 2]) * across
-            tangents[1, k] = (ux * plane[2, 0] + uy * plane[2, 1] + uz * plane[2, 2]) * across
-        _onto_face(out, tangents, face, first, count)
+            # Tangents of the angles between u and N along s_x and s_y.
+            tangents[0, k] = component_along(ux, uy, uz, plane, _S_X) * across
+            tangents[1, k] = component_along(ux, uy, uz, plane, _S_Y) * across
+        _move_to_face(out, tangents, face, first, count)
 
 
 @compile_kernel
-def _onto_face(out, tangents, face, first, count):  # type: ignore[no-untyped-def]
+def _move_to_face(out, tangents, face, first, count):  # type: ignore[no-untyped-def]
     """Move points from where rays cross the plane to where they meet the face.
 
     Newton's steps on w = face(s + w tangent): w <- w - (w - face) / (1 - tangent grad face). A step
@@ -347,10 +407,13 @@ def _onto_face(out, tangents, face, first, count):  # type: ignore[no-untyped-de
     if screen_face.is_plane(face):
         return
     for k in range(count):
-        a, b, ta, tb = out[0, first + k], out[1, first + k], tangents[0, k], tangents[1, k]
+        a = out[0, first + k]
+        b = out[1, first + k]
+        tangent_a = tangents[0, k]
+        tangent_b = tangents[1, k]
         w = 0.0
         for _ in range(FACE_STEPS):
-            height, wa, wb = screen_face.face_height(face, a + w * ta, b + w * tb)
-            w -= (w - height) / (1 - wa * ta - wb * tb)
-        out[0, first + k] = a + w * ta
-        out[1, first + k] = b + w * tb
+            height, wa, wb = screen_face.face_height(face, a + w * tangent_a, b + w * tangent_b)
+            w -= (w - height) / (1 - wa * tangent_a - wb * tangent_b)
+        out[0, first + k] = a + w * tangent_a
+        out[1, first + k] = b + w * tangent_b

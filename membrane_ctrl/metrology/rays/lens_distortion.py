@@ -5,24 +5,43 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import FloatArray
 
-_UNDONE = 1e-9  # of a tangent: 5e-6 of a pixel of the paper's lens
+_LARGEST_ERROR = 1e-9  # of a tangent: 5e-6 of a pixel of the paper's lens
 
 
 def undistort_points(
     x: FloatArray, y: FloatArray, distortion: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Normalised pinhole coordinates of distorted ones; iterated until the last digit is stable.
+    """Invert the lens distortion; iterated until the last digit is stable.
 
-    NaN where the iteration does not reach the point, or reaches one beyond a fold of the model,
-    where the distance from the axis falls again: no ray, or another one, belongs to such a point.
+    Parameters
+    ----------
+    x, y : (...) arrays
+        Distorted coordinates, as tangents.
+    distortion : tuple of float
+        OpenCV's coefficients.
+
+    Returns
+    -------
+    x, y : (...) arrays
+        Normalised pinhole coordinates. NaN where the iteration does not reach the point, or reaches
+        one beyond a fold of the model, where the distance from the axis falls again: no ray, or
+        another one, belongs to such a point.
     """
-    points, lens = np.stack([x.ravel(), y.ravel()], axis=1), np.array(distortion)
+    # OpenCV's iteration.
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    coefficients = np.array(distortion)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
-    solved = cv2.undistortPoints(points[:, None], np.eye(3), lens, None, None, None, criteria)
+    solved = cv2.undistortPoints(
+        points[:, None], np.eye(3), coefficients, None, None, None, criteria
+    )
     straight: FloatArray = np.asarray(solved, np.float64)[:, 0]
+
+    # Its result counts only if the lens maps it back to the point, from before the fold.
     back = distort_points(straight[:, 0], straight[:, 1], distortion)
-    undone = np.abs(back.T - points).max(axis=1) <= _UNDONE
-    straight[~undone | (np.hypot(*straight.T) > _find_fold(distortion))] = np.nan
+    error = np.abs(back.T - points).max(axis=1)
+    is_inverse = error <= _LARGEST_ERROR
+    is_beyond_fold = np.hypot(straight[:, 0], straight[:, 1]) > _find_fold(distortion)
+    straight[~is_inverse | is_beyond_fold] = np.nan
     return straight[:, 0].reshape(x.shape), straight[:, 1].reshape(x.shape)
 
 
@@ -31,13 +50,18 @@ def _find_fold(distortion: tuple[float, ...]) -> float:
     (63 degrees).
     """
     radius: FloatArray = np.linspace(0.0, 2.0, 2001)
-    radial = (*distortion[:2], 0.0, 0.0, *distortion[4:])
-    falls = np.diff(distort_points(radius, np.zeros_like(radius), radial)[0]) <= 0
-    return float(radius[np.argmax(falls)]) if falls.any() else float(radius[-1])
+    radial_alone = (*distortion[:2], 0.0, 0.0, *distortion[4:])
+    distorted = distort_points(radius, np.zeros_like(radius), radial_alone)[0]
+    falls = np.diff(distorted) <= 0
+    if not falls.any():
+        return float(radius[-1])
+    return float(radius[np.argmax(falls)])
 
 
 def distort_points(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> FloatArray:
     """Distorted coordinates (2, n) of normalised pinhole ones, by OpenCV's model."""
-    through = np.stack([x, y, np.ones_like(x)], axis=1)
-    seen = cv2.projectPoints(through, np.zeros(3), np.zeros(3), np.eye(3), np.array(distortion))[0]
-    return np.asarray(seen[:, 0].T, np.float64)
+    points = np.stack([x, y, np.ones_like(x)], axis=1)
+    no_turn = np.zeros(3)
+    no_shift = np.zeros(3)
+    projected = cv2.projectPoints(points, no_turn, no_shift, np.eye(3), np.array(distortion))[0]
+    return np.asarray(projected[:, 0].T, np.float64)

@@ -134,8 +134,10 @@ def face_height(face, a, b):  # type: ignore[no-untyped-def]
             h = h * v + line
             hu = hu * v + slope
         w += h
-        wa += hu / face.pitch_mm[0] if inside_u else 0.0
-        wb += hv / face.pitch_mm[1] if inside_v else 0.0
+        if inside_u:
+            wa += hu / face.pitch_mm[0]
+        if inside_v:
+            wb += hv / face.pitch_mm[1]
     return w, wa, wb
 
 

@@ -117,27 +117,37 @@ class Surface:
         self, x_mm: FloatArray, y_mm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """h_xx, h_xy and h_yy in 1/mm."""
+        # Of the terms.
         x = x_mm / self.radius_mm
         y = y_mm / self.radius_mm
-        v = x * x + y * y
-        # Derivatives of the excess e(v): 2 e'(v), and 4 e''(v) times the product of coordinates.
-        first = 2 * series.polyval(v, series.polyder(self.excess))
-        second = 4 * series.polyval(v, series.polyder(self.excess, 2))
         by_x = series.polyder(self._whole, axis=0)
         by_y = series.polyder(self._whole, axis=1)
-        hxx = series.polyval2d(x, y, series.polyder(by_x, axis=0)) + first + second * x * x
-        hxy = series.polyval2d(x, y, series.polyder(by_x, axis=1)) + second * x * y
-        hyy = series.polyval2d(x, y, series.polyder(by_y, axis=1)) + first + second * y * y
-        return hxx / self.radius_mm**2, hxy / self.radius_mm**2, hyy / self.radius_mm**2
+        terms_xx = series.polyval2d(x, y, series.polyder(by_x, axis=0))
+        terms_xy = series.polyval2d(x, y, series.polyder(by_x, axis=1))
+        terms_yy = series.polyval2d(x, y, series.polyder(by_y, axis=1))
+
+        # Of the excess e(v): e_xx = 2 e'(v) + 4 e''(v) x^2, e_xy = 4 e''(v) x y.
+        v = x * x + y * y
+        first = 2 * series.polyval(v, series.polyder(self.excess))
+        second = 4 * series.polyval(v, series.polyder(self.excess, 2))
+        hxx = terms_xx + first + second * x * x
+        hxy = terms_xy + second * x * y
+        hyy = terms_yy + first + second * y * y
+
+        # From radii to mm.
+        square_mm2 = self.radius_mm**2
+        return hxx / square_mm2, hxy / square_mm2, hyy / square_mm2
 
     def on_grid(self, axis_mm: FloatArray) -> FloatArray:
         """Height in mm and its slopes along x and y, (3, n, n), on a square grid; rows along y."""
         axis = axis_mm / self.radius_mm
-        terms = self._whole.T  # rows are powers of y
+        # The terms: rows are powers of y.
+        terms = self._whole.T
         terms_x = series.polyder(terms, axis=1)
         terms_y = series.polyder(terms, axis=0)
         out = np.stack([series.polygrid2d(axis, axis, part) for part in (terms, terms_x, terms_y)])
 
+        # The excess e(v), with the slopes 2 e'(v) x and 2 e'(v) y.
         v = axis**2 + axis[:, None] ** 2
         excess = series.polyval(v, self.excess)
         excess_slope = 2 * series.polyval(v, series.polyder(self.excess))
@@ -163,9 +173,11 @@ def parameter_to_coeffs() -> FloatArray:
 @cache
 def sag_gradient() -> FloatArray:
     """d sag / d parameters (parameters,): mean over the rim minus the vertex, term by term."""
+    by_terms = zernike.at_rim() - zernike.at_vertex()
+    # On the rim v = 1: the power series is the sum of its coefficients.
     excess = hencky_bowl.excess_series()
-    rim_minus_vertex = (excess.sum() - excess[0]) / hencky_bowl.excess_rms()
-    return np.append((zernike.at_rim() - zernike.at_vertex())[1:], rim_minus_vertex)
+    by_excess = (excess.sum() - excess[0]) / hencky_bowl.excess_rms()
+    return np.append(by_terms[1:], by_excess)
 
 
 @cache

@@ -12,54 +12,66 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 
 def evaluate_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights and slopes (parameters, n) of the surface's parameters in radii, each 0 at the
-    vertex.
+    """Heights of the surface's parameters and their slopes along x and y, each (parameters, n), at
+    points of the unit disc; slopes per radius, heights 0 at the vertex.
     """
+    # The Zernike terms, as sums of monomials.
+    powers = _evaluate_monomials(x, y, ZERNIKE_DEGREE)
+    heights, slopes_x, slopes_y = (table @ powers for table in _term_tables())
+    heights -= zernike.at_vertex()[1:, None]
+
+    # The excess e(v), v = x^2 + y^2, with the slopes 2 e'(v) x and 2 e'(v) y.
     v = x * x + y * y
     excess = hencky_bowl.excess_series() / hencky_bowl.excess_rms()
-    bowl = series.polyval(v, excess) - excess[0]
-    grows = 2 * series.polyval(v, series.polyder(excess))
-    powers, tables = _evaluate_monomials(x, y, ZERNIKE_DEGREE), _term_tables()
-    heights, slopes_x, slopes_y = (table @ powers for table in tables)
-    heights -= zernike.at_vertex()[1:, None]
+    excess_height = series.polyval(v, excess) - excess[0]
+    excess_slope = 2 * series.polyval(v, series.polyder(excess))
     return (
-        np.vstack([heights, bowl]),
-        np.vstack([slopes_x, grows * x]),
-        np.vstack([slopes_y, grows * y]),
+        np.vstack([heights, excess_height]),
+        np.vstack([slopes_x, excess_slope * x]),
+        np.vstack([slopes_y, excess_slope * y]),
     )
 
 
 def evaluate_round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights and slopes (k, n) of the round terms beyond the fit's in radii, each 0 at the
-    vertex.
+    """Heights of the round terms beyond the fit's and their slopes along x and y, each (k, n), at
+    points of the unit disc; slopes per radius, heights 0 at the vertex.
     """
-    v, terms = x * x + y * y, terms_beyond_fit.round_series()
-    heights = [series.polyval(v, term) for term in terms]
-    grows = np.array([2 * series.polyval(v, series.polyder(term)) for term in terms])
-    return np.array(heights), grows * x, grows * y
+    v = x * x + y * y
+    heights = []
+    slopes = []
+    for term in terms_beyond_fit.round_series():
+        heights.append(series.polyval(v, term))
+        slopes.append(2 * series.polyval(v, series.polyder(term)))
+    radial = np.array(slopes)
+    return np.array(heights), radial * x, radial * y
 
 
 def evaluate_beyond_basis(
     x: FloatArray, y: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights and slopes (k, n) of all terms beyond the fit's in radii, each 0 at the vertex."""
+    """Heights of all terms beyond the fit's and their slopes along x and y, each (k, n), at points
+    of the unit disc: the round ones, then the waves.
+    """
+    round_height, round_x, round_y = evaluate_round_basis(x, y)
     powers = _evaluate_monomials(x, y, terms_beyond_fit.WAVE_DEGREE)
-    waves = [table @ powers for table in _wave_tables()]
-    height, of_x, of_y = (
-        np.vstack(parts) for parts in zip(evaluate_round_basis(x, y), waves, strict=True)
+    wave_height, wave_x, wave_y = (table @ powers for table in _wave_tables())
+    return (
+        np.vstack([round_height, wave_height]),
+        np.vstack([round_x, wave_x]),
+        np.vstack([round_y, wave_y]),
     )
-    return height, of_x, of_y
 
 
 def _evaluate_monomials(x: FloatArray, y: FloatArray, degree: int) -> FloatArray:
     """x^p y^q, p + q <= degree, p outer, (terms, n)."""
-    out, column = [], np.ones_like(x)
+    out = []
+    power_x = np.ones_like(x)
     for p in range(degree + 1):
-        term = column
+        monomial = power_x
         for _ in range(degree + 1 - p):
-            out.append(term)
-            term = term * y
-        column = column * x
+            out.append(monomial)
+            monomial = monomial * y
+        power_x = power_x * x
     return np.stack(out)
 
 
@@ -80,9 +92,12 @@ def _wave_tables() -> tuple[FloatArray, FloatArray, FloatArray]:
 def _flatten_tables(table: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Polynomials (k, degree + 1, degree + 1) and their derivatives along x and y, (k, terms)."""
     degree = table.shape[1] - 1
-    p, q = np.array([(p, q) for p in range(degree + 1) for q in range(degree + 1 - p)]).T
-    height, of_x, of_y = (
-        np.ascontiguousarray(each[:, p, q])
-        for each in (table, *(zernike.differentiate_table(table, axis) for axis in (1, 2)))
+    powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p)]
+    p, q = np.array(powers).T
+    slope_x = zernike.differentiate_table(table, 1)
+    slope_y = zernike.differentiate_table(table, 2)
+    return (
+        np.ascontiguousarray(table[:, p, q]),
+        np.ascontiguousarray(slope_x[:, p, q]),
+        np.ascontiguousarray(slope_y[:, p, q]),
     )
-    return height, of_x, of_y

@@ -32,9 +32,15 @@ def _smooth_sweep(right, down, rhs, h, forward):  # type: ignore[no-untyped-def]
     """
     rows, columns = h.shape
     for a in range(rows):
-        i = a if forward else rows - 1 - a
+        i = a
+        if not forward:
+            i = rows - 1 - a
         for b in range(columns):
-            j = b if forward else columns - 1 - b
+            j = b
+            if not forward:
+                j = columns - 1 - b
+
+            # Sum of weight, and of weight times height, over the neighbours on all four sides.
             total = 0.0
             weight = 0.0
             if j > 0:
@@ -49,6 +55,8 @@ def _smooth_sweep(right, down, rhs, h, forward):  # type: ignore[no-untyped-def]
             if i + 1 < rows:
                 weight += down[i, j]
                 total += down[i, j] * h[i + 1, j]
+
+            # h = (rhs + sum of weight h_neighbour) / sum of weight.
             if weight > 0:
                 h[i, j] = (rhs[i, j] + total) / weight
 

@@ -20,9 +20,9 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 _M = kernels.SLOPE_MONOMIALS
-_POWERS = [
-    (p, q) for p in range(ZERNIKE_DEGREE) for q in range(ZERNIKE_DEGREE - p)
-]  # in the kernels' order
+# Exponents (p, q) of x^p y^q: of the slopes, and of the products of two slopes; in the kernels'
+# order.
+_POWERS = [(p, q) for p in range(ZERNIKE_DEGREE) for q in range(ZERNIKE_DEGREE - p)]
 _PRODUCT_POWERS = [
     (p, q) for p in range(kernels.PRODUCT_DEGREE + 1) for q in range(kernels.PRODUCT_DEGREE + 1 - p)
 ]
@@ -32,19 +32,20 @@ _PRODUCT_POWERS = [
 def slope_tables() -> tuple[FloatArray, FloatArray]:
     """dZ_j/dx and dZ_j/dy for j = 2, 3, ... as monomial coefficients, (terms - 1, SLOPE_MONOMIALS)
     each, on the unit disc."""
-    rows, columns = np.array(_POWERS).T
-    tables = [
-        zernike.differentiate_table(zernike.monomial_table(), axis)[1:, rows, columns]
-        for axis in (1, 2)
-    ]
-    return tables[0], tables[1]
+    p, q = np.array(_POWERS).T
+    slope_x = zernike.differentiate_table(zernike.monomial_table(), 1)
+    slope_y = zernike.differentiate_table(zernike.monomial_table(), 2)
+    return slope_x[1:, p, q], slope_y[1:, p, q]
 
 
 @cache
 def _product_index() -> IntArray:
     """Index of the product of monomials k and l among the product moments, a square matrix."""
     place = {power: k for k, power in enumerate(_PRODUCT_POWERS)}
-    return np.array([[place[a[0] + b[0], a[1] + b[1]] for b in _POWERS] for a in _POWERS])
+    rows = []
+    for p_k, q_k in _POWERS:
+        rows.append([place[p_k + p_l, q_k + q_l] for p_l, q_l in _POWERS])
+    return np.array(rows)
 
 
 @dataclass(frozen=True)
@@ -88,15 +89,26 @@ class NormalMatrix:
 
 
 def _assemble_matrix(products: FloatArray, radius_mm: float) -> tuple[FloatArray, FloatArray]:
+    """D^T W D of the x and of the y slopes, (parameters, parameters) each, from the moments of
+    `kernels.product_sums`.
+    """
+    # The products in the order in which the kernel returns them: sum w x^p y^q as a matrix over
+    # pairs of monomials, sum w e'(v) x x^p y^q and sum w e'(v) y x^p y^q, and their squares.
     count = kernels.PRODUCT_MONOMIALS
-    hankel = products[:count][_product_index()]
-    crosses = products[count : count + _M], products[count + _M : count + 2 * _M]
+    pair_moments = products[:count][_product_index()]
+    excess_x = products[count : count + _M]
+    excess_y = products[count + _M : count + 2 * _M]
+    squares = products[-2:]
+
+    # Slopes of the terms are sums of monomials; those of the excess are 2 e'(v) x / R and
+    # 2 e'(v) y / R.
     out = []
-    # the excess' slopes are 2 x e'(v) / R and 2 y e'(v) / R
-    for table, cross, square in zip(slope_tables(), crosses, products[-2:], strict=True):
+    for table, moments, square in zip(slope_tables(), (excess_x, excess_y), squares, strict=True):
         matrix = np.empty((PARAMETERS, PARAMETERS))
-        matrix[:-1, :-1] = table @ hankel @ table.T
-        matrix[-1, :-1] = matrix[:-1, -1] = 2 * (table @ cross)
+        matrix[:-1, :-1] = table @ pair_moments @ table.T
+        by_excess = 2 * (table @ moments)
+        matrix[-1, :-1] = by_excess
+        matrix[:-1, -1] = by_excess
         matrix[-1, -1] = 4 * square
         out.append(matrix / radius_mm**2)
     return out[0], out[1]
@@ -124,9 +136,9 @@ def residual_rms(
     weight = sums[-1]
     if not weight > 0:
         return float("nan"), float("nan")
-    squares = [
-        sums[2 * _M + 2 + axis] - 2 * delta @ right[axis] + delta @ matrix @ delta
-        for axis, matrix in enumerate((normal.x, normal.y))
-    ]
-    x, y = (float(np.sqrt(max(square, 0.0) / weight)) for square in squares)
-    return x, y
+    rms = []
+    for axis, matrix in enumerate((normal.x, normal.y)):
+        before = sums[2 * _M + 2 + axis]  # |r|^2
+        square = before - 2 * delta @ right[axis] + delta @ matrix @ delta
+        rms.append(float(np.sqrt(max(square, 0.0) / weight)))
+    return rms[0], rms[1]

@@ -41,28 +41,33 @@ def slope_per_screen(geometry: Geometry, radius_mm: float, sag_mm: float) -> Flo
     (2, 2) array
         Mean of (d g_i / d s_k)^2 in 1/mm^2: rows are the slopes x and y, columns s_x and s_y.
     """
-    # Points on the bowl, and the normal there.
+    # Points on the bowl h = sag (r / R)^2, and the normal (-h_x, -h_y, 1) there.
     axis_mm = np.linspace(-0.9, 0.9, _POINTS_ACROSS) * radius_mm
     grid_x, grid_y = np.meshgrid(axis_mm, axis_mm)
     inside = np.hypot(grid_x, grid_y) <= _INSIDE * radius_mm
-    x, y = grid_x[inside], grid_y[inside]
-    point = np.stack([x, y, sag_mm * (x**2 + y**2) / radius_mm**2])
-    n = np.stack([-2 * sag_mm * x / radius_mm**2, -2 * sag_mm * y / radius_mm**2, np.ones_like(x)])
+    x = grid_x[inside]
+    y = grid_y[inside]
+    height = sag_mm * (x**2 + y**2) / radius_mm**2
+    point = np.stack([x, y, height])
+    slope_x = 2 * sag_mm * x / radius_mm**2
+    slope_y = 2 * sag_mm * y / radius_mm**2
+    n = np.stack([-slope_x, -slope_y, np.ones_like(x)])
 
-    # The camera's ray d, its reflection u, and the way to the screen.
+    # The camera's ray d, its reflection u = d - 2 (d n) / (n n) n, and the way to the screen.
     d = point - geometry.pinhole_mm[:, None]
     d /= np.linalg.norm(d, axis=0)
     u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
-    face = np.cross(geometry.screen_s_x, geometry.screen_s_y)
-    reach_mm = (face @ (geometry.screen_origin_mm[:, None] - point)) / (face @ u)
+    screen_normal = np.cross(geometry.screen_s_x, geometry.screen_s_y)
+    to_origin = geometry.screen_origin_mm[:, None] - point
+    reach_mm = (screen_normal @ to_origin) / (screen_normal @ u)
 
-    # Change of the bisector and of its slopes per mm on the screen.
+    # Change of the bisector's direction and of its slopes per mm along each of the screen's axes.
     bisector = u - d
     squares = np.empty((2, 2))
     for k, axis in enumerate((geometry.screen_s_x, geometry.screen_s_y)):
         turn = (axis[:, None] - u * (axis @ u)) / reach_mm
-        slopes = -(turn[:2] - bisector[:2] / bisector[2] * turn[2]) / bisector[2]
-        squares[:, k] = np.mean(slopes**2, axis=1)
+        slope_changes = -(turn[:2] - bisector[:2] / bisector[2] * turn[2]) / bisector[2]
+        squares[:, k] = np.mean(slope_changes**2, axis=1)
     return squares
 
 

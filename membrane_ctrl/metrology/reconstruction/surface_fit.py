@@ -73,6 +73,9 @@ def fit_surface(
     else:
         tracer.start(points, start)
         surface = Surface.from_parameters(np.zeros(PARAMETERS), tracer.radius_mm)
+
+    # Gauss-Newton steps, each with the points moved onto the present surface, until the largest
+    # change of height is small enough.
     changes: list[float] = []
     step = None
     while len(changes) < max_iterations:
@@ -99,6 +102,10 @@ def fit_surface(
 
 @dataclass(frozen=True)
 class _Step:
+    """A Gauss-Newton step: moments of the residual, right-hand side of x and y slopes, matrix, and
+    change of the parameters.
+    """
+
     sums: FloatArray
     right: FloatArray
     normal: NormalMatrix
@@ -108,8 +115,10 @@ class _Step:
 def _gauss_newton_step(
     tracer: Tracer, points: Points, surface: Surface, normal: NormalMatrix | None, newton: int
 ) -> _Step:
-    """One Gauss-Newton step, after moving the points onto the surface by Newton steps (0: they
-    stay).
+    """One Gauss-Newton step, (D^T W D) delta = D^T W r (the paper's least squares of slopes, with
+    the residual r = g - D a instead of g).
+
+    Before it, Newton steps move the points onto the surface (0: they stay).
     """
     sums = tracer.residual_sums(points, surface, newton)
     matrix = normal or NormalMatrix.from_points(tracer, points)

@@ -60,16 +60,21 @@ class ResidualGrid:
 
 @compile_kernel
 def _scatter_samples(field, weights, first_mm, step_mm, sums, start, stop):  # type: ignore[no-untyped-def]
-    """Add weight and weighted residuals of pixels to the cells, `sums` (3, n, n)."""
+    """Add weight and weighted residuals of pixels to the cells, `sums` (3, n, n).
+
+    Rows of `field` (6, pixels): x, y, measured slopes, fitted slopes.
+    """
     n = sums.shape[1]
     for p in range(start, stop):
         w = weights[p]
         if not w > 0:
             continue
+        # The cell whose middle is nearest, if the grid has it.
         j = math.floor((field[0, p] - first_mm) / step_mm + 0.5)
         i = math.floor((field[1, p] - first_mm) / step_mm + 0.5)
         if i < 0 or j < 0 or i >= n or j >= n:
             continue
+        # Weight, and weight times (measured - fitted) along x and along y.
         sums[0, i, j] += w
         sums[1, i, j] += w * (field[2, p] - field[4, p])
         sums[2, i, j] += w * (field[3, p] - field[5, p])
@@ -114,23 +119,27 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
 def integrate_residual(grid: ResidualGrid) -> FloatArray:
     """Height (n, n) in mm of the residual, 0 at the vertex; NaN where nothing was measured.
 
-    Slopes cannot tell the relative height of parts that are not connected (a hair across the
+    Slopes do not determine the relative height of parts that are not connected (a hair across the
     mirror): each is put on the fitted surface, mean 0.
     """
-    # Links of each cell to its right and lower neighbours.
+    # Links of each cell to its right and to its lower neighbour: 1 if both were measured.
     seen = grid.count > 0
     right = np.zeros(seen.shape)
     down = np.zeros(seen.shape)
     right[:, :-1] = seen[:, :-1] & seen[:, 1:]
     down[:-1] = seen[:-1] & seen[1:]
 
-    # Rise along each link, by the mean slope of its two cells.
+    # Rise along each link, by the mean slope of its two cells (Southwell's model).
+    slope_sum_x = grid.slope_x[:, :-1] + grid.slope_x[:, 1:]
+    slope_sum_y = grid.slope_y[:-1] + grid.slope_y[1:]
     rise_x = np.zeros(seen.shape)
     rise_y = np.zeros(seen.shape)
-    rise_x[:, :-1] = right[:, :-1] * (grid.slope_x[:, :-1] + grid.slope_x[:, 1:]) * grid.step_mm / 2
-    rise_y[:-1] = down[:-1] * (grid.slope_y[:-1] + grid.slope_y[1:]) * grid.step_mm / 2
+    rise_x[:, :-1] = right[:, :-1] * slope_sum_x * grid.step_mm / 2
+    rise_y[:-1] = down[:-1] * slope_sum_y * grid.step_mm / 2
 
-    # Normal equations of the least squares: a Laplacian.
+    # Least squares over the links, sum of (h_b - h_a - rise)^2. Its normal equations have the
+    # grid's Laplacian on the left, and on the right of each cell the rises into it less those out
+    # of it.
     rhs = -rise_x - rise_y
     rhs[:, 1:] += rise_x[:, :-1]
     rhs[1:] += rise_y[:-1]
