@@ -341,9 +341,12 @@ class EstimatorConfig(Section):
     thermometer (docs/explanation/estimator.md).
     """
 
-    process_value: Literal["laser", "estimate", "optics"] = "laser"
+    process_value: Literal["auto", "laser", "estimate", "optics"] = "laser"
     """What the inner loop holds: the laser's reading, the estimate of the centre, or that without a
-    laser: `optics` uses none, fitted or not. Change it to hold with the optics, or by them alone.
+    laser: `optics` uses none, fitted or not. `auto`: the estimate once dead time and lag of the
+    pump are known, with a camera or a barometer, and the laser until then and where the estimate is
+    worse. A hold whose file does not have this key uses `auto`. Change it to hold by the optics
+    alone, or to forbid one of the two.
     """
     gain_per_s: Annotated[float, Field(gt=0, le=20)] = 16.0
     """Speed at which the loop removes an error of the estimate. Lower it for a pump whose delay is

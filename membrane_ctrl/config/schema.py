@@ -371,6 +371,17 @@ class Config(Section):
         """Whether the mirror is held without a laser."""
         return self.estimator.process_value == "optics"
 
+    @property
+    def estimates_centre(self) -> bool:
+        """Whether an estimate of the centre runs beside the states."""
+        match self.estimator.process_value:
+            case "laser":
+                return False
+            case "auto":
+                return self.shape.enabled or self.loop.feedforward_barometer
+            case _:
+                return True
+
     def with_gains(self, changed: Mapping[str, Any] | None) -> "Config":
         """This configuration with the gains, and the pump's curve, of an event; as it is if they do
         not fit.
@@ -396,4 +407,6 @@ def leave_to_start(config: Config) -> Config:
     estimator = config.estimator
     if not _PUMP_RESPONSE_KEYS & estimator.model_fields_set:
         estimator = estimator.model_copy(update={"pump_response": "identified"})
+    if "process_value" not in estimator.model_fields_set:
+        estimator = estimator.model_copy(update={"process_value": "auto"})
     return config.model_copy(update={"estimator": estimator})

@@ -71,7 +71,7 @@ class CentreEstimation:
         self.memory = memory or CentreEstimationState()
         self._config = config.estimator
         self._loop = config.loop
-        self._wanted = config.estimator.process_value != "laser"
+        self._wanted = config.estimates_centre
         self._by_optics = config.by_optics
         self._sag_zero_um = 1e3 * config.optics.mirror.sag_mm if config.by_optics else math.nan
         centre = self.memory.centre

@@ -13,7 +13,7 @@ from dataclasses import asdict, replace
 from numpy.linalg import LinAlgError
 
 from firmware_iface.roles import ALL_FAULTS, BenchCommand
-from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
+from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments import trial
 from membrane_ctrl.control.experiments.experiment import ExperimentEnd, Finished
@@ -25,6 +25,7 @@ from membrane_ctrl.controller import (
     hold_status,
     interlocks,
     locks,
+    process_value,
     resume_rule,
     safe_levels,
     safety,
@@ -59,6 +60,7 @@ from membrane_ctrl.model.telemetry import SafeLevel, State
 # range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the
 # safety table sees
 _DT_RANGE = (0.2, 5.0)
+_RAMP_ENDS_UM = 0.1
 _WHY_STANDS_S = 1.0  # shorter-lived reasons (a pump that touches its limit) are not reported
 _WITHOUT_LASER = make_reason(
     shape_loop.ShapeCode.NO_MOUNT,
@@ -109,6 +111,9 @@ class Controller:
         )
         self._estimation.set_gains(present.loop)
         self._consistency.set_gains(present.loop, present.pump)
+        self._process_value = process_value.ProcessValueChoice(
+            present.loop, present.pump, estimator, memory.process_value
+        )
         self._sample_rate = SampleRate(memory.sample_rate)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
@@ -136,6 +141,11 @@ class Controller:
     def pump_config(self) -> PumpConfig:
         """The pump's present curve."""
         return self._context.pump_config
+
+    @property
+    def _estimator(self) -> EstimatorConfig:
+        """The estimator's settings, with dead time and lag as identified."""
+        return apply_response(self._config.estimator, self._context.pump_response)
 
     @property
     def _present_config(self) -> Config:
@@ -204,6 +214,9 @@ class Controller:
         context.laser_doubted = bool(consistency.laser_fault_text)
         is_held = self.state in (State.SETTLE, State.HOLD) or self._config.states.observe
         context.estimate = estimate if is_held else None
+        if self._config.estimator.process_value == "auto":
+            context.estimate, chosen = self._process_value.step(self._collect_facts(last))
+            events += chosen
         if math.isnan(self.memory.state_since_s):  # the verdict has just changed the state
             self.memory.state_since_s = inputs.now_s
             context.state_age_s = 0.0
@@ -225,6 +238,36 @@ class Controller:
             finished=context.finished,
             answers=tuple(self._answers),
             clear_mask=self._clear_mask,
+        )
+
+    def _collect_facts(self, last: inner_loop.LoopOutput) -> process_value.ProcessValueFacts:
+        """What decides which process value the loop follows in this tick."""
+        context, observer = self._context, self._context.observer
+        reading = observer.reading
+        is_steady = (
+            self.state == State.HOLD
+            and not context.paused
+            and context.levels.safe_level == SafeLevel.NONE
+            and abs(context.setpoint_um - context.loop.ramp_um) < _RAMP_ENDS_UM
+        )
+        is_stated = self._config.estimator.pump_response == "stated"
+        return process_value.ProcessValueFacts(
+            now_s=context.now_s,
+            dt_s=context.dt_s,
+            estimate=context.estimate,
+            held_by_optics=self._estimation.held_by_optics,
+            response_known=is_stated or context.pump_response is not None,
+            on_trial=self._gains.on_trial,
+            laser_um=observer.moving_laser_um,
+            repeats_sample=observer.repeats_sample,
+            laser_doubted=context.laser_doubted,
+            steady=is_steady,
+            setpoint_um=last.setpoint_um,
+            flow_um_per_s=last.flow_um_per_s,
+            weather=(
+                reading.ambient_pressure_pa if reading else math.nan,
+                reading.air_temperature_c if reading else math.nan,
+            ),
         )
 
     def _may_follow_optics(self) -> bool:
@@ -402,6 +445,7 @@ class Controller:
         context.pump_config = pump
         context.loop.set_gains(loop)
         self._estimation.set_gains(loop)
+        self._process_value.set_loop(loop, pump, self._estimator)
         self._consistency.set_gains(loop, pump)
         self._shape.set_memory(self._gains.present.shape_time_constant_s)
         self._step_setpoint()
@@ -518,9 +562,11 @@ class Controller:
         if found is None:
             return
         context.pump_response = found
-        estimator = apply_response(self._config.estimator, found)
+        estimator = self._estimator
         context.loop.set_pump_lag(estimator)
         self._estimation.set_estimator(estimator)
+        self._process_value.set_loop(context.loop_config, context.pump_config, estimator)
+        self._process_value.forget_verdict()
         events.append(
             PumpResponseFound(
                 delay_s=found.delay_s,

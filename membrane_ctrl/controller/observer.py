@@ -83,7 +83,7 @@ class Observer:
         self.memory = memory or ObserverState()
         limits = config.limits
         self._by_optics = config.by_optics
-        self._follows_optics = config.estimator.process_value != "laser" and config.shape.enabled
+        self._follows_optics = config.estimates_centre and config.shape.enabled
         self._stuck_s = limits.stuck_s
         self._step_max_um = limits.step_max_um
         self._gauge_step_max_pa = limits.gauge_step_max_pa

@@ -35,11 +35,23 @@ class FilmSensor(Enum):
 
 
 class ProcessValue(Enum):
-    """What the inner loop holds: `estimator.process_value`."""
+    """What the inner loop holds: `estimator.process_value`.
+
+    With `auto` the estimate runs all the time, and all its protections hold, whatever the loop
+    follows.
+    """
 
     LASER = "laser"
     ESTIMATE = "estimate"
     OPTICS = "optics"
+
+    @classmethod
+    def from_config(cls, config: Config) -> "ProcessValue":
+        """Whose protections hold with a configuration."""
+        value = config.estimator.process_value
+        if value == "auto":
+            return cls.ESTIMATE if config.estimates_centre else cls.LASER
+        return cls(value)
 
 
 class Activity(Enum):

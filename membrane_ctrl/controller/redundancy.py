@@ -34,7 +34,7 @@ class RedundancyWatch:
     def __init__(self, config: Config, memory: RedundancyState | None = None) -> None:
         self.memory = memory or RedundancyState()
         self._config = config
-        self._process_value = ProcessValue(config.estimator.process_value)
+        self._process_value = ProcessValue.from_config(config)
         optics_lost_s = LOST_S
         if self._process_value is ProcessValue.LASER:
             # A rejected cycle must not raise a notice: as long as the shape loop uses the last one.

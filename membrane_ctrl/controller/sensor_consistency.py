@@ -125,7 +125,7 @@ class SensorConsistency:
         self._optics_film = film_monitor.FilmMonitor(limits, mirror, "optics", memory.optics_film)
         self._nominal_sag_um = 1e3 * config.optics.mirror.sag_mm
         self._by_optics = config.by_optics
-        self._follows_optics = config.estimator.process_value != "laser"
+        self._follows_optics = config.estimates_centre
         self._redundancy = RedundancyWatch(config, memory.redundancy)
         self._leak_growth_max = config.limits.leak_growth_max
         self._fresh_s = config.shape.fresh_s

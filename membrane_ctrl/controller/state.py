@@ -14,6 +14,7 @@ from membrane_ctrl.controller.centre_estimation import CentreEstimationState
 from membrane_ctrl.controller.gains_trial import GainsInUse, GainsState
 from membrane_ctrl.controller.interlocks import InterlocksState
 from membrane_ctrl.controller.observer import ObserverState
+from membrane_ctrl.controller.process_value import ProcessValueState
 from membrane_ctrl.controller.resume_rule import ResumeState
 from membrane_ctrl.controller.safe_levels import SafeLevelsState
 from membrane_ctrl.controller.safety import SafetyState
@@ -61,6 +62,7 @@ class ControllerState(StateNode):
     loop: InnerLoopState = field(default_factory=InnerLoopState)
     shape: ShapeLoopMemory = field(default_factory=ShapeLoopMemory)
     estimation: CentreEstimationState = field(default_factory=CentreEstimationState)
+    process_value: ProcessValueState = field(default_factory=ProcessValueState)
 
 
 def make_first_state(config: Config) -> ControllerState:

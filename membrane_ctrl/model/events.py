@@ -328,6 +328,18 @@ class PumpResponseFound(
     sum_sigma_s: float
 
 
+class ProcessValueChosen(
+    Event, kind="process_value", sentence="The loop follows the {value}: {reason}"
+):
+    """What the inner loop follows with `process_value = "auto"`; `code` names the reason
+    (`process_value.ProcessValueReason`).
+    """
+
+    value: str
+    reason: str
+    code: str
+
+
 class InterlockOpened(
     Event,
     kind="interlock_opened",

@@ -140,7 +140,7 @@ def list_learned_plots(config: Config) -> dict[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     if config.pump.probe_um:
         found[figure_plot_title(figure_columns.PUMP_CURVE)] = (streams.PUMP.path,)
-    if config.estimator.process_value != "laser":
+    if config.estimates_centre:
         found |= {plot_title(plot): streams.entities_of(plot) for plot in plots_of(Group.ESTIMATE)}
     return found
 

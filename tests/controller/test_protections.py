@@ -43,16 +43,25 @@ Fail = Callable[[Wrong, float], None]  # switches of the bench, seconds since th
 MANUAL_RANGE_UM = StatesConfig().manual_range_um
 
 
+# The loop follows the estimate; or the laser, as the pump's response is not known.
+AUTO = ("auto", "auto, by the laser")
+
+
 def config_of(process_value: str, **tables: object) -> Config:
     """A quiet bench with figures at the tick rate."""
+    value, *how = process_value.split(", ")
+    estimator = {"process_value": value, "pump_response": "identified" if how else "stated"}
+    states = tables.pop("states", StatesConfig())
+    assert isinstance(states, StatesConfig)
     return Config.model_validate(
         {
             "loop": LoopConfig(rate_hz=RATE_HZ),
             "shape": ShapeConfig(mode="track", track_rate_hz=RATE_HZ),
-            "estimator": EstimatorConfig(process_value=process_value),  # type: ignore[arg-type]
+            "estimator": EstimatorConfig.model_validate(estimator),
             "twin": TwinConfig(
                 scenario="quiet", start_error_um=-1.0, laser=process_value != "optics"
             ),
+            "states": states.model_copy(update={"actuator_test": not how}),
             **tables,
         }
     )
@@ -69,6 +78,7 @@ class Bench:
     config: Config
     settle_s: float
     spoil: Spoil = unspoiled
+    exchange_s: float = math.inf  # how long the loop follows either of laser and estimate
 
     def __post_init__(self) -> None:
         self.bench = VirtualBench(Plant(self.config.twin, self.config.pump))
@@ -91,7 +101,11 @@ class Bench:
     def _pass(self, seconds: float, fail: Fail) -> None:
         begins_s = self.run.now_s
         while self.run.now_s < begins_s + seconds - 1e-6 and self.run.finished is None:
-            fail(self.bench.wrong, self.run.now_s - begins_s)
+            since_s = self.run.now_s - begins_s
+            fail(self.bench.wrong, since_s)
+            if math.isfinite(self.exchange_s):
+                decision = self.run._supervisor._controller.memory.process_value
+                decision.follows_estimate = since_s % (2 * self.exchange_s) < self.exchange_s
             tick = self.run.run_tick()
             assert tick is not None
             self.ticks.append(tick)
@@ -188,7 +202,7 @@ def test_manual_flow_stays_within_its_range_when_the_laser_fails(
     assert held.faults == []
 
 
-@pytest.mark.parametrize("process_value", ["estimate", "optics"])
+@pytest.mark.parametrize("process_value", ["estimate", *AUTO, "optics"])
 def test_manual_flow_with_frozen_figures_is_stopped_by_the_gauge(process_value: str) -> None:
     held = settled(config_of(process_value), frozen())
     held.command(Command("manual", "a test", value=5.0))
@@ -243,14 +257,14 @@ def test_short_laser_dropouts_are_not_reported() -> None:
     assert settled(config_of("estimate")).fail(40.0, blink).notices == []
 
 
-@pytest.mark.parametrize("process_value", ["laser", "estimate", "optics"])
+@pytest.mark.parametrize("process_value", ["laser", "estimate", *AUTO, "optics"])
 def test_a_pause_with_frozen_sensors_ends_in_the_safe_state(process_value: str) -> None:
     """The weather moves the film after the pause; what the loop follows shows nothing of it."""
     held = settled(config_of(process_value, states=StatesConfig(pause_max_s=20.0)), frozen())
     held.command(Command("pause", "a test"))
 
     def fail(wrong: Wrong, since_s: float) -> None:
-        wrong.no_light = process_value == "estimate"
+        wrong.no_light = process_value in ("estimate", *AUTO)
         wrong.pump_share = 0.5  # a pump that gives half of its flow, so that the film must sink
         if process_value == "laser":  # it shows its place with noise, whatever the film does
             wrong.laser_offset_um = held.start_um - held.bench.plant.truth().displacement_um
@@ -273,13 +287,41 @@ def test_a_pause_with_frozen_sensors_ends_in_the_safe_state(process_value: str) 
     ],
     ids=["sigma nan", "sigma huge", "sigma negative", "time nan", "future", "late", "sag nan"],
 )
-@pytest.mark.parametrize("process_value", ["estimate", "optics"])
+@pytest.mark.parametrize("process_value", ["estimate", *AUTO, "optics"])
 def test_a_figure_that_cannot_be_used_counts_as_missing(spoil: Spoil, process_value: str) -> None:
     held = settled(config_of(process_value), spoil).fail(40.0, lose_laser)
-    first = {"estimate": "displacement_missing", "optics": "film_unseen"}[process_value]
+    first = "film_unseen" if process_value == "optics" else "displacement_missing"
     assert held.faults[0] == first
     assert held.moved_um < 10.0
     assert held.state == State.FAULT
+
+
+@pytest.mark.parametrize("exchange_s", [0.1, 1.0, 7.0])
+def test_no_protection_is_lost_while_laser_and_estimate_exchange_the_loop(
+    exchange_s: float,
+) -> None:
+    def knock(wrong: Wrong, since_s: float) -> None:
+        wrong.laser_offset_um = 15.0
+
+    by_estimate = settled(config_of("estimate")).fail(60.0, knock)
+    exchanged = settled(config_of("auto"))
+    exchanged.exchange_s = exchange_s
+    exchanged.fail(60.0, knock)
+    assert exchanged.faults == by_estimate.faults == []
+    assert exchanged.moved_um < by_estimate.moved_um + 1.0
+
+    lost = settled(config_of("auto"))
+    lost.exchange_s = exchange_s
+    lost.fail(40.0, lose_laser)
+    assert lost.faults == []
+    assert lost.moved_um < 1.0
+
+    blind = settled(config_of("auto"), lambda since_s, figure: None)
+    blind.exchange_s = exchange_s
+    blind.fail(40.0, lose_laser)
+    assert blind.faults[0] == "displacement_missing"
+    assert blind.state == State.FAULT
+    assert blind.moved_um < 10.0
 
 
 @pytest.mark.parametrize("um_per_s", [-0.05, 0.05])
@@ -369,7 +411,7 @@ def test_wrong_optics_are_outvoted_whatever_the_hold_does(undertaking: str, spoi
     assert held.faults == []
 
 
-@pytest.mark.parametrize("process_value", ["laser", "estimate"])
+@pytest.mark.parametrize("process_value", ["laser", "estimate", *AUTO])
 def test_a_wrong_laser_ends_an_experiment(process_value: str) -> None:
     held = settled(config_of(process_value))
     held.command(UNDERTAKINGS["tune"])
@@ -410,7 +452,7 @@ def test_figures_of_another_mirror_count_as_missing() -> None:
 
 @pytest.mark.parametrize("undertaking", list(UNDERTAKINGS))
 @pytest.mark.parametrize("shape", [ShapeConfig(mode="track", track_rate_hz=RATE_HZ), ShapeConfig()])
-@pytest.mark.parametrize("process_value", ["laser", "estimate"])
+@pytest.mark.parametrize("process_value", ["laser", "estimate", *AUTO])
 def test_sensors_without_faults_never_contradict_each_other(
     undertaking: str, shape: ShapeConfig, process_value: str
 ) -> None:
@@ -515,12 +557,12 @@ def noisy_with_a_small_sigma() -> Spoil:
     )
 
 
-@pytest.mark.parametrize("process_value", ["estimate", "optics"])
+@pytest.mark.parametrize("process_value", ["estimate", *AUTO, "optics"])
 def test_optics_that_are_left_out_as_unsteady_count_as_missing_without_a_laser(
     process_value: str,
 ) -> None:
     held = settled(config_of(process_value), noisy_with_a_small_sigma()).fail(80.0, lose_laser)
-    first = {"estimate": "displacement_missing", "optics": "film_unseen"}[process_value]
+    first = "film_unseen" if process_value == "optics" else "displacement_missing"
     assert held.faults[0] == first
     messages = {event.name: event.message for event in held.told(Maintenance)}  # type: ignore[attr-defined]
     assert "no laser" in messages["optics_unsteady"]

@@ -1,0 +1,358 @@
+"""Decides what the inner loop follows with `process_value = "auto"`: laser or estimate. Pure.
+
+The estimate needs the pump's dead time and lag, and a second sensor of the centre or of the
+weather. While it holds the mirror, it is judged in two ways: by what the PI on the laser would have
+done (`control/predicted_pi.py`), and by its errors, which are uncorrelated if the pump responds as
+assumed (`control/error_correlation.py`). If either speaks against it, the PI is tried for a minute
+and a half. If the PI is better, it stays for a time that doubles with each such case. Either loop
+takes over without a bump (`control/inner_loop.py`).
+
+All protections are those of the estimate: the estimate runs all the time, and where the optics must
+replace the laser, it holds the mirror at once.
+"""
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from membrane_ctrl.config.control import EstimatorConfig, LoopConfig, PumpConfig
+from membrane_ctrl.control.centre_estimate import CentreEstimate, Sensor
+from membrane_ctrl.control.error_correlation import ErrorCorrelation, ErrorCorrelationState
+from membrane_ctrl.control.innovation_test import InnovationTest, InnovationTestState
+from membrane_ctrl.control.loop_comparison import (
+    LoopComparison,
+    LoopComparisonState,
+    LoopErrors,
+    MeanSquare,
+)
+from membrane_ctrl.control.predicted_pi import PredictedPi, PredictedPiState
+from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, ProcessValueChosen
+from membrane_ctrl.model.state_tree import Count, StateNode
+
+NOTICE = "estimate_worse"
+# Sensors that come and go must not exchange the loops again and again.
+_FIRST_S = 0.5
+_AGAIN_S = 10.0
+# The laser contradicts the estimate beyond so many standard deviations (`control/centre.py`).
+_CONTRADICTS_SIGMAS = 5.0
+# The prediction starts from the estimate's steadier hold; so many integral times later it is the
+# PI's own.
+_WARM_UP_S = 10.0
+_WARM_UP_INTEGRAL_TIMES = 2.0
+# The PI is tried if it would be better by so many standard deviations, and by this share of the
+# variance; or if errors are correlated by this much.
+_WORSE_SIGMAS = 2.0
+_WORSE_SHARE = 1.05
+_CORRELATED = 0.33
+# After a trial the PI stays unless it is worse by so many standard deviations: what began the trial
+# speaks for it.
+_TRIAL_SPANS = 12
+_RETURNS_SIGMAS = 1.0
+_FALL_BACK_S = 600.0
+_FALL_BACK_MOST_S = 6 * 3600.0
+
+
+class ProcessValueReason(StrEnum):
+    """Why the loop follows what it follows; the value is a phrase for people."""
+
+    RESPONSE_KNOWN = "dead time and lag of the pump are known"
+    RESPONSE_UNKNOWN = "dead time and lag of the pump are not known"
+    LASER_ALONE = "neither camera nor barometer shows the centre or its weather"
+    GAINS_ON_TRIAL = "gains of the PI are on trial"
+    PI_TRIED = "the PI is tried, as the estimate may be worse"
+    ESTIMATE_WORSE = "the estimate held the mirror no better"
+    LASER_UNUSABLE = "the laser is missing or wrong"
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessValueFacts:
+    """What decides in a tick.
+
+    Attributes
+    ----------
+    now_s, dt_s : float
+    estimate : CentreEstimate or None
+        None in a state that holds no estimate.
+    held_by_optics : bool
+        The optics alone could hold the mirror.
+    response_known : bool
+        Dead time and lag of the pump are known.
+    on_trial : bool
+        Gains of the PI are on trial.
+    laser_um : float
+        Its reading; NaN without a new and moving one.
+    repeats_sample : bool
+        The reading is that of an earlier tick.
+    laser_doubted : bool
+        Optics and gauge contradict the laser.
+    steady : bool
+        The mirror is held at a setpoint that rests.
+    setpoint_um, flow_um_per_s : float
+        Of the last tick.
+    weather : tuple of float
+        Ambient pressure in Pa and air temperature in °C.
+    """
+
+    now_s: float
+    dt_s: float
+    estimate: CentreEstimate | None
+    held_by_optics: bool
+    response_known: bool
+    on_trial: bool
+    laser_um: float
+    repeats_sample: bool
+    laser_doubted: bool
+    steady: bool
+    setpoint_um: float
+    flow_um_per_s: float
+    weather: tuple[float, float]
+
+
+@dataclass(slots=True)
+class ProcessValueState(StateNode):
+    """What the decision remembers from tick to tick.
+
+    Attributes
+    ----------
+    follows_estimate : bool
+        As decided; a laser that cannot be used overrules it.
+    reason_name : str
+        Name of the reported reason; empty before the first.
+    wanted_since_s : float
+        Since when another loop is wanted.
+    compares_from_s : float
+        When the prediction has become the PI's own.
+    tries_pi : bool
+        The PI is tried.
+    fall_back_until_s : float
+        End of the present fall-back; infinite in the past without one.
+    trusted_until_s : float
+        Until then the PI is not tried again.
+    trials : int
+    estimate_error : MeanSquare or None
+        Of the estimate's loop before the trial.
+    """
+
+    follows_estimate: bool = False
+    reason_name: str = ""
+    wanted_since_s: float = math.nan
+    compares_from_s: float = math.nan
+    tries_pi: bool = False
+    fall_back_until_s: float = -math.inf
+    trusted_until_s: float = -math.inf
+    trials: Count = 0
+    estimate_error: MeanSquare | None = None
+    noticed: bool = False
+    prediction: PredictedPiState = field(default_factory=PredictedPiState)
+    comparison: LoopComparisonState = field(default_factory=LoopComparisonState)
+    innovations: InnovationTestState = field(default_factory=InnovationTestState)
+    correlation: ErrorCorrelationState = field(default_factory=ErrorCorrelationState)
+
+
+class ProcessValueChoice:
+    """Chooses between laser and estimate in each tick.
+
+    Parameters
+    ----------
+    loop, pump, estimator
+        Present gains, curve, dead time and lag.
+    memory : ProcessValueState, optional
+    """
+
+    def __init__(
+        self,
+        loop: LoopConfig,
+        pump: PumpConfig,
+        estimator: EstimatorConfig,
+        memory: ProcessValueState | None = None,
+    ) -> None:
+        self.memory = memory or ProcessValueState()
+        self._comparison = LoopComparison(self.memory.comparison)
+        self._innovations = InnovationTest(self.memory.innovations)
+        self._loop, self._pump, self._estimator = loop, pump, estimator
+        self._prediction = PredictedPi(loop, pump, estimator, self.memory.prediction)
+        self._correlation = ErrorCorrelation(loop, estimator, self.memory.correlation)
+
+    def set_loop(self, loop: LoopConfig, pump: PumpConfig, estimator: EstimatorConfig) -> None:
+        """Predict and compare with other settings, from the beginning."""
+        self._loop, self._pump, self._estimator = loop, pump, estimator
+        self._prediction = PredictedPi(loop, pump, estimator, self.memory.prediction)
+        self._correlation = ErrorCorrelation(loop, estimator, self.memory.correlation)
+        self._correlation.reset()
+        self._stop_comparing()
+
+    def forget_verdict(self) -> None:
+        """The pump's response was identified again: the estimate is to be judged again."""
+        memory = self.memory
+        memory.tries_pi = False
+        memory.fall_back_until_s = memory.trusted_until_s = -math.inf
+        memory.trials = 0
+
+    def step(self, facts: ProcessValueFacts) -> tuple[CentreEstimate | None, list[Event]]:
+        """One tick.
+
+        Returns
+        -------
+        CentreEstimate or None
+            What the loop follows; None: the laser.
+        list of Event
+            The decision if it is another one, and notices.
+        """
+        memory, estimate = self.memory, facts.estimate
+        if estimate is None:
+            memory.wanted_since_s = math.nan
+            self._stop_comparing()
+            return None, []
+        events = self._judge_estimate(facts, estimate)
+        wanted = self._find_reason(facts, estimate)
+        events += self._decide(wanted, facts.now_s)
+        overruled = facts.held_by_optics and not self._is_laser_usable(facts, estimate)
+        return (estimate if memory.follows_estimate or overruled else None), events
+
+    def _find_reason(
+        self, facts: ProcessValueFacts, estimate: CentreEstimate
+    ) -> ProcessValueReason:
+        """What is best to follow in this tick."""
+        if facts.held_by_optics and not estimate.sensors[Sensor.LASER].fresh:
+            return ProcessValueReason.LASER_UNUSABLE
+        if not facts.response_known:
+            return ProcessValueReason.RESPONSE_UNKNOWN
+        if not (facts.held_by_optics or estimate.sensors[Sensor.BAROMETER].fresh):
+            return ProcessValueReason.LASER_ALONE
+        if facts.on_trial:
+            return ProcessValueReason.GAINS_ON_TRIAL
+        if self.memory.tries_pi:
+            return ProcessValueReason.PI_TRIED
+        if facts.now_s < self.memory.fall_back_until_s:
+            return ProcessValueReason.ESTIMATE_WORSE
+        return ProcessValueReason.RESPONSE_KNOWN
+
+    def _decide(self, wanted: ProcessValueReason, now_s: float) -> list[Event]:
+        """Take another decision: at once for the laser, for the estimate after some time."""
+        memory = self.memory
+        by_estimate = wanted in _BY_ESTIMATE
+        first = not memory.reason_name
+        if wanted.name == memory.reason_name:
+            memory.wanted_since_s = math.nan
+            return []
+        if math.isnan(memory.wanted_since_s):
+            memory.wanted_since_s = now_s
+        waits_s = 0.0
+        if by_estimate and not memory.follows_estimate:
+            waits_s = _FIRST_S if first else _AGAIN_S
+        if now_s - memory.wanted_since_s < waits_s:
+            return []
+        if by_estimate != memory.follows_estimate:
+            self._stop_comparing()
+        memory.follows_estimate = by_estimate
+        memory.reason_name = wanted.name
+        memory.wanted_since_s = math.nan
+        value = "estimate of the centre" if by_estimate else "laser"
+        return [ProcessValueChosen(value, wanted.value, wanted.name.lower())]
+
+    def _is_laser_usable(self, facts: ProcessValueFacts, estimate: CentreEstimate) -> bool:
+        """Whether the PI may follow this tick's reading."""
+        if facts.laser_doubted:
+            return False
+        read = math.isfinite(facts.laser_um) or facts.repeats_sample
+        return read and abs(estimate.sensors[Sensor.LASER].innovation) <= _CONTRADICTS_SIGMAS
+
+    def _judge_estimate(self, facts: ProcessValueFacts, estimate: CentreEstimate) -> list[Event]:
+        """Compare the loops; begin or end a fall-back."""
+        memory = self.memory
+        laser = estimate.sensors[Sensor.LASER]
+        if not facts.steady or facts.laser_doubted or not laser.fresh:
+            self._stop_comparing()
+            return []
+        self._innovations.step(laser.innovation, facts.dt_s)
+        self._compare_loops(facts)
+        if memory.tries_pi:
+            return self._end_trial(facts)
+        if memory.follows_estimate:
+            self._correlation.step(facts.setpoint_um - estimate.um, facts.dt_s)
+            if memory.noticed:
+                return self._end_notice("the estimate is tried again")
+            errors = self._comparison.errors
+            if facts.now_s < memory.trusted_until_s or errors is None:
+                return []
+            if self._may_be_worse(errors):
+                memory.estimate_error = errors.own
+                memory.tries_pi = True
+        return []
+
+    def _may_be_worse(self, errors: LoopErrors) -> bool:
+        """Whether the PI may hold the mirror better than the estimate."""
+        excess = errors.excess
+        worse = excess.um2 > (1.0 - 1.0 / _WORSE_SHARE) * errors.own.um2
+        predicted = worse and excess.um2 > _WORSE_SIGMAS * excess.sigma_um2
+        return predicted or self._correlation.largest > _CORRELATED
+
+    def _compare_loops(self, facts: ProcessValueFacts) -> None:
+        """Add this tick's reading to the comparison."""
+        memory = self.memory
+        error_um = facts.setpoint_um - facts.laser_um
+        if math.isnan(memory.compares_from_s):
+            warm_up_s = _WARM_UP_S + _WARM_UP_INTEGRAL_TIMES * self._loop.ti_s
+            memory.compares_from_s = facts.now_s + warm_up_s
+        if not memory.follows_estimate:
+            if facts.now_s >= memory.compares_from_s:
+                self._comparison.step(error_um, error_um, facts.dt_s)
+            return
+        if not self._prediction.runs:
+            assert facts.estimate is not None  # it is followed
+            self._prediction.start(
+                facts.estimate.um, facts.estimate.leak_um_per_s, facts.flow_um_per_s
+            )
+        seen_um = self._prediction.step(
+            facts.laser_um, facts.setpoint_um, facts.weather, facts.flow_um_per_s, facts.dt_s
+        )
+        if facts.now_s >= memory.compares_from_s:
+            self._comparison.step(error_um, facts.setpoint_um - seen_um, facts.dt_s)
+
+    def _stop_comparing(self) -> None:
+        self._prediction.stop()
+        self._comparison.reset()
+        self.memory.compares_from_s = math.nan
+
+    def _end_trial(self, facts: ProcessValueFacts) -> list[Event]:
+        """End a trial of the PI once its errors are known: it stays if it is better."""
+        memory = self.memory
+        errors, estimate_error = self._comparison.errors, memory.estimate_error
+        if errors is None or estimate_error is None or self._comparison.spans < _TRIAL_SPANS:
+            return []
+        memory.tries_pi = False
+        until_s = facts.now_s + min(_FALL_BACK_S * 2.0**memory.trials, _FALL_BACK_MOST_S)
+        memory.trials += 1
+        sigma_um2 = math.hypot(errors.own.sigma_um2, estimate_error.sigma_um2)
+        if errors.own.um2 - estimate_error.um2 > _RETURNS_SIGMAS * sigma_um2:
+            memory.trusted_until_s = until_s
+            self._correlation.reset()
+            return []
+        memory.fall_back_until_s = until_s
+        memory.noticed = True
+        message = (
+            f"with the estimate the centre moved by {_root(estimate_error.um2):.2f} µm, with the "
+            f"PI on the laser by {_root(errors.own.um2):.2f} µm; {self._explain_worse()}. "
+            "The loop follows the laser"
+        )
+        return [Maintenance(NOTICE, message)]
+
+    def _explain_worse(self) -> str:
+        """What errors and innovations show of the cause."""
+        if self._correlation.largest > _CORRELATED:
+            return (
+                "its errors swing: it looks like another dead time, lag or curve of the pump than "
+                "assumed, or like weather of one period"
+            )
+        return self._innovations.describe()
+
+    def _end_notice(self, why: str) -> list[Event]:
+        self.memory.noticed = False
+        return [MaintenanceOver(NOTICE, why)]
+
+
+_BY_ESTIMATE = (ProcessValueReason.RESPONSE_KNOWN, ProcessValueReason.LASER_UNUSABLE)
+
+
+def _root(mean_square_um2: float) -> float:
+    return math.sqrt(max(0.0, mean_square_um2))

@@ -1,0 +1,277 @@
+"""`process_value = "auto"`: the loop follows the estimate where it is better, else the laser."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.config.control import EstimatorConfig, LoopConfig, PumpConfig
+from membrane_ctrl.config.schema import Config, ShapeConfig, StatesConfig, leave_to_start
+from membrane_ctrl.control.centre_estimate import CentreEstimate, Sensor, SensorView
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.process_value import (
+    NOTICE,
+    ProcessValueChoice,
+    ProcessValueFacts,
+    ProcessValueState,
+)
+from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
+from membrane_ctrl.model.events import (
+    Event,
+    Maintenance,
+    MaintenanceOver,
+    ProcessValueChosen,
+    PumpResponseFound,
+)
+from membrane_ctrl.model.state_tree import decode_state, encode_state
+from membrane_ctrl.model.telemetry import SafeLevel, State
+from tests.worlds.eleven_benches import BENCHES, Bench, ForeignCamera
+from tests.worlds.foreign_plant import ForeignPump, foreign_bench
+
+DT_S = 0.1
+LOOP = LoopConfig(rate_hz=10.0)
+ESTIMATOR = EstimatorConfig(process_value="auto")
+CALM = tuple(SensorView(fresh, 0.1, 0.5) for fresh in (True, False, True, True))
+ESTIMATE = CentreEstimate(0.1, 0.05, 0.0, 0.1, 0.0, 1.2, 1.2, CALM)
+FACTS = ProcessValueFacts(
+    now_s=0.0,
+    dt_s=DT_S,
+    estimate=ESTIMATE,
+    held_by_optics=False,
+    response_known=True,
+    on_trial=False,
+    laser_um=0.1,
+    repeats_sample=False,
+    laser_doubted=False,
+    steady=True,
+    setpoint_um=0.0,
+    flow_um_per_s=1.2,
+    weather=(98_000.0, 20.0),
+)
+
+
+class Choice:
+    """A choice with its clock."""
+
+    def __init__(self) -> None:
+        self.choice = ProcessValueChoice(LOOP, PumpConfig(), ESTIMATOR)
+        self.now_s = 0.0
+        self.events: list[Event] = []
+
+    def run(self, seconds: float, facts: ProcessValueFacts) -> list[bool]:
+        """Whether the loop follows the estimate, by tick."""
+        follows = []
+        for _ in range(round(seconds / DT_S)):
+            self.now_s += DT_S
+            estimate, events = self.choice.step(replace(facts, now_s=self.now_s))
+            follows.append(estimate is not None)
+            self.events += events
+        return follows
+
+    @property
+    def codes(self) -> list[str]:
+        return [event.code for event in self.events if isinstance(event, ProcessValueChosen)]
+
+
+def without(sensor: Sensor) -> CentreEstimate:
+    sensors = list(CALM)
+    sensors[sensor] = SensorView(False, 0.1, 0.0)
+    return replace(ESTIMATE, sensors=tuple(sensors))
+
+
+def test_the_estimate_is_followed_once_the_response_is_known() -> None:
+    choice = Choice()
+    assert not any(choice.run(20.0, replace(FACTS, response_known=False)))
+    assert choice.run(20.0, FACTS)[-1]
+    assert choice.codes == ["response_unknown", "response_known"]
+    chosen = choice.events[-1]
+    assert chosen.sentence == (
+        "The loop follows the estimate of the centre: dead time and lag of the pump are known"
+    )
+
+
+def test_the_laser_is_followed_without_camera_and_barometer() -> None:
+    choice = Choice()
+    alone = replace(FACTS, estimate=without(Sensor.BAROMETER))
+    assert not any(choice.run(20.0, alone))
+    assert choice.codes == ["laser_alone"]
+
+
+def test_a_barometer_that_comes_and_goes_does_not_exchange_the_loops_again_and_again() -> None:
+    choice = Choice()
+    choice.run(20.0, FACTS)
+    alone = replace(FACTS, estimate=without(Sensor.BAROMETER))
+    for _ in range(20):
+        choice.run(2.0, alone)
+        choice.run(6.0, FACTS)
+    assert choice.codes == ["response_known", "laser_alone"]
+
+
+def test_gains_on_trial_act_on_the_mirror() -> None:
+    choice = Choice()
+    choice.run(20.0, FACTS)
+    assert not any(choice.run(20.0, replace(FACTS, on_trial=True)))
+    assert choice.run(20.0, FACTS)[-1]
+
+
+@pytest.mark.parametrize(
+    "unusable",
+    [
+        {"laser_um": math.nan},
+        {"laser_doubted": True},
+        {
+            "estimate": replace(ESTIMATE, sensors=(SensorView(True, -6.0, 0.5), *CALM[1:])),
+        },
+    ],
+    ids=["missing", "doubted", "jumps"],
+)
+def test_a_laser_that_the_optics_replace_is_never_followed(unusable: dict[str, object]) -> None:
+    """Also while the loop follows the laser, from the first such tick on."""
+    choice = Choice()
+    by_laser = replace(FACTS, response_known=False, held_by_optics=True)
+    assert not any(choice.run(5.0, by_laser))
+    assert all(choice.run(5.0, replace(by_laser, **unusable)))  # type: ignore[arg-type]
+
+
+def test_a_missing_laser_without_optics_is_left_to_the_safety_table() -> None:
+    choice = Choice()
+    alone = replace(FACTS, response_known=False, laser_um=math.nan)
+    assert not any(choice.run(5.0, alone))
+
+
+def test_the_decision_continues_from_its_memory() -> None:
+    first = Choice()
+    first.run(12.0, FACTS)
+    memory = decode_state(encode_state(first.choice.memory), ProcessValueState, 100_000)
+    second = ProcessValueChoice(LOOP, PumpConfig(), ESTIMATOR, memory)
+    facts = replace(FACTS, now_s=12.1)
+    assert second.step(facts) == first.choice.step(facts)
+    assert encode_state(second.memory) == encode_state(first.choice.memory)
+
+
+def bench_of(name: str, rate_hz: float = 10.0) -> Bench:
+    (bench,) = (bench for bench in BENCHES if bench.name == name)
+    return replace(bench, rate_hz=rate_hz)
+
+
+class Held:
+    """A foreign bench held for some time."""
+
+    def __init__(self, bench: Bench, estimator: EstimatorConfig, seconds: float, seed: int = 1):
+        plant = bench.plant(seed)
+        config = bench.config().model_copy(update={"estimator": estimator})
+        run = VirtualRun(config, foreign_bench(plant), zernike_projection())
+        self.ticks: list[VirtualTick] = []
+        self.true_um: list[float] = []
+        commands: tuple[Command, ...] = (Command("hold", "a test"),)
+        while run.now_s < seconds and (tick := run.run_tick(commands)) is not None:
+            self.ticks.append(tick)
+            self.true_um.append(plant.truth().displacement_um)
+            commands = ()
+
+    def events(self, kind: type[Event]) -> list[tuple[float, Event]]:
+        return [
+            (tick.row.mono_s, event)
+            for tick in self.ticks
+            for event in tick.events
+            if isinstance(event, kind)
+        ]
+
+    def std_um(self, begin_s: float) -> float:
+        values = [
+            um
+            for um, tick in zip(self.true_um, self.ticks, strict=True)
+            if tick.row.mono_s > begin_s
+        ]
+        return float(np.std(values))
+
+
+def test_an_estimate_with_a_wrong_response_falls_back_to_the_pi_with_a_notice() -> None:
+    """A slow pump whose stated dead time and lag are those of a quick one."""
+    bench = replace(bench_of("slow pump"), pump=lambda: ForeignPump(delay_s=0.8, lag_s=0.8))
+    held = Held(bench, ESTIMATOR, 420.0)
+    codes = [event.code for _, event in held.events(ProcessValueChosen)]  # type: ignore[attr-defined]
+    assert codes == ["response_known", "pi_tried", "estimate_worse"]
+    ((at_s, notice),) = held.events(Maintenance)
+    assert notice.name == NOTICE  # type: ignore[attr-defined]
+    assert "The loop follows the laser" in notice.message  # type: ignore[attr-defined]
+    by_laser = Held(bench, ESTIMATOR.model_copy(update={"process_value": "laser"}), 420.0)
+    assert held.std_um(at_s + 30.0) <= 1.05 * by_laser.std_um(at_s + 30.0)
+
+
+def test_an_estimate_that_is_better_stays() -> None:
+    estimator = EstimatorConfig(process_value="auto", pump_response="identified")
+    held = Held(bench_of("quick pump"), estimator, 300.0)
+    codes = [event.code for _, event in held.events(ProcessValueChosen)]  # type: ignore[attr-defined]
+    assert codes == ["response_known"]
+    assert held.events(Maintenance) == held.events(MaintenanceOver) == []
+    by_laser = Held(
+        bench_of("quick pump"), estimator.model_copy(update={"process_value": "laser"}), 300.0
+    )
+    assert held.std_um(60.0) < by_laser.std_um(60.0)
+
+
+def test_the_transfer_makes_no_bump() -> None:
+    estimator = EstimatorConfig(process_value="auto", pump_response="identified")
+    held = Held(bench_of("quick pump"), estimator, 60.0)
+    flows = np.array([tick.row.flow_um_per_s for tick in held.ticks])
+    (at_s, _), *_ = held.events(ProcessValueChosen)
+    times = np.array([tick.row.mono_s for tick in held.ticks])
+    place = int(np.flatnonzero(times >= at_s)[0])
+    usual = np.abs(np.diff(flows[place + 1 : place + 300]))
+    assert abs(flows[place] - flows[place - 1]) <= np.quantile(usual, 0.99)
+
+
+def test_without_a_response_the_hold_follows_the_laser() -> None:
+    estimator = EstimatorConfig(process_value="auto", pump_response="identified")
+    bench = bench_of("quick pump")
+    plant = bench.plant(1)
+    config = bench.config().model_copy(
+        update={"estimator": estimator, "states": StatesConfig(actuator_test=False)}
+    )
+    run = VirtualRun(config, foreign_bench(plant), zernike_projection())
+    ticks = [run.run_tick((Command("hold", "a test"),))]
+    while run.now_s < 30.0:
+        ticks.append(run.run_tick())
+    rows = [tick.row for tick in ticks if tick is not None]
+    events = [event for tick in ticks if tick is not None for event in tick.events]
+    assert rows[-1].state == State.HOLD
+    assert [e.code for e in events if isinstance(e, ProcessValueChosen)] == ["response_unknown"]
+    assert not [e for e in events if isinstance(e, PumpResponseFound)]
+    assert all(math.isnan(row.estimate_sigma_um) for row in rows)
+
+
+def test_a_camera_that_replaces_the_laser_holds_the_mirror_at_once() -> None:
+    """As with `estimate`, also in a hold that follows the laser."""
+    bench = bench_of("quick pump")
+    plant = bench.plant(1)
+    config = bench.config().model_copy(
+        update={
+            "estimator": EstimatorConfig(process_value="auto", pump_response="identified"),
+            "states": StatesConfig(actuator_test=False),
+            "shape": ShapeConfig(mode="track", track_rate_hz=10.0),
+        }
+    )
+    virtual = foreign_bench(plant)
+    run = VirtualRun(config, virtual, zernike_projection(), ForeignCamera(plant, 1))
+    run.run_tick((Command("hold", "a test"),))
+    while run.now_s < 40.0:
+        run.run_tick()
+    before_um = plant.truth().displacement_um
+    virtual.wrong.no_light = True
+    rows = [tick.row for _ in range(200) if (tick := run.run_tick()) is not None]
+    assert rows[-1].state == State.HOLD
+    assert {row.safe_level for row in rows} == {SafeLevel.NONE}
+    assert math.isfinite(rows[-1].estimate_sigma_um)
+    assert abs(plant.truth().displacement_um - before_um) < 1.5
+
+
+def test_a_file_that_states_nothing_leaves_the_process_value_to_the_hold() -> None:
+    assert leave_to_start(Config()).estimator.process_value == "auto"
+    stated = Config.model_validate({"estimator": {"process_value": "laser"}})
+    assert leave_to_start(stated).estimator.process_value == "laser"
+    assert Config().estimator.process_value == "laser"  # of a recorded run without the table
