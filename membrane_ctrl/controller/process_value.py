@@ -176,6 +176,8 @@ class ProcessValueChoice:
     def set_loop(self, loop: LoopConfig, pump: PumpConfig, estimator: EstimatorConfig) -> None:
         """Predict and compare with other settings, from the beginning."""
         self._loop, self._pump, self._estimator = loop, pump, estimator
+        # The gas in transit is of the former dead time
+        self.memory.prediction.start_afresh()
         self._prediction = PredictedPi(loop, pump, estimator, self.memory.prediction)
         self._correlation = ErrorCorrelation(loop, estimator, self.memory.correlation)
         self._correlation.reset()

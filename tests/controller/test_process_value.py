@@ -143,6 +143,16 @@ def test_a_missing_laser_without_optics_is_left_to_the_safety_table() -> None:
     assert not any(choice.run(5.0, alone))
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.3, 2.0])
+def test_another_response_is_used_in_a_hold(delay_s: float) -> None:
+    choice = Choice()
+    choice.run(40.0, FACTS)
+    slower = ESTIMATOR.model_copy(update={"pump_delay_s": delay_s})
+    choice.choice.set_loop(LOOP, PumpConfig(), slower)
+    choice.choice.forget_verdict()
+    assert all(choice.run(40.0, FACTS))
+
+
 def test_the_decision_continues_from_its_memory() -> None:
     first = Choice()
     first.run(12.0, FACTS)
