@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from membrane_ctrl.model import durations
-from membrane_ctrl.model.optional import require_installed
+from membrane_ctrl.model.optional import PAGE_LIBRARIES, require_installed
 
 if TYPE_CHECKING:
     from tuning.options import TuneOptions
@@ -48,7 +48,7 @@ ChooseOption = Annotated[
     str, typer.Option("--choose", help="Apply this candidate without asking.", metavar="NAME")
 ]
 PageOption = Annotated[
-    bool, typer.Option("--page", help="With `run`: serve a live page on localhost.")
+    bool, typer.Option("--page", help="With `run`: print the link of the page that shows it.")
 ]
 ShortOption = Annotated[
     bool,
@@ -203,18 +203,12 @@ def compare(
 @app.command()
 def explore(
     folder: Annotated[Path, typer.Argument(metavar="RUN|SESSION", help="Run or session folder.")],
-    logs: LogsOption = Path("logs"),
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port on localhost; a free one by default.")
-    ] = 0,
-    author: AuthorOption = None,
 ) -> int:
-    """Explore gains by hand: a page with sliders, on the fitted plant in the recorded weather; a
-    session live.
+    """Explore gains by hand: open the page with its sliders, on the fitted plant in the recorded
+    weather; a session live.
     """
-    from membrane_ctrl.model.account import account_name
+    for library in PAGE_LIBRARIES:
+        require_installed(library, "web", "`tune explore`")
+    from tuning.commands.open_page import explore
 
-    require_installed("bokeh", "web", "`tune explore`")
-    from tuning.explore.page import explore
-
-    return explore(folder, logs, port, author or account_name())
+    return explore(folder)

@@ -104,8 +104,19 @@ def make_closing_lines(closing: RunEnd) -> list[str]:
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class PageAtEnd:
+    """The page after a hold: its link, or why its service has ended; neither without a page."""
+
+    link: str = ""
+    problem: str = ""
+
+
+NO_PAGE = PageAtEnd()
+
+
 def print_closing_report(
-    run_dir: Path, as_json: bool, closing: RunEnd | None = None, link: str = ""
+    run_dir: Path, as_json: bool, closing: RunEnd | None = None, page: PageAtEnd = NO_PAGE
 ) -> None:
     """Print how the run ended, a fault first, then its result, its folder and the page's link."""
     for line in make_closing_lines(closing) if closing is not None else ():
@@ -137,9 +148,11 @@ def print_closing_report(
             f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}",
             file=sys.stderr,
         )
-    if link:
-        print(f"page:       {link}", file=sys.stderr)
-        print(draw_link_code(link), end="", file=sys.stderr)
+    if page.problem:
+        print(f"no page:    its service has ended: {page.problem}", file=sys.stderr)
+    elif page.link:
+        print(f"page:       {page.link}", file=sys.stderr)
+        print(draw_link_code(page.link), end="", file=sys.stderr)
 
 
 def _list_headlines(summary: dict[str, Any]) -> Iterator[str]:

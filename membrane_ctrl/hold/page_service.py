@@ -11,27 +11,85 @@ import os
 import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 
 from membrane_ctrl.config.port import LOCAL
 from membrane_ctrl.config.service import DEFAULT_PORT
 from membrane_ctrl.control_port import service_link
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.optional import describe_missing, find_missing_page_library
-from membrane_ctrl.processes.command_process import CommandProcess
 
 LOG_NAME = "service.log"
 _IDLE_WORDS = ("--idle-end", "1h")
 _NICE = 10
 _ENDS_S = 10.0
-_STARTS_S = 10.0
+_LOOK_S = 0.1
+_TAIL_BYTES = 2000
+
+
+class PageService:
+    """The service that has the page of a folder of runs.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder of the runs.
+    link : str
+        To the page.
+    process : Popen or None
+        None: another program has started the service.
+    """
+
+    def __init__(
+        self, logs: Path, link: str, process: subprocess.Popen[bytes] | None = None
+    ) -> None:
+        self._logs = logs
+        self.link = link
+        self._process = process
+
+    def find_problem(self) -> str:
+        """Why the service that was started has ended; empty if it runs."""
+        if self._process is None or self._process.poll() is None:
+            return ""
+        return _read_last_line(self._logs / LOG_NAME) or f"code {self._process.returncode}"
+
+    def wait_until_it_serves(self, patience_s: float) -> str:
+        """Wait until the service is ready; returns why it is not, empty if it is."""
+        give_up_s = time.monotonic() + patience_s
+        while not service_link.find_service(self._logs):
+            if problem := self.find_problem():
+                return problem
+            if time.monotonic() > give_up_s:
+                return f"not ready within {patience_s:.0f} s; see {self._logs / LOG_NAME}"
+            time.sleep(_LOOK_S)
+        return ""
+
+    def forget(self) -> None:
+        """Leave the service to itself: it goes on."""
+        if self._process is not None and self._process.poll() is None:
+            # it is not ours to wait for: without a code its end would be reported as a leak
+            self._process.returncode = 0
+
+    def stop(self) -> None:
+        """End the service that was started."""
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(_ENDS_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.stdin is not None:
+            self._process.stdin.close()
 
 
 def start_page_service(
-    logs: Path, configuration: Path | None, stack: ExitStack, warn: Callable[[str], None]
-) -> str:
+    logs: Path, configuration: Path | None, warn: Callable[[str], None], ends_with_us: bool
+) -> PageService | None:
     """Start a service for a folder of runs unless one is there.
 
     Parameters
@@ -40,54 +98,62 @@ def start_page_service(
         Folder of the runs.
     configuration : Path or None
         Of this hold: the service offers those beside it.
-    stack : ExitStack
-        In continuous integration, it ends the service.
     warn : callable
         Gets one line if there will be no page.
+    ends_with_us : bool
+        Whether the service ends with this program; else it goes on, and ends an hour after its
+        last use.
 
     Returns
     -------
-    str
-        The link to the page; empty without a page.
+    PageService or None
+        None without a page.
     """
     if (link := service_link.find_service(logs)) is not None:
-        return link
+        return PageService(logs, link)
     if (missing := find_missing_page_library()) is not None:
         warn(f"no page: {describe_missing('it', missing, 'web')}")
-        return ""
+        return None
     port = _find_free_port()
     folder = Path() if configuration is None else configuration.resolve().parent
     words = ["serve", "--logs", str(logs), "--port", str(port), "--configurations", str(folder)]
+    words += ["--with-hold"] if ends_with_us else _IDLE_WORDS
     try:
         link = service_link.add_key(f"http://{LOCAL}:{port}/")
-        if os.environ.get("CI"):
-            service = CommandProcess("service", [*words, "--with-hold"], logs / LOG_NAME, _NICE)
-            service.start()
-            stack.callback(service.stop, _ENDS_S)
-        else:
-            _start_in_session([*words, *_IDLE_WORDS], logs / LOG_NAME)
-    except (errors.DeviceError, OSError, subprocess.TimeoutExpired) as error:
+        process = _start_in_session(words, logs / LOG_NAME, ends_with_us)
+    except (errors.DeviceError, OSError) as error:
         warn(f"no page: {error}")
-        return ""
-    return link
+        return None
+    return PageService(logs, link, process)
 
 
-def _start_in_session(words: list[str], log: Path) -> None:
-    """Start one of our commands in a session of its own, no child of this program, and forget it.
-    Raises OSError.
-    """
+def _start_in_session(words: list[str], log: Path, ends_with_us: bool) -> subprocess.Popen[bytes]:
+    """Start one of our commands in a session of its own. Raises OSError."""
+    log.parent.mkdir(parents=True, exist_ok=True)
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW
     handle = os.open(log, flags, 0o600)
-    detached = ["nice", "-n", str(_NICE), "setsid", "--fork", sys.executable]
     with os.fdopen(handle, "wb") as output:
-        subprocess.run(
-            [*detached, "-m", "membrane_ctrl", *words],
-            stdin=subprocess.DEVNULL,
+        process = subprocess.Popen(
+            ["nice", "-n", str(_NICE), sys.executable, "-m", "membrane_ctrl", *words],
+            # its standard input closes when this program dies
+            stdin=subprocess.PIPE if ends_with_us else subprocess.DEVNULL,
             stdout=output,
             stderr=output,
-            check=False,
-            timeout=_STARTS_S,
+            start_new_session=True,
         )
+    # takes its exit code when it ends: it must not remain as a zombie
+    threading.Thread(target=process.wait, name="page service", daemon=True).start()
+    return process
+
+
+def _read_last_line(log: Path) -> str:
+    """Return the last line that a program has written."""
+    try:
+        text = log.read_bytes()[-_TAIL_BYTES:].decode("utf-8", "replace")
+    except OSError:
+        return ""
+    lines = text.strip().splitlines()
+    return terminal.one_line(lines[-1]).removeprefix("membrane-ctrl: ") if lines else ""
 
 
 def _find_free_port() -> int:

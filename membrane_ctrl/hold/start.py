@@ -7,6 +7,7 @@ end, the safe state comes first, then the recording, then the rest.
 
 import asyncio
 import contextlib
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,7 @@ from membrane_ctrl.controller import cross_check
 from membrane_ctrl.geometry.run_geometry import read_configured_geometry
 from membrane_ctrl.hold import child_processes, page_service
 from membrane_ctrl.hold.autotune import start_autotune
-from membrane_ctrl.hold.closing_words import RunEnd, print_closing_report
+from membrane_ctrl.hold.closing_words import PageAtEnd, RunEnd, print_closing_report
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.listeners import FaultLatch
 from membrane_ctrl.hold.lock_keeper import LockKeeper
@@ -95,7 +96,7 @@ def hold_mirror(options: HoldOptions) -> int:
             f"run folder {run_dir}; starting {', '.join(children.process_names)}"
         )
         children.start(stack)
-        link = _start_service(options, logs_dir, stack)
+        page = _start_service(options, logs_dir, stack)
         if options.autotune:
             stack.callback(start_autotune(listeners.path, run_dir))
         bench = make_bench(
@@ -122,19 +123,33 @@ def hold_mirror(options: HoldOptions) -> int:
             if closing.exit is None:
                 raise
             # the run had ended before: its own end counts
+        page_at_end = _describe_page(page)
     assert closing.exit is not None
     with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
-        print_closing_report(run_dir, options.json, closing, link)
+        print_closing_report(run_dir, options.json, closing, page_at_end)
     return closing.exit
 
 
-def _start_service(options: HoldOptions, logs_dir: Path, stack: contextlib.ExitStack) -> str:
-    """Start the service if it is wanted and none is there; returns and prints the page's link."""
+def _start_service(
+    options: HoldOptions, logs_dir: Path, stack: contextlib.ExitStack
+) -> page_service.PageService | None:
+    """Start the service if it is wanted and none is there; prints the page's link."""
     if not options.service or not options.config.port.enabled:
-        return ""
-    link = page_service.start_page_service(
-        logs_dir, options.configuration, stack, terminal.print_progress
+        return None
+    ends_with_us = bool(os.environ.get("CI"))
+    page = page_service.start_page_service(
+        logs_dir, options.configuration, terminal.print_progress, ends_with_us
     )
-    if link:
-        terminal.print_progress(f"page: {link}")
-    return link
+    if page is not None:
+        stack.callback(page.stop if ends_with_us else page.forget)
+        if page.link:
+            terminal.print_progress(f"page: {page.link}")
+    return page
+
+
+def _describe_page(page: page_service.PageService | None) -> PageAtEnd:
+    """The page after the hold: its link, or why its service has ended."""
+    if page is None:
+        return PageAtEnd()
+    problem = page.find_problem()
+    return PageAtEnd("" if problem else page.link, problem)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import Literal
-from urllib.parse import parse_qs
+from urllib.parse import parse_qs, urlencode
 
 from starlette.middleware.sessions import SessionMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -64,6 +64,7 @@ _HEADERS: tuple[Header, ...] = (
     (b"referrer-policy", b"same-origin"),
 )
 _BEARER = "bearer "
+_PLACE = ("hold", "tab", "gains")  # names of a query that show a part of the page
 _CLOSE: Header = (b"connection", b"close")
 
 
@@ -224,7 +225,7 @@ class LoginMiddleware:
         secret = parse_qs(scope["query_string"].decode("latin-1")).get("key", [""])[0]
         user = self._accounts.by_link(secret)
         if user is not None:
-            await self._admit(scope, send, user, "")
+            await self._admit(scope, send, user, "", _find_place(scope))
             return
         text = (
             "Log in."
@@ -235,10 +236,12 @@ class LoginMiddleware:
             text = f"This link is wrong, or of another user. {text}"
         await self._show_form(scope, send, HTTPStatus.UNAUTHORIZED, text)
 
-    async def _admit(self, scope: Scope, send: Send, user: WebUser, device: str) -> None:
-        """Give a user a session and show the page."""
+    async def _admit(
+        self, scope: Scope, send: Send, user: WebUser, device: str, place: str = ""
+    ) -> None:
+        """Give a user a session and show the page; `place` is a query that names its tab."""
         scope["session"].update(self._accounts.make_session(user))
-        headers = [self._location()]
+        headers = [self._location(place)]
         cookie = self._accounts.device_cookie(user, device)
         if cookie is not None:
             headers.append((b"set-cookie", cookie.encode()))
@@ -258,8 +261,8 @@ class LoginMiddleware:
             headers.append(_CLOSE)  # the body of a request that is not read would still be received
         await _answer(scope, send, status, page, headers)
 
-    def _location(self) -> Header:
-        return (b"location", self._address.home.encode())
+    def _location(self, place: str = "") -> Header:
+        return (b"location", f"{self._address.home}{place}".encode())
 
     def _source(self, scope: Scope) -> str:
         """Return the network address of the client."""
@@ -330,6 +333,13 @@ def _guarded(send: Send) -> Send:
         await send(message)
 
     return wrapped
+
+
+def _find_place(scope: Scope) -> str:
+    """Return the query of a link without its key: what of the page it shows."""
+    given = parse_qs(scope["query_string"].decode("latin-1"))
+    place = {name: given[name][0] for name in _PLACE if name in given}
+    return f"?{urlencode(place)}" if place else ""
 
 
 def _cookies(headers: dict[str, str]) -> dict[str, str]:

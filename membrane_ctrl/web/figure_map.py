@@ -19,7 +19,7 @@ from membrane_ctrl.model.colours import DIVERGING_MAP
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, zernike_labels
 from membrane_ctrl.run_files import shapes
-from membrane_ctrl.web.history_chart import GREY, RULE
+from membrane_ctrl.web.chart_axes import GREY, RULE
 
 SCRIPT = (Path(__file__).parent / "figure_map.js").read_text(encoding="utf-8")
 # terms that a viewer may remove, with their Noll indices

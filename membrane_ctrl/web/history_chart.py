@@ -12,10 +12,10 @@ from typing import Any
 from membrane_ctrl.model.colours import Colour
 from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.service.feed import Series
+from membrane_ctrl.web.chart_axes import GREY, make_axis
 
 SCRIPT = (Path(__file__).parent / "history_chart.js").read_text(encoding="utf-8")
 SIGNALS_MOST = 4  # panels that a screen has room for
-GREY, RULE = "#8a8a8a", "rgba(128, 128, 128, 0.3)"  # legible on white and on black
 _RED = "#d55e00"
 _MARKS_MOST, _MARK_LETTERS = 20, 24  # newest marks on a chart, and what fits beside each
 # per cent of the chart's height
@@ -66,11 +66,11 @@ def make_history_chart(
         is_lowest = place == count - 1
         top = _TOP + place * (height + _GAP)
         grids.append({"left": 72, "right": 16, "top": f"{top:.1f}%", "height": f"{height:.1f}%"})
-        x_axis = {**_make_axis("UTC" if utc else "local time", 28), "type": "time", **span}
+        x_axis = {**make_axis("UTC" if utc else "local time", 28), "type": "time", **span}
         if not is_lowest:
             x_axis |= {"name": "", "axisLabel": {"show": False}}
         x_axes.append({**x_axis, "gridIndex": place})
-        y_axis = {**_make_axis(column.title, 52), "type": "value", "scale": True}
+        y_axis = {**make_axis(column.title, 52), "type": "value", "scale": True}
         y_axes.append({**y_axis, "gridIndex": place})
         series += _make_series(signal, values, place, shift_ms, lines, labelled=place == 0)
     places = list(range(count))
@@ -138,17 +138,6 @@ def _make_series(
             "markLine": _make_mark_lines(lines, labelled),
         },
     ]
-
-
-def _make_axis(name: str, gap_px: int) -> dict[str, Any]:
-    return {
-        "name": name,
-        "nameGap": gap_px,
-        "nameLocation": "middle",
-        "nameTextStyle": {"color": GREY},
-        "axisLabel": {"color": GREY, "hideOverlap": True},
-        "splitLine": {"lineStyle": {"color": RULE}},
-    }
 
 
 def _make_line(moment: ChartLine, shift_ms: float) -> dict[str, Any]:

@@ -35,7 +35,9 @@ from membrane_ctrl.web.alarms_panel import alarms_panel
 from membrane_ctrl.web.chart_marks import is_now, mark_past
 from membrane_ctrl.web.configuration_panel import EDITS, ConfigurationPanel
 from membrane_ctrl.web.consequences import Consequence, find_consequence
+from membrane_ctrl.web.fetched_charts import SCRIPT as FETCHED_CHARTS
 from membrane_ctrl.web.fleet_panel import fleet_panel
+from membrane_ctrl.web.gains_panel import GainsPanel
 from membrane_ctrl.web.held_by import describe_holder
 from membrane_ctrl.web.log_lines import find_new_lines
 from membrane_ctrl.web.messages import MESSAGE_CSS, show_message
@@ -109,11 +111,21 @@ class WebPage:
         # of this viewer, in records
         self._session = f"page {ui.context.client.id[:_SESSION_DIGITS]}"
 
-    def build(self) -> None:
-        """Put the page together."""
+    def build(self, tab: str = "", gains: str = "") -> None:
+        """Put the page together.
+
+        Parameters
+        ----------
+        tab : str
+            Name of the tab to begin with, such as `tune`; empty or unknown for the first.
+        gains : str
+            Session or run whose gains are explored; empty for the newest.
+        """
+        self._first_tab, self._wanted_gains = tab, gains
         self._dark = ui.dark_mode(None)
         ui.add_css(_CSS)
-        ui.add_head_html(f"<script>{history_chart.SCRIPT}\n{figure_map.SCRIPT}</script>")
+        scripts = (history_chart.SCRIPT, figure_map.SCRIPT, FETCHED_CHARTS)
+        ui.add_head_html(f"<script>{chr(10).join(scripts)}</script>")
         ui.colors(primary=_PRIMARY)
         self._build_header()
         if len(self._feeds) > 1:
@@ -171,9 +183,25 @@ class WebPage:
                 )
             with ui.tab_panel(tune):
                 TuningPanel(
-                    lambda: self._views.sessions.get(self._hold), self._user, self._may_choose
+                    lambda: self._views.sessions.get(self._hold),
+                    self._hold,
+                    self._user,
+                    self._may_choose,
                 )
-            loads = {look_back.props["name"]: load_runs, alarms.props["name"]: load_alarms}
+                ui.separator()
+                gains = GainsPanel(
+                    self._views.gains,
+                    self._feed,
+                    self._hold,
+                    self._user,
+                    lambda: on_behalf(self._user, self._session),
+                    self._wanted_gains,
+                )
+            loads = {
+                look_back.props["name"]: load_runs,
+                alarms.props["name"]: load_alarms,
+                tune.props["name"]: gains.load,
+            }
             if self._may_edit:
                 with ui.tab_panel(configuration):
                     loads[configuration.props["name"]] = self._build_editor().load_list
@@ -183,6 +211,9 @@ class WebPage:
                 await loads[event.value]()
 
         tabs.on_value_change(load)
+        by_name = {name.lower(): name for name in loads}
+        if self._first_tab in by_name:
+            tabs.set_value(by_name[self._first_tab])
 
     @property
     def _may_edit(self) -> bool:

@@ -20,7 +20,7 @@ from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.link_code import draw_link_code
 from membrane_ctrl.control_port.service_link import link_key, publish_address, read_or_make_secret
-from membrane_ctrl.model import files
+from membrane_ctrl.model import errors, files
 from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.accounts import Accounts
 from membrane_ctrl.service.alarm_child import AlarmChild
@@ -38,7 +38,8 @@ from membrane_ctrl.service.public_address import public_address
 from membrane_ctrl.service.service_check import read_users, require_usable_files
 from membrane_ctrl.service.service_feed import make_feed
 from membrane_ctrl.service.tokens import TokenBook, tokens_file
-from membrane_ctrl.service.work_pools import REPORT_FILES, PoolFullError
+from membrane_ctrl.service.work_pools import REPORT_FILES, SESSIONS, PoolFullError
+from membrane_ctrl.web.gains_views import parse_setting
 from membrane_ctrl.web.page import WebPage
 from membrane_ctrl.web.runs_panel import run_folder
 from membrane_ctrl.web.shared_views import SharedViews, parse_removed, parse_signals
@@ -148,12 +149,12 @@ def _run_server(
     views = SharedViews(feeds)
 
     @ui.page("/", title="membrane_ctrl")
-    def view(request: Request, hold: str = "") -> None:
+    def view(request: Request, hold: str = "", tab: str = "", gains: str = "") -> None:
         user: WebUser = request.scope["membrane_user"]
         shown = hold if hold in feeds else next(iter(feeds))
         is_ours = feeds[shown].logs == Path(page.logs)
         ours = (starter, editor) if is_ours else (None, None)
-        WebPage(feeds, shown, user, views, *ours).build()
+        WebPage(feeds, shown, user, views, *ours).build(tab, gains)
 
     @app.get("/chart")
     async def chart(hold: str, signals: str, span: str, utc: bool) -> Response:
@@ -167,9 +168,7 @@ def _run_server(
             packed = await views.chart(hold, names, span, utc)
         except PoolFullError as error:
             return PlainTextResponse(str(error), 503)
-        return Response(
-            packed, media_type="application/json", headers={**_FRESH, "content-encoding": "gzip"}
-        )
+        return _packed_json(packed)
 
     @app.get("/map")
     async def picture(hold: str, removed: str, reference: str) -> Response:
@@ -184,11 +183,26 @@ def _run_server(
             drawn = await views.map(hold, terms, reference, figure.time_s)
         except PoolFullError as error:
             return PlainTextResponse(str(error), 503)
-        return Response(
-            drawn.data,
-            media_type="application/json",
-            headers={**_FRESH, "content-encoding": "gzip"},
-        )
+        return _packed_json(drawn.data)
+
+    @app.get("/gains")
+    async def gains(hold: str, name: str, start: str, setting: str = "") -> Response:
+        try:
+            found = await views.gains.explore(hold, name, start, parse_setting(setting))
+        except (KeyError, ValueError, errors.InputError):
+            return Response(status_code=404)
+        except PoolFullError as error:
+            return PlainTextResponse(str(error), 503)
+        return _packed_json(found.charts)
+
+    @app.get("/session-chart")
+    async def session_chart(hold: str) -> Response:
+        if hold not in feeds or feeds[hold].logs is None:
+            return Response(status_code=404)
+        try:
+            return _packed_json(await SESSIONS.run(views.session_chart, hold))
+        except PoolFullError as error:
+            return PlainTextResponse(str(error), 503)
 
     @app.get("/report/{name}")
     async def report(name: str, hold: str = "") -> Response:
@@ -218,6 +232,12 @@ def _run_server(
         loop="membrane_ctrl.service.connections:PageLoop" if page.secure else "auto",
         proxy_headers=False,  # `PublicAddress.source_of` reads them, if the proxy is a trusted one
     )
+
+
+def _packed_json(content: bytes) -> Response:
+    """An answer of JSON in gzip."""
+    headers = {**_FRESH, "content-encoding": "gzip"}
+    return Response(content, media_type="application/json", headers=headers)
 
 
 class HangUp:

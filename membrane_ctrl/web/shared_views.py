@@ -24,6 +24,7 @@ from membrane_ctrl.service.work_pools import (
     SESSIONS,
 )
 from membrane_ctrl.web import alarm_history, figure_map
+from membrane_ctrl.web.gains_views import GainsViews
 from membrane_ctrl.web.history_chart import SIGNALS_MOST, ChartLine, make_history_chart
 from membrane_ctrl.web.made_once import MadeOnce
 from membrane_ctrl.web.tuning_panel import SessionWatch
@@ -67,6 +68,8 @@ class SharedViews:
         watches = {
             name: SessionWatch(feed.logs) for name, feed in feeds.items() if feed.logs is not None
         }
+        self.gains = GainsViews(feeds)
+        self._watches = watches
         self.sessions = MadeOnce(lambda hold: watches[hold].look(), SESSIONS, life_s=LOOK_S)
 
     async def chart(self, hold: str, signals: tuple[str, ...], span: str, utc: bool) -> bytes:
@@ -85,6 +88,10 @@ class SharedViews:
     async def alarms(self, hold: str) -> list[alarm_history.PastAlarm]:
         """The faults and notices of the last runs, newest first. Raises PoolFullError."""
         return await self._alarms.get(hold)
+
+    def session_chart(self, hold: str) -> bytes:
+        """Options of the chart of the newest tuning session, as JSON in gzip."""
+        return gzip.compress(json.dumps({"session": self._watches[hold].make_chart()}).encode(), 1)
 
     def list_references(self, hold: str) -> list[str]:
         """What a figure may be compared with."""

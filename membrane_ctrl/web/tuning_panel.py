@@ -1,10 +1,14 @@
 """The tab of the newest tuning session."""
 
+import json
+import math
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
 
 from nicegui import ui
 
@@ -15,11 +19,16 @@ from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.work_pools import ANSWERS
 from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, write_answer
+from membrane_ctrl.web.confirmation import confirm
 from membrane_ctrl.web.log_lines import find_new_lines
 from membrane_ctrl.web.messages import show_message
+from membrane_ctrl.web.session_chart import SessionChart
+from membrane_ctrl.web.session_status import describe_session, find_silent_s
 
 CHOOSES: Role = "tune"  # as for `ctl gains`
 _LOOK_S = 1.0
+_DRAW_S = 2.0
+_FETCH_S = 30.0
 _TAKES = 5  # looks until a session that asks has taken an answer
 
 
@@ -33,13 +42,14 @@ class SessionSeen:
     candidates: tuple[
         tuple[str, ...], ...
     ] = ()  # their table, its head first, while the session waits for a choice
+    silent_s: float = 0.0  # how long its log has not grown
+    points: int = 0  # of its chart
 
     @property
     def head(self) -> str:
-        """Where it is, in a line."""
-        step, asks, ended = self.progress.step, self.progress.asks, self.progress.ended
-        words = (step or "begun", asks and f"asks: {asks}", ended and f"ended: {ended}")
-        return f"{self.path.name}: {', '.join(filter(None, words))}"
+        """What it does, in a line."""
+        doing = describe_session(self.progress, self.done, self.silent_s, self.path)
+        return f"{self.path.name}: {doing}"
 
 
 class SessionWatch:
@@ -48,6 +58,7 @@ class SessionWatch:
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._reader: LiveReader | None = None
+        self._chart = SessionChart()
 
     def look(self) -> SessionSeen | None:
         """The session now; None if there is none."""
@@ -56,14 +67,24 @@ class SessionWatch:
         except (errors.CommandError, OSError):
             return None
         if self._reader is None or self._reader.session != newest.path:
-            self._reader = LiveReader(newest.path)
-        self._reader.read_new()
-        done = frozenset(step for step in folders.STEPS if newest.is_done(step))
-        progress = self._reader.progress
+            self._reader, self._chart = LiveReader(newest.path), SessionChart()
+        self._chart.add_points(self._reader.read_new())
+        seen = SessionSeen(
+            newest.path,
+            frozenset(step for step in folders.STEPS if newest.is_done(step)),
+            self._reader.progress,
+            silent_s=find_silent_s(newest.path),
+            points=self._chart.count,
+        )
         with suppress(errors.InputError):
-            if progress.among:
-                return SessionSeen(newest.path, done, progress, _table(newest.read_candidates()))
-        return SessionSeen(newest.path, done, progress)
+            if seen.progress.among:
+                return replace(seen, candidates=_table(newest.read_candidates()))
+        return seen
+
+    def make_chart(self) -> dict[str, Any]:
+        """Options of the chart of the session that was seen last."""
+        begun = () if self._reader is None else self._reader.progress.begun_s
+        return self._chart.make_options(begun)
 
 
 def _table(markdown: str) -> tuple[tuple[str, ...], ...]:
@@ -93,25 +114,33 @@ def answered(session: Path, question: str, given: PageAnswer) -> Outcome:
 class TuningPanel:
     """The tab of the tuning session: its steps, what it has found, and the choice it waits for.
 
-    `look` returns the session now, `may` whether the viewer may choose.
+    `look` returns the session now, `is_action_allowed` whether the viewer may choose.
     """
 
     def __init__(
         self,
         look: Callable[[], Awaitable[SessionSeen | None]],
+        hold: str,
         user: WebUser,
         is_action_allowed: Callable[[], bool],
     ) -> None:
-        self._look, self._user, self._may = look, user, is_action_allowed
+        self._look, self._hold = look, hold
+        self._user, self._may = user, is_action_allowed
         self._head = (
             ui.label("No tuning session in this folder.")
             .classes("text-subtitle1")
             .props('role="status"')
+            .style("overflow-wrap: anywhere")
         )
         self._steps = ui.row()
         self._choice = ui.column().classes("w-full")
         self._said = ui.log(max_lines=200).classes("w-full h-64").props('aria-label="results"')
         self._said.set_visibility(False)
+        with ui.element("div").classes("w-full") as self._chart_place:
+            self._chart_place.props('role="img" aria-label="centre and flow of the session"')
+            self._chart = ui.echart({"series": []}).classes("w-full").style("height: 20rem")
+        self._chart_place.set_visibility(False)
+        self._drawn_points, self._drawn_s = 0, -math.inf
         self._buttons: list[ui.button] = []
         self._seen: SessionSeen | None = None
         ui.timer(_LOOK_S, self._show)
@@ -121,11 +150,14 @@ class TuningPanel:
         for button in self._buttons:
             if button.enabled != self._may():
                 button.set_enabled(self._may())
-        if seen is None or seen == before:
+        if seen is None:
+            return
+        await self._draw(seen)
+        if seen == before:
             return
         self._seen = seen
         self._head.set_text(seen.head)
-        self._said.set_visibility(True)
+        self._said.set_visibility(bool(seen.progress.said))
         if before is None or before.path != seen.path:
             self._said.clear()
             before = SessionSeen(seen.path, frozenset(), Progressed())
@@ -139,6 +171,18 @@ class TuningPanel:
             seen.progress.among,
         ):
             self._show_choice(seen)
+
+    async def _draw(self, seen: SessionSeen) -> None:
+        """Draw the chart if it has grown."""
+        is_due = time.monotonic() - self._drawn_s > _DRAW_S
+        if not seen.points or seen.points == self._drawn_points or not is_due:
+            return
+        self._drawn_points, self._drawn_s = seen.points, time.monotonic()
+        self._chart_place.set_visibility(True)
+        ids = json.dumps({"session": self._chart.id})
+        url = f"/session-chart?{urlencode({'hold': self._hold})}"
+        with suppress(TimeoutError):
+            await ui.run_javascript(f"await membraneDrawCharts({ids}, '{url}')", timeout=_FETCH_S)
 
     def _show_steps(self, seen: SessionSeen) -> None:
         self._steps.clear()
@@ -184,17 +228,8 @@ class TuningPanel:
 
     async def _answer(self, seen: SessionSeen, said: str) -> None:
         """Ask for a confirmation, answer, and say what became of it."""
-        with ui.dialog() as dialog, ui.card():
-            ui.label(f"{seen.progress.asks} {said or 'none'}").classes("text-h6")
-            with ui.row():
-                ui.button("Do it", on_click=lambda: dialog.submit("yes")).props(
-                    "color=primary autofocus"
-                )
-                ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None).props("flat")
-        sure = await dialog
-        if not dialog.is_deleted:  # with the viewer
-            dialog.delete()
-        if not sure or not self._may():
+        question = f"{seen.progress.asks} {said or 'none'}"
+        if not await confirm(question, enter_confirms=True) or not self._may():
             return
         given = PageAnswer(said, self._user.name)
         outcome = await ANSWERS.run(answered, seen.path, seen.progress.asks, given)

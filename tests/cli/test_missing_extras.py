@@ -26,7 +26,7 @@ sys.meta_path.insert(0, Absent())
 from membrane_ctrl.cli import run
 sys.exit(run({words!r}))
 """
-EXTRAS = ("nicegui", "fastapi", "starlette", "bokeh", "h5py", "distributed", "apprise")
+EXTRAS = ("nicegui", "fastapi", "starlette", "h5py", "distributed", "apprise")
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ EXTRAS = ("nicegui", "fastapi", "starlette", "bokeh", "h5py", "distributed", "ap
         (["serve"], "`serve` needs nicegui: pip install 'membrane-ctrl[web]'"),
         (
             ["tune", "explore", "absent"],
-            "`tune explore` needs bokeh: pip install 'membrane-ctrl[web]'",
+            "`tune explore` needs nicegui: pip install 'membrane-ctrl[web]'",
         ),
         (
             ["measure", "frames.h5"],

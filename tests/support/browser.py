@@ -66,9 +66,18 @@ class Tab:
         """
         guarded = f"(() => {{ try {{ return {script} }} catch {{ return null }} }})()"
         async with asyncio.timeout(_PATIENCE_S):
-            while not (found := await self.value(guarded)):  # noqa: ASYNC110
+            while not (found := await self._value_if_loaded(guarded)):  # noqa: ASYNC110
                 await asyncio.sleep(_LOOK_S)
             return found
+
+    async def _value_if_loaded(self, script: str) -> Any:
+        """As `value`; None of a page that has no document yet."""
+        try:
+            return await self.value(script)
+        except AssertionError as error:
+            if "execution context" not in str(error):
+                raise
+            return None
 
     async def click(self, label: str) -> None:
         """Click the button of that label, also inside shadow roots."""
@@ -77,7 +86,7 @@ class Tab:
 
     async def press(self, *keys: str) -> None:
         """Press keys one after the other, such as `s`, `Enter` or `Tab`."""
-        codes = {"Enter": 13, "Tab": 9, "Escape": 27}
+        codes = {"Enter": 13, "Tab": 9, "Escape": 27, "ArrowRight": 39}
         for key in keys:
             pressed: dict[str, Any] = {
                 "key": key,

@@ -28,8 +28,10 @@ from tests.support.browser import Tab, browser_tab
 from tests.support.recording_picture import screenshot
 from tests.support.review_runs import written
 from tests.web.test_page import PRESS, served
+from tests.worlds.designed_session import make_designed_session
 from tests.worlds.fleet_file import fleet_file
 from tests.worlds.nights import DOOR, GLITCH, JUMP, LEAK, Planted
+from tests.worlds.port_run import keep_ticking, port_run
 from tests.worlds.slowed_holds import slowed_holds
 from tests.worlds.virtual_record import kept_ticks, write_record
 
@@ -204,6 +206,30 @@ async def _configuration_picture(tab: Tab, target: Path) -> bytes:
     return await asyncio.to_thread(target.read_bytes)
 
 
+def tune_picture(folder: Path) -> dict[str, bytes]:
+    """The sliders of the tab *Tune*, on a session with made-up data."""
+    return {"tune-explore": asyncio.run(_tune_picture(folder))}
+
+
+async def _tune_picture(folder: Path) -> bytes:
+    session = await asyncio.to_thread(make_designed_session, folder)
+    target = folder / "tune.png"
+    async with port_run(folder) as run, served(folder) as link:
+        ticks = asyncio.create_task(keep_ticking(run))
+        place = f"{link}&tab=tune&gains=tuning/{session.name}"
+        async with browser_tab(place, folder / "profile", 1500, 1640) as tab:
+            await tab.until("document.body.innerText.includes('membrane-ctrl ctl gains')")
+            slider = 'document.querySelector(\'[aria-label^="response"] [tabindex="0"]\')'
+            await tab.value(f"{slider}.focus()")
+            for _ in range(25):
+                await tab.press("ArrowRight")
+            await asyncio.sleep(10.0)
+            await tab.value(f"{slider}.blur()")
+            await tab.screenshot(target, whole=False)
+        ticks.cancel()
+    return await asyncio.to_thread(target.read_bytes)
+
+
 def fleet_picture(folder: Path) -> dict[str, bytes]:
     """The page of six holds, one of which has ended."""
     names = ["north", "south", "east", "west", "spare", "bench"]
@@ -265,6 +291,7 @@ MAKERS: dict[tuple[str, ...], Callable[[Path], dict[str, bytes]]] = {
     ("tutorial-fault",): tutorial_picture,
     ("calibration-bowed-screen",): bowed_picture,
     ("web", "web-phone", "web-configuration"): page_pictures,
+    ("tune-explore",): tune_picture,
     ("web-fleet",): fleet_picture,
 }
 

@@ -1,14 +1,8 @@
-"""`tune explore`: responses against another implementation, sources, saved gains, and the page in a
-browser.
-"""
+"""`tune explore`: responses against another implementation, margins, sources and saved gains."""
 
 from __future__ import annotations
 
-import asyncio
-import json
-import re
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,35 +10,28 @@ from types import SimpleNamespace
 import control
 import numpy as np
 import pytest
-import synthetic
-from tornado.httpclient import HTTPClientError, HTTPRequest
-from tornado.websocket import websocket_connect
 
-from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.control.experiments import experiment, operating_point
+from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions import folder, session_json
 from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support import review_runs
-from tests.support.browser import browser_tab
-from tests.support.machine_needs import needs
+from tests.worlds.designed_session import CALM, LOOP, PLANT, make_designed_session
 from tuning import gains_file
-from tuning.explore.curves import Sliders, Workpiece, curves, of_path, responded
-from tuning.explore.page import make_saver
-from tuning.identification import disturbance, noise_spectrum, plant_model, record_file
+from tuning.explore.crossings import find_crossings
+from tuning.explore.curves import compute_curves, simulate_response
+from tuning.explore.saving import save_gains
+from tuning.explore.sliders import Sliders, find_time_constants_s
+from tuning.explore.workpiece import Workpiece, load_workpiece
+from tuning.identification import disturbance, record_file
 from tuning.identification.closed_loop import Gains
 from tuning.identification.experiments import SHORT
-from tuning.identification.record import Record
-from tuning.proposal import model_bench, verification
+from tuning.proposal import verification
 from tuning.proposal.preview import preview_loop
 from tuning.proposal.verification import Stage
-from tuning.rigs.bench_rig import Rig
-from tuning.steps import apply, characterise, design, identify, observe, preview, verify
+from tuning.steps import apply, observe, preview, verify
 
-PLANT = plant_model.PlantModel(0.9, 0.4, 0.3, 1.2)
-CALM = noise_spectrum.Noise(1.0, 0.01, 0.01, 12.0, 0.02)
-LOOP = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
 MADE = Workpiece("made up", PLANT, disturbance.DisturbanceModel(CALM, None, None), LOOP, None, None)
 GAINS = (
     Gains(0.3, 9.0, 0.0, 0.2),
@@ -76,66 +63,37 @@ def test_the_responses_are_those_of_another_implementation(gains: Gains, output:
     if output == "step" and gains.td_s:
         gains = replace(gains, td_s=0.0)
     step = (1.0, 0.0) if output == "step" else (0.0, 1.0)
-    time_s, centre_um = responded(gains, MADE, 60.0, *step)
+    time_s, centre_um = simulate_response(gains, MADE, 60.0, *step)
     other = control.forced_response(closed_loop(gains, output), time_s, np.ones(time_s.size))
     assert np.abs(centre_um - other.y[0]).max() < 0.02 * np.abs(centre_um).max()
 
 
 def test_the_load_peak_is_that_of_the_real_loop() -> None:
     gains = GAINS[0]
-    shown = curves("yours", gains, MADE, 60.0)
+    shown = compute_curves("yours", gains, MADE, 60.0)
     loop = gains.applied_to(LOOP)
     seen = preview_loop(loop, PumpConfig(), PLANT, MADE.weather, duration_s=40.0)
     assert np.abs(shown.load_um).max() == pytest.approx(seen.load_peak_um, rel=0.05)
 
 
 def test_an_unstable_loop_has_no_response_and_is_named() -> None:
-    shown = curves("yours", Gains(5.0, 1.0, 0.0, 0.0), MADE, 60.0)
+    shown = compute_curves("yours", Gains(5.0, 1.0, 0.0, 0.0), MADE, 60.0)
     assert not shown.figures.margins.stable
     assert shown.time_s.size == shown.load_um.size == 0
 
 
 def test_the_sliders_begin_where_the_gains_are() -> None:
     for gains in (*GAINS[:2], Gains(0.1, 40.0, 0.0, 0.03)):
-        again = Sliders.near(gains, PLANT, CALM.dt_s).gains(PLANT, CALM.dt_s)
+        again = Sliders.place_near(gains, PLANT, CALM.dt_s).make_gains(PLANT, CALM.dt_s)
         assert (again.kp_per_s, again.ti_s, again.filter_s) == pytest.approx(
             (gains.kp_per_s, gains.ti_s, gains.filter_s), rel=1e-9
         )
 
 
-def quiet_hold(seed: int = 3) -> Record:
-    bench = model_bench.ModelBench(PLANT, MADE.weather, PumpConfig(), seed)
-    rig = Rig(bench, LOOP, PumpConfig(), PLANT.holding_flow_um_per_s)
-    rig.hold(30.0)
-    return rig.hold(260.0)
-
-
 @pytest.fixture(scope="module")
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session up to its design, on made-up data; tests work on copies."""
-    opened = folder.create_session(
-        tmp_path_factory.mktemp("logs"), "made", "tester", "made up", Config(loop=LOOP), LOOP
-    )
-    record = synthetic.record(PLANT, samples=6000)
-    record_file.save_record(opened.file_path("experiments.npz"), record)
-    around = operating_point.OperatingPoint(PLANT.holding_flow_um_per_s, 0.4, 5.3, 1.0)
-    ends_s = record.duration_s
-    head = characterise.ExperimentsHead(
-        around,
-        ends_s,
-        (ends_s, ends_s),
-        experiment.Finished(experiment.ExperimentEnd.COMPLETED, "done"),
-    )
-    session_json.write_session_file(opened.file_path("experiments.json"), head)
-    identify.run_identify(opened)
-    quiet = quiet_hold()
-    record_file.save_record(opened.file_path("quiet.npz"), quiet)
-    found = identify.load_identified(opened).identified.model
-    session_json.write_session_file(
-        opened.file_path("disturbance.json"), disturbance.observe_disturbance(quiet, found, LOOP)
-    )
-    design.run_design(opened)
-    return opened.path
+    """A session up to its design; tests work on copies."""
+    return make_designed_session(tmp_path_factory.mktemp("logs"))
 
 
 def copy_of(template: Path, into: Path) -> folder.SessionFolder:
@@ -144,11 +102,11 @@ def copy_of(template: Path, into: Path) -> folder.SessionFolder:
 
 def test_a_session_gives_plant_weather_and_proposal(template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
-    found = of_path(opened.path, tmp_path)
+    found = load_workpiece(opened.path, tmp_path)
     assert found.model.gain == pytest.approx(PLANT.gain, rel=0.05)
     assert found.proposed == Gains.of(gains_file.load_gains(opened.file_path("gains.toml")).loop)
     opened.begin_step("design")
-    assert of_path(opened.path, tmp_path).proposed is None
+    assert load_workpiece(opened.path, tmp_path).proposed is None
 
 
 def test_a_short_session_takes_the_weather_from_before_its_experiments(
@@ -232,28 +190,26 @@ def test_a_run_gives_its_weather_and_names_the_source_of_its_plant(
     template: Path, tmp_path: Path
 ) -> None:
     run = review_runs.written(tmp_path, 0.2)
-    assumed = of_path(run, tmp_path)
+    assumed = load_workpiece(run, tmp_path)
     assert "as the configuration assumes" in assumed.source
     assert assumed.weather.laser_um == pytest.approx(1.0, rel=0.1)
     shutil.copytree(template, tmp_path / "tuning" / "20261122T000000Z-made")
-    identified = of_path(run, tmp_path)
+    identified = load_workpiece(run, tmp_path)
     assert "plant of the session 20261122T000000Z-made" in identified.source
     assert identified.model.gain == pytest.approx(PLANT.gain, rel=0.05)
 
 
 def test_a_folder_that_cannot_be_explored_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no undisturbed hold of 200 s"):
-        of_path(review_runs.written(tmp_path, 0.05), tmp_path)
+        load_workpiece(review_runs.written(tmp_path, 0.05), tmp_path)
     with pytest.raises(InputError):
-        of_path(tmp_path, tmp_path)
+        load_workpiece(tmp_path, tmp_path)
 
 
 def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
     session_json.write_session_file(opened.file_path("preview.json"), preview.Previewed((), ()))
-    save = make_saver(of_path(opened.path, tmp_path), "ada")
-    assert save is not None
-    assert "tune apply" in save(GAINS[0])
+    assert "tune apply" in save_gains(load_workpiece(opened.path, tmp_path), GAINS[0], "ada")
     assert Gains.of(apply.load_checked_gains(opened)) == GAINS[0]
     assert gains_file.load_gains(opened.file_path("gains.toml")).author == "ada"
     assert not opened.is_done("preview")  # it was of other gains
@@ -263,61 +219,42 @@ def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) 
 def test_gains_without_margin_are_not_saved(gains: Gains, template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
     before = opened.file_path("gains.toml").read_bytes()
-    save = make_saver(of_path(opened.path, tmp_path), "ada")
-    assert save is not None
-    assert re.search("Not saved: .*(unstable|sensitivity)", save(gains))
+    with pytest.raises(InputError, match=r"not saved: (unstable|Ms \d)"):
+        save_gains(load_workpiece(opened.path, tmp_path), gains, "ada")
     assert opened.file_path("gains.toml").read_bytes() == before
 
 
-_ROW = "Bokeh.documents[0].get_model_by_name('table').text"
-_GAINS_NEAR = (
-    "(() => {{ const found = "
-    "Bokeh.documents[0].get_model_by_name('command').text.match(/{{.*}}/)[0];"
-    "return Math.abs(JSON.parse(found).ti_s / {} - 1) < 0.05 && found }})()"
-)
-_MOVE = "Bokeh.documents[0].get_model_by_name('{}').value = {}"
+def test_a_run_takes_no_gains(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="only a session that has a design"):
+        save_gains(MADE, GAINS[0], "ada")
 
 
-@pytest.mark.real_time
-@needs("chromium")
-async def test_the_page_in_a_browser(template: Path, tmp_path: Path) -> None:
-    opened = copy_of(template, tmp_path)
-    command = (sys.executable, "-m", "membrane_ctrl", "tune", "explore", str(opened.path))
-    served = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
-    try:
-        assert served.stdout is not None
-        async with asyncio.timeout(60.0):
-            said = (await served.stdout.readline()).decode()
-        url = said.split()[2]
-        async with browser_tab(url, tmp_path / "profile") as tab:
-            await tab.until(_ROW)
-            await tab.value(_MOVE.format("speed", 0.5))
-            await tab.value(_MOVE.format("damping", 12.0))
-            loop = gains_file.load_gains(opened.file_path("gains.toml")).loop
-            slowed_s = 10**0.5 + PLANT.delay_s + CALM.dt_s / 2 + loop.measurement_filter_s
-            shown = json.loads(await tab.until(_GAINS_NEAR.format(12.0 * slowed_s)))
-            assert shown["kp_per_s"] == pytest.approx(1 / (PLANT.gain * slowed_s), rel=0.1)
-            await tab.click("Save as gains.toml")
-            await tab.until("Bokeh.documents[0].get_model_by_name('said').text.includes('Saved')")
-            await tab.screenshot(tmp_path / "page.png")
-            await tab.call("Page.navigate", url=f"{url}session")
-            await tab.until(
-                "Bokeh.documents[0].get_model_by_name('now').text.includes('Nothing recorded yet')"
-            )
-        assert (tmp_path / "page.png").stat().st_size > 30_000
-        assert gains_file.load_gains(opened.file_path("gains.toml")).loop.ti_s == pytest.approx(
-            shown["ti_s"], rel=1e-3
-        )
-        await _is_refused(url)
-    finally:
-        served.terminate()  # a shell that runs us in the background has SIGINT ignored
-        assert await served.wait() == 0
+@pytest.mark.parametrize("gains", GAINS)
+def test_the_margins_are_drawn_where_they_are(gains: Gains) -> None:
+    found = compute_curves("yours", gains, MADE, 60.0)
+    at_gain, at_phase = find_crossings(found.w_rad_per_s, found.open_loop)
+    margins = found.figures.margins
+    assert at_gain is not None
+    assert at_phase is not None
+    assert at_gain.phase_deg + 180.0 == pytest.approx(margins.phase_margin_deg, abs=0.5)
+    assert 1.0 / at_phase.gain == pytest.approx(margins.gain_margin, rel=0.02)
+    assert at_gain.gain == pytest.approx(1.0, rel=1e-6)
+    assert at_phase.phase_deg == pytest.approx(-180.0, abs=1e-6)
+    delay_margin_s = np.radians(at_gain.phase_deg + 180.0) / (2 * np.pi * at_gain.hertz)
+    assert delay_margin_s == pytest.approx(margins.delay_margin_s, rel=0.02)
 
 
-async def _is_refused(url: str) -> None:
-    """Another site's web socket."""
-    socket = url.replace("http", "ws") + "ws"
-    with pytest.raises(HTTPClientError, match="403"):
-        await websocket_connect(
-            HTTPRequest(socket, headers={"Origin": "http://evil.example"}), subprotocols=["bokeh"]
-        )
+def test_the_sliders_reach_no_further_than_they_show() -> None:
+    dt_s = CALM.dt_s
+    wild = Sliders(1e9, 1e9, 1e9).within_reach(PLANT, dt_s)
+    low_s, high_s = find_time_constants_s(PLANT, dt_s)
+    assert (wild.closed_loop_s, wild.damping, wild.filter_s) == (high_s, 16.0, 2.0)
+    none = Sliders(0.0, 0.0, 0.0).within_reach(PLANT, dt_s)
+    assert (none.closed_loop_s, none.damping, none.filter_s) == (low_s, 2.0, 0.01)
+
+
+def test_candidates_of_a_session_are_offered_once(template: Path, tmp_path: Path) -> None:
+    found = load_workpiece(copy_of(template, tmp_path).path, tmp_path).named_gains
+    assert list(found)[:2] == ["present", "proposed"]
+    assert len(found) > 2
+    assert len(set(found.values())) == len(found)

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -27,8 +28,9 @@ from membrane_ctrl.sessions.live_log import (
     write_answer,
 )
 from membrane_ctrl.sessions.progress import Progress
+from membrane_ctrl.web.session_chart import SessionChart
+from membrane_ctrl.web.session_status import describe_session, find_silent_s, is_running
 from tuning import same_bench
-from tuning.explore.live_page import LivePage, status
 
 RATE_HZ = 50.0
 
@@ -137,7 +139,7 @@ def test_a_full_disk_ends_the_log_and_is_reported_once(tmp_path: Path) -> None:
             Progressed("design", asks="which?"),
             5,
             4000.0,
-            "Waiting for an answer on its terminal: which?",
+            "Waiting for an answer: which?",
         ),
         (
             Progressed("verify", 600.0),
@@ -157,19 +159,44 @@ def test_a_full_disk_ends_the_log_and_is_reported_once(tmp_path: Path) -> None:
 def test_the_page_shows_what_a_session_does(
     progress: Progressed, done: int, silent_s: float, words: str
 ) -> None:
-    assert words in status(progress, set(folder.STEPS[:done]), silent_s, Path("logs/tuning/s"))
+    assert words in describe_session(
+        progress, set(folder.STEPS[:done]), silent_s, Path("logs/tuning/s")
+    )
 
 
-def test_the_page_s_text_is_text(tmp_path: Path) -> None:
+def test_a_session_that_works_or_has_ended(tmp_path: Path) -> None:
     opened = folder.create_session(tmp_path, "s", "eve", "twin", Config(), LoopConfig())
+    assert not is_running(opened.path)
     log = logged(opened.path)
     log.log_entry("step", "characterise", planned_s=10.0, after_s=0.0)
-    held(log, 2.0)
-    log.log_entry("said", "<script>alert(1)</script>")
-    page = LivePage(opened)
-    assert "&lt;script&gt;" in page._results.text
-    assert len(page._points.data["minutes"]) == 10
-    assert "class=now>&#9654; characterise" in page._steps.text
+    assert is_running(opened.path)
+    long_ago_s = time.time() - 1000.0
+    os.utime(opened.path / NAME, (long_ago_s, long_ago_s))
+    assert find_silent_s(opened.path) == pytest.approx(1000.0, abs=60.0)
+    assert not is_running(opened.path), "killed"
+    log.log_entry("ended", "done")
+    assert not is_running(opened.path)
+
+
+def test_the_chart_of_a_session_keeps_its_whole_course(tmp_path: Path) -> None:
+    log, reader, chart = logged(tmp_path), LiveReader(tmp_path), SessionChart()
+    log.log_entry("step", "observe", planned_s=10.0, after_s=0.0)
+    for part in range(4):
+        held(log, 600.0, displacement_um=part)
+        chart.add_points(reader.read_new())
+    log.log_entry("step", "<script>", planned_s=10.0, after_s=0.0)
+    reader.read_new()
+    options = chart.make_options(reader.progress.begun_s)
+    by_name = {each["name"]: each["data"] for each in options["series"]}
+    assert set(by_name) == {"centre", "setpoint", "flow"}
+    minutes = [point[0] for point in by_name["centre"]]
+    assert 1500 < len(minutes) <= 3000
+    assert minutes == sorted(minutes)
+    assert (minutes[0], minutes[-1]) == (pytest.approx(0.0, abs=0.1), pytest.approx(40.0, abs=0.1))
+    assert {point[1] for point in by_name["centre"]} == {0.0, 1.0, 2.0, 3.0}
+    (mark,) = [line for line in options["series"][0]["markLine"]["data"] if line["xAxis"] > 1]
+    assert mark["name"] == "<script>", "as data: ECharts draws it on a canvas"
+    json.dumps(options, allow_nan=False)
 
 
 RUNNING = LoopConfig(kp_per_s=0.5, setpoint_um=7.0)

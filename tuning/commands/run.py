@@ -9,8 +9,8 @@ from membrane_ctrl.sessions.progress import Progress
 from tuning import connection, journal
 from tuning.commands import choose
 from tuning.commands.conclusion import conclude
-from tuning.commands.live_page import serve_live_page
 from tuning.commands.map_pump import measure_pump
+from tuning.commands.open_page import find_page, link_to_tab
 from tuning.options import TuneOptions
 from tuning.proposal.verification import SETTLE_LEAST_S, Stage
 from tuning.report import page
@@ -40,7 +40,9 @@ def run_session(options: TuneOptions) -> int:
     choose.require_answer(options.yes, options.choose)
     with connection.open_on_hold(options) as (folder, rig, progress):
         if options.page:
-            progress.print_line(f"live page: {serve_live_page(folder, options)}session")
+            page_service = find_page(options.logs)
+            progress.print_line(f"page: {link_to_tab(page_service.link)}")
+            page_service.forget()
         try:
             _run_steps(
                 [step for step in STEPS if not folder.is_done(step)], folder, rig, options, progress
