@@ -17,7 +17,8 @@ from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, Pum
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments import trial
 from membrane_ctrl.control.experiments.experiment import ExperimentEnd, Finished
-from membrane_ctrl.control.pump_response import apply_response
+from membrane_ctrl.control.gain_limits import limit_gains
+from membrane_ctrl.control.pump_response import PumpResponse, apply_response
 from membrane_ctrl.controller import (
     centre_estimation,
     commands,
@@ -44,6 +45,7 @@ from membrane_ctrl.model.events import (
     Cleared,
     Event,
     ExperimentEnded,
+    GainsLimited,
     GainsReverted,
     LockRemoved,
     LockSet,
@@ -215,8 +217,7 @@ class Controller:
         is_held = self.state in (State.SETTLE, State.HOLD) or self._config.states.observe
         context.estimate = estimate if is_held else None
         if self._config.estimator.process_value == "auto":
-            context.estimate, chosen = self._process_value.step(self._collect_facts(last))
-            events += chosen
+            self._choose_process_value(last, events)
         if math.isnan(self.memory.state_since_s):  # the verdict has just changed the state
             self.memory.state_since_s = inputs.now_s
             context.state_age_s = 0.0
@@ -239,6 +240,16 @@ class Controller:
             answers=tuple(self._answers),
             clear_mask=self._clear_mask,
         )
+
+    def _choose_process_value(self, last: inner_loop.LoopOutput, events: list[Event]) -> None:
+        """Let the loop follow laser or estimate; after an error the estimate."""
+        context = self._context
+        try:
+            context.estimate, chosen = self._process_value.step(self._collect_facts(last))
+        except Exception as error:
+            self.memory.tick_error = f"process value: {type(error).__name__}: {error}"
+            return
+        events += chosen
 
     def _collect_facts(self, last: inner_loop.LoopOutput) -> process_value.ProcessValueFacts:
         """What decides which process value the loop follows in this tick."""
@@ -575,6 +586,25 @@ class Controller:
                 lag_sigma_s=found.lag_sigma_s,
                 sum_s=found.sum_s,
                 sum_sigma_s=found.sum_sigma_s,
+            )
+        )
+        if self._config.estimator.pump_response == "identified":
+            self._limit_gains(found, events)
+
+    def _limit_gains(self, response: PumpResponse, events: list[Event]) -> None:
+        """Slow down a loop whose gains are those of its file, and too quick for the pump."""
+        stated = self._config.loop
+        limited = limit_gains(stated, response)
+        if self._gains.on_trial or self._gains.present.loop != stated or limited is stated:
+            return
+        self._gains.limit(limited)
+        self._set_gains(limited)
+        events.append(
+            GainsLimited(
+                kp_per_s=limited.kp_per_s,
+                ti_s=limited.ti_s,
+                stated_kp_per_s=stated.kp_per_s,
+                stated_ti_s=stated.ti_s,
             )
         )
 

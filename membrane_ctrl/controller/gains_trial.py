@@ -75,6 +75,11 @@ class GainsTrial:
         self.memory.good = self.memory.tried
         self._end_trial()
 
+    def limit(self, loop: LoopConfig) -> None:
+        """Replace the loop's settings, which are not on trial, by others that stay."""
+        self.memory.tried = replace(self.memory.tried, loop=loop)
+        self.keep()
+
     def is_overdue(self, now_s: float) -> bool:
         """The trial has ended without `keep`."""
         return now_s >= self.memory.until_s

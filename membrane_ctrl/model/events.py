@@ -328,6 +328,21 @@ class PumpResponseFound(
     sum_sigma_s: float
 
 
+class GainsLimited(
+    Event,
+    kind="gains_limited",
+    sentence="The gains are limited to Kp {kp_per_s:.3g} 1/s and Ti {ti_s:.3g} s, as the pump is "
+    "slow; stated were {stated_kp_per_s:g} 1/s and {stated_ti_s:g} s. `tune run` finds better ones",
+    notable=True,
+):
+    """The pump's identified response forbids the stated gains: those in use, and the stated."""
+
+    kp_per_s: float
+    ti_s: float
+    stated_kp_per_s: float
+    stated_ti_s: float
+
+
 class ProcessValueChosen(
     Event, kind="process_value", sentence="The loop follows the {value}: {reason}"
 ):

@@ -120,6 +120,10 @@ class RunStatus:
                 return replace(self, unstored={**self.unstored, event.word: event.message})
             case run_events.LockStored():
                 return replace(self, unstored=_remove_standing(self.unstored, event.word))
+            case events.GainsLimited():
+                limits = {"kp_per_s": event.kp_per_s, "ti_s": event.ti_s}
+                limited = {**(self.loop or {}), **limits}
+                return replace(self, loop=limited, kept_loop=limited)
             case events.GainsReverted():
                 return replace(self, loop=self.kept_loop, trial_ends_s=math.nan)
             case acquisition_events.GeometryInUse():

@@ -20,11 +20,14 @@ from membrane_ctrl.config.schema import (
     TwinConfig,
     leave_to_start,
 )
+from membrane_ctrl.control.gain_limits import find_dead_time_s, limit_gains
+from membrane_ctrl.control.pump_response import PumpResponse
 from membrane_ctrl.controller.actuator_test import ActuatorTest, ActuatorTestState
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
-from membrane_ctrl.model.events import PumpResponseFound
+from membrane_ctrl.model.events import GainsLimited, PumpResponseFound
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.state_tree import decode_state, encode_state
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
@@ -320,3 +323,50 @@ def test_the_twin_is_not_inflated_with_a_dead_actuator_at_any_rate(
             ticks.append(run.run_tick())
         states = {tick.row.state for tick in ticks if tick is not None}
         assert State.INFLATE not in states, seed
+
+
+def test_a_slow_pump_is_held_from_the_first_start_with_limited_gains() -> None:
+    """Stated gains of a quick pump swing behind 1 s of dead time and 1.5 s of lag."""
+    config = leave_to_start(foreign_config(rate_hz=10.0))
+    config = config.model_copy(
+        update={"estimator": config.estimator.model_copy(update={"process_value": "laser"})}
+    )
+    errors_um = []
+    for limited in (True, False):
+        plant = ForeignPlant(ForeignPump(delay_s=1.0, lag_s=1.5), 3)
+        run = VirtualRun(config, foreign_bench(plant), zernike_projection())
+        ticks = [run.run_tick((Command("hold", "test"),))]
+        while run.now_s < 200.0 and run.finished is None:
+            found = [e for t in ticks[-1:] if t for e in t.events if isinstance(e, GainsLimited)]
+            if found and not limited:
+                ticks.append(run.run_tick((Command("gains", "test", loop=config.loop),)))
+            ticks.append(run.run_tick())
+        rows = [tick.row for tick in ticks if tick is not None and tick.row.mono_s > 60.0]
+        errors_um.append(float(np.std([row.truth_displacement_um for row in rows])))
+        events = [event for tick in ticks if tick is not None for event in tick.events]
+        (event,) = (event for event in events if isinstance(event, GainsLimited))
+        assert 0.1 < event.kp_per_s < 0.3
+        assert event.ti_s > 12.0
+        status = RunStatus()
+        for each in events:
+            status = status.after_event(each)
+        assert status.loop is not None
+        assert (status.loop["kp_per_s"] == event.kp_per_s) == limited
+    assert errors_um[0] < 0.6
+    assert errors_um[1] > 2 * errors_um[0]
+
+
+@pytest.mark.parametrize("delay_s", [0.05, 0.1])
+def test_a_quick_pump_keeps_the_stated_gains(delay_s: float) -> None:
+    response = PumpResponse(delay_s, 0.15, 0.03, 0.03, 0.05)
+    stated = LoopConfig()
+    assert limit_gains(stated, response) is stated
+
+
+def test_limited_gains_keep_their_margins_at_any_response() -> None:
+    for sum_s in (0.1, 0.5, 1.0, 3.0):
+        for share in (0.1, 0.5, 0.9):
+            response = PumpResponse(share * sum_s, (1 - share) * sum_s, 0.1, 0.1, 0.1 * sum_s)
+            loop = limit_gains(LoopConfig(kp_per_s=5.0, ti_s=0.5), response)
+            assert loop.kp_per_s * find_dead_time_s(loop, response) <= 0.5 + 1e-9
+            assert loop.ti_s >= 8.0 * find_dead_time_s(loop, response) - 1e-9
