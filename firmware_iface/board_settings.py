@@ -88,7 +88,9 @@ def make_record(table: Mapping[str, Any]) -> bytes:
 
 
 def _standard_silence_us(baud: int) -> int:
-    return _FAST_SILENCE_US if baud > _FAST_BAUD else -int(-_SILENCE_BITS * 1e6 // baud)
+    if baud > _FAST_BAUD:
+        return _FAST_SILENCE_US
+    return -int(-_SILENCE_BITS * 1e6 // baud)
 
 
 def _pack_protection(table: Mapping[str, Any]) -> bytes:

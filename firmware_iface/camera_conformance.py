@@ -172,9 +172,10 @@ def check_screen_may_change_after_exposure(bench: CameraBench) -> None:
         _require_picture(
             camera.fetch(), scene, "a frame whose exposure was over before the scene changed"
         )
-        fetch = (
-            camera.driver.fetch if isinstance(camera.driver, roles.ExposingCamera) else camera.fetch
-        )
+        if isinstance(camera.driver, roles.ExposingCamera):
+            fetch = camera.driver.fetch
+        else:
+            fetch = camera.fetch
         require_error(fetch, roles.LinkError)
 
 

@@ -358,7 +358,8 @@ class Conformance(board_under_test.BoardUnderTest):
     async def _check_shown_claim(self) -> None:
         await self._arm_watchdog(1.5)
         found = await self._read_sensors()
-        claim, period_s = int(found["claim_in_force"]), found["period_in_force_s"]
+        claim = int(found["claim_in_force"])
+        period_s = found["period_in_force_s"]
         require(claim == self._id, f"claimed as {self._id:#x}, claim_in_force reads {claim:#x}")
         require(
             abs(period_s - 1.5) < 1e-3,
@@ -445,7 +446,8 @@ class Conformance(board_under_test.BoardUnderTest):
         await self._write_block("stop", {"stop": 1.0})
         await self._write_command(PUMP_FRACTION, 0.25)
         found = await self._read_sensors()
-        value, mask = found["pump_readback_fraction"], self._registers.make_fault_mask("stopped")
+        value = found["pump_readback_fraction"]
+        mask = self._registers.make_fault_mask("stopped")
         require(value == 0, f"runs the pump at {value:g} after stop")
         require(abs(found["vent_readback_fraction"] - 0.25) < _NEAR, "moves the vent at stop")
         require(bool(int(found["latched_faults"]) & mask), "does not latch the fault `stopped`")

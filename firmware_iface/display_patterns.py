@@ -67,21 +67,25 @@ def compute_pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.
 
     Raises ValueError for a role or Gray bit that is unknown.
     """
-    inside = {
-        axis: _is_inside(raster.from_low_edge_mm(axis), 2 * raster.half_side_mm) for axis in "xy"
-    }
+    side_mm = 2 * raster.half_side_mm
+    s_mm = {axis: raster.from_low_edge_mm(axis) for axis in "xy"}
+    inside = {axis: _is_inside(s_mm[axis], side_mm) for axis in "xy"}
     lit = {axis: inside[axis].astype(np.float32) for axis in "xy"}
-    if pattern.role in ("white", "black"):
-        return np.outer(lit["y"], lit["x"]) * np.float32(pattern.role == "white")
+    if pattern.role == "white":
+        return np.outer(lit["y"], lit["x"])
+    if pattern.role == "black":
+        return np.zeros((lit["y"].size, lit["x"].size), dtype=np.float32)
     if pattern.role == "crossed":
-        period_mm = 2 * raster.half_side_mm / pattern.index
-        for axis, shift_rad in (("x", pattern.shift_rad), ("y", pattern.shift_y_rad)):
-            wave = _pattern_profile(
-                Pattern("sin", axis, shift_rad=shift_rad), raster.from_low_edge_mm(axis), period_mm
-            )
+        # The mean of a wave along x and one along y
+        period_mm = side_mm / pattern.index
+        shifts_rad = {"x": pattern.shift_rad, "y": pattern.shift_y_rad}
+        for axis, shift_rad in shifts_rad.items():
+            sine = Pattern("sin", axis, shift_rad=shift_rad)
+            wave = _pattern_profile(sine, s_mm[axis], period_mm)
             lit[axis] = 0.5 * wave.astype(np.float32)
         return np.add.outer(lit["y"], lit["x"]) * np.outer(inside["y"], inside["x"])
-    profile = _pattern_profile(pattern, raster.from_low_edge_mm(pattern.axis), raster.period_mm)
+    # Stripes: the light changes along one axis alone
+    profile = _pattern_profile(pattern, s_mm[pattern.axis], raster.period_mm)
     lit[pattern.axis] *= profile.astype(np.float32)
     return np.outer(lit["y"], lit["x"])
 
@@ -100,8 +104,10 @@ def _pattern_profile(pattern: Pattern, s_mm: FloatArray, period_mm: float) -> Fl
         phi = 2 * math.pi * s_mm / period_mm - math.pi
         return np.asarray(0.5 + 0.5 * np.cos(phi + pattern.shift_rad))
     if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
-        v2 = np.floor(2 * s_mm / period_mm).astype(np.int64)
-        return np.asarray((v2 ^ (v2 >> 1)) >> (_GRAY_BITS - pattern.index) & 1, np.float64)
+        half_period = np.floor(2 * s_mm / period_mm).astype(np.int64)
+        gray_code = half_period ^ (half_period >> 1)
+        bit = gray_code >> (_GRAY_BITS - pattern.index) & 1
+        return np.asarray(bit, np.float64)
     raise ValueError(
         f"pattern {pattern.name!r}: role must be sin, gray (bit 1..{_GRAY_BITS}), white or black"
     )

@@ -26,7 +26,8 @@ class DisplayResponse:
     def gamma(self) -> float:
         """Exponent of the power law that best fits the middle half of the ramp; for people."""
         middle = (self.light > 0.1) & (self.light < 0.9)
-        x, y = np.log(self.levels[middle] / 255.0), np.log(self.light[middle])
+        x = np.log(self.levels[middle] / 255.0)
+        y = np.log(self.light[middle])
         return float(np.sum(x * y) / np.sum(x * x))
 
     def find_levels(self, light: ArrayLike) -> NDArray[np.uint8]:
@@ -50,7 +51,8 @@ def make_measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayRes
 
     Raises ValueError if the camera saw no ramp, with the remedy.
     """
-    shown, seen = np.asarray(levels, np.float64), np.asarray(seen_adu, np.float64)
+    shown = np.asarray(levels, np.float64)
+    seen = np.asarray(seen_adu, np.float64)
     if (
         shown.shape != seen.shape
         or shown.size < 3

@@ -48,13 +48,30 @@ def share_left(frame: ArrayLike, before: ArrayLike, after: ArrayLike) -> float:
 
 
 def fit_settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settling:
-    """Latency, time constant and the time to wait.
+    """Fit latency and time constant of the display, and the time to wait.
 
-    `delay_s` (K,) are the starts of the exposures after the command, from any number of steps;
-    `left` (K,) the remaining shares of the step (`share_left`), `noise` the value of `left` at the
-    end. Raises ValueError if the display never settles.
+    An exponential is fitted to the shares between `_FIT_FROM` and the floor of the noise,
+
+        left(t) = exp(-(t - latency) / tau)
+
+    and the wait is the time at which it falls to `_LEFT`.
+
+    Parameters
+    ----------
+    delay_s : (k,) array
+        Starts of the exposures after the command, of any number of steps.
+    left : (k,) array
+        Remaining shares of the step (`share_left`).
+    noise : float
+        Value of `left` at the end.
+
+    Raises
+    ------
+    ValueError
+        The display does not settle.
     """
-    delays, shares = np.asarray(delay_s, np.float64), np.asarray(left, np.float64)
+    delays = np.asarray(delay_s, np.float64)
+    shares = np.asarray(left, np.float64)
     order = np.argsort(delays)
     delays, shares = delays[order], shares[order]
     floor = max(_FIT_TO, _NOISE_SIGMAS * noise)
@@ -79,8 +96,8 @@ def fit_settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Set
     slope, offset = np.polyfit(delays[falling], np.log(shares[falling]), 1)
     if slope >= 0:
         return Settling(2 * seen_s, math.nan, math.nan)
-    tau_s, latency_s = -1.0 / slope, offset / -slope
-    # accept a display whose tail is slower than its start
-    return Settling(
-        max(latency_s - tau_s * math.log(_LEFT), seen_s), float(latency_s), float(tau_s)
-    )
+    tau_s = -1.0 / slope
+    latency_s = -offset / slope
+    settled_s = latency_s - tau_s * math.log(_LEFT)
+    # The first good frame is a lower limit, for a display whose tail is slower than its start
+    return Settling(max(settled_s, seen_s), float(latency_s), float(tau_s))

@@ -54,4 +54,6 @@ def _one_line(error: BaseException) -> str:
 def _name_device(name: str, message: str) -> str:
     """Prefix a message with the device's name, unless it begins with the kind of device."""
     kind = name.partition(" ")[0]
-    return message if message.startswith(kind) else f"{name}: {message}"
+    if message.startswith(kind):
+        return message
+    return f"{name}: {message}"

@@ -15,7 +15,8 @@ def explain_exposure(white: Pixels, black: Pixels, full_scale_adu: int, exposure
     empty if none.
     """
     saturated = float(np.mean(white >= full_scale_adu))
-    bright, dark = float(np.quantile(white, 0.99)), float(np.quantile(black, 0.99))
+    bright = float(np.quantile(white, 0.99))
+    dark = float(np.quantile(black, 0.99))
     if saturated > _SATURATED_SHARE:
         return (
             f"{100 * saturated:.1f} % of the pixels are saturated on white; lower "

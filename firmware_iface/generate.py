@@ -66,7 +66,9 @@ def _markdown_block(block: Block) -> list[str]:
 
 
 def _markdown_row(register: Register) -> str:
-    limits = f"{register.minimum:g} .. {register.maximum:g}" if register.access == "rw" else ""
+    limits = ""
+    if register.access == "rw":
+        limits = f"{register.minimum:g} .. {register.maximum:g}"
     return (
         f"| {register.address} | `{register.name}` | {register.type} | {register.unit} | "
         f"{register.counts_per_unit} | {limits} | {register.access} | {register.since} | "

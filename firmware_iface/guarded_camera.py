@@ -53,7 +53,8 @@ class GuardedCamera:
         """Trigger, and return when the exposure is over. Raises LinkError."""
         if not self._opened:
             self.open()
-        self._grabbed, self._triggered_s = None, self._now()
+        self._grabbed = None
+        self._triggered_s = self._now()
         if self._overlaps:
             self._call_camera("expose", out)
             return
@@ -126,7 +127,8 @@ class GuardedCamera:
                 f"{sensor.width_px} x "
                 f"{sensor.height_px} {sensor.dtype}"
             )
-        earliest_s, latest_s = triggered_s - _CLOCK_TOLERANCE_S, self._now() + _CLOCK_TOLERANCE_S
+        earliest_s = triggered_s - _CLOCK_TOLERANCE_S
+        latest_s = self._now() + _CLOCK_TOLERANCE_S
         if not isinstance(frame.time_s, int | float) or not earliest_s <= frame.time_s <= latest_s:
             raise roles.FrameLostError(
                 f"{self._name}: gave a frame of {frame.time_s} s for the trigger at "

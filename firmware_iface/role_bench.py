@@ -179,12 +179,16 @@ class RoleBench:
 
     def dead_guards(self) -> tuple[str, ...]:
         """The software watchdog, if its task has ended while the bench is open."""
-        return () if self._watchdog is None or not self._watchdog.done() else ("software watchdog",)
+        if self._watchdog is None or not self._watchdog.done():
+            return ()
+        return ("software watchdog",)
 
     def link_state(self) -> roles.LinkState:
         """Sensors without a valid answer to the last reading, and the device that answered last."""
         answered_s = self._answered_s
-        slowest = max(answered_s, key=answered_s.__getitem__) if answered_s else ""
+        slowest = ""
+        if answered_s:
+            slowest = max(answered_s, key=answered_s.__getitem__)
         return roles.LinkState(tuple(self._silent.items()), slowest)
 
     async def close(self) -> None:
@@ -294,7 +298,9 @@ class RoleBench:
         """
         if self._watchdog is not None and not self._watchdog.done():
             return
-        error = "was not started" if self._watchdog is None else _describe_ending(self._watchdog)
+        error = "was not started"
+        if self._watchdog is not None:
+            error = _describe_ending(self._watchdog)
         self._tripped = True
         with contextlib.suppress(Exception):
             await self._devices.pump.set_pump(0.0)
@@ -320,7 +326,9 @@ async def _stop_tasks(tasks: list[asyncio.Task[None]]) -> None:
 def _describe_ending(task: asyncio.Task[None]) -> str:
     """How a task ended that should run forever."""
     error = None if task.cancelled() else task.exception()
-    return "was cancelled" if error is None else f"ended with {type(error).__name__}: {error}"
+    if error is None:
+        return "was cancelled"
+    return f"ended with {type(error).__name__}: {error}"
 
 
 async def answer(role: str, request: Awaitable[T]) -> T:

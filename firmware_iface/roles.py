@@ -369,7 +369,9 @@ class Pattern:
         `x_sin_0_of_61.7mm`.
         """
         coarser = f"_of_{self.period_mm:g}mm" if self.period_mm else ""
-        return f"{self.axis}_{self.role}_{self.index}{coarser}" if self.axis else self.role
+        if not self.axis:
+            return self.role
+        return f"{self.axis}_{self.role}_{self.index}{coarser}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,11 +76,9 @@ def _list_kinds(annotation: Any) -> set[Any]:
         _list_kinds(part) if not isinstance(part, int | str) else {type(part)}
         for part in get_args(annotation)
     ]
-    return (
-        {annotation}.union(*inner)
-        if inner or isinstance(annotation, type) or annotation is Any
-        else set()
-    )
+    if inner or isinstance(annotation, type) or annotation is Any:
+        return {annotation}.union(*inner)
+    return set()
 
 
 class Optoncdt1420Config(Section):
@@ -448,7 +446,9 @@ class AravisCameraConfig(CameraSection):
     @property
     def frame_bits(self) -> int:
         """Depth of a pixel."""
-        return int(self.pixel_format[-2:]) if self.pixel_format[-2:].isdigit() else 8
+        if not self.pixel_format[-2:].isdigit():
+            return 8
+        return int(self.pixel_format[-2:])
 
 
 class UvcCameraConfig(CameraSection):
@@ -500,7 +500,9 @@ class ExternalCameraConfig(CameraSection, ExternalSection):
     @property
     def frame_exposure_s(self) -> float | None:
         """Exposure of a frame; None if the driver does not state it."""
-        return None if self.exposure_ms is None else self.exposure_ms / 1000.0
+        if self.exposure_ms is None:
+            return None
+        return self.exposure_ms / 1000.0
 
 
 class ScreenSection(Section):

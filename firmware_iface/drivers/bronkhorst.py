@@ -107,7 +107,8 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
             f"{port.name}: serial number {number} answers, but the configuration names {serial}"
         )
     firmware = await port.text(FIRMWARE)
-    capacity, unit = await port.number(CAPACITY), await port.text(CAPACITY_UNIT)
+    capacity = await port.number(CAPACITY)
+    unit = await port.text(CAPACITY_UNIT)
     if not (math.isfinite(capacity) and capacity > 0):
         raise DeviceRefusedError(
             f"{port.name}: capacity {capacity:g} {unit}; the instrument is not set up"

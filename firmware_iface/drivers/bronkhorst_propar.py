@@ -3,6 +3,9 @@
 Source: manual 9.17.027. Binary, because its messages carry a sequence number: an answer is never
 taken for that of another question. ProPar lacks a checksum. So every number is requested three
 times in one message, and written values are read back; a flipped bit then makes the answers differ.
+
+Messages: binary is DLE STX sequence node length data DLE ETX, with a DLE inside doubled (section
+3.6); ASCII is a colon, then length + 1, node and data as hexadecimal, CR LF (section 3.5).
 """
 
 import struct
@@ -13,15 +16,10 @@ from firmware_iface.drivers.bronkhorst import MEASURE, InstrumentParameter
 from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceRefusedError, LinkError
 
-# ProPar messages (Bronkhorst, manual 9.17.027): data of requests and answers, and the two ways to
-# frame them.
-#
-# Binary: DLE STX sequence node length data DLE ETX, a DLE inside doubled (section 3.6). ASCII: a
-# colon, then length + 1, node and data as hexadecimal, CR LF (section 3.5). Neither has a checksum.
-
-
-STATUS, WRITE, VALUES, REQUEST = 0, 1, 2, 4  # commands: status, write with answer, values, request
+# Commands: status, write with answer, values, request
+STATUS, WRITE, VALUES, REQUEST = 0, 1, 2, 4
 _DLE, _STX, _ETX = 0x10, 0x02, 0x03
+_BEGIN = bytes((_DLE, _STX))
 _TYPES = {"u8": 0x00, "u16": 0x20, "f32": 0x40, "text": 0x60}
 _PROPAR_FORMATS = {0x00: ">B", 0x20: ">H", 0x40: ">I"}
 STATUS_TEXT = {
@@ -75,19 +73,32 @@ def ascii_frame(message: ProparMessage) -> bytes:
 
 
 def split_binary(received: bytes) -> tuple[list[ProparMessage], bytes]:
-    """The complete messages received, and the remaining bytes; drops broken ones."""
+    """Return the complete messages received, and the remaining bytes; broken messages are dropped.
+
+    The form of a message is in the module's docstring.
+    """
     messages: list[ProparMessage] = []
-    while (start := received.find(b"\x10\x02")) >= 0:
-        body, at = bytearray(), start + 2
+    while (start := received.find(_BEGIN)) >= 0:
+        # Read to the next DLE that is not doubled
+        body = bytearray()
+        at = start + len(_BEGIN)
         while at + 1 < len(received) and (received[at] != _DLE or received[at + 1] == _DLE):
             body.append(received[at])
             at += 2 if received[at] == _DLE else 1
         if at + 1 >= len(received):
             return messages, received[start:]
-        if received[at + 1] == _ETX and len(body) > 3 and body[2] == len(body) - 3:
-            messages.append(ProparMessage(body[0], body[1], bytes(body[3:])))
-        received = received[at + 2 if received[at + 1] == _ETX else at :]
-    return messages, received[-1:] if received.endswith(b"\x10") else b""
+        # After it comes ETX, or the message is broken and another begins here
+        if received[at + 1] != _ETX:
+            received = received[at:]
+            continue
+        data = bytes(body[3:])
+        if data and body[2] == len(data):
+            messages.append(ProparMessage(body[0], body[1], data))
+        received = received[at + 2 :]
+    # A single DLE at the end may begin the next message
+    if received.endswith(_BEGIN[:1]):
+        return messages, received[-1:]
+    return messages, b""
 
 
 def parse_ascii(line: bytes) -> ProparMessage | None:
@@ -132,14 +143,19 @@ def parse_values(data: bytes) -> list[tuple[int, int, bytes]]:
     Raises ValueError when the data do not add up.
     """
     found: list[tuple[int, int, bytes]] = []
-    at, group, chained, last_group = 1, 0, False, False
+    at = 1
+    group = 0
+    chained = False
+    last_group = False
     while at < len(data):
         if not chained:
             if last_group:
                 raise ValueError("bytes after the last process")
             group, last_group = data[at] & 0x7F, not data[at] & 0x80
             at += 1
-        index, kind, chained = data[at] & 0x1F, data[at] & 0x60, bool(data[at] & 0x80)
+        index = data[at] & 0x1F
+        kind = data[at] & 0x60
+        chained = bool(data[at] & 0x80)
         at += 1
         if kind == 0x60:
             size, at = data[at], at + 1
@@ -185,18 +201,19 @@ class ProparParameters:
 
     async def number(self, parameter: InstrumentParameter) -> float:
         """A number that arrived `_COPIES` times the same. Raises LinkError."""
-        first, *others = await self._request_values(*[parameter] * _COPIES)
-        if any(other != first for other in others):
-            came = ", ".join(raw.hex() for raw in (first, *others))
-            raise LinkError(f"{self.name}: {parameter.name} differs between copies ({came}); noise")
-        return float(struct.unpack(_FORMATS[parameter.kind], first)[0])
+        copies = await self._request_values(*[parameter] * _COPIES)
+        if len(set(copies)) > 1:
+            shown = ", ".join(copy.hex() for copy in copies)
+            raise LinkError(
+                f"{self.name}: {parameter.name} differs between copies ({shown}); noise"
+            )
+        (value,) = struct.unpack(_FORMATS[parameter.kind], copies[0])
+        return float(value)
 
     async def text(self, parameter: InstrumentParameter) -> str:
         """A text that arrived twice the same. Raises LinkError."""
-        first, second = (
-            (await self._request_values(parameter))[0],
-            (await self._request_values(parameter))[0],
-        )
+        first = (await self._request_values(parameter))[0]
+        second = (await self._request_values(parameter))[0]
         if first != second:
             raise LinkError(
                 f"{self.name}: {parameter.name} read as {first!r}, then as {second!r}; noise"

@@ -25,12 +25,10 @@ _SOCKET_BYTES = 8 << 20
 # A newly started stream misses the first trigger (seen on loopback without this)
 _STREAM_READY_S = 0.2
 # arvenums.h, arvgvdevice.h, arvgvstream.h
-_AUTO_OFF, _CONTINUOUS, _ADJUST_NEVER, _NO_PACKET_SOCKET = (
-    0,
-    0,
-    0,
-    1,
-)
+_AUTO_OFF = 0
+_CONTINUOUS = 0
+_ADJUST_NEVER = 0
+_NO_PACKET_SOCKET = 1
 _RANGE_CHECKED = 1  # arvdevice.h; by default the library writes values outside the camera's range
 _SUCCESS = 0  # ArvBufferStatus
 _REAL_TIME = roles.DriverClock()

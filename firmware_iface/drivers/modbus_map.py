@@ -45,21 +45,26 @@ class ValueMap:
     def decode(self, words: list[int]) -> float:
         """Registers to a value; NaN for a float that is not a number."""
         ordered = words if self.word_order == "big" else words[::-1]
-        (raw,) = struct.unpack(
-            ">" + _FORMATS[self.type], struct.pack(f">{len(ordered)}H", *ordered)
-        )
-        (raw_0, raw_1), (value_0, value_1) = self.raw, self.value
+        packed = struct.pack(f">{len(ordered)}H", *ordered)
+        (raw,) = struct.unpack(">" + _FORMATS[self.type], packed)
+        raw_0, raw_1 = self.raw
+        value_0, value_1 = self.value
         return float(value_0 + (raw - raw_0) * (value_1 - value_0) / (raw_1 - raw_0))
 
     def encode(self, value: float) -> list[int]:
         """A value to registers. Raises ValueError outside the limits."""
         if not self.allows(value):
             raise ValueError(f"{value:g} is not within {self.limits[0]:g} .. {self.limits[1]:g}")
-        (raw_0, raw_1), (value_0, value_1) = self.raw, self.value
-        raw = raw_0 + (value - value_0) * (raw_1 - raw_0) / (value_1 - value_0)
-        packed = struct.pack(">" + _FORMATS[self.type], raw if self.type == "f32" else round(raw))
+        raw_0, raw_1 = self.raw
+        value_0, value_1 = self.value
+        raw: float = raw_0 + (value - value_0) * (raw_1 - raw_0) / (value_1 - value_0)
+        if self.type != "f32":
+            raw = round(raw)
+        packed = struct.pack(">" + _FORMATS[self.type], raw)
         words = list(struct.unpack(f">{self.words}H", packed))
-        return words if self.word_order == "big" else words[::-1]
+        if self.word_order == "big":
+            return words
+        return words[::-1]
 
     def allows(self, value: float) -> bool:
         """Whether the value is within the limits; NaN is not."""
@@ -83,10 +88,8 @@ def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bo
     does not have).
     """
     defaults = load_preset(preset_name) if preset_name else {}
-    raw_limits, address_limits = (
-        defaults.pop("raw_limits", None),
-        defaults.pop("address_limits", None),
-    )
+    raw_limits = defaults.pop("raw_limits", None)
+    address_limits = defaults.pop("address_limits", None)
     fence = bool(defaults.pop("fence", True))
     keys = {**defaults, **{key: value for key, value in given.items() if value is not None}}
     if "raw" not in keys:
@@ -177,14 +180,15 @@ class ModbusValue:
             "port": self._link.name,
             "register": f"{self._map.function} {self._map.address}, {self._map.type}",
         }
-        return (
-            found
-            if self._rest is None
-            else {**found, "watchdog": "none known: check what its output does alone"}
-        )
+        if self._rest is None:
+            return found
+        return {**found, "watchdog": "none known: check what its output does alone"}
 
     async def _read_value(self) -> float:
-        read = self._link.read_input if self._map.function == "input" else self._link.read_holding
+        if self._map.function == "input":
+            read = self._link.read_input
+        else:
+            read = self._link.read_holding
         value = self._map.decode(await read(self._map.address, self._map.words))
         if not self._map.allows(value):
             low, high = self._map.limits

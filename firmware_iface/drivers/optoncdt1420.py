@@ -60,21 +60,28 @@ class StreamParser:
         """Digital values or error codes (n,) of the trusted measurements that are complete with
         these bytes.
         """
+        # Frames begin where the two upper bits of successive bytes are those of a frame
         stream = np.frombuffer(self._rest + data, np.uint8)
         marks = stream >> 6
-        starts = np.arange(max(0, len(stream) - _BYTES + 1))
-        found = np.ones(len(starts), bool)
+        candidates = np.arange(max(0, len(stream) - _BYTES + 1))
+        is_start = np.ones(len(candidates), bool)
         for offset, mark in enumerate(_MARKS):
-            found &= marks[offset : offset + len(starts)] == mark
-        starts = starts[found]
-        used = int(starts[-1]) + _BYTES if len(starts) else max(0, len(stream) - _BYTES + 1)
+            is_start &= marks[offset : offset + len(candidates)] == mark
+        starts = candidates[is_start]
+        # Keep the bytes that may begin the next frame
+        if len(starts):
+            used = int(starts[-1]) + _BYTES
+        else:
+            used = len(candidates)
         self.bytes_lost += used - _BYTES * len(starts)
         self._rest = stream[used:].tobytes()
         if not len(starts):
             return np.empty(0, np.int64)
+        # Three bytes of six bits make a number, the lowest first: the value, then the counter
         bits = (stream & 0x3F).astype(np.int64)
         raw = bits[starts] | bits[starts + 1] << 6 | bits[starts + 2] << 12
         counters = bits[starts + 3] | bits[starts + 4] << 6 | bits[starts + 5] << 12
+        # A value is trusted if its counter is the next one
         before = np.concatenate(([self._counter], counters[:-1]))
         trusted = counters == (before + 1) % _COUNTER_MODULUS
         self._counter = int(counters[-1])
@@ -158,7 +165,8 @@ class Optoncdt1420:
     async def _identify(self) -> roles.DeviceIdentity:
         text = await self._send_command("GETINFO")
         fields = dict(re.findall(r"^\s*([\w. -]+?):\s*(.*?)\s*$", text, re.MULTILINE))
-        name, measuring_range = fields.get("Name", ""), fields.get("Measuring range", "")
+        name = fields.get("Name", "")
+        measuring_range = fields.get("Measuring range", "")
         found = re.match(r"([\d.]+)\s*mm", measuring_range)
         if "1420" not in name or found is None:
             raise roles.DeviceRefusedError(
@@ -170,7 +178,10 @@ class Optoncdt1420:
                 f"{self._port.name}: {name} measures {self._range_mm:g} mm, range_mm = "
                 f"{self._config.range_mm:g}"
             )
-        self._zero_mm = self._range_mm / 2 if self._config.zero_mm is None else self._config.zero_mm
+        if self._config.zero_mm is None:
+            self._zero_mm = self._range_mm / 2
+        else:
+            self._zero_mm = self._config.zero_mm
         ends = [
             1000 * self._config.direction * (end_mm - self._zero_mm)
             for end_mm in (0.0, self._range_mm)
@@ -320,11 +331,9 @@ class Optoncdt1420:
 
     def describe(self) -> dict[str, str]:
         """For people: port, settings, manual."""
-        zero = (
-            "middle of the range"
-            if self._config.zero_mm is None
-            else f"{self._config.zero_mm:g} mm"
-        )
+        zero = "middle of the range"
+        if self._config.zero_mm is not None:
+            zero = f"{self._config.zero_mm:g} mm"
         return {
             "port": f"{self._port.name}, {self._port.settings}",
             "settings": f"{self._config.rate_khz:g} kHz, zero at {zero}, direction "

@@ -157,7 +157,9 @@ class VaisalaPtb330(line_link.LineDriver):
         if not self._link.port.is_open:
             raise roles.LinkDownError(f"{self._link.name}: not connected")
         fresh = asyncio.get_running_loop().time() - self._newest_s <= self._age_max_s
-        return self._newest.pressure_pa if fresh else math.nan
+        if fresh:
+            return self._newest.pressure_pa
+        return math.nan
 
     async def close(self) -> None:
         """Stop asking and close the port. Never raises."""

@@ -15,10 +15,19 @@ import re
 from firmware_iface import roles, settings
 from firmware_iface.links import line_link, serial_port
 
-ENABLE, POWER_LIMIT_MW, STREAM, MODE, MANUAL_SOURCE, SET_VALUE, ERROR = 0, 1, 2, 10, 11, 23, 31
+ENABLE = 0
+POWER_LIMIT_MW = 1
+STREAM = 2
+MODE = 10
+MANUAL_SOURCE = 11
+SET_VALUE = 23
+ERROR = 31
 FIRMWARE, DEVICE_TYPE, FIRMWARE_MINOR = 36, 37, 38
 DEVICE_TYPES = {2: "general purpose driver", 3: "smart pump module"}
-_MODE_MANUAL, _SOURCE_SET_VALUE, _OFF, _ON = 0, 0, 0, 1
+_MODE_MANUAL = 0
+_SOURCE_SET_VALUE = 0
+_OFF = 0
+_ON = 1
 # what a corrupted write or a power cycle could change unseen: read back with every command
 _KEPT = (POWER_LIMIT_MW, MODE, MANUAL_SOURCE)
 _STATE = (ENABLE, SET_VALUE, ERROR, *_KEPT)
@@ -160,4 +169,6 @@ def _make_answer_form(*registers: int) -> re.Pattern[str]:
 
 def _format_value(register: int, value: float) -> str:
     """Power values are floats and written with three decimals, the others are integers."""
-    return f"{value:.3f}" if register == SET_VALUE else f"{value:.0f}"
+    if register == SET_VALUE:
+        return f"{value:.3f}"
+    return f"{value:.0f}"

@@ -85,7 +85,9 @@ class EmulatedRequest:
         settings = self._config[line]
         raised = self._is_raised(line, settings)
         active = not raised if settings.active_low else raised
-        return EmulatedGpio.line.Value.ACTIVE if active else EmulatedGpio.line.Value.INACTIVE
+        if active:
+            return EmulatedGpio.line.Value.ACTIVE
+        return EmulatedGpio.line.Value.INACTIVE
 
     def _is_raised(self, line: int, settings: EmulatedGpio.LineSettings) -> bool:
         """The electrical level: the contact's if it is closed,
@@ -94,8 +96,6 @@ class EmulatedRequest:
         to_ground = settings.active_low
         if self._gpio.contacts[self._chip, line] == "closed":
             return not to_ground
-        return (
-            to_ground
-            if settings.bias == "disabled"
-            else settings.bias == EmulatedGpio.line.Bias.PULL_UP
-        )
+        if settings.bias == "disabled":
+            return to_ground
+        return settings.bias == EmulatedGpio.line.Bias.PULL_UP

@@ -48,11 +48,9 @@ class KeyenceDlRs1aEmulator(LineDevice):
         amplifier, number = parameters[:2]
         if not amplifier.isdigit() or int(amplifier) >= self._amplifiers:
             return f"ER,{command},65"
-        return (
-            self._read(amplifier, number)
-            if command == "SR"
-            else self._write(amplifier, number, parameters[2])
-        )
+        if command == "SR":
+            return self._read(amplifier, number)
+        return self._write(amplifier, number, parameters[2])
 
     def _read(self, amplifier: str, number: str) -> str:
         values = {
@@ -60,7 +58,9 @@ class KeyenceDlRs1aEmulator(LineDevice):
             "037": self._judged(int(amplifier)),
             "038": _format_value(self._measured_mm(int(amplifier))),
         }
-        return f"SR,{amplifier},{number},{values[number]}" if number in values else "ER,SR,22"
+        if number not in values:
+            return "ER,SR,22"
+        return f"SR,{amplifier},{number},{values[number]}"
 
     def _write(self, amplifier: str, number: str, value: str) -> str:
         if number not in _WRITABLE or value not in ("0", "1"):

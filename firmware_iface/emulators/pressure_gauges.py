@@ -12,6 +12,8 @@ from firmware_iface.emulators.serial_device import LineDevice, Sensor, Transmit
 
 _SYNTAX, _ARGUMENT = "160", "169"
 _PASCALS = {"TORR": 133.322368, "MBAR": 100.0, "PASCAL": 1.0, "MICRON": 0.133322368}
+_MODULES = ("A", "B", "C")  # of two sensors each
+_SENSORS = ("1", "2", "3", "4", "5", "6")
 _PERIOD_S = 0.1  # of its measurements
 _WORD = re.compile(r'"[^"]*"|\S+')
 _DEFAULT_FORMAT = '"P= " 4.2 P " " U3 #r #n'
@@ -53,16 +55,25 @@ class Mks937bEmulator(LineDevice):
                 return f"NAK{_ARGUMENT}"
             self.unit = command[2:].upper()
             return f"ACK{self.unit}"
-        setting = self._answer_setting(command[:-1]) if command.endswith("?") else None
-        return f"NAK{_SYNTAX}" if setting is None else f"ACK{setting}"
+        setting = None
+        if command.endswith("?"):
+            setting = self._answer_setting(command[:-1])
+        if setting is None:
+            return f"NAK{_SYNTAX}"
+        return f"ACK{setting}"
 
     def _answer_setting(self, name: str) -> str | None:
-        if len(name) == 3 and name[:2] == "ST" and name[2] in "ABC":
-            first = 2 * "ABC".index(name[2])
+        command, index = name[:2], name[2:]
+        # STA, STB, STC: the two sensors of a module
+        if command == "ST" and index in _MODULES:
+            first = 2 * _MODULES.index(index)
             return "".join(self.sensors[first : first + 2])
-        if len(name) == 3 and name[:2] == "PR" and name[2] in "123456":
-            return self._format_pressure(self.sensors[int(name[2]) - 1])
-        return {"MD": self.model, "SN": self.serial, "FV6": "1.27", "U": self.unit}.get(name)
+        # PR1 to PR6: the pressure of a sensor
+        if command == "PR" and index in _SENSORS:
+            sensor = self.sensors[int(index) - 1]
+            return self._format_pressure(sensor)
+        texts = {"MD": self.model, "SN": self.serial, "FV6": "1.27", "U": self.unit}
+        return texts.get(name)
 
     def _format_pressure(self, sensor: str) -> str:
         if sensor != "CM":
@@ -70,7 +81,10 @@ class Mks937bEmulator(LineDevice):
         if not self.frozen:
             value = self._gauge_pa() / _PASCALS[self.unit]
             mantissa, _, exponent = f"{value:.3E}".partition("E")
-            self._held = "OVER" if math.isnan(value) else f"{mantissa}E{int(exponent):+d}"
+            if math.isnan(value):
+                self._held = "OVER"
+            else:
+                self._held = f"{mantissa}E{int(exponent):+d}"
         return self._held
 
 
@@ -147,7 +161,9 @@ class VaisalaPtb330Emulator(LineDevice):
         elif command == "?":
             return self._format_identity()
         elif command == "ERRS":
-            return "PASS\nNo errors\n" if "1" not in self.error_flags else "FAIL\nModule error\n"
+            if "1" not in self.error_flags:
+                return "PASS\nNo errors\n"
+            return "FAIL\nModule error\n"
         elif command == "ECHO":
             self._echo = rest.upper() != "OFF"
             return f"Echo           : {'ON' if self._echo else 'OFF'}\n"

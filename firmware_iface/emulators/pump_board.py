@@ -91,10 +91,17 @@ class BoardState:
         self._claims = registers.map_version >= 2
         self._watchdog_mask = registers.make_fault_mask("watchdog")
         self._over_pressure_mask = registers.make_fault_mask("over_pressure")
-        self._stopped_mask = registers.make_fault_mask("stopped") if self._claims else 0
+        if self._claims:
+            self._stopped_mask = registers.make_fault_mask("stopped")
+        else:
+            self._stopped_mask = 0
         self._guards = registers.map_version >= 3
-        self._gauge_lost_mask = registers.make_fault_mask("gauge_lost") if self._guards else 0
-        self._interlock_mask = registers.make_fault_mask("interlock") if self._guards else 0
+        if self._guards:
+            self._gauge_lost_mask = registers.make_fault_mask("gauge_lost")
+            self._interlock_mask = registers.make_fault_mask("interlock")
+        else:
+            self._gauge_lost_mask = 0
+            self._interlock_mask = 0
         self._sample = sample
         self._now_s = 0.0
         self.restart()
@@ -123,11 +130,9 @@ class BoardState:
     @property
     def pump_fraction(self) -> float:
         """What the pump is given: 0 while any fault is latched."""
-        return (
-            0.0
-            if self._faults
-            else min(self._settable["pump_command_fraction"], PUMP_LIMIT_FRACTION)
-        )
+        if self._faults:
+            return 0.0
+        return min(self._settable["pump_command_fraction"], PUMP_LIMIT_FRACTION)
 
     @property
     def vent_fraction(self) -> float:
@@ -137,11 +142,9 @@ class BoardState:
         the venting, and one that died while holding had it closed or at a small bleed, on which the
         mirror sinks slowly.
         """
-        return (
-            1.0
-            if self._faults & self._over_pressure_mask
-            else self._settable["vent_command_fraction"]
-        )
+        if self._faults & self._over_pressure_mask:
+            return 1.0
+        return self._settable["vent_command_fraction"]
 
     def advance(self, now_s: float, sample: BoardSample) -> None:
         """Take the newest sample at a time (on any axis),

@@ -35,7 +35,11 @@ _STREAM_PERIOD_S = 0.02
 ANALOG_INPUT = 1  # control mode after power-up: not the bus
 _COUNTS_MAX = 41_942
 _NODE_ANY = 128
-_PARAMETER_ERROR, _TYPE_ERROR, _VALUE_ERROR, _COMMAND_ERROR, _READ_ONLY = 4, 5, 6, 2, 13
+_PARAMETER_ERROR = 4
+_TYPE_ERROR = 5
+_VALUE_ERROR = 6
+_COMMAND_ERROR = 2
+_READ_ONLY = 13
 _BY_PLACE = {(parameter.process, parameter.number): parameter for parameter in bronkhorst.ALL}
 _FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
 _TYPES = {"u8": 0x00, "u16": 0x20, "f32": 0x40, "text": 0x60}
@@ -105,7 +109,9 @@ class VentusEmulator(LineDevice):
         # manual mode from SetVal is the only one with a known power; the analogue input is open, at
         # zero
         manual = self.registers[0] and not self.registers[10] and not self.registers[11]
-        return min(self.registers[23], self.registers[1]) if manual else 0.0
+        if not manual:
+            return 0.0
+        return min(self.registers[23], self.registers[1])
 
     def _send_state(self) -> None:
         self._stream = None
@@ -154,11 +160,9 @@ class Instrument:
     @property
     def fraction(self) -> float:
         """Present flow over the capacity."""
-        return (
-            self._settings[bronkhorst.SETPOINT] / bronkhorst.FULL_SCALE
-            if self._settings[bronkhorst.CONTROL_MODE] == bronkhorst.BUS_SETPOINT
-            else 0.0
-        )
+        if self._settings[bronkhorst.CONTROL_MODE] != bronkhorst.BUS_SETPOINT:
+            return 0.0
+        return self._settings[bronkhorst.SETPOINT] / bronkhorst.FULL_SCALE
 
     def _drive(self) -> None:
         if self._actuate is not None:
@@ -173,7 +177,10 @@ class Instrument:
     def _read_parameter(self, parameter: bronkhorst.InstrumentParameter) -> float:
         if parameter in self._settings:
             return self._settings[parameter]
-        measured = self.fraction * self._capacity if self._measured is None else self._measured()
+        if self._measured is None:
+            measured = self.fraction * self._capacity
+        else:
+            measured = self._measured()
         counts = round(measured / self._capacity * bronkhorst.FULL_SCALE)
         return {
             bronkhorst.MEASURE: min(max(counts, _COUNTS_MAX - 0x10000 + 1), _COUNTS_MAX) % 0x10000,
@@ -188,10 +195,8 @@ class Instrument:
     def write(self, parameter: bronkhorst.InstrumentParameter, raw: bytes) -> bool:
         """Take a setting; False when the value is impossible."""
         if parameter == bronkhorst.FSETPOINT:
-            parameter, value = (
-                bronkhorst.SETPOINT,
-                round(struct.unpack(">f", raw)[0] / self._capacity * bronkhorst.FULL_SCALE),
-            )
+            parameter = bronkhorst.SETPOINT
+            value = round(struct.unpack(">f", raw)[0] / self._capacity * bronkhorst.FULL_SCALE)
         else:
             (value,) = struct.unpack(_FORMATS[parameter.kind], raw)
         if not 0 <= value <= (bronkhorst.FULL_SCALE if parameter == bronkhorst.SETPOINT else 255):
@@ -284,11 +289,9 @@ class ProparDevice(serial_device.SerialDevice):
             return self._answer_request(data)
         if data[0] in (bronkhorst_propar.WRITE, bronkhorst_propar.VALUES):
             status = self._write_parameters(data)
-            return (
-                bytes([bronkhorst_propar.STATUS, status, len(data)])
-                if data[0] == bronkhorst_propar.WRITE
-                else b""
-            )
+            if data[0] != bronkhorst_propar.WRITE:
+                return b""
+            return bytes([bronkhorst_propar.STATUS, status, len(data)])
         return bytes([bronkhorst_propar.STATUS, _COMMAND_ERROR, 0])
 
     def _write_parameters(self, data: bytes) -> int:
@@ -323,7 +326,10 @@ class ProparDevice(serial_device.SerialDevice):
             raw = self.instrument.raw(parameter)
             if kind == 0x60:
                 length, at = data[at], at + 1
-                raw = raw.rstrip(b"\0") + b"\0" if length == 0 else raw.ljust(length, b" ")[:length]
+                if length == 0:
+                    raw = raw.rstrip(b"\0") + b"\0"
+                else:
+                    raw = raw.ljust(length, b" ")[:length]
                 answer.append(length)
             answer += raw
         return bytes(answer)

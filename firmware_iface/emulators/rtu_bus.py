@@ -35,7 +35,10 @@ class RtuBusEmulator(SerialDevice):
     def received(self, data: bytes) -> None:
         """Answer a frame as soon as its CRC is right; after a silence the next one begins."""
         now_s = asyncio.get_running_loop().time()
-        self._buffer = data if now_s - self._received_s > _SILENCE_S else self._buffer + data
+        if now_s - self._received_s > _SILENCE_S:
+            self._buffer = data
+        else:
+            self._buffer = self._buffer + data
         self._received_s = now_s
         frame = self._buffer = self._buffer[-_LONGEST:]
         if len(frame) < _SHORTEST or struct.unpack("<H", frame[-2:])[0] != compute_bitwise_crc(

@@ -170,7 +170,9 @@ class PtyWire:
         """The bytes as the other end receives them: at another baud rate, garbage."""
         assert self._ends is not None
         same = termios.tcgetattr(self._ends[0])[_SPEED] == _read_baud_rate(self._device)
-        return data if same else bytes((7 * byte + 0xA5) % 256 for byte in data)
+        if same:
+            return data
+        return bytes((7 * byte + 0xA5) % 256 for byte in data)
 
 
 def _read_baud_rate(device: SerialDevice) -> int:

@@ -19,7 +19,10 @@ MISSING = f"{_LIBRARY} is not installed: apt install libaravis-0.8-0"
 
 # ArvDeviceError, arvdevice.h
 NOT_OF_THE_DEVICE = -1
-NOT_CONNECTED, TRANSFER_ERROR, TIMEOUT, NOT_FOUND = 2, 4, 5, 6
+NOT_CONNECTED = 2
+TRANSFER_ERROR = 4
+TIMEOUT = 5
+NOT_FOUND = 6
 NOT_CONTROLLER, ACCESS_DENIED, BUSY = 10, 17, 18
 
 PIXEL_FORMATS = {  # arvenums.h (values of the GigE Vision standard)
@@ -147,7 +150,8 @@ class Aravis:
         error = POINTER(_GError)()
         result = self._calls[name](*arguments, ctypes.byref(error))
         if error:
-            message, code = error.contents.message.decode(errors="replace"), error.contents.code
+            message = error.contents.message.decode(errors="replace")
+            code = error.contents.code
             if error.contents.domain != self._calls["arv_device_error_quark"]():
                 code = NOT_OF_THE_DEVICE  # the same numbers have other meanings there
             self._calls["g_error_free"](error)
@@ -157,7 +161,9 @@ class Aravis:
     def text(self, name: str, *arguments: Any) -> str:
         """Call a function that returns a string it keeps; empty for none."""
         found = self.call(name, *arguments)
-        return found.decode(errors="replace") if found else ""
+        if not found:
+            return ""
+        return str(found, "utf-8", errors="replace")
 
     def set_double(self, instance: int, name: str, value: float) -> None:
         """Set a property of type double."""

@@ -220,7 +220,10 @@ class SerialExchange:
         self._late.note_in_time()
         self._abandoned.clear()
         received_bytes = answer.result()
-        self._repeated = question.data if self._buffer == question.data else b""
+        if self._buffer == question.data:
+            self._repeated = question.data
+        else:
+            self._repeated = b""
         return received_bytes
 
     def _require_open(self, what: str) -> None:

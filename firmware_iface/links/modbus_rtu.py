@@ -58,7 +58,9 @@ def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
     ValueError.
     """
     parts = urlsplit(url)
-    options = dict(parse_qsl(parts.query, strict_parsing=True)) if parts.query else {}
+    options = {}
+    if parts.query:
+        options = dict(parse_qsl(parts.query, strict_parsing=True))
     port = parts.netloc + parts.path
     if (
         parts.scheme != "rtu"
@@ -82,7 +84,10 @@ class RtuBus:
 
     def __init__(self, port: serial_port.SerialPort, quiet_s: float = 0.2) -> None:
         baud = port.settings.baud
-        gap_s = _FAST_GAP_S if baud > _FAST_BAUD else 3.5 * port.settings.char_s
+        if baud > _FAST_BAUD:
+            gap_s = _FAST_GAP_S
+        else:
+            gap_s = 3.5 * port.settings.char_s
         self.exchange = exchange.SerialExchange(port, gap_s, quiet_s)
         self._tokens = 0
 
@@ -186,9 +191,9 @@ class GuardedModbusRtu:
 
     async def _read(self, function_code: int, address: int, count: int) -> list[int]:
         what = f"{self.name}: reading {address}..{address + count - 1}"
-        reply = await self._transact(
-            struct.pack(">BHH", function_code, address, count), 5 + 2 * count, what
-        )
+        request = struct.pack(">BHH", function_code, address, count)
+        reply_bytes = 5 + 2 * count
+        reply = await self._transact(request, reply_bytes, what)
         return list(struct.unpack(f">{count}H", reply[2:]))
 
     async def _read_bits(self, function_code: int, address: int, count: int) -> list[bool]:

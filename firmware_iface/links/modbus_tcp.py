@@ -213,11 +213,10 @@ class GuardedModbusTcp:
         what = f"{self.name}: reading {address}..{address + count - 1}"
 
         def send(client: AsyncModbusTcpClient) -> Awaitable[ModbusPDU]:
-            read = (
-                client.read_input_registers
-                if function_code == READ_INPUT
-                else client.read_holding_registers
-            )
+            if function_code == READ_INPUT:
+                read = client.read_input_registers
+            else:
+                read = client.read_holding_registers
             return read(address, count=count, device_id=self._unit_id)
 
         reply = await self._exchange_pdu(send, function_code, what)
@@ -232,9 +231,10 @@ class GuardedModbusTcp:
         what = f"{self.name}: reading bits {address}..{address + count - 1}"
 
         def send(client: AsyncModbusTcpClient) -> Awaitable[ModbusPDU]:
-            read = (
-                client.read_discrete_inputs if function_code == READ_DISCRETE else client.read_coils
-            )
+            if function_code == READ_DISCRETE:
+                read = client.read_discrete_inputs
+            else:
+                read = client.read_coils
             return read(address, count=count, device_id=self._unit_id)
 
         reply = await self._exchange_pdu(send, function_code, what)

@@ -52,7 +52,9 @@ def resolve_port_path(
     wanted = _USB_NAME.fullmatch(name)
     if wanted is None:
         return name
-    vid, pid, serial = int(wanted[1], 16), int(wanted[2], 16), wanted[3]
+    vid = int(wanted[1], 16)
+    pid = int(wanted[2], 16)
+    serial = wanted[3]
     found = [
         port
         for port in comports()

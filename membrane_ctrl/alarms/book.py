@@ -203,7 +203,10 @@ class AlarmBook:
         alarm.reported_s = first.at_s
         alarm.reminded_s = of_newest[-1].at_s
         # the first list may have the message and the second not: each gets what it has not got
-        last_list = ESCALATION if self._config.escalation_urls_file else first.to
+        if self._config.escalation_urls_file:
+            last_list = ESCALATION
+        else:
+            last_list = first.to
         alarm.escalated = any(each.message.escalated and each.to == last_list for each in of_newest)
         alarm.acknowledged = self._acknowledged_s >= first.at_s
 
@@ -241,12 +244,16 @@ class AlarmBook:
         if now_s - alarm.gone_s >= config.clear_after_s:
             return "cleared"
         if not alarm.is_reported:
-            return "raised" if now_s - alarm.since_s >= alarm.sign.for_s else None
+            if now_s - alarm.since_s >= alarm.sign.for_s:
+                return "raised"
+            return None
         if alarm.acknowledged or math.isfinite(alarm.gone_s):
             return None
         if not alarm.escalated and now_s - alarm.reported_s >= config.escalate_after_s:
             return "escalated"
-        return "reminder" if now_s - alarm.reminded_s >= config.remind_every_s else None
+        if now_s - alarm.reminded_s >= config.remind_every_s:
+            return "reminder"
+        return None
 
 
 def _began_later(sign: Sign, sent: AlarmMessage) -> bool:

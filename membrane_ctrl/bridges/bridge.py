@@ -43,7 +43,8 @@ class Bridge:
     def __init__(self, feed: HoldFeed, config: Config) -> None:
         self.feed = feed
         self.settings = config.bridges
-        limits, flow_max = config.limits, config.loop.flow_most_um_per_s(config.pump)
+        limits = config.limits
+        flow_max = config.loop.flow_most_um_per_s(config.pump)
         # what the hold would accept; it judges by itself
         self.bounds: dict[str, tuple[float, float]] = {
             "setpoint": (limits.displacement_min_um, limits.displacement_max_um),

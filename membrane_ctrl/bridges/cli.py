@@ -110,7 +110,9 @@ async def _serve(bridge: Bridge) -> None:
 def _first_error(group: BaseExceptionGroup[errors.CommandError]) -> errors.CommandError:
     """The first error of a group, also of groups in it."""
     first = group.exceptions[0]
-    return _first_error(first) if isinstance(first, BaseExceptionGroup) else first
+    if not isinstance(first, BaseExceptionGroup):
+        return first
+    return _first_error(first)
 
 
 def _opened(bridge: Bridge) -> list[Any]:

@@ -65,7 +65,10 @@ def _search_addresses(ca_port: int) -> list[tuple[str, int]]:
     found = []
     for each in hosts:
         host, _, port = each.partition(":")
-        ports = [int(port)] if port.isdigit() else sorted({ca_port, _DEFAULT_PORT})
+        if port.isdigit():
+            ports = [int(port)]
+        else:
+            ports = sorted({ca_port, _DEFAULT_PORT})
         found += [(host, each_port) for each_port in ports]
     return found
 

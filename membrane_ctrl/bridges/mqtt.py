@@ -150,21 +150,28 @@ class Broker:
         """Use MQTT 3.1.1 from now on if the broker refuses version 5."""
         for error in reasons:
             if isinstance(error, MqttConnectError):
-                code = error.rc if isinstance(error.rc, int) or error.rc is None else error.rc.value
+                if isinstance(error.rc, int) or error.rc is None:
+                    code = error.rc
+                else:
+                    code = error.rc.value
                 if code in _UNSUPPORTED_VERSION:
                     self._version = aiomqtt.ProtocolVersion.V311
 
 
 def _read(file: str | None) -> str | None:
     try:
-        return None if file is None else files.read_text(Path(file), follow=True).strip()
+        if file is None:
+            return None
+        return files.read_text(Path(file), follow=True).strip()
     except (OSError, ValueError) as error:
         raise errors.InputError(f"bridges.mqtt.password_file: {error}") from None
 
 
 def _context(config: MqttConfig) -> ssl.SSLContext | None:
     try:
-        return None if config.ca_file is None else ssl.create_default_context(cafile=config.ca_file)
+        if config.ca_file is None:
+            return None
+        return ssl.create_default_context(cafile=config.ca_file)
     except OSError as error:
         raise errors.InputError(f"bridges.mqtt.ca_file: {config.ca_file}: {error}") from None
 
@@ -341,7 +348,9 @@ def _command_name(message: aiomqtt.Message) -> str:
 
 
 def _payload(message: aiomqtt.Message) -> bytes:
-    return message.payload if isinstance(message.payload, bytes) else b""
+    if isinstance(message.payload, bytes):
+        return message.payload
+    return b""
 
 
 def discovery(bridge: Bridge, base: str) -> dict[str, Any]:

@@ -46,7 +46,9 @@ class OrderBarrier:
         """The safety command behind which commands that are received now may have been published;
         usually empty.
         """
-        return self._newest if self._returned < self._sent else ""
+        if self._returned < self._sent:
+            return self._newest
+        return ""
 
     async def run(self, publish: PublishMarker) -> None:
         """Publish markers until cancelled."""

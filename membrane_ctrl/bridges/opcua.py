@@ -146,7 +146,8 @@ async def _nodes(
         found[each.name] = node
     for do, action in bridge.commands.items():
         given = [_argument(action)] if action.asks else []
-        node_id, browse_name = ua.NodeId(f"{name}.do.{do}", space), ua.QualifiedName(do, space)
+        node_id = ua.NodeId(f"{name}.do.{do}", space)
+        browse_name = ua.QualifiedName(do, space)
         answer = ua.Argument(Name="answer", DataType=ua.NodeId(ua.ObjectIds.String))
         await mirror.add_method(node_id, browse_name, _method(bridge, do, users), given, [answer])
     return found
@@ -166,10 +167,11 @@ def _method(bridge: Bridge, do: str, users: dict[str, KnownUser] | None) -> Any:
     async def call(parent: ua.NodeId, *given: ua.Variant) -> list[ua.Variant] | ua.StatusCode:
         if len(given) > 1 or any(not isinstance(each.Value, float | int | str) for each in given):
             return ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
+        value = given[0].Value if given else ""
         who = caller.get()
         role = None if users is None else users[who].role
-        said = await bridge.ask("opcua", do, given[0].Value if given else "", role, who)
-        return [ua.Variant(said, ua.VariantType.String)]
+        answer = await bridge.ask("opcua", do, value, role, who)
+        return [ua.Variant(answer, ua.VariantType.String)]
 
     return call
 
@@ -178,7 +180,13 @@ def _data(value: Value, live: bool) -> ua.DataValue:
     """A value with its time; without contact, texts stay, and numbers are bad."""
     at = datetime.now(UTC)
     if value is not None:
-        kind = ua.VariantType.String if isinstance(value, str) else ua.VariantType.Double
+        if isinstance(value, str):
+            kind = ua.VariantType.String
+        else:
+            kind = ua.VariantType.Double
         return ua.DataValue(ua.Variant(value, kind), SourceTimestamp=at)
-    bad = ua.StatusCodes.BadNoData if live else ua.StatusCodes.BadNoCommunication
+    if live:
+        bad = ua.StatusCodes.BadNoData
+    else:
+        bad = ua.StatusCodes.BadNoCommunication
     return ua.DataValue(ua.Variant(), ua.StatusCode(bad), SourceTimestamp=at)

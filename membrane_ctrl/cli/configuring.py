@@ -50,7 +50,10 @@ def explain(
     for table in found:
         print(textwrap.fill(f"{table.title}: {table.meaning}", _WIDTH))
         for each in table.keys:
-            default = each.default if each.default == "required" else f"default {each.default}"
+            if each.default == "required":
+                default = each.default
+            else:
+                default = f"default {each.default}"
             print(f"  {each.name}: {each.range} {each.unit}".rstrip() + f"; {default}")
             print(textwrap.indent(textwrap.fill(f"{each.meaning} {each.advice}", _WIDTH), "    "))
     return 0

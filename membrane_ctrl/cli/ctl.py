@@ -124,7 +124,9 @@ def _make_common_fields(
     from membrane_ctrl.control_port.ctl import Where
     from membrane_ctrl.control_port.service_client import ServiceAddress, read_token
 
-    service = ServiceAddress(host, read_token(token_file), authority) if host else None
+    service = None
+    if host:
+        service = ServiceAddress(host, read_token(token_file), authority)
     return {"why": why, "take_over": take_over}, Where(socket, run, service=service), json
 
 
@@ -176,7 +178,9 @@ def _gains(loop: GainsArgument, trial: TrialOption = "") -> dict[str, Any]:
 
 
 def _capture(turned_deg: TurnedOption = None) -> dict[str, Any]:
-    return {} if turned_deg is None else {"value": turned_deg}
+    if turned_deg is None:
+        return {}
+    return {"value": turned_deg}
 
 
 def _mark(text: TextArgument) -> dict[str, Any]:

@@ -100,7 +100,9 @@ def hold(
         raise errors.InputError(
             "a hold that observes writes nothing: start it without --autotune and --clear-faults"
         )
-    duration_s = None if duration is None else durations.parse_duration_s(duration)
+    duration_s = None
+    if duration is not None:
+        duration_s = durations.parse_duration_s(duration)
     terminal.print_progress("loading the control program")
     from membrane_ctrl.hold.hold_options import HoldOptions
     from membrane_ctrl.hold.start import hold_mirror
@@ -308,11 +310,9 @@ def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> "Con
         raise errors.InputError("--devices needs --twin; otherwise --config names the devices")
     if lab.devices is None:
         raise errors.InputError(f"{devices}: devices: missing; nothing to emulate")
-    return (
-        lab
-        if config is None
-        else load_configuration(config).model_copy(update={"devices": lab.devices})
-    )
+    if config is None:
+        return lab
+    return load_configuration(config).model_copy(update={"devices": lab.devices})
 
 
 def _start_from_flat(config: "Config", from_flat: bool) -> "Config":

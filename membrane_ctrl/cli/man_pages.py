@@ -121,4 +121,6 @@ def _format_help(text: str) -> str:
 def _escape_roff(text: str) -> str:
     """Text in which roff finds no request and no escape."""
     escaped = text.replace("\\", "\\e").replace("-", "\\-")
-    return f"\\&{escaped}" if escaped.startswith((".", "'")) else escaped
+    if not escaped.startswith((".", "'")):
+        return escaped
+    return f"\\&{escaped}"

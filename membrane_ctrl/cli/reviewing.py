@@ -221,7 +221,9 @@ def list_runs(
     if context.invoked_subcommand is not None:
         _require_only_logs(context)
         return 0
-    least_s = None if longer is None else durations.parse_duration_s(longer)
+    least_s = None
+    if longer is not None:
+        least_s = durations.parse_duration_s(longer)
     wanted = Filter(
         least_s=least_s,
         most_std_um=std_um,

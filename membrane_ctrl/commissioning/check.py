@@ -159,9 +159,9 @@ def _print_probes(
     if probes:
         table = Table("role", "device", "identity", "reading", "p50 / p99 ms")
         for probe in probes:
-            latency = (
-                f"{probe.latency_p50_ms:.1f} / {probe.latency_p99_ms:.1f}" if probe.reading else ""
-            )
+            latency = ""
+            if probe.reading:
+                latency = f"{probe.latency_p50_ms:.1f} / {probe.latency_p99_ms:.1f}"
             words = (
                 probe.role,
                 probe.device,
@@ -200,7 +200,10 @@ def _describe_hold(config: Config) -> dict[str, str]:
         if on
     ]
     cycle = f"a cycle every {shape.period_s:g} s"
-    figures = f"{shape.track_rate_hz:g} figures/s, tracked" if shape.mode == "track" else cycle
+    if shape.mode == "track":
+        figures = f"{shape.track_rate_hz:g} figures/s, tracked"
+    else:
+        figures = cycle
     return {
         "devices": config.devices.name if config.devices else "none: only `hold --twin` can run",
         "hold": f"{loop.setpoint_um:g} µm at {loop.rate_hz:g} Hz, limits "
@@ -252,7 +255,9 @@ def _describe_locks(config: Config) -> str:
     if config.devices is None:
         return "none"
     found = lock_store.LockStore.of_machine().find_locks(lock_keys.list_device_keys(config.devices))
-    return lock_store.format_locked_line([each.lock for each in found]) if found else "none"
+    if not found:
+        return "none"
+    return lock_store.format_locked_line([each.lock for each in found])
 
 
 def _describe_alarms(alarms: AlarmsConfig) -> str:
@@ -269,7 +274,9 @@ def _describe_geometry(config: Config) -> str:
     origin = there.origin
     if there.note or not origin.file:
         return there.note or "as stated in [optics.geometry]"
-    made = f", calibrated {origin.calibrated_utc}" if origin.calibrated_utc else ""
+    made = ""
+    if origin.calibrated_utc:
+        made = f", calibrated {origin.calibrated_utc}"
     return f"{origin.file} (hash {origin.hash}{made})"
 
 
@@ -296,7 +303,9 @@ def _measure_samples_hz(
     do not advance.
     """
     duration_s = last.device_time_s - first.device_time_s
-    return (last.sample_counter - first.sample_counter) / duration_s if duration_s > 0 else math.nan
+    if duration_s > 0:
+        return (last.sample_counter - first.sample_counter) / duration_s
+    return math.nan
 
 
 async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> DeviceProbe:
@@ -315,7 +324,8 @@ async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> Device
         await board.close()
     reading = timed.last
     who = f"{identity.kind} {identity.firmware}, map {identity.map_version}"
-    shown, problem = _describe_board_reading(reading), _find_board_problem(reading, laser)
+    shown = _describe_board_reading(reading)
+    problem = _find_board_problem(reading, laser)
     notes = NO_CLAIM if identity.map_version == 1 else ""
     return DeviceProbe(
         role="board",
@@ -346,11 +356,9 @@ def _find_board_problem(reading: roles.BenchReading, laser: bool) -> str:
         )
     if laser and not math.isfinite(reading.displacement_um):
         return f"no laser reading (code {reading.displacement_quality}); check its aim"
-    return (
-        ""
-        if math.isfinite(reading.gauge_pressure_pa)
-        else "no gauge pressure reading; check the sensor"
-    )
+    if math.isfinite(reading.gauge_pressure_pa):
+        return ""
+    return "no gauge pressure reading; check the sensor"
 
 
 async def probe_roles(devices: role_bench.RoleDevices) -> list[DeviceProbe]:
@@ -384,11 +392,9 @@ async def _probe_role(
     samples_hz = math.nan
     value = timed.last
     if isinstance(value, roles.DisplacementSample):
-        problem = (
-            ""
-            if value.quality == 0
-            else f"no reading, error code {value.quality}; check aim and manual"
-        )
+        problem = ""
+        if value.quality != 0:
+            problem = f"no reading, error code {value.quality}; check aim and manual"
         samples_hz = _measure_samples_hz(timed.first, value)
         value = value.displacement_um
     if not problem and not math.isfinite(value):
@@ -518,4 +524,6 @@ def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
         terminal.table_console().print(
             "conforms" if passed else "does not conform: do not use it to run a pump"
         )
-    return errors.Exit.DONE if passed else errors.Exit.REJECTED
+    if passed:
+        return errors.Exit.DONE
+    return errors.Exit.REJECTED

@@ -74,11 +74,9 @@ def find_displays(root: Path = _DRM) -> list[FoundDevice]:
         modes = (status.parent / "modes").read_text(encoding="ascii").split()
         size = modes[0] if modes else "size unknown"
         width, _, height = size.partition("x")
-        paste = (
-            f"width_px = {width}\nheight_px = {height}"
-            if width.isdigit() and height.isdigit()
-            else ""
-        )
+        paste = ""
+        if width.isdigit() and height.isdigit():
+            paste = f"width_px = {width}\nheight_px = {height}"
         found.append(FoundDevice("display", f"{connector}, {size}", paste))
     return found
 

@@ -37,11 +37,10 @@ def write_first_config(path: Path, twin: bool, ask: bool) -> int:
             f"{path}: exists already, and is not overwritten; name another file"
         )
     found = [] if twin else _find_connected()
-    tables = (
-        _ask_devices(found)
-        if ask
-        else {"devices": {"board": _TWIN.format(port=Config().twin.port)}}
-    )
+    if ask:
+        tables = _ask_devices(found)
+    else:
+        tables = {"devices": {"board": _TWIN.format(port=Config().twin.port)}}
     parsed = toml_file.parse_tables(tables, Config, str(path))
     if parsed.devices is not None:
         bench.require_separate_ports(parsed.devices)
@@ -95,7 +94,9 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
             tables["pump"] = dict.fromkeys(
                 ("dead_fraction", "start_fraction", "stall_fraction"), 0.0
             )
-    return tables if "camera" in section else tables | {"shape": {"enabled": False}}
+    if "camera" in section:
+        return tables
+    return tables | {"shape": {"enabled": False}}
 
 
 def _shows_patterns(camera: TomlTable) -> bool:
@@ -148,7 +149,10 @@ def _ask_table(name: str, known: Mapping[str, type[BaseModel]], optional: bool) 
             # only a preset replaces `raw`
             if key == "raw" or (field.is_required() and key != "driver"):
                 answer = _ask_question(f"  {key} ({_key_meaning(f'{driver}.{key}').rstrip('.')})")
-                table[key] = answer if field.annotation is str else _parse_answer(answer)
+                if field.annotation is str:
+                    table[key] = answer
+                else:
+                    table[key] = _parse_answer(answer)
         try:
             toml_file.parse_tables(table, known[driver], name)
         except errors.InputError as error:

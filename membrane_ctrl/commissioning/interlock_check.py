@@ -51,7 +51,9 @@ def describe_effect(probes: list[InterlockProbe]) -> str:
     blocking = [f"{probe.name} ({probe.state})" for probe in probes if probe.state != CLOSED]
     if blocking:
         return f"no hold before they are closed: {', '.join(blocking)}"
-    return f"all {len(probes)} closed" if probes else "none configured"
+    if not probes:
+        return "none configured"
+    return f"all {len(probes)} closed"
 
 
 def make_interlock_table(probes: list[InterlockProbe]) -> Table:

@@ -99,7 +99,10 @@ def write_package(name: str, role: str, folder: Path) -> int:
         kind = "actuator"
     elif role == "displacement":
         kind = "displacement"
-    prefix, lab = (f"{role}_", "optics_lab.toml.txt") if role in _OPTICS else ("", "lab.toml.txt")
+    if role in _OPTICS:
+        prefix, lab = f"{role}_", "optics_lab.toml.txt"
+    else:
+        prefix, lab = "", "lab.toml.txt"
     files = {
         "pyproject.toml": "pyproject.toml.txt",
         f"{name}.py": f"{prefix}driver.txt",
@@ -116,7 +119,9 @@ def write_package(name: str, role: str, folder: Path) -> int:
         for file, template in files.items():
             text = _of_kind((_TEMPLATES / template).read_text(encoding="utf-8"), kind)
             (target / file).write_text(string.Template(text).substitute(words), encoding="utf-8")
-    page = "docs/how-to/new-camera.md" if role in _OPTICS else "docs/how-to/new-device.md"
+    page = "docs/how-to/new-device.md"
+    if role in _OPTICS:
+        page = "docs/how-to/new-camera.md"
     typer.echo(
         f"{target}: a driver, its emulator, its tests and lab.toml are written. Next ({page}):\n"
         f"  pip install --no-deps --editable {target}\n"

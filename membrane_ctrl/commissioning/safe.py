@@ -182,7 +182,8 @@ def _store_lock(devices: DevicesConfig) -> None:
     """Store a lock on the devices, which keeps every command down until a person removes it. Raises
     DeviceError.
     """
-    store, keys = lock_store.LockStore.of_machine(), lock_keys.list_device_keys(devices)
+    store = lock_store.LockStore.of_machine()
+    keys = lock_keys.list_device_keys(devices)
     account = f"unix:{account_name()}"
     word = lock_store.draw_word({each.lock.word for each in store.find_locks()})
     set_utc = datetime.now(UTC).isoformat(timespec="seconds")

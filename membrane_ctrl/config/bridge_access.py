@@ -30,11 +30,10 @@ def list_bridge_accesses(bridges: BridgesConfig) -> list[BridgeAccess]:
         opcua = bridges.opcua
         where = f"OPC UA on {opcua.host}:{opcua.port}" + (", encrypted" if opcua.encrypted else "")
         known = opcua.users_file is not None
-        who = (
-            f"the users in {opcua.users_file}, each by its role"
-            if known
-            else _is_open_to_anybody(opcua.host)
-        )
+        if known:
+            who = f"the users in {opcua.users_file}, each by its role"
+        else:
+            who = _is_open_to_anybody(opcua.host)
         found.append(BridgeAccess("bridges.opcua", where, who, not known))
     if bridges.epics is not None:
         where = f"EPICS on {bridges.epics.host}"
@@ -49,15 +48,13 @@ def describe_bridges(bridges: BridgesConfig) -> str:
     accesses = list_bridge_accesses(bridges)
     if not accesses:
         return "none"
-    may = (
-        "read, and nobody acts"
-        if bridges.role == "read"
-        else f"read and act (role {bridges.role} at most)"
-    )
+    may = "read, and nobody acts"
+    if bridges.role != "read":
+        may = f"read and act (role {bridges.role} at most)"
     return "; ".join(f"{each.where}: {each.who} may {may}" for each in accesses)
 
 
 def _is_open_to_anybody(host: str) -> str:
-    return (
-        "every program on this machine" if host in LOCAL_HOSTS else "every program on the network"
-    )
+    if host in LOCAL_HOSTS:
+        return "every program on this machine"
+    return "every program on the network"

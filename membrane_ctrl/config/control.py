@@ -122,18 +122,18 @@ class PumpConfig(Section):
     @classmethod
     def _set_full_flow(cls, table: Any) -> Any:
         """The full flow of a measured curve is its last one."""
-        flows = table.get("curve_um_per_s") if isinstance(table, dict) else None
+        flows = None
+        if isinstance(table, dict):
+            flows = table.get("curve_um_per_s")
         if isinstance(flows, list | tuple) and flows and isinstance(flows[-1], int | float):
             return {"flow_full_um_per_s": flows[-1], **table}
         return table
 
     @model_validator(mode="after")
     def _require_rising_curve(self) -> "PumpConfig":
-        commands, flows, falling = (
-            self.curve_fraction,
-            self.curve_um_per_s,
-            self.curve_falling_um_per_s,
-        )
+        commands = self.curve_fraction
+        flows = self.curve_um_per_s
+        falling = self.curve_falling_um_per_s
         if not (commands or flows or falling):
             return self
         if (

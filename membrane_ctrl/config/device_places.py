@@ -141,7 +141,8 @@ def normalise_link(link: str) -> Hashable:
         return link.removeprefix("rtu://").partition("?")[0]
     try:
         parts = urlsplit(link)
-        host, port = (parts.hostname or "").rstrip("."), parts.port or _MODBUS_PORT
+        host = (parts.hostname or "").rstrip(".")
+        port = parts.port or _MODBUS_PORT
     except ValueError:  # impossible: opening it reports that
         return link
     return ("localhost" if host in _THIS_MACHINE else host), port

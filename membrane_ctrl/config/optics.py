@@ -16,10 +16,8 @@ Axis = Annotated[tuple[Length, ...], Field(min_length=2, max_length=500)]
 _DISTORTION_LENGTHS = (0, 4, 5, 8)
 _EVEN = 1e-6  # of the node spacing: rounding of written decimals
 # of the squared length, from rounding to five digits, and of the cosine
-_UNIT, _SQUARE = (
-    1.1e-5,
-    1e-6,
-)
+_UNIT = 1.1e-5
+_SQUARE = 1e-6
 Share = Annotated[float, Field(ge=0, le=0.5)]
 
 

@@ -36,4 +36,6 @@ class PortConfig(Section):
 
     def socket_in(self, logs_dir: Path) -> Path:
         """The socket's file of a hold with its runs in `logs_dir`."""
-        return Path(self.socket) if self.socket else logs_dir / SOCKET_NAME
+        if self.socket:
+            return Path(self.socket)
+        return logs_dir / SOCKET_NAME

@@ -100,7 +100,9 @@ class TableHelp:
     def title(self) -> str:
         """How the table begins in the file, or each of its places."""
         headers = ", ".join(f"[[{place}]]" if self.many else f"[{place}]" for place in self.places)
-        return f'{headers} driver = "{self.driver}"' if self.driver else headers
+        if not self.driver:
+            return headers
+        return f'{headers} driver = "{self.driver}"'
 
 
 class _TomlSchema(GenerateJsonSchema):
@@ -171,11 +173,9 @@ def _make_table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
         ):
             continue  # a table of its own, or the name of this one
         meaning, *advice = _ADVICE.split(" ".join(field.get("description", "").split()), maxsplit=1)
-        default = (
-            "required"
-            if name in required
-            else _format_default(defaults.get(name, field.get("default")))
-        )
+        default = "required"
+        if name not in required:
+            default = _format_default(defaults.get(name, field.get("default")))
         keys.append(
             Key(name, unit_of(name), _describe_range(field), default, meaning, "".join(advice))
         )
@@ -201,21 +201,19 @@ def find_explained(word: str) -> tuple[TableHelp, ...]:
             for key in table.keys
         }
         known += [*prefixes, *(name for key in names.values() for name in sorted(key))]
-        keys = (
-            table.keys
-            if wanted in prefixes
-            else tuple(key for key in table.keys if wanted in names[key.name])
-        )
+        if wanted in prefixes:
+            keys = table.keys
+        else:
+            keys = tuple(key for key in table.keys if wanted in names[key.name])
         if keys or wanted in prefixes:
             found.append(replace(table, keys=keys))
     found = found or _of_other_packages(wanted)
     if not found:
         inside = sorted({name for name in known if wanted and wanted in name}, key=len)[:3]
-        near = (
-            f"did you mean {' or '.join(inside)}?"
-            if inside
-            else suggest_word(wanted, known, "see `config reference`")
-        )
+        if inside:
+            near = f"did you mean {' or '.join(inside)}?"
+        else:
+            near = suggest_word(wanted, known, "see `config reference`")
         raise InputError(f"{word}: no such key or table; {near}")
     return tuple(found)
 
@@ -273,25 +271,29 @@ def _describe_range(field: Any) -> str:
         return _list_limits(field) + (", whole" if kind == "integer" else "")
     if kind == "array":
         parts = field.get("prefixItems")
-        return (
-            f"{len(parts)} x ({_describe_range(parts[0])})"
-            if parts
-            else f"list of {_describe_range(field['items'])}"
-        )
+        if parts:
+            return f"{len(parts)} x ({_describe_range(parts[0])})"
+        return f"list of {_describe_range(field['items'])}"
     if kind == "boolean":
         return "true, false"
     if "pattern" in field:
         return f"text like `{field['pattern']}`"
     if "$ref" in field or "oneOf" in field:
         return "a table"
-    return "a file" if field.get("format") == "path" else "text"
+    if field.get("format") == "path":
+        return "a file"
+    return "text"
 
 
 def _list_limits(field: Any) -> str:
     """Return the limits of a number; a key of another package may lack one or both."""
-    lows = [f"above {field['exclusiveMinimum']:g}"] if "exclusiveMinimum" in field else []
+    lows = []
+    if "exclusiveMinimum" in field:
+        lows = [f"above {field['exclusiveMinimum']:g}"]
     lows += [f"{field['minimum']:g}"] if "minimum" in field else []
-    highs = [f"below {field['exclusiveMaximum']:g}"] if "exclusiveMaximum" in field else []
+    highs = []
+    if "exclusiveMaximum" in field:
+        highs = [f"below {field['exclusiveMaximum']:g}"]
     highs += [f"{field['maximum']:g}"] if "maximum" in field else []
     if not lows and not highs:
         return "any number"
@@ -302,7 +304,9 @@ def _format_default(default: Any) -> str:
     """Return a default as in TOML; "none" for an absent key."""
     if isinstance(default, list) and default and isinstance(default[0], dict):
         return f"{len(default)} tables"
-    return "none" if default is None else json.dumps(default)
+    if default is None:
+        return "none"
+    return json.dumps(default)
 
 
 def make_reference_page() -> str:

@@ -359,7 +359,9 @@ class Config(Section):
     @property
     def interlocks(self) -> tuple[settings.InterlockDriver, ...]:
         """The interlocks; bit i of `interlocks_open` is the i-th."""
-        return () if self.devices is None else self.devices.interlocks
+        if self.devices is None:
+            return ()
+        return self.devices.interlocks
 
     @property
     def vent_fitted(self) -> bool:

@@ -90,8 +90,9 @@ def compute_poses(
     """
     screen = None if geometry.screen is None else geometry.screen.pose
     if geometry.camera is not None and screen is not None:
-        general = (geometry.camera.position_mm, geometry.camera.rotation, *screen)
-        pinhole, rotation, origin, s_x, s_y = (np.array(value, float) for value in general)
+        pinhole = np.array(geometry.camera.position_mm, float)
+        rotation = np.array(geometry.camera.rotation, float)
+        origin, s_x, s_y = (np.array(vector, float) for vector in screen)
         return pinhole, rotation, origin, s_x, s_y
     if geometry.a_mm is None or geometry.b_mm is None or geometry.alpha_deg is None:
         raise ValueError("geometry has neither a_mm, b_mm, alpha_deg nor both poses")
@@ -102,7 +103,9 @@ def compute_poses(
     pinhole = geometry.a_mm * np.array([cosine, 0.0, sine])
     rotation = np.array([[sine, 0.0, -cosine], [0.0, -1.0, 0.0], [-cosine, 0.0, -sine]])
     origin = geometry.b_mm * np.array([-cosine, 0.0, sine])
-    return pinhole, rotation, origin, np.array([-sine, 0.0, -cosine]), np.array([0.0, 1.0, 0.0])
+    s_x = np.array([-sine, 0.0, -cosine])
+    s_y = np.array([0.0, 1.0, 0.0])
+    return pinhole, rotation, origin, s_x, s_y
 
 
 def trace_view(optics: OpticsConfig, sag_mm: float) -> Sight:
@@ -133,23 +136,28 @@ def trace_view(optics: OpticsConfig, sag_mm: float) -> Sight:
     point = np.stack([x, y, bend * (x**2 + y**2)], axis=1)
     normal = np.stack([-2 * bend * x, -2 * bend * y, np.ones_like(x)], axis=1)
 
-    # The camera's rays: their pixels, and their reflections.
+    # The camera's rays to these points, and their reflections: r - 2 (r.n) n / n.n
     ray = point - pinhole
-    in_camera = ray @ rotation.T
     towards = np.sum(ray * normal, axis=1)
-    reflected = ray - (2 * towards / np.sum(normal**2, axis=1))[:, None] * normal
-    face = np.cross(s_x, s_y)  # the screen's normal, which points at the mirror
+    twice_projected = 2 * towards / np.sum(normal**2, axis=1)
+    reflected = ray - twice_projected[:, None] * normal
+
+    # The pixels that see the points, and where the reflections meet the screen's plane.
+    in_camera = ray @ rotation.T
     focal_px = camera.focal_mm / (1e-3 * camera.pixel_um)
+    screen_normal = np.cross(s_x, s_y)  # points at the mirror
+    to_screen = (origin - point) @ screen_normal
+    along_reflected = reflected @ screen_normal
     with np.errstate(divide="ignore", invalid="ignore"):
         pixel = focal_px * in_camera[:, :2] / in_camera[:, 2:] + camera.principal
-        reach = (origin - point) @ face / (reflected @ face)
+        reach = to_screen / along_reflected
         from_origin = point + reach[:, None] * reflected - origin
 
     # Which points are in the image, and which reflections meet the pattern from the front.
     size_px = np.array([camera.width_px, camera.height_px])
     inside = (pixel >= -0.5) & (pixel <= size_px - 0.5)
     shown = (in_camera[:, 2] > 0) & inside.all(axis=1)
-    arrives = (towards < 0) & (reflected @ face < 0) & ((origin - point) @ face < 0)
+    arrives = (towards < 0) & (along_reflected < 0) & (to_screen < 0)
     on_screen_mm = np.abs(from_origin @ np.stack([s_x, s_y], axis=1))
     half_side_mm = pattern.periods * pattern.period_mm / 2
     measured = shown & arrives & (on_screen_mm <= half_side_mm).all(axis=1)
@@ -178,16 +186,35 @@ def find_lens_fold_px(camera: CameraConfig) -> float:
     if not falls.any():
         return math.inf
     fold_px = float(pictured_px[np.argmax(falls)])
-    return fold_px if fold_px < corner_px else math.inf
+    if fold_px < corner_px:
+        return fold_px
+    return math.inf
 
 
 def _distort_radius(tangent: FloatArray, distortion: tuple[float, ...]) -> FloatArray:
-    """Radial part of OpenCV's model: distance from the axis behind the lens, of that before it."""
-    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *[0.0] * 8)[:8]
-    square: FloatArray = tangent**2
-    above = 1 + square * (k1 + square * (k2 + square * k3))
-    below = 1 + square * (k4 + square * (k5 + square * k6))
-    return np.asarray(tangent * above / below)
+    """Radial part of OpenCV's lens model.
+
+    Source: OpenCV, camera calibration, `calib3d`: coefficients in the order k1, k2, p1, p2, k3, k4,
+    k5, k6; missing ones are 0.
+
+    Parameters
+    ----------
+    tangent : array
+        Distance from the axis over the distance along it, before the lens.
+    distortion : tuple of float
+        Coefficients.
+
+    Returns
+    -------
+    array
+        The same behind the lens.
+    """
+    padded = distortion + (0.0,) * 8
+    k1, k2, _, _, k3, k4, k5, k6 = padded[:8]
+    r2: FloatArray = tangent**2
+    numerator = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    denominator = 1 + k4 * r2 + k5 * r2**2 + k6 * r2**3
+    return np.asarray(tangent * numerator / denominator)
 
 
 def find_lens_doubt(optics: OpticsConfig) -> Doubt | None:
@@ -208,7 +235,9 @@ def find_lens_doubt(optics: OpticsConfig) -> Doubt | None:
     tangent = np.hypot(in_camera[:, 0], in_camera[:, 1]) / in_camera[:, 2]
     up_to_rim = np.linspace(0.0, float(tangent.max()), _FOLD_STEPS)
     in_mirror = bool((np.diff(_distort_radius(up_to_rim, camera.distortion)) <= 0).any())
-    where = "within the mirror's picture" if in_mirror else "within the picture, beside the mirror"
+    where = "within the picture, beside the mirror"
+    if in_mirror:
+        where = "within the mirror's picture"
     why = (
         f"the lens model folds {fold_px:.0f} px from the principal point, {where}: farther points "
         "would be pictured nearer"

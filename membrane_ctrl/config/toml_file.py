@@ -88,11 +88,9 @@ def _describe_cause(message: str, text: str) -> str:
     line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
     if number := re.search(r"=\s*([-+]?\d+),(\d+)\s*(#|$)", line):
         return f"{message}: a number has a decimal point; write {number[1]}.{number[2]}"
-    return (
-        f"{message}: {line} comes twice"
-        if "overwrite" in message or "twice" in message
-        else message
-    )
+    if "overwrite" in message or "twice" in message:
+        return f"{message}: {line} comes twice"
+    return message
 
 
 def _has_too_many_parts(line: str) -> bool:
@@ -110,7 +108,9 @@ def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
 
     Raises InputError if the file is missing or holds anything but rows of numbers.
     """
-    screen = geometry.get("screen") if isinstance(geometry, dict) else None
+    screen = None
+    if isinstance(geometry, dict):
+        screen = geometry.get("screen")
     table = screen.get("height_map") if isinstance(screen, dict) else None
     if not isinstance(table, dict) or "file" not in table:
         return
@@ -171,13 +171,16 @@ def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
     """One line for a validation error: the field, the problem and the remedy."""
     path, parent = _walk_location(model, error["loc"])
     field = ".".join(str(part) for part in path)
-    kind, fields = error["type"], {} if parent is None else parent.model_fields
+    kind = error["type"]
+    fields = {} if parent is None else parent.model_fields
     if kind == "extra_forbidden":
         key = str(error["loc"][-1])
         home = next(_find_tables_with_key(model, key), "")
         otherwise = home and f"it belongs in [{home}]"
         return f"{field}: unknown key; {suggest_word(key, [*fields], otherwise)}"
-    inner = list_sections(fields[path[-1]].annotation) if path and path[-1] in fields else []
+    inner = []
+    if path and path[-1] in fields:
+        inner = list_sections(fields[path[-1]].annotation)
     if kind.startswith("union_tag"):
         choices = _sections_at(model, path)
         tag, known = (
@@ -197,11 +200,9 @@ def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
     if kind == "missing":
         return f"{field}: missing; it has no default"
     if kind in ("dict_type", "model_type"):
-        return (
-            f"{field}: write a table, [{field}] and its keys below"
-            if field
-            else "input should be an object"
-        )
+        if not field:
+            return "input should be an object"
+        return f"{field}: write a table, [{field}] and its keys below"
     if kind == "tuple_type":
         return f"{field}: write a list, " + (
             f"[[{field}]] and its keys below" if inner else "in square brackets"
@@ -212,7 +213,9 @@ def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
             "rtu:///dev/ttyUSB0?baud=115200"
         )
     value = error["input"]
-    shown = f" (it is {value!r})" if isinstance(value, (int, float, str, bool)) else ""
+    shown = ""
+    if isinstance(value, (int, float, str, bool)):
+        shown = f" (it is {value!r})"
     return f"{field}: {message[:1].lower()}{message[1:]}{shown}"
 
 
@@ -236,7 +239,9 @@ def _find_tables_with_key(model: type[BaseModel], key: str, prefix: str = "") ->
 def _choose_error(errors: list[ErrorDetails]) -> ErrorDetails:
     """The most helpful error: an unknown key is often a misspelling of one reported missing."""
     misspelt = [error for error in errors if error["type"] == "extra_forbidden"]
-    return misspelt[0] if misspelt and errors[0]["type"] == "missing" else errors[0]
+    if misspelt and errors[0]["type"] == "missing":
+        return misspelt[0]
+    return errors[0]
 
 
 def _walk_location(
@@ -287,4 +292,6 @@ def list_sections(annotation: Any) -> list[type[BaseModel]]:
 def list_driver_names(section: type[BaseModel]) -> tuple[Any, ...]:
     """Return the values of `driver` that select this section."""
     driver = section.model_fields.get("driver")
-    return () if driver is None else get_args(driver.annotation)
+    if driver is None:
+        return ()
+    return get_args(driver.annotation)

@@ -45,7 +45,9 @@ class Desk:
                 return f"mark: {self._text}▏ (Enter sends, Esc cancels)"
             case "stop":
                 return "stop the run? y: yes, any other key: no"
-        return f"{self._status_line}   · {_FOOT}" if self._status_line else _FOOT
+        if not self._status_line:
+            return _FOOT
+        return f"{self._status_line}   · {_FOOT}"
 
     def process_keys(self, text: str, paused: bool) -> None:
         """Take what was typed. Of several characters at once only the first is a command: the rest

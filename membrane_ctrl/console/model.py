@@ -184,7 +184,10 @@ class ConsoleModel:
     def make_view(self, now_s: float) -> ConsoleView:
         """The content at a time of the run's clock."""
         status, row = self._status, self._status.row
-        state, next_step, age_s, held_s = telemetry.State.STANDBY, "", 0.0, 0.0
+        state = telemetry.State.STANDBY
+        next_step = ""
+        age_s = 0.0
+        held_s = 0.0
         if row is not None:
             state = telemetry.State(int(row.state))
             next_step = explain_next_step(
@@ -252,7 +255,9 @@ class ConsoleModel:
 
     def _make_shape_view(self, now_s: float) -> ShapeView:
         """The figure's part of the view; NaN for what is not known yet."""
-        estimate, reference, status = self._estimate, self._reference, self._status
+        estimate = self._estimate
+        reference = self._reference
+        status = self._status
         state = telemetry.ShapeState.OFF
         if status.row is not None:
             state = telemetry.ShapeState(int(status.row.shape_state))

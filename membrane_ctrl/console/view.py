@@ -79,7 +79,9 @@ _PLACED = frozenset(
 
 def level_bar(fraction: float, width: int, style: str = "cyan") -> Text:
     """A bar of `width` characters, filled to `fraction` (0..1; NaN is empty)."""
-    filled = round(min(max(fraction, 0.0), 1.0) * width) if math.isfinite(fraction) else 0
+    filled = 0
+    if math.isfinite(fraction):
+        filled = round(min(max(fraction, 0.0), 1.0) * width)
     return Text("█" * filled, style=style) + Text("░" * (width - filled), style="dim")
 
 
@@ -93,11 +95,9 @@ def signed_bars(values: Sequence[float], full: float, band: float, rows: int = 1
     lines = [Text() for _ in range(2 * rows)]
     for value in values:
         colour = "green" if abs(value) <= band else "red"
-        eighths = (
-            min(8 * rows, max(1, math.ceil(8 * rows * abs(value) / full)))
-            if math.isfinite(value)
-            else 0
-        )
+        eighths = 0
+        if math.isfinite(value):
+            eighths = min(8 * rows, max(1, math.ceil(8 * rows * abs(value) / full)))
         for row, line in enumerate(lines):
             up = row < rows
             in_row = min(8, max(0, eighths - 8 * (rows - 1 - row if up else row - rows)))
@@ -169,7 +169,9 @@ class ConsolePage:
             ((n, left) for n in range(len(_DISPENSABLE)) if (left := spare(n)) >= needed),
             (len(_DISPENSABLE), max(0, spare(len(_DISPENSABLE)))),
         )
-        rows = 1 if self._help else 1 + max(0, min(_BAR_ROWS_MAX - 1, (below - _EVENTS_MIN) // 6))
+        rows = 1
+        if not self._help:
+            rows = 1 + max(0, min(_BAR_ROWS_MAX - 1, (below - _EVENTS_MIN) // 6))
         yield self._make_panel(trend_s, _DISPENSABLE[:omitted], rows, below - 2 * (rows - 1))
 
     def _make_panel(self, trend_s: int, omitted: Sequence[str], rows: int, below: int) -> Panel:
@@ -177,14 +179,14 @@ class ConsolePage:
         `below` more.
         """
         view = self._view
-        time_left = (
-            f"{format_duration(view.left_s)} left"
-            if math.isfinite(view.left_s)
-            else "until stopped"
-        )
+        time_left = "until stopped"
+        if math.isfinite(view.left_s):
+            time_left = f"{format_duration(view.left_s)} left"
         title = Text.assemble(" ", (view.state.name.lower(), _STATE_STYLES.get(view.state, "bold")))
         title.append(f" for {format_duration(view.state_age_s)} ")
-        trend = () if "trend" in omitted else _make_trend_items(view, self._config, trend_s, rows)
+        trend: Sequence[tuple[str, Text]] = ()
+        if "trend" not in omitted:
+            trend = _make_trend_items(view, self._config, trend_s, rows)
         figures = _make_figures_table(view, self._config, trend, omitted)
         parts: list[RenderableType] = [
             _make_headline(view, self._config),
@@ -268,7 +270,9 @@ def _make_headline(view: ConsoleView, config: Config) -> Text:
             f"LOCKED by {len(view.locks) - _LOCKS_SHOWN} more locks\n", style="bold white on red"
         )
     line.append(view.why, style=style)
-    return line.append(f"\n{view.next_step}", style="default") if view.next_step else line
+    if not view.next_step:
+        return line
+    return line.append(f"\n{view.next_step}", style="default")
 
 
 def _make_figures_table(
@@ -453,7 +457,9 @@ def _format_lateness(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
 def _format_faults(view: ConsoleView) -> Text:
     if view.fault:
         text = Text(view.fault, style="bold red")
-        return text.append(f"; {view.remedy}", style="default") if view.remedy else text
+        if not view.remedy:
+            return text
+        return text.append(f"; {view.remedy}", style="default")
     if not view.faults:
         return Text("none")
     return Text(f"none now, {view.faults} in this run; last: {view.last_fault}")

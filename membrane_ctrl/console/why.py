@@ -62,7 +62,8 @@ def explain_state(
     config : Config
     paused : bool
     """
-    state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
+    state = State(int(row.state))
+    safe_level = SafeLevel(int(row.safe_level))
     if safe_level != SafeLevel.NONE:
         return f"{_level_words(safe_level, row, config)}: {fault or reported or 'unknown fault'}"
     if state in _STATES:
@@ -80,11 +81,9 @@ def explain_state(
         )
     if abs(row.error_um) > config.limits.band_um:
         return f"outside the band: {_describe_deviation(row)}"
-    return (
-        _describe_flow_terms(row)
-        if state == State.HOLD
-        else f"settling: {_describe_flow_terms(row)}"
-    )
+    if state == State.HOLD:
+        return _describe_flow_terms(row)
+    return f"settling: {_describe_flow_terms(row)}"
 
 
 def _level_words(safe_level: SafeLevel, row: TelemetryRow, config: Config) -> str:
@@ -117,7 +116,10 @@ def explain_next_step(
         return f"next: ask {locks[0].author}, then `{ctl} unlock {locks[0].word}`"
     if state == State.STANDBY and latched:
         state = State.FAULT
-    command, key = ("resume", " or key p") if paused else _NEXT_COMMANDS.get(state, ("", ""))
+    if paused:
+        command, key = "resume", " or key p"
+    else:
+        command, key = _NEXT_COMMANDS.get(state, ("", ""))
     if not command:
         return ""
     return f"next: `{ctl} {command}`{key if keys else ''}"
@@ -185,4 +187,6 @@ def format_duration(seconds_s: float) -> str:
         return f"{days} d {hours:02}:{minutes:02}:{seconds:02}"
     if hours:
         return f"{hours}:{minutes:02}:{seconds:02}"
-    return f"{minutes}:{seconds:02}" if minutes else f"{seconds} s"
+    if minutes:
+        return f"{minutes}:{seconds:02}"
+    return f"{seconds} s"

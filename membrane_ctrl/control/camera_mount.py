@@ -44,7 +44,9 @@ class CameraMountGrowth:
     def warmed_k(self) -> float:
         """By how much the mount is warmer than at the lock; 0 if unknown."""
         locked_c = self.memory.locked_c
-        return 0.0 if math.isnan(locked_c) else self.memory.mount_c.value - locked_c
+        if math.isnan(locked_c):
+            return 0.0
+        return self.memory.mount_c.value - locked_c
 
     @property
     def um(self) -> float:

@@ -55,7 +55,8 @@ class FeedForward:
             ambient_pressure_pa, air_temperature_c
         )
         pressure_pa = pressure_pa if loop.feedforward_barometer else math.nan
-        temperature_c = temperature_c if loop.feedforward_temperature else math.nan
+        if not loop.feedforward_temperature:
+            temperature_c = math.nan
         pa_per_s = self.memory.pressure.update(
             pressure_pa, dt_s, loop.feedforward_filter_s, _STEP_MAX_PA
         )

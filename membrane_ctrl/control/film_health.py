@@ -132,13 +132,15 @@ class FilmHealth:
         """The leak, and how long the pump can keep up at this growth."""
         hours = self.memory.hours
         days = (len(hours) - 1) / DAY_HOURS
-        growth_per_day = (leak_um_per_s - hours[0].leak_um_per_s) / days if days else 0.0
-        left = (
-            (self._flow_max_um_per_s - leak_um_per_s) / growth_per_day
-            if growth_per_day > 0
-            else math.inf
-        )
-        until = f"; the pump keeps up for {left:.1f} days more" if left < 365 else ""
+        growth_per_day = 0.0
+        if days:
+            growth_per_day = (leak_um_per_s - hours[0].leak_um_per_s) / days
+        left = math.inf
+        if growth_per_day > 0:
+            left = (self._flow_max_um_per_s - leak_um_per_s) / growth_per_day
+        until = ""
+        if left < 365:
+            until = f"; the pump keeps up for {left:.1f} days more"
         return f"the leak has grown to {leak_um_per_s:.2f} µm/s{until}: look for an opening seam"
 
     def _creep_per_day(self) -> float:

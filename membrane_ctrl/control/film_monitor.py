@@ -95,7 +95,8 @@ class _GaugeComparison:
             memory.laser_um = laser_um
             memory.trim_um = trim_um
             memory.root = root
-        by_laser_um, trimmed_um = laser_um - memory.laser_um, trim_um - memory.trim_um
+        by_laser_um = laser_um - memory.laser_um
+        trimmed_um = trim_um - memory.trim_um
         by_gauge_um = (sag_um - by_laser_um) * (root / memory.root - 1)
         # A laser drift that the shape loop has compensated has not moved the film.
         difference_um = min(

@@ -16,7 +16,9 @@ def lag_step_fraction(dt_s: float, time_constant_s: float) -> float:
     time_constant_s : float
         T; 0 means no lag, and a share of 1.
     """
-    return -math.expm1(-dt_s / time_constant_s) if time_constant_s > 0 else 1.0
+    if time_constant_s > 0:
+        return -math.expm1(-dt_s / time_constant_s)
+    return 1.0
 
 
 @dataclass(slots=True)

@@ -198,7 +198,9 @@ class InnerLoop:
             and self._probe_um > 0.0
             and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
         )
-        probe_um_per_s = self._drift.flow_um_per_s(self._probe_um) if probing else 0.0
+        probe_um_per_s = 0.0
+        if probing:
+            probe_um_per_s = self._drift.flow_um_per_s(self._probe_um)
         # 3. The limits, from which the integrator is back-calculated; then the pump's command
         limited_um_per_s = self._limiter.limit(wanted_um_per_s + probe_um_per_s, dt_s)
         if given.estimate is None:
@@ -251,7 +253,9 @@ class InnerLoop:
         shaped_um, ramp_um_per_s = self._shape_setpoint(given, filtered_um, dt_s)
         matched_um = self.memory.matched.update(shaped_um, dt_s, self._loop.measurement_filter_s)
         error_um = matched_um - filtered_um
-        rate_um_per_s = 0.0 if math.isnan(before_um) else (filtered_um - before_um) / dt_s
+        rate_um_per_s = 0.0
+        if not math.isnan(before_um):
+            rate_um_per_s = (filtered_um - before_um) / dt_s
         return self._pid.terms(error_um, rate_um_per_s), ramp_um_per_s
 
     def _step_on_estimate(
@@ -284,7 +288,9 @@ class InnerLoop:
         """
         self._forget_output()
         seen = math.isfinite(given.displacement_um)
-        filtered_um = self._filter_reading(given.displacement_um, dt_s) if seen else math.nan
+        filtered_um = math.nan
+        if seen:
+            filtered_um = self._filter_reading(given.displacement_um, dt_s)
         if not math.isnan(self._ramp.value_um):
             self.memory.setpoint_um = self._ramp.value_um + given.trim_um
         self._feedforward.update(math.nan, math.nan, dt_s)
@@ -478,7 +484,10 @@ def _place_poles(estimator: EstimatorConfig, tick_s: float) -> tuple[float, floa
     slow_per_s = filters.lag_step_fraction(tick_s, own_s) / tick_s
     # The pump's pole, or the loop's own if that is faster
     fast_per_s = filters.lag_step_fraction(tick_s, min(own_s, lag_s)) / tick_s
-    error_gain_per_s = lag_s * slow_per_s * fast_per_s if lag_s > 0 else slow_per_s
+    if lag_s > 0:
+        error_gain_per_s = lag_s * slow_per_s * fast_per_s
+    else:
+        error_gain_per_s = slow_per_s
     return error_gain_per_s, (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
 
 

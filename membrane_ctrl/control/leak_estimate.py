@@ -44,11 +44,9 @@ class LeakEstimate(StateNode):
     @property
     def leak_um_per_s(self) -> float:
         """Estimate; NaN until there is one, and while nothing is seen."""
-        return (
-            self.mean_um_per_s
-            if self.elapsed_s >= FIRST_S and math.isfinite(self.last_um)
-            else math.nan
-        )
+        if self.elapsed_s >= FIRST_S and math.isfinite(self.last_um):
+            return self.mean_um_per_s
+        return math.nan
 
     @property
     def too_tight(self) -> bool:

@@ -64,7 +64,10 @@ class LeakGrowth(StateNode):
             self.stands_s = 0.0
             # the larger of the two, as a faulty thermometer may shift the estimate down for long
             known = math.isfinite(self.usual.value)
-            takes_um_per_s = max(leak_um_per_s, flow_um_per_s) if known else leak_um_per_s
+            if known:
+                takes_um_per_s = max(leak_um_per_s, flow_um_per_s)
+            else:
+                takes_um_per_s = leak_um_per_s
             self.usual.update(takes_um_per_s, dt_s, LEAK_REFERENCE_S)
             return ""
         self.stands_s += dt_s

@@ -39,4 +39,6 @@ class Slope(StateNode):
     def per_s(self) -> float:
         """The slope, 0 until there are two different times."""
         spread = self.count * self.sum_tt - self.sum_t * self.sum_t
-        return (self.count * self.sum_ty - self.sum_t * self.sum_y) / spread if spread > 0 else 0.0
+        if spread > 0:
+            return (self.count * self.sum_ty - self.sum_t * self.sum_y) / spread
+        return 0.0

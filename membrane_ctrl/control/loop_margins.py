@@ -38,16 +38,22 @@ def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
     """
     dt_s = 1 / loop.rate_hz
     z = np.exp(1j * omega * dt_s)
-    share = lag_step_fraction(dt_s, loop.measurement_filter_s)
-    measurement_filter = share / (1 - (1 - share) / z)
+    # Measurement filter: y[n] = y[n - 1] + fraction (x[n] - y[n - 1])
+    fraction = lag_step_fraction(dt_s, loop.measurement_filter_s)
+    measurement_filter = fraction / (1 - (1 - fraction) / z)
+    # PID; the integrator moves after the output, so that its sum is one tick late
+    integral = dt_s / loop.ti_s / (z - 1)
     derivative = loop.td_s * (1 - 1 / z) / dt_s
-    # the integrator moves after the output
-    pi = loop.kp_per_s * (1 + dt_s / loop.ti_s / (z - 1) + derivative)
-    mirror = np.zeros_like(z)
-    for k in range(-_ALIASES, _ALIASES + 1):  # what the samples fold back; at 1 Hz it decides
+    pid = loop.kp_per_s * (1 + integral + derivative)
+    # Zero-order hold, dead time, pump lag and the mirror's integrator, summed over the aliases that
+    # sampling folds back; at a tick rate of 1 Hz the aliases decide
+    plant = np.zeros_like(z)
+    for k in range(-_ALIASES, _ALIASES + 1):
         s = 1j * (omega + 2 * math.pi * k / dt_s)
-        mirror += (1 - 1 / z) / (s * dt_s) * np.exp(-s * DEAD_S) / (1 + s * PUMP_LAG_S) / s
-    return np.asarray(pi * measurement_filter * mirror)
+        zero_order_hold = (1 - 1 / z) / (s * dt_s)
+        pump = np.exp(-s * DEAD_S) / (1 + s * PUMP_LAG_S)
+        plant += zero_order_hold * pump / s
+    return np.asarray(pid * measurement_filter * plant)
 
 
 def peak_sensitivity(loop: LoopConfig) -> float:
@@ -60,11 +66,12 @@ def peak_sensitivity(loop: LoopConfig) -> float:
         return math.nan
     low = _FAR_BELOW * min(loop.kp_per_s, 1 / loop.ti_s)
     omega = np.geomspace(low, math.pi * loop.rate_hz * 0.999, _POINTS)
-    difference = 1 + open_loop(loop, omega)
+    return_difference = 1 + open_loop(loop, omega)
     # Nyquist: L has two poles at the origin and none outside, so 1 + L must turn by half a turn
     # from far below to the sampling limit; each further encirclement of -1 is a pair of unstable
     # poles.
-    turned = float(np.unwrap(np.angle(difference))[-1] - np.angle(difference)[0])
+    angle = np.unwrap(np.angle(return_difference))
+    turned = float(angle[-1] - angle[0])
     if abs(turned - math.pi) > math.pi / 2:
         return math.inf
-    return float(np.max(1 / np.abs(difference)))
+    return float(np.max(1 / np.abs(return_difference)))

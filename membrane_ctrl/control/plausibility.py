@@ -57,10 +57,8 @@ class SagChanges(StateNode):
         """Which of laser and optics the gauge contradicts: it must be clearly nearer to the other
         one.
         """
-        to_laser_um, to_optics_um = (
-            abs(self.gauge_um - self.laser_um),
-            abs(self.gauge_um - self.optics_um),
-        )
+        to_laser_um = abs(self.gauge_um - self.laser_um)
+        to_optics_um = abs(self.gauge_um - self.optics_um)
         if to_optics_um * CLEARER < to_laser_um:
             return FaultySensor.LASER
         if to_laser_um * CLEARER < to_optics_um:
@@ -229,7 +227,9 @@ class PlausibilityCheck:
             and estimate.verdict != "rejected"
             and math.isfinite(estimate.sag_um)
         ):
-            since_s = 0.0 if math.isnan(memory.figure_s) else estimate.time_s - memory.figure_s
+            since_s = 0.0
+            if not math.isnan(memory.figure_s):
+                since_s = estimate.time_s - memory.figure_s
             memory.optics.update(estimate.sag_um, max(since_s, 0.0), SMOOTH_S)
             memory.figure_s = estimate.time_s
         means = (memory.laser.value, memory.optics.value, memory.gauge.value)
@@ -270,7 +270,10 @@ class PlausibilityCheck:
             # The verdict stands until the two clearly agree again: a drifting gauge must not accuse
             # the other.
             judged = memory.slow if memory.slow_wrong else memory.fast
-            limit_um = self._slow_limit_um if memory.slow_wrong else self._limit_um
+            if memory.slow_wrong:
+                limit_um = self._slow_limit_um
+            else:
+                limit_um = self._limit_um
             memory.changes = changes = judged.changes(means, self._sag_um)
             if abs(changes.laser_um - changes.optics_um) <= limit_um / 2 + self._lag_um:
                 self._clear_verdict()
@@ -286,7 +289,10 @@ class PlausibilityCheck:
         memory = self.memory
         memory.changes = changes = memory.fast.changes(means, self._sag_um)
         # and back only when clearly so
-        limit_um = self._limit_um if memory.faulty == FaultySensor.NONE else self._limit_um / 2
+        if memory.faulty == FaultySensor.NONE:
+            limit_um = self._limit_um
+        else:
+            limit_um = self._limit_um / 2
         agree = abs(changes.laser_um - changes.optics_um) <= limit_um + self._lag_um
         memory.faulty = FaultySensor.NONE if agree else changes.judge()
 

@@ -57,11 +57,9 @@ class _Measured:
         self.highest_fraction = fractions[-1]
 
     def flow(self, fraction: float) -> float:
-        return (
-            _interpolate_clamped(self._fractions, self._flows, fraction)
-            if fraction >= self._fractions[0]
-            else 0.0
-        )
+        if fraction >= self._fractions[0]:
+            return _interpolate_clamped(self._fractions, self._flows, fraction)
+        return 0.0
 
     def fraction(self, flow_um_per_s: float) -> float:
         return _interpolate_clamped(self._flows, self._fractions, flow_um_per_s)
@@ -69,14 +67,18 @@ class _Measured:
 
 def make_branch(pump: PumpConfig, flows_um_per_s: Sequence[float]) -> _StraightLine | _Measured:
     """One branch of the pump's curve."""
-    return _Measured(pump.curve_fraction, flows_um_per_s) if flows_um_per_s else _StraightLine(pump)
+    if flows_um_per_s:
+        return _Measured(pump.curve_fraction, flows_um_per_s)
+    return _StraightLine(pump)
 
 
 def _interpolate_clamped(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
     """Linear interpolation, clamped to the ends."""
     right = min(max(bisect_right(xs, x), 1), len(xs) - 1)
     low, high = xs[right - 1], xs[right]
-    share = min(max((x - low) / (high - low), 0.0), 1.0) if high > low else 0.0
+    share = 0.0
+    if high > low:
+        share = min(max((x - low) / (high - low), 0.0), 1.0)
     return ys[right - 1] + share * (ys[right] - ys[right - 1])
 
 
@@ -182,7 +184,10 @@ class PumpCurve:
             self.note_stop()
             return 0.0
         memory = self.memory
-        branch = self._rising if flow_um_per_s > memory.flow_um_per_s else self._falling
+        if flow_um_per_s > memory.flow_um_per_s:
+            branch = self._rising
+        else:
+            branch = self._falling
         fraction = min(
             max(branch.fraction(flow_um_per_s), self._least_fraction), branch.highest_fraction
         )

@@ -167,9 +167,9 @@ class PumpDrift:
             return
         # 2. Innovation: this segment's motion along that phase, less the predicted one
         scale = memory.known.scale + memory.rate_per_s * SEGMENT_S
-        off = (centre * along.conjugate()).real / abs(along) - scale * (
-            expected * usual.conjugate()
-        ).real / size
+        measured_along = (centre * along.conjugate()).real / abs(along)
+        expected_along = (expected * usual.conjugate()).real
+        off = measured_along - scale * expected_along / size
         if memory.count <= _LEARNED:
             memory.scatter += share * (off**2 - memory.scatter)
             return
@@ -181,17 +181,18 @@ class PumpDrift:
         gain = spread[0] * size / (memory.scatter + spread[0, 0] * size**2)
         memory.spread = spread - np.outer(gain, spread[0]) * size
         memory.rate_per_s = _KEEPS * memory.rate_per_s + float(gain[1]) * off
-        memory.known = PumpScale(
-            scale + float(gain[0]) * off, math.hypot(math.sqrt(memory.spread[0, 0]), _SIGMA_LEAST)
-        )
+        sigma = math.hypot(math.sqrt(memory.spread[0, 0]), _SIGMA_LEAST)
+        memory.known = PumpScale(scale + float(gain[0]) * off, sigma)
         memory.scatter += share * (off**2 - memory.scatter)
 
     def _follow_drift(self) -> None:
         memory = self.memory
-        known, step = memory.known, _RATE_PER_S * SEGMENT_S
+        known = memory.known
+        step_most = _RATE_PER_S * SEGMENT_S
         if abs(known.scale - memory.correction) > _SURE * known.sigma:
             goal = min(max(known.scale, RANGE[0]), RANGE[1])
-            memory.correction += min(max(goal - memory.correction, -step), step)
+            step = goal - memory.correction
+            memory.correction += min(max(step, -step_most), step_most)
 
     def _next_segment(self) -> None:
         """Alternate the sign by a shift register of 16 bits: the same in every run, and like

@@ -248,4 +248,7 @@ class ShapeLoop:
         memory.trim_um += min(max(bounded_um - memory.trim_um, -step_um), step_um)
         at_limit = bounded_um != goal_um
         limited = f"trim at its limit of {config.trim_max_um:g} µm"
-        memory.reason = make_reason(ShapeCode.TRIM_LIMIT, limited) if at_limit else NO_REASON
+        if at_limit:
+            memory.reason = make_reason(ShapeCode.TRIM_LIMIT, limited)
+        else:
+            memory.reason = NO_REASON

@@ -43,7 +43,9 @@ class ReferenceMean(StateNode):
     @property
     def wanted(self) -> int:
         """Number of shapes that make a reference."""
-        return TRACKED_SHAPES if self.taken and self.taken[-1].of_frame else SHAPES
+        if self.taken and self.taken[-1].of_frame:
+            return TRACKED_SHAPES
+        return SHAPES
 
     @property
     def count(self) -> int:

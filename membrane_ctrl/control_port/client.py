@@ -54,7 +54,9 @@ class PortClient:
         notice: Callable[[str], None],
         until_s: float | None = None,
     ) -> None:
-        self._connection, self._where, self._notice = connection, where, notice
+        self._connection = connection
+        self._where = where
+        self._notice = notice
         self._lines = lines.LineReader(connection)
         self._number = 0
         self.command_taken = ""

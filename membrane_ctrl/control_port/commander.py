@@ -26,7 +26,9 @@ class CommandSession:
 
     def describe(self) -> str:
         """Who it is, in words."""
-        process = f"process {self.pid}" if self.pid is not None else "on another machine"
+        process = "on another machine"
+        if self.pid is not None:
+            process = f"process {self.pid}"
         return f"{self.who} ({self.what}, session {self.id}, {process}, since {self.since_utc})"
 
     def to_dict(self) -> dict[str, str | int | None]:
@@ -55,7 +57,9 @@ class Commander:
         """Name of the client that has command; empty if nobody."""
         if self.session is not None:
             return self.session.who
-        return self._holder if now_s - self._last_s <= self._lapses_s else ""
+        if now_s - self._last_s <= self._lapses_s:
+            return self._holder
+        return ""
 
     def claim(self, who: str, take_over: bool, now_s: float, connection: str = "") -> str:
         """Take or keep command for a single command.
@@ -81,7 +85,8 @@ class Commander:
         if not take_over and (refusal := self._refusal(who, now_s)):
             return refusal
         self.session = None
-        self._holder, self._last_s = who, now_s
+        self._holder = who
+        self._last_s = now_s
         return ""
 
     def begin_session(self, session: CommandSession, take_over: bool, now_s: float) -> str:

@@ -62,7 +62,9 @@ def _print_answer(action: str, answer: dict[str, Any], as_json: bool) -> int:
     if as_json:
         print(json.dumps(answer))
     else:
-        state = f"; the state was {answer['state']}" if "state" in answer else ""
+        state = ""
+        if "state" in answer:
+            state = f"; the state was {answer['state']}"
         lock = f": word {answer['lock']['word']}" if "lock" in answer else ""
         print(f"{action}: done{lock}{state}", file=sys.stderr)
     if answer.get("problem"):
@@ -93,7 +95,9 @@ def _ask_service(request: dict[str, Any], address: ServiceAddress, as_json: bool
     else:
         lines = [state.reason] if state.ended is None else state.ended.lines
         print("\n".join(terminal.one_line(line) for line in lines))
-    return errors.Exit.DONE if state.in_contact else errors.Exit.DEVICE_FAILED
+    if state.in_contact:
+        return errors.Exit.DONE
+    return errors.Exit.DEVICE_FAILED
 
 
 def fleet(file: Path) -> dict[str, Where]:
@@ -102,7 +106,9 @@ def fleet(file: Path) -> dict[str, Where]:
     """
 
     def beside(name: str | None) -> Path | None:
-        return None if name is None else file.resolve().parent / Path(name).expanduser()
+        if name is None:
+            return None
+        return file.resolve().parent / Path(name).expanduser()
 
     found = {}
     for hold in load_toml(file, FleetConfig).holds:
@@ -131,7 +137,9 @@ def fleet_status(file: Path, as_json: bool) -> int:
         for name, status in answers.items():
             print(terminal.one_line(f"{name:{width}}  {fleet_line(status)}"))
     silent = any("problem" in status for status in answers.values())
-    return errors.Exit.DEVICE_FAILED if silent else errors.Exit.DONE
+    if silent:
+        return errors.Exit.DEVICE_FAILED
+    return errors.Exit.DONE
 
 
 def _status_of(where: Where) -> dict[str, Any]:
@@ -145,23 +153,29 @@ def _status_of(where: Where) -> dict[str, Any]:
         return {"problem": "; ".join(error.lines)}
     except Exception as error:  # whatever one hold causes, the others are listed
         return {"problem": f"{type(error).__name__}: {error}"}
-    return dict(answer["status"]) if answer.get("ok") else {"problem": str(answer.get("refused"))}
+    if answer.get("ok"):
+        return dict(answer["status"])
+    return {"problem": str(answer.get("refused"))}
 
 
 def _status_of_service(address: ServiceAddress) -> dict[str, Any]:
     state = ServiceClient(address, _FLEET_S / 2).read_state()
-    return state.status if state.in_contact else {"problem": state.reason}
+    if state.in_contact:
+        return state.status
+    return {"problem": state.reason}
 
 
 def fleet_line(status: dict[str, Any]) -> str:
     """A hold's status in one line: state, error, and what is wrong or why it is as it is."""
     if "problem" in status:
         return f"{'no contact':10}{'':14}{status['problem']}"
-    words = alarm_lines(status) or [str(status.get("why") or "as it should be")]
-    error = COLUMNS["error_um"]
-    error_um = (status.get("row") or {}).get(error.name)
-    shown = f"{error.format_value(error_um):>10} {error.unit}"
-    return f"{status['state']:10}{shown} {'; '.join(words)}"
+    reasons = alarm_lines(status)
+    if not reasons:
+        reasons = [str(status.get("why") or "as it should be")]
+    row = status.get("row") or {}
+    column = COLUMNS["error_um"]
+    error = column.format_value(row.get(column.name))
+    return f"{status['state']:10}{error:>10} {column.unit} {'; '.join(reasons)}"
 
 
 def status_lines(status: dict[str, Any]) -> list[str]:
@@ -296,4 +310,6 @@ def socket_path(where: Where) -> Path:
     if where.run is None:
         return where.logs / SOCKET_NAME
     configured = read_toml(where.run / "config.toml").get("port", {}).get("socket")
-    return Path(configured) if configured else where.run.resolve().parent / SOCKET_NAME
+    if configured:
+        return Path(configured)
+    return where.run.resolve().parent / SOCKET_NAME

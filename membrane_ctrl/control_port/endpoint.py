@@ -117,8 +117,10 @@ class Refusals:
     """Records refusals at the rate of a token bucket; `count` counts all."""
 
     def __init__(self, tell: Callable[[events.Event], None], now: Callable[[], float]) -> None:
-        self._tell, self._now = tell, now
-        self._left, self._since_s = _REFUSAL_BURST, now()
+        self._tell = tell
+        self._now = now
+        self._left = _REFUSAL_BURST
+        self._since_s = now()
         self._unsaid = 0
         self.count = 0
 

@@ -104,12 +104,17 @@ class Request(Section):
     @field_validator("do", mode="before")
     @classmethod
     def _one_name(cls, do: object) -> object:
-        return SAME_AS.get(do, do) if isinstance(do, str) else do
+        if not isinstance(do, str):
+            return do
+        return SAME_AS.get(do, do)
 
     @model_validator(mode="after")
     def _complete(self) -> Request:
         rule = TABLE.get(self.do)  # type: ignore[arg-type]
-        needs, takes = (rule.needs, rule.takes) if rule else (_ERRAND_NEEDS.get(self.do, ()), ())
+        if rule:
+            needs, takes = rule.needs, rule.takes
+        else:
+            needs, takes = (_ERRAND_NEEDS.get(self.do, ()), ())
         for name in (
             "value",
             "text",
@@ -149,13 +154,17 @@ def _number_in(line: bytes) -> int:
         number = json.loads(line)["number"]
     except (ValueError, TypeError, LookupError, RecursionError):
         return 0
-    return number if type(number) is int and 0 <= number < 2**53 else 0
+    if type(number) is int and 0 <= number < 2**53:
+        return number
+    return 0
 
 
 def _short(reason: str, most: int = 300) -> str:
     """One printable line, which may quote the client."""
     clean = "".join(c if c.isprintable() else "?" for c in reason)
-    return clean if len(clean) <= most else clean[: most - 3] + "..."
+    if len(clean) <= most:
+        return clean
+    return clean[: most - 3] + "..."
 
 
 _LINE_S = 5.0  # to complete a line
@@ -172,7 +181,8 @@ class Wire:
     """Reads and writes lines."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._reader, self._writer = reader, writer
+        self._reader = reader
+        self._writer = writer
         self._part = b""  # of a line that is not complete yet
 
     @classmethod
@@ -271,7 +281,9 @@ class Peer:
         """What identifies the sender of a lock for people: its process;
         empty if that is unknown.
         """
-        return "" if self.pid is None else f"process {self.pid}"
+        if self.pid is None:
+            return ""
+        return f"process {self.pid}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,8 +60,11 @@ class Port:
     def __init__(
         self, config: port.PortConfig, listeners: sockets.Listeners, run: str, hooks: RunHooks
     ) -> None:
-        self._listeners, self._run, self._hooks = listeners, run, hooks
-        self._tell, self._now = hooks.tell, hooks.now
+        self._listeners = listeners
+        self._run = run
+        self._hooks = hooks
+        self._tell = hooks.tell
+        self._now = hooks.now
         self._commander = Commander(config.commander_lapses_s)
         self._refusals = Refusals(hooks.tell, hooks.now)
         self._status = RunStatus()
@@ -171,13 +174,12 @@ class Port:
 
     def _make_room(self, peer: Peer) -> None:
         own = [session for session in self._sessions if session.peer.who == peer.who]
-        crowd = (
-            own
-            if len(own) >= _SESSIONS_EACH
-            else self._sessions
-            if len(self._sessions) >= _SESSIONS_MOST
-            else []
-        )
+        if len(own) >= _SESSIONS_EACH:
+            crowd = own
+        elif len(self._sessions) >= _SESSIONS_MOST:
+            crowd = self._sessions
+        else:
+            crowd = []
         # a session that has command is silent while its experiment runs; there is one at most
         in_command = self._commander.session
         idle = [each for each in crowd if in_command is None or each.id != in_command.id]
@@ -252,7 +254,8 @@ class Port:
         if request.do in FREE:
             return ""
         who, now_s = session.peer.who, self._now()
-        former, former_session = self._commander.holder(now_s), self._commander.session
+        former = self._commander.holder(now_s)
+        former_session = self._commander.session
         take_over = request.take_over
         if request.do == "claim":
             since_utc = datetime.now(UTC).isoformat(timespec="seconds")
@@ -264,7 +267,10 @@ class Port:
         if refusal or (former == who and former_session is present):
             return refusal
         name = who if present is None else present.describe()
-        former_name = former if former_session is None else former_session.describe()
+        if former_session is None:
+            former_name = former
+        else:
+            former_name = former_session.describe()
         self._tell(port_events.CommanderChanged(name, former_name or None, request.why))
         reason = f": {request.why}" if request.why else ""
         for other in self._sessions:
@@ -305,16 +311,12 @@ class Port:
         """
         kind = next(kind for kind in commands.TABLE if kind == request.do)
         loop = None if request.loop is None else self._new_loop(request.loop)
-        experiment = (
-            None
-            if request.experiment is None
-            else toml_file.parse_tables(request.experiment, ExperimentSpec, "tune")
-        )
-        pump = (
-            None
-            if request.pump is None
-            else toml_file.parse_tables(request.pump, schema.PumpConfig, "gains: pump")
-        )
+        experiment = None
+        if request.experiment is not None:
+            experiment = toml_file.parse_tables(request.experiment, ExperimentSpec, "tune")
+        pump = None
+        if request.pump is not None:
+            pump = toml_file.parse_tables(request.pump, schema.PumpConfig, "gains: pump")
         value, shape_s, step_um = (
             math.nan if number is None else number
             for number in (request.value, request.shape_time_constant_s, request.setpoint_step_um)

@@ -121,10 +121,12 @@ class ServiceClient:
     """
 
     def __init__(self, address: ServiceAddress, answer_s: float = ANSWER_S) -> None:
-        self._address, self._answer_s = address, answer_s
+        self._address = address
+        self._answer_s = answer_s
         parts = urlsplit(address.url)
         try:
-            self._host, self._port = parts.hostname or "", parts.port
+            self._host = parts.hostname or ""
+            self._port = parts.port
         except ValueError:
             self._host = ""
         if parts.scheme not in ("http", "https") or not self._host:
@@ -226,7 +228,9 @@ class ServiceClient:
         except ConnectionRefusedError:
             raise errors.DeviceError(f"{self._where}: no service is listening") from None
         except (TimeoutError, http.client.HTTPException, OSError, ValueError) as error:
-            reason = errors.os_reason(error) if isinstance(error, OSError) else "no HTTP answer"
+            reason = "no HTTP answer"
+            if isinstance(error, OSError):
+                reason = errors.os_reason(error)
             if is_over.is_set():
                 reason = f"no answer within {self._answer_s:g} s"
             raise errors.DeviceError(f"{self._where}: {reason or 'no answer'}") from None

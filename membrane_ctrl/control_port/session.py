@@ -88,11 +88,10 @@ class PortSession:
         """Stream the status from now on; None ends it."""
         if self._watch is not None:
             self._watch.cancel()
-        self._watch = (
-            None
-            if period_s is None
-            else asyncio.create_task(self._stream(period_s), name="port watch")
-        )
+        if period_s is None:
+            self._watch = None
+        else:
+            self._watch = asyncio.create_task(self._stream(period_s), name="port watch")
 
     async def _stream(self, period_s: float) -> None:
         with contextlib.suppress(SlowReaderError):

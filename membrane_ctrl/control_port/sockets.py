@@ -33,7 +33,8 @@ class UnixListener:
     """
 
     def __init__(self, path: Path, group: str | None, group_role: Role) -> None:
-        self._path, self._group_role = path, group_role
+        self._path = path
+        self._group_role = group_role
         # looked up now: a name service may be too slow for a tick
         self._names = {entry.pw_uid: entry.pw_name for entry in pwd.getpwall()}
         try:

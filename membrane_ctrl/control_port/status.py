@@ -80,7 +80,9 @@ def lock_lines(status: Mapping[str, Any]) -> list[str]:
 def fault_line(status: Mapping[str, Any]) -> str:
     """Return the fault of a status with its cause and remedy; empty without one."""
     fault = status.get("fault")
-    return "{code} {name}: {cause}; {remedy}".format_map(fault) if fault else ""
+    if not fault:
+        return ""
+    return "{code} {name}: {cause}; {remedy}".format_map(fault)
 
 
 def notice_lines(status: Mapping[str, Any], topic: str | None = None) -> list[str]:

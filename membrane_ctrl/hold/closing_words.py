@@ -86,7 +86,9 @@ def make_closing_lines(closing: RunEnd) -> list[str]:
     nothing for a run that ended well.
     """
     if closing.exit is errors.Exit.REJECTED:
-        state = "starting" if closing.state is None else closing.state.name.lower()
+        state = "starting"
+        if closing.state is not None:
+            state = closing.state.name.lower()
         return [
             f"NEVER HELD: the duration was over in the state {state}",
             "  to do:    give a longer --duration; what it waited for is in events.jsonl",

@@ -46,7 +46,9 @@ class StallMeter:
     @property
     def stalled_s(self) -> float:
         """Total until now; 0 without a loop."""
-        overdue_s = 0.0 if self._due_s is None else max(0.0, self._now() - self._due_s)
+        overdue_s = 0.0
+        if self._due_s is not None:
+            overdue_s = max(0.0, self._now() - self._due_s)
         return self._stalled_s + overdue_s
 
     def _beat(self) -> None:
@@ -74,7 +76,9 @@ class WaitMeter:
     def take_wait_ms(self) -> float:
         """The time since the last call, in whole microseconds; 0 if it delays no tick."""
         waited_s, self._waited_s = self._waited_s, 0.0
-        return 0.0 if waited_s < _WAIT_MIN_S else round(1e3 * waited_s, 3)
+        if waited_s < _WAIT_MIN_S:
+            return 0.0
+        return round(1e3 * waited_s, 3)
 
 
 class FailureCounter:

@@ -71,7 +71,9 @@ class FaultLatch:
     @property
     def resumes_s(self) -> tuple[float, ...]:
         """Ages of the last day's resumes, oldest first."""
-        return () if self._resumes is None else self._resumes.ages_s(datetime.now(UTC))
+        if self._resumes is None:
+            return ()
+        return self._resumes.ages_s(datetime.now(UTC))
 
     def __enter__(self) -> FaultLatch:
         if self._file is not None:
@@ -182,11 +184,13 @@ class SystemdNotify:
         ready = "READY=1\n" if math.isinf(self._next_s) else ""
         self._next_s = row.mono_s + _NOTIFY_S
         self._state = row.state
-        error = (
-            f", {row.format_labelled('error_um', sign=True)}" if math.isfinite(row.error_um) else ""
-        )
+        error = ""
+        if math.isfinite(row.error_um):
+            error = f", {row.format_labelled('error_um', sign=True)}"
         fault = f", fault {row.fault:g}" if row.fault else ""
-        locked = f", {len(self._status.locks)} locks" if self._status.locks else ""
+        locked = ""
+        if self._status.locks:
+            locked = f", {len(self._status.locks)} locks"
         problems = self._status.recording_problems
         trouble = f", recording: {'; '.join(problems)}" if problems else ""
         self._send_message(

@@ -79,7 +79,9 @@ class LockKeeper:
     @property
     def at_start(self) -> tuple[Lock, ...]:
         """Locks that are set when the run starts."""
-        return () if self._storage is None else tuple(each.lock for each in self._storage.locks)
+        if self._storage is None:
+            return ()
+        return tuple(each.lock for each in self._storage.locks)
 
     def __enter__(self) -> LockKeeper:
         return self
@@ -151,11 +153,10 @@ class LockKeeper:
         try:
             act()
         except Exception as error:  # nothing else would see an exception of this thread
-            reason = (
-                f"{error.filename}: {os_reason(error)}"
-                if isinstance(error, OSError)
-                else str(error)
-            )
+            if isinstance(error, OSError):
+                reason = f"{error.filename}: {os_reason(error)}"
+            else:
+                reason = str(error)
             if word not in self._failed:
                 self._pending.append(run_events.LockNotStored(word, reason))
             self._failed[word] = act

@@ -115,7 +115,10 @@ def start_page_service(
         warn(f"no page: {describe_missing('it', missing, 'web')}")
         return None
     port = _find_free_port()
-    folder = Path() if configuration is None else configuration.resolve().parent
+    if configuration is None:
+        folder = Path()
+    else:
+        folder = configuration.resolve().parent
     words = ["serve", "--logs", str(logs), "--port", str(port), "--configurations", str(folder)]
     words += ["--with-hold"] if ends_with_us else _IDLE_WORDS
     try:

@@ -48,13 +48,13 @@ class ScenarioRun:
             config.devices.watchdog_s if config.devices else 0.5,
             interlocks=virtual_interlocks.VirtualInterlocks(config.interlocks),
         )
-        shape = TruthShape(self.bench, config, config.twin.seed) if scenario.shapes else None
+        shape = None
+        if scenario.shapes:
+            shape = TruthShape(self.bench, config, config.twin.seed)
         self.virtual = VirtualRun(config, self.bench, zernike_projection(), shape, rings=rings)
         self._ends_s = scenario.duration_s
-        begin, end = (
-            (0.0, Command("hold", "scenario")),
-            (scenario.duration_s, Command("stop", "duration")),
-        )
+        begin = (0.0, Command("hold", "scenario"))
+        end = (scenario.duration_s, Command("stop", "duration"))
         agenda: list[tuple[float, ScheduledAction]] = [
             begin,
             *_list_actions(steps, scenario.duration_s),
@@ -94,16 +94,16 @@ def _list_actions(
             command = Command(at.command, "scenario", value=at.value, text=at.text)  # type: ignore[arg-type]  # checked
             yield at.time_s, command
         elif at.wrong is not None:
-            times = 1 if at.every_s is None else max(1, math.ceil((end_s - at.time_s) / at.every_s))
+            times = 1
+            if at.every_s is not None:
+                times = max(1, math.ceil((end_s - at.time_s) / at.every_s))
             if at.interlock is not None:
                 wrong, right = (
                     _switch_interlock(at.wrong, at.interlock, on) for on in (at.value != 0, False)
                 )
             else:
-                wrong, right = (
-                    _set_switch(at.wrong, at.value),
-                    _set_switch(at.wrong, SWITCHES[at.wrong]),
-                )
+                wrong = _set_switch(at.wrong, at.value)
+                right = _set_switch(at.wrong, SWITCHES[at.wrong])
             for begin_s in (at.time_s + k * (at.every_s or 0.0) for k in range(times)):
                 yield begin_s, wrong
                 if at.for_s is not None:

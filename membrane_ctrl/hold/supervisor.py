@@ -151,7 +151,10 @@ class Supervisor:
         if now_s >= self._next_watch_s:
             self._next_watch_s = now_s + _CHILD_WATCH_S
             self._run_guarded("children", self._report_children)
-        truth_um, bias_um = wiring.truth() if wiring.truth else (math.nan, math.nan)
+        if wiring.truth:
+            truth_um, bias_um = wiring.truth()
+        else:
+            truth_um, bias_um = math.nan, math.nan
         commands, self._pending = tuple(self._pending), []
         inputs = TickInputs(
             now_s=now_s,
@@ -309,7 +312,9 @@ def newest_of(reader: RingReader) -> Callable[[], shape_estimate.ShapeEstimate |
 
     def newest() -> shape_estimate.ShapeEstimate | None:
         messages = reader.drain()
-        return shape_estimate.unpack_estimate(messages[-1]) if messages else None
+        if not messages:
+            return None
+        return shape_estimate.unpack_estimate(messages[-1])
 
     return newest
 

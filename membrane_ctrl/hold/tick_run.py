@@ -109,7 +109,8 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
                     finished = await supervisor.run(options.duration_s)
                     closing.exit = exit_code = closing.judge_exit(finished, options.standby)
         except asyncio.CancelledError:  # a signal before the first tick
-            exit_code = errors.Exit.INTERRUPTED if closing.exit is None else exit_code
+            if closing.exit is None:
+                exit_code = errors.Exit.INTERRUPTED
             raise
         except LinkError as error:
             supervisor.record_event(run_events.Link(str(error), up=False))
@@ -136,11 +137,9 @@ def _make_wiring(parts: HoldResources, stack: contextlib.ExitStack) -> Wiring:
         stack.enter_context(contextlib.closing(ring.RingWriter(address)))
         for address in (rings.telemetry, rings.events, rings.inputs, rings.snapshots)
     )
-    shapes = (
-        stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes)))
-        if rings.shapes
-        else None
-    )
+    shapes = None
+    if rings.shapes:
+        shapes = stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes)))
     truth = parts.twin.truth_reader() if parts.twin else None
     newest_shape = newest_of(shapes) if shapes else None
     reports = parts.children.read_reports

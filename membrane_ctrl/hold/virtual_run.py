@@ -92,7 +92,10 @@ class VirtualRun:
         self._shape = shape
         self._alter = alter
         track = config.shape.mode == "track"
-        self._shape_period_s = 1 / config.shape.track_rate_hz if track else config.shape.period_s
+        if track:
+            self._shape_period_s = 1 / config.shape.track_rate_hz
+        else:
+            self._shape_period_s = config.shape.period_s
         self._shape_due_s = 0.0
         self._period_s = 1.0 / config.loop.rate_hz
         self._steps = 0
@@ -143,7 +146,9 @@ class VirtualRun:
     @property
     def exit_code(self) -> errors.Exit:
         """The exit code; `INTERRUPTED` while the run has not ended."""
-        return errors.Exit.INTERRUPTED if self.finished is None else self.finished
+        if self.finished is None:
+            return errors.Exit.INTERRUPTED
+        return self.finished
 
     def end_run(self) -> None:
         """Record the end of the run."""
@@ -172,7 +177,9 @@ class VirtualRun:
         return self._bench.truth.displacement_um, self._bench.truth.laser_bias_um
 
     def _alter_reading(self, reading: roles.BenchReading) -> roles.BenchReading:
-        altered = reading if self._alter is None else self._alter(self.now_s, reading)
+        if self._alter is None:
+            return reading
+        altered = self._alter(self.now_s, reading)
         if altered is None:
             raise roles.LinkError("no reading")
         return altered
@@ -202,7 +209,9 @@ class _AtOnce:
         self._bench.clear_faults(mask)
 
     def dead_guards(self) -> tuple[str, ...]:
-        return ("virtual task",) if self._bench.wrong.dead_task else ()
+        if not self._bench.wrong.dead_task:
+            return ()
+        return ("virtual task",)
 
     def link_state(self) -> roles.LinkState:
         return roles.NO_LINK_STATE

@@ -67,4 +67,6 @@ def host_addresses(host: str) -> set[str]:
 def _plain_address(address: str) -> str:
     parsed = ipaddress.ip_address(address.partition("%")[0])
     parsed = getattr(parsed, "ipv4_mapped", None) or parsed
-    return "localhost" if parsed.is_loopback or parsed.is_unspecified else str(parsed)
+    if parsed.is_loopback or parsed.is_unspecified:
+        return "localhost"
+    return str(parsed)

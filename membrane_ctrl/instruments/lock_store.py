@@ -220,7 +220,9 @@ def draw_word(taken: Collection[str]) -> str:
 def _find_own_folder() -> Path | None:
     """Return the user's own folder of locks; None without a home."""
     folder = find_state_folder()
-    return None if folder is None else folder / "locks"
+    if folder is None:
+        return None
+    return folder / "locks"
 
 
 def _is_lock_name(name: str) -> bool:

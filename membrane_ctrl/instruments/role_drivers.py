@@ -58,11 +58,9 @@ def _make_driver(role: str, section: settings.AnyDriver, links: modbus_rtu.Modbu
 def _make_bronkhorst(
     role: str, port: bronkhorst.ParameterPort, serial: str
 ) -> bronkhorst.BronkhorstFlow | bronkhorst.BronkhorstPressure:
-    return (
-        bronkhorst.BronkhorstFlow(port, serial)
-        if role == "pump"
-        else bronkhorst.BronkhorstPressure(port, serial)
-    )
+    if role == "pump":
+        return bronkhorst.BronkhorstFlow(port, serial)
+    return bronkhorst.BronkhorstPressure(port, serial)
 
 
 def _make_modbus_value(

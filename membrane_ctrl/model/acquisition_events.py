@@ -58,7 +58,9 @@ class GeometryKnown(
     @property
     def level(self) -> LogLevel:
         """A geometry that the frames contradict is a warning."""
-        return LogLevel.INFO if self.why is None else LogLevel.WARNING
+        if self.why is None:
+            return LogLevel.INFO
+        return LogLevel.WARNING
 
 
 class Capture(

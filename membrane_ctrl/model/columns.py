@@ -184,7 +184,9 @@ class TelemetryColumn:
     @property
     def title(self) -> str:
         """Label and unit: `error, µm`."""
-        return f"{self.label}, {self.unit}" if self.unit else self.label
+        if not self.unit:
+            return self.label
+        return f"{self.label}, {self.unit}"
 
     @property
     def legend(self) -> str:
@@ -195,7 +197,9 @@ class TelemetryColumn:
     def short_label(self) -> str:
         """Label without what its unit gives: `gauge` for `gauge pressure` in Pa."""
         quantity = QUANTITY_OF_UNIT.get(self.unit)
-        return self.label if quantity is None else self.label.removesuffix(f" {quantity}")
+        if quantity is None:
+            return self.label
+        return self.label.removesuffix(f" {quantity}")
 
     @property
     def twin_only(self) -> bool:
@@ -252,7 +256,9 @@ def declare_column(
 def _usual_aggregation(kind: Kind, published: bool) -> Aggregation:
     if kind is Kind.CODE:
         return Aggregation.LAST
-    return Aggregation.EXTREMES if published else Aggregation.NONE
+    if published:
+        return Aggregation.EXTREMES
+    return Aggregation.NONE
 
 
 _EXTREMES = Aggregation.EXTREMES

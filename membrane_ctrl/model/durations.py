@@ -15,7 +15,9 @@ def pause_s(failures: int, first_s: float = 1.0, longest_s: float = 60.0) -> flo
     """Wait after a number of consecutive failures: `first_s`, doubled with each; 0 without a
     failure.
     """
-    return 0.0 if failures < 1 else min(longest_s, first_s * 2.0 ** min(failures - 1, 32))
+    if failures < 1:
+        return 0.0
+    return min(longest_s, first_s * 2.0 ** min(failures - 1, 32))
 
 
 def parse_duration_s(text: str) -> float:

@@ -126,7 +126,9 @@ class Event:
             filled = prose.fill_template(template, shown)
         except (ValueError, TypeError):  # a number that is none
             filled = None
-        return list_fields(line) if filled is None else filled
+        if filled is not None:
+            return filled
+        return list_fields(line)
 
     @property
     def stands(self) -> bool:

@@ -27,7 +27,9 @@ def parse_event(message: bytes) -> EventLine:
         event = json.loads(message)
     except (ValueError, RecursionError):
         event = None
-    return event if isinstance(event, dict) else UnreadableEvent(repr(message[:200])).to_dict()
+    if isinstance(event, dict):
+        return event
+    return UnreadableEvent(repr(message[:200])).to_dict()
 
 
 def from_dict(logged: EventLine) -> Event:
@@ -35,7 +37,9 @@ def from_dict(logged: EventLine) -> Event:
 
     Keys that a line lacks are empty; anything unintelligible is an `UnknownEvent`.
     """
-    cls = KINDS.get(logged["kind"]) if isinstance(logged.get("kind"), str) else None
+    cls = None
+    if isinstance(logged.get("kind"), str):
+        cls = KINDS.get(logged["kind"])
     if cls is None:
         return UnknownEvent(logged)
     try:
@@ -48,7 +52,9 @@ def from_dict(logged: EventLine) -> Event:
 def _read_value(logged: EventLine, key: str, hint: Any) -> object:
     """The value of a key, of its declared type. Raises ValueError if it is of another type."""
     if isinstance(hint, type) and issubclass(hint, StrEnum):
-        return hint(logged[key]) if key in logged else next(iter(hint))
+        if key in logged:
+            return hint(logged[key])
+        return next(iter(hint))
     if get_origin(hint) is tuple:
         texts = logged.get(key, ())
         if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):

@@ -139,7 +139,9 @@ class CommandTaken(
     @property
     def level(self) -> LogLevel:
         """A refused command is a warning."""
-        return LogLevel.WARNING if self.refused else LogLevel.INFO
+        if self.refused:
+            return LogLevel.WARNING
+        return LogLevel.INFO
 
     @property
     def unit(self) -> str:
@@ -149,7 +151,9 @@ class CommandTaken(
     @property
     def plot_mark(self) -> str:
         """A line of the command, unless it was refused."""
-        return "" if self.refused else _COMMAND_MARKS.get(self.command, "command")
+        if self.refused:
+            return ""
+        return _COMMAND_MARKS.get(self.command, "command")
 
 
 class LockSet(
@@ -250,10 +254,14 @@ class Plausibility(
     @property
     def level(self) -> LogLevel:
         """An agreement is no warning."""
-        return LogLevel.WARNING if self.stands else LogLevel.INFO
+        if self.stands:
+            return LogLevel.WARNING
+        return LogLevel.INFO
 
     def _choose_template(self) -> str:
-        return self._template if self.stands else "Laser and camera agree again[ ({readings})]"
+        if self.stands:
+            return self._template
+        return "Laser and camera agree again[ ({readings})]"
 
 
 class SensorsUsed(

@@ -47,7 +47,9 @@ def count_elements(text: str) -> int:
 
 
 def _parse_number(text: str) -> int | float:
-    return int(text) if len(text) <= _DIGITS_MAX else float(text)
+    if len(text) <= _DIGITS_MAX:
+        return int(text)
+    return float(text)
 
 
 def _replace_non_finite(value: Any) -> Any:

@@ -53,7 +53,9 @@ class CommanderChanged(
     why: str
 
     def _choose_template(self) -> str:
-        return self._template if self.who else "Control released[ by {former}][: {why}]"
+        if self.who:
+            return self._template
+        return "Control released[ by {former}][: {why}]"
 
 
 class Refused(

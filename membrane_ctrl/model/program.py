@@ -82,7 +82,9 @@ def stated_program(table: Mapping[str, Any]) -> str:
     program, commit = table.get("program"), table.get("commit")
     if not isinstance(program, str) or not program:
         return ""
-    return f"{program} ({commit})" if isinstance(commit, str) and commit else program
+    if isinstance(commit, str) and commit:
+        return f"{program} ({commit})"
+    return program
 
 
 def find_commit(checkout: Path) -> str:
@@ -112,13 +114,18 @@ def _describe_with_git(checkout: Path) -> str:
         )
     except (OSError, subprocess.SubprocessError):
         return ""
-    return _find_match(done.stdout.decode(errors="replace").strip()) if done.returncode == 0 else ""
+    if done.returncode != 0:
+        return ""
+    return _find_match(done.stdout.decode(errors="replace").strip())
 
 
 def _read_head(git: Path) -> str:
     head = _read_line(git / "HEAD")
     name = head.removeprefix("ref: ")
-    found = _read_line(git / name) if name != head and ".." not in Path(name).parts else head
+    if name != head and ".." not in Path(name).parts:
+        found = _read_line(git / name)
+    else:
+        found = head
     return _find_match(found)[:_COMMIT_DIGITS]
 
 

@@ -66,7 +66,9 @@ class _LinkReport:
     @property
     def level(self) -> LogLevel:
         """A failure is a warning."""
-        return LogLevel.INFO if self.up else LogLevel.WARNING
+        if self.up:
+            return LogLevel.INFO
+        return LogLevel.WARNING
 
 
 class Link(

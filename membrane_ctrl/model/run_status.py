@@ -53,7 +53,9 @@ class RunStatus:
     @property
     def trial_left_s(self) -> float:
         """How long gains on trial may still be kept; NaN if none are."""
-        return self.trial_ends_s - self.row.mono_s if self.row else math.nan
+        if not self.row:
+            return math.nan
+        return self.trial_ends_s - self.row.mono_s
 
     @property
     def other_notices(self) -> tuple[Notice, ...]:
@@ -80,7 +82,10 @@ class RunStatus:
         """The status after an event; most change nothing."""
         changes = event.notice_changes(self.notices)
         notices = apply_changes(self.notices, changes)
-        status = self if notices is self.notices else replace(self, notices=notices)
+        if notices is self.notices:
+            status = self
+        else:
+            status = replace(self, notices=notices)
         return status._after_details(event, mono_s)
 
     def _after_details(self, event: events.Event, mono_s: float) -> "RunStatus":
@@ -154,11 +159,9 @@ class RunStatus:
 def gains_words(loop: Mapping[str, Any], trial_left_s: float | None) -> str:
     """Gains for a person, with the countdown of a trial."""
     on_trial = trial_left_s is not None and math.isfinite(trial_left_s)
-    trial = (
-        f"; on trial, reverted in {max(trial_left_s or 0.0, 0.0):.0f} s unless kept"
-        if on_trial
-        else ""
-    )
+    trial = ""
+    if on_trial:
+        trial = f"; on trial, reverted in {max(trial_left_s or 0.0, 0.0):.0f} s unless kept"
     return f"Kp {loop['kp_per_s']:g} 1/s, Ti {loop['ti_s']:g} s, Td {loop['td_s']:g} s{trial}"
 
 

@@ -223,14 +223,16 @@ def _list_leaves(value: Any, place: str) -> Iterator[tuple[str, str]]:
     if isinstance(value, np.ndarray) and value.size > _SHOWN_NUMBERS:
         shape = " x ".join(str(length) for length in value.shape)
         finite = value[np.isfinite(value)]
-        span = f"{finite.min():g} to {finite.max():g}" if finite.size else "none finite"
+        span = "none finite"
+        if finite.size:
+            span = f"{finite.min():g} to {finite.max():g}"
         yield place, f"{shape} numbers, {span}"
     elif isinstance(value, Mapping) and value:
         for name, part in value.items():
-            yield from _list_leaves(part, f"{place}.{getattr(name, 'name', name)}".lstrip("."))
+            yield from _list_leaves(part, _join_place(place, name))
     elif isinstance(value, list | tuple | deque) and value and isinstance(value[0], Mapping):
         for index, part in enumerate(value):
-            yield from _list_leaves(part, f"{place}.{index}")
+            yield from _list_leaves(part, _join_place(place, index))
     else:
         yield place, str(_with_lists(value))
 
@@ -254,19 +256,25 @@ def find_differences(one: StateNode, other: StateNode, within: float = 0.0) -> l
     return list(_find_differences(adapter.dump_python(one), adapter.dump_python(other), "", within))
 
 
+def _join_place(place: str, key: Any) -> str:
+    """Return the place of a member: that of the whole, then its key or the name of an enum."""
+    name = getattr(key, "name", key)
+    return f"{place}.{name}".lstrip(".")
+
+
 def _find_differences(one: Any, other: Any, place: str, within: float) -> Iterator[str]:
     """Yield the places that differ: go down into dicts and lists of the same length in step."""
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         one, other = one.tolist(), other.tolist()
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in dict.fromkeys([*one, *other]):
-            inner = f"{place}.{getattr(key, 'name', key)}".lstrip(".")
-            yield from _find_differences(
-                one.get(key, "absent"), other.get(key, "absent"), inner, within
-            )
+            part = one.get(key, "absent")
+            part_of_other = other.get(key, "absent")
+            inner = _join_place(place, key)
+            yield from _find_differences(part, part_of_other, inner, within)
     elif _is_list(one) and _is_list(other) and len(one) == len(other):
         for index, (part, part_of_other) in enumerate(zip(one, other, strict=True)):
-            yield from _find_differences(part, part_of_other, f"{place}.{index}", within)
+            yield from _find_differences(part, part_of_other, _join_place(place, index), within)
     elif not _is_same(one, other, within):
         yield f"{place}: {_with_lists(one)!r}, {_with_lists(other)!r}"
 

@@ -115,7 +115,10 @@ def _run_target(target: str, args: tuple[Any, ...], nice: int) -> None:
         with terminal.only_text():
             getattr(importlib.import_module(module), function)(*args)
     except SystemExit as leaving:
-        code = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+        if isinstance(leaving.code, int):
+            code = leaving.code
+        else:
+            code = int(leaving.code is not None)
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

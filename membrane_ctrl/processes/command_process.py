@@ -28,7 +28,10 @@ class CommandProcess:
     def start(self) -> None:
         """Start the program without waiting."""
         program = [sys.executable, "-m", "membrane_ctrl", *self._arguments]
-        stdin = subprocess.PIPE if "--with-hold" in self._arguments else subprocess.DEVNULL
+        if "--with-hold" in self._arguments:
+            stdin = subprocess.PIPE
+        else:
+            stdin = subprocess.DEVNULL
         with contextlib.suppress(OSError), _open_log(self._log) as log:
             self._process = subprocess.Popen(
                 program, stdin=stdin, stdout=log, stderr=log, process_group=0
@@ -50,7 +53,9 @@ class CommandProcess:
     @property
     def exit_code(self) -> int | None:
         """Exit code, negative for a signal, None while it runs."""
-        return None if self._process is None else self._process.returncode
+        if self._process is None:
+            return None
+        return self._process.returncode
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the program to end; True if it did."""

@@ -33,4 +33,6 @@ def make_event_sender(status: Connection | None) -> Callable[[events.Event], Non
 
 def _shorten_value(value: Any) -> Any:
     """Shorten a message so that a pipe takes it whole or not at all."""
-    return value[:1000] if isinstance(value, str) else value
+    if not isinstance(value, str):
+        return value
+    return value[:1000]

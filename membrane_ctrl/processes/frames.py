@@ -140,7 +140,9 @@ class FrameReader:
         if slots.after(head.index) != head.index + 1:
             return None
         pixels = slots.pixels(head.index)[::step, ::step].copy()
-        return pixels if slots.before(head.index) == head.index + 1 else None
+        if slots.before(head.index) == head.index + 1:
+            return pixels
+        return None
 
     def close(self) -> None:
         """Detach."""

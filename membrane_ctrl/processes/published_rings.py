@@ -73,7 +73,9 @@ def _read_addresses(path: Path) -> dict[str, RingAddress]:
 
 
 def _parse_address(ring: str, values: dict[str, Any]) -> RingAddress:
-    name, slots, slot_bytes = values["name"], values["slots"], values["slot_bytes"]
+    name = values["name"]
+    slots = values["slots"]
+    slot_bytes = values["slot_bytes"]
     if (
         ring not in _RINGS
         or not _NAME.fullmatch(name)

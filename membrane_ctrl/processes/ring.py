@@ -210,11 +210,9 @@ class RingReader:
         length = min(seal & 0xFFFFFFFF, self._slot_bytes)
         message = bytes(slots.bytes[8 * first + 16 : 8 * first + 16 + length])
         before = slots.words[first]
-        return (
-            message
-            if before == after == index + 1 and seal == _compute_seal(message, index + 1)
-            else None
-        )
+        if before == after == index + 1 and seal == _compute_seal(message, index + 1):
+            return message
+        return None
 
     def close(self) -> None:
         """Detach."""

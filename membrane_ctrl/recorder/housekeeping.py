@@ -62,7 +62,8 @@ class Housekeeping:
             self._errors.run_guarded("retention", self._delete_old)
 
     def _watch_disk(self) -> None:
-        left_mb, least_mb = run_folder.free_mb(self._run_dir), self._config.min_free_mb
+        left_mb = run_folder.free_mb(self._run_dir)
+        least_mb = self._config.min_free_mb
         self.detail = detail_level.decide_detail_level(left_mb, least_mb, self.detail)
         if left_mb < least_mb:
             limit = f"less than recording.min_free_mb = {least_mb:g} MB free"

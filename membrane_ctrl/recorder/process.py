@@ -99,10 +99,14 @@ def _record_run(
     rings = {
         name: RingReader(address) for name, address in addresses.items() if address is not None
     }
-    first = sum(1 for _ in spec.run_dir.glob(f"{spec.run_name}-*.rrd")) if spec.resumes else 0
+    first = 0
+    if spec.resumes:
+        first = sum(1 for _ in spec.run_dir.glob(f"{spec.run_name}-*.rrd"))
     recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config, first)
     wanted = spec.frames is not None and spec.config.recording.thumbnails
-    thumbnails = Thumbnails(spec.frames) if wanted and spec.frames is not None else None
+    thumbnails = None
+    if wanted and spec.frames is not None:
+        thumbnails = Thumbnails(spec.frames)
     recorder = Recorder(
         spec.run_dir, spec.clock, spec.config, rings, recording, thumbnails, report, spec.resumes
     )

@@ -40,7 +40,9 @@ CHANGES = {
 def colour_span(values: AnyArray, least_um: float | None) -> tuple[float, float]:
     """Range of colours for nearly all of some maps: from 0, or around it if `least_um` is given."""
     most = float(np.nanquantile(np.abs(values), _NEARLY_ALL))
-    return (0.0, most) if least_um is None else (-max(least_um, most), max(least_um, most))
+    if least_um is None:
+        return (0.0, most)
+    return (-max(least_um, most), max(least_um, most))
 
 
 def map_picture(values: AnyArray, span: tuple[float, float]) -> rr.DepthImage:
@@ -175,10 +177,12 @@ class ShapeStreams:
     ) -> None:
         """Send a map; with `least_um` in diverging colours, which span at least that, around 0."""
         span = colour_span(values, least_um)
-        # millimetres need more than three digits
-        picture = map_picture(values if unit == "mm" else values.astype(np.float16), span)
+        if unit != "mm":  # millimetres need more than three digits
+            values = values.astype(np.float16)
+        picture = map_picture(values, span)
         self._recording.log_component(f"/shape/map/{kind}", time_s, picture)
-        self._colours[kind] = f"{'0 to ' if least_um is None else '±'}{span[1]:.3g} {unit}"
+        sign = "0 to " if least_um is None else "±"
+        self._colours[kind] = f"{sign}{span[1]:.3g} {unit}"
 
 
 def _make_legend(
@@ -193,7 +197,9 @@ def _make_legend(
     )
     reason = f" ({estimate.reason})" if estimate.reason else ""
     shared_um = estimate.geometry_sag_sigma_um
-    shared = f", ± {shared_um:.3g} µm shared by all cycles" if math.isfinite(shared_um) else ""
+    shared = ""
+    if math.isfinite(shared_um):
+        shared = f", ± {shared_um:.3g} µm shared by all cycles"
     return (
         f"| map | colours |\n|---|---|\n{rows}\n\n"
         "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of a map "
@@ -224,10 +230,8 @@ def _make_change_scalars(
     """Values and variances; these are this cycle's own,
     as those of the reference shift all equally.
     """
-    change_um, variances_um2 = (
-        estimate.coeffs_um - reference.coeffs_um,
-        np.diag(estimate.covariance_um2),
-    )
+    change_um = estimate.coeffs_um - reference.coeffs_um
+    variances_um2 = np.diag(estimate.covariance_um2)
     sag_um = [
         estimate.sag_um - reference.sag_um,
         estimate.displacement_um - reference.displacement_um,

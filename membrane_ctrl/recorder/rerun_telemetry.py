@@ -78,12 +78,11 @@ class TelemetryStreams:
         true_um = telemetry.true_error_um(telemetry.get_columns(means))[:, np.newaxis]
         blocks = [(stream.path, stream.select_values(means)) for stream in streams.MEANS]
         blocks += [(streams.OVERVIEW.path, errors_um), (streams.TRUE_MEAN.path, true_um)]
+        mean_time_s = telemetry.get_column(means, "mono_s")
         for path, values in blocks:
-            there = np.isfinite(values).any(axis=1)
-            if there.any():
-                self._recording.send_scalars(
-                    path, telemetry.get_column(means, "mono_s")[there], values[there]
-                )
+            finite = np.isfinite(values).any(axis=1)
+            if finite.any():
+                self._recording.send_scalars(path, mean_time_s[finite], values[finite])
 
     def _send_streams(self, rows: telemetry.Rows) -> None:
         time_s = telemetry.get_column(rows, "mono_s")

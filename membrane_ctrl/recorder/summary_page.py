@@ -66,11 +66,15 @@ def _format_geometry(geometry: Mapping[str, Any]) -> str:
 
 
 def _format_um(value: float | None, sign: str = "", unit: str = "µm") -> str:
-    return f"{value:{sign}.3g} {unit}" if value is not None and math.isfinite(value) else ""
+    if value is not None and math.isfinite(value):
+        return f"{value:{sign}.3g} {unit}"
+    return ""
 
 
 def _format_share(value: float | None) -> str:
-    return f"{100 * value:.4g} %" if value is not None and math.isfinite(value) else ""
+    if value is not None and math.isfinite(value):
+        return f"{100 * value:.4g} %"
+    return ""
 
 
 def _format_span(seconds: float) -> str:

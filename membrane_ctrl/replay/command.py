@@ -73,7 +73,9 @@ class RecordedRun:
         empty.
         """
         recorded = self.inputs.arithmetic
-        return "" if recorded == describe_arithmetic() else recorded or "an unknown processor"
+        if recorded == describe_arithmetic():
+            return ""
+        return recorded or "an unknown processor"
 
     def recorded_rows(self, from_s: float) -> RecordedRows | None:
         """Its rows, if those of this program can have other bits without being others;
@@ -113,10 +115,14 @@ def open_recorded(folder: Path) -> RecordedRun:
     log = event_log.read_events(folder, [])
     cut = not any(isinstance(each.event, run_events.Ended) for each in log)
     decisions = replays.decisions_of((each.mono_s, each.event) for each in log)
-    log_end_s = max((each.mono_s for each in log), default=0.0) if cut else math.inf
+    log_end_s = math.inf
+    if cut:
+        log_end_s = max((each.mono_s for each in log), default=0.0)
     config = run_config.read_exact_config(folder)
     right = file_checksums.is_comment_checksum_correct(files.read_text(folder / "config.toml"))
-    damage = "" if right else "config.toml: checksum mismatch (damaged or edited)"
+    damage = "config.toml: checksum mismatch (damaged or edited)"
+    if right:
+        damage = ""
     return RecordedRun(folder, config, inputs, decisions, log_end_s, damage)
 
 
@@ -257,7 +263,9 @@ def _make_verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) 
         return "different"
     if found.gaps or damaged or not found.compared:
         return "gaps"
-    return "same numbers" if found.near else "identical"
+    if found.near:
+        return "same numbers"
+    return "identical"
 
 
 def _format_report(report: dict[str, Any]) -> list[str]:

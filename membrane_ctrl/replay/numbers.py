@@ -64,7 +64,10 @@ class RecordedRows:
             self._rows = np.column_stack([block.get(name, missing) for name in telemetry.FIELDS])
             self._known = np.array([name in block for name in telemetry.FIELDS])
         place = int(np.searchsorted(self._ticks, tick))
-        return self._rows[place] if self._ticks[place] == tick else None
+        if self._ticks[place] != tick:
+            return None
+        row: FloatArray = self._rows[place]
+        return row
 
 
 def _compute_tolerances(values: FloatArray) -> FloatArray:

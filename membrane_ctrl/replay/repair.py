@@ -148,11 +148,9 @@ def _seal_journals(run_dir: Path, in_place: bool) -> list[FileFinding]:
         left = sorted((run_dir / spec.name).glob(f"*{JOURNAL_SUFFIX}"))
         if left and in_place:
             TableWriter(run_dir, table_specs.with_origin(spec), resumed=True).close()
-        action = (
-            "made parts of them"
-            if in_place
-            else "readable by `open_run`; --in-place makes parts for other programs"
-        )
+        action = "readable by `open_run`; --in-place makes parts for other programs"
+        if in_place:
+            action = "made parts of them"
         if left:
             findings.append(FileFinding(f"{spec.name} ({len(left)} journals)", "open", action))
     return findings
@@ -178,14 +176,18 @@ def _check_inputs(run_dir: Path) -> list[FileFinding]:
     ticks = sum(len(frame.records) for frame in reader)
     if reader.damage:
         return [FileFinding("inputs", "torn", f"{ticks} ticks are readable")]
-    return [FileFinding("inputs", "whole", f"{ticks} ticks")] if reader.exists else []
+    if not reader.exists:
+        return []
+    return [FileFinding("inputs", "whole", f"{ticks} ticks")]
 
 
 def _check_config(run_dir: Path) -> list[FileFinding]:
     """Report only: a rebuilt summary uses defaults for settings that cannot be read."""
     notes: list[str] = []
     run_config.read_config(run_dir, notes)
-    return [FileFinding("config.toml", "damaged", "; ".join(notes))] if notes else []
+    if not notes:
+        return []
+    return [FileFinding("config.toml", "damaged", "; ".join(notes))]
 
 
 def _repair_summary(run_dir: Path, in_place: bool) -> FileFinding:
@@ -217,11 +219,10 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
         ticks += len(frame.records)
         for estimate in frame.estimates.values():
             summary.add_shape(estimate)
-    good, _ = (
-        _split_events(files.read_bytes(path, event_log.EVENTS_BYTES_MAX))
-        if path.exists()
-        else (b"", b"")
-    )
+    if path.exists():
+        good, _ = _split_events(files.read_bytes(path, event_log.EVENTS_BYTES_MAX))
+    else:
+        good, _ = b"", b""
     for line in good.splitlines():
         summary.add_event(event_log.event_of(line.decode()) or {})
     table = summary.as_dict({}, {})

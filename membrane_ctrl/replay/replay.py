@@ -146,7 +146,8 @@ def replay_record(
         if not found.ticks:
             found.begin_s = item.inputs.now_s
             if item.tick > 1 and item.snapshot:
-                controller, remembered = continue_from(item.snapshot, config, sag_sensitivity), True
+                controller = continue_from(item.snapshot, config, sag_sensitivity)
+                remembered = True
         elif item.snapshot and not same_past:
             with suppress(UnknownSnapshotError):  # then decisions only, as before
                 controller = continue_from(item.snapshot, config, sag_sensitivity)
@@ -177,7 +178,9 @@ def _compare_state(
     fields = find_differences(
         recorded, controller.memory, NUMBERS_WITHIN if comparison.rows else 0.0
     )
-    return StateDifferences(item.inputs.now_s, fields) if fields else None
+    if not fields:
+        return None
+    return StateDifferences(item.inputs.now_s, fields)
 
 
 def _run_tick(controller: Controller, item: RecordedTick, remembered: bool) -> TickOutputs:
@@ -305,6 +308,6 @@ def find_unmatched(recorded: list[Decision], today: list[Decision], slack_s: flo
 
 
 def _describe_decision(decision: Decision | None) -> str:
-    return (
-        "nothing more" if decision is None else f"{decision.description} at {decision.time_s:.2f} s"
-    )
+    if decision is None:
+        return "nothing more"
+    return f"{decision.description} at {decision.time_s:.2f} s"

@@ -108,7 +108,8 @@ def _entry_or_why(folder: Path) -> RunEntry:
     try:
         return read_entry(folder)
     except OSError as error:
-        began, why = origin_of(folder, ()), f"cannot be read ({errors.os_reason(error)})"
+        began = origin_of(folder, ())
+        why = f"cannot be read ({errors.os_reason(error)})"
         nan = math.nan
         return RunEntry(folder, began, nan, nan, nan, 0, why, nan, nan, "", nan, 0, False, "")
 
@@ -121,7 +122,8 @@ def read_entry(folder: Path) -> RunEntry:
     log = event_log.read_events(folder, notes)
     summary: dict[str, Any] = summary_file.read_summary(folder, notes) or {}
     config = run_config.read_config(folder, notes)
-    stored, duration_s = summary.get("held"), _read_number(summary.get("duration_s"))
+    stored = summary.get("held")
+    duration_s = _read_number(summary.get("duration_s"))
     held = stored if isinstance(stored, dict) else {}
     pump = next(
         (each.event for each in reversed(log) if isinstance(each.event, events.PumpLearned)), None
@@ -213,11 +215,15 @@ def _fault_of_end(log: Sequence[event_log.LoggedEvent], exit_: object) -> str:
 def _recorded_s(folder: Path) -> float:
     """End of a run's 1 s level."""
     newest = TableReader(folder, table_specs.LEVELS[_LEVEL_S], []).read_newest("time_s")
-    return math.nan if newest is None else float(newest.as_py()) + _LEVEL_S
+    if newest is None:
+        return math.nan
+    return float(newest.as_py()) + _LEVEL_S
 
 
 def _read_number(value: object) -> float:
-    return float(value) if isinstance(value, (int, float)) else math.nan
+    if not isinstance(value, (int, float)):
+        return math.nan
+    return float(value)
 
 
 def _read_hash(path: Path) -> str:

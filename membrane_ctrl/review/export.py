@@ -32,7 +32,10 @@ def refuse_originals(folder: Path) -> None:
     A folder of exported files also has `events.jsonl`, and may be overwritten.
     """
     folder = folder.resolve()
-    at = folder.parent if any(folder.name == spec.name for spec in table_specs.ALL) else folder
+    if any(folder.name == spec.name for spec in table_specs.ALL):
+        at = folder.parent
+    else:
+        at = folder
     if (at / "config.toml").exists() or any(at.glob("*.rrd")) or any(at.glob("ticks/ticks-*")):
         raise errors.InputError(
             f"{folder}: this folder contains the recorder's files; choose another folder"
@@ -164,7 +167,10 @@ def _write_tables(
     try:
         for table in tables:
             if writer is None:
-                make = pa.parquet.ParquetWriter if to == "parquet" else pa.csv.CSVWriter
+                if to == "parquet":
+                    make = pa.parquet.ParquetWriter
+                else:
+                    make = pa.csv.CSVWriter
                 writer = make(str(path), table.schema.with_metadata(origin))
             writer.write_table(table.cast(writer.schema) if to == "parquet" else table)
     finally:

@@ -26,12 +26,16 @@ def format_number(value: float | None, digits: int = 3) -> str:
     """A number to the given digits; a dash for none."""
     if value is None or not math.isfinite(value):
         return "–"
-    return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
+    if abs(value) < 10**digits:
+        return f"{value:.{digits}g}"
+    return f"{value:.0f}"
 
 
 def format_signed(value: float, digits: int = 3) -> str:
     """A number with its sign, to the given digits and without an exponent above 1."""
-    return f"{value:+.{digits}g}" if abs(value) < 10**digits else f"{value:+.0f}"
+    if abs(value) < 10**digits:
+        return f"{value:+.{digits}g}"
+    return f"{value:+.0f}"
 
 
 def one_line(text: str) -> str:

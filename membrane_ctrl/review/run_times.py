@@ -38,7 +38,8 @@ def moment_s(text: str, origin_utc: datetime) -> float:
                 moment += timedelta(days=1)
         else:
             moment = datetime.fromisoformat(text)
-            moment = moment if moment.tzinfo else moment.replace(tzinfo=origin_utc.tzinfo)
+            if moment.tzinfo is None:
+                moment = moment.replace(tzinfo=origin_utc.tzinfo)
     except ValueError:
         with contextlib.suppress(errors.InputError):
             return parse_duration_s(text)
@@ -62,7 +63,9 @@ def end_s(run: Run) -> float:
     0 without data.
     """
     time_s = run.level(_END_LEVEL_S, names=("rows",))["time_s"]
-    return float(time_s[-1]) + _END_LEVEL_S if time_s.size else 0.0
+    if not time_s.size:
+        return 0.0
+    return float(time_s[-1]) + _END_LEVEL_S
 
 
 def make_outside_error(run: Run, wanted: str) -> errors.InputError:

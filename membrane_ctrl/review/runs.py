@@ -109,7 +109,9 @@ def _parse_day(text: str | None) -> datetime | None:
         moment = datetime.fromisoformat(text)
     except ValueError:
         raise errors.InputError(f"date {text!r}: write 2026-11-21 or 2026-11-21T03:00") from None
-    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    if moment.tzinfo:
+        return moment
+    return moment.replace(tzinfo=UTC)
 
 
 def _make_console() -> Console:
@@ -119,7 +121,9 @@ def _make_console() -> Console:
 
 def _make_table(found: list[catalogue.RunEntry]) -> Table:
     """The table; runs of several folders have names from where these part."""
-    common = os.path.commonpath([entry.folder.parent for entry in found]) if found else ""
+    common = ""
+    if found:
+        common = os.path.commonpath([entry.folder.parent for entry in found])
     table = Table(box=None, header_style="bold", pad_edge=False)
     text_columns = {"run", "started, UTC", "configuration", "end"}
     numbers = ("length", "held", "std µm", "in band", "faults", "Kp", "Ti")

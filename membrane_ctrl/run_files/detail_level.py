@@ -27,4 +27,6 @@ def decide_detail_level(free_mb: float, min_free_mb: float, before: DetailLevel)
 def _level_for_free_space(free_mb: float, min_free_mb: float) -> DetailLevel:
     if free_mb < _RERUN_FROM * min_free_mb:
         return DetailLevel.ESSENTIAL
-    return DetailLevel.NO_PICTURES if free_mb < PICTURES_FROM * min_free_mb else DetailLevel.ALL
+    if free_mb < PICTURES_FROM * min_free_mb:
+        return DetailLevel.NO_PICTURES
+    return DetailLevel.ALL

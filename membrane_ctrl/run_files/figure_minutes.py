@@ -80,7 +80,9 @@ class OpenFigureMinute(StateNode):
         if not is_usable:
             return None
         start_s = math.floor(estimate.time_s / WINDOW_S) * WINDOW_S
-        ended = self.end_minute() if self.figures and start_s > self.start_s else None
+        ended = None
+        if self.figures and start_s > self.start_s:
+            ended = self.end_minute()
         if not self.figures:
             self.start_s = start_s
         # Welford's update: exact also for a scatter of nanometres about a sag of millimetres.

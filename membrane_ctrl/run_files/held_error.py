@@ -49,7 +49,9 @@ class HeldError:
 
         def read_number(name: str) -> float:
             value = held.get(name)
-            return float(value) if isinstance(value, (int, float)) else math.nan
+            if not isinstance(value, (int, float)):
+                return math.nan
+            return float(value)
 
         seconds = read_number("seconds")
         return cls(
@@ -73,7 +75,9 @@ class HeldError:
     @property
     def mean_text(self) -> str:
         """Mean error in µm, without the unit."""
-        return f"{self.mean_um:+.3f}" if math.isfinite(self.mean_um) else _MISSING
+        if not math.isfinite(self.mean_um):
+            return _MISSING
+        return f"{self.mean_um:+.3f}"
 
     @property
     def in_band_text(self) -> str:
@@ -88,7 +92,9 @@ class HeldError:
 
 def format_std_um(std_um: float) -> str:
     """A standard deviation in µm, without the unit."""
-    return f"{std_um:.3f}" if math.isfinite(std_um) else _MISSING
+    if not math.isfinite(std_um):
+        return _MISSING
+    return f"{std_um:.3f}"
 
 
 def format_in_band(share: float) -> str:
@@ -110,7 +116,8 @@ class HeldErrorMeter(StateNode):
     @classmethod
     def for_config(cls, config: Config) -> HeldErrorMeter:
         """Return a meter without rows."""
-        band_um, least = config.limits.band_um, count_least_ticks(1.0, config.loop.rate_hz)
+        band_um = config.limits.band_um
+        least = count_least_ticks(1.0, config.loop.rate_hz)
         return cls(HoldParts(band_um), SecondMeans(band_um, least), SecondMeans(band_um, least))
 
     def add_rows(self, rows: telemetry.Rows) -> BoolArray:

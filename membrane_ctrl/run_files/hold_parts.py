@@ -77,35 +77,43 @@ class HoldParts(StateNode):
         """(n,) the ticks outside the band from the moment that it is held again until it has stayed
         inside.
         """
-        time_s, outside = block["mono_s"], ~(np.abs(block["error_um"]) <= self.band_um)
+        time_s = block["mono_s"]
+        outside = ~(np.abs(block["error_um"]) <= self.band_um)
         straying = np.zeros(time_s.size, dtype=bool)
         for first in np.flatnonzero(
             ~let_go & np.concatenate(([not math.isnan(self.let_go_s)], let_go[:-1]))
         ):
-            end_s, away_s = (
-                (time_s[first - 1], time_s[first - 1]) if first else (self.let_go_s, self.away_s)
-            )
+            if first:
+                end_s, away_s = time_s[first - 1], time_s[first - 1]
+            else:
+                end_s, away_s = self.let_go_s, self.away_s
             rows = first + np.flatnonzero((outside & (time_s <= end_s + _BACK_WITHIN_S))[first:])
             away = np.append(away_s, time_s[rows])
             stayed = np.flatnonzero(np.diff(away, append=time_s[-1]) >= telemetry.SETTLED_AFTER_S)
             count = int(stayed[0]) if stayed.size else rows.size
             straying[rows[:count]] = True
             over = stayed.size or time_s[-1] > end_s + _BACK_WITHIN_S
-            self.let_go_s, self.away_s = (
-                (math.nan, math.nan) if over else (float(end_s), float(away[count]))
-            )
+            if over:
+                self.let_go_s, self.away_s = math.nan, math.nan
+            else:
+                self.let_go_s, self.away_s = float(end_s), float(away[count])
         if let_go.size and let_go[-1]:
             self.let_go_s = self.away_s = float(time_s[-1])
         return straying
 
 
 def held_at(level: Mapping[str, Column], time_s: Column) -> BoolArray:
-    """(n,) whether the mirror was settled in `hold` at each time, as far as the windows of a level
-    tell.
+    """Return (n,) whether the mirror was settled in `hold` at each time, to within a window of the
+    level.
     """
-    if not level["time_s"].size:
+    starts_s = level["time_s"]
+    if not starts_s.size:
         return np.zeros(time_s.size, dtype=bool)
-    place = np.clip(np.searchsorted(level["time_s"], time_s, side="right") - 1, 0, None)
-    hold = level["state"] == telemetry.State.HOLD
-    since_s = np.maximum.accumulate(np.where(hold, -np.inf, np.append(level["time_s"][1:], np.inf)))
-    return np.asarray(hold[place] & (time_s - since_s[place] >= telemetry.SETTLED_AFTER_S))
+    window = np.searchsorted(starts_s, time_s, side="right") - 1
+    window = np.clip(window, 0, None)
+    # When the newest window of another state ended: since then the mirror has been in `hold`
+    is_hold = level["state"] == telemetry.State.HOLD
+    ends_s = np.append(starts_s[1:], np.inf)
+    since_s = np.maximum.accumulate(np.where(is_hold, -np.inf, ends_s))
+    is_settled = time_s - since_s[window] >= telemetry.SETTLED_AFTER_S
+    return np.asarray(is_hold[window] & is_settled)

@@ -87,7 +87,8 @@ class InputsReader:
             records = block[(block["tick"] > last) & (block["now_s"] >= self._from_s)]
             if not len(records):
                 continue
-            last, until_s = int(records["tick"][-1]), float(records["now_s"][-1])
+            last = int(records["tick"][-1])
+            until_s = float(records["now_s"][-1])
             tails = {row.tick: row.json.encode() for row in rare.take_until_time(until_s)}
             snapshots = {row.tick: row.json.encode() for row in kept.take_until_time(until_s)}
             estimates = [*cycles.take_until_time(until_s), *tracked.take_until_time(until_s)]
@@ -184,7 +185,10 @@ class _TickRows:
             return None
         joined = pa.concat_tables(parts)
         count = int(np.searchsorted(_record_column(joined, "tick"), tick, side="right"))
-        self._waiting = joined.slice(count) if count < joined.num_rows else None
+        if count < joined.num_rows:
+            self._waiting = joined.slice(count)
+        else:
+            self._waiting = None
         return joined.slice(0, count)
 
 

@@ -149,7 +149,8 @@ class ResumeLog:
 
     def add_resume(self, when: datetime) -> None:
         """Add one and drop those older than a day. Raises OSError."""
-        kept = [when - timedelta(seconds=age_s) for age_s in self.ages_s(when)][-_RESUMES_MOST:]
+        ages_s = self.ages_s(when)
+        kept = [when - timedelta(seconds=age_s) for age_s in ages_s[-_RESUMES_MOST:]]
         scratch = self.path.with_name(f".{self.path.name}.new")
         stamps = [stamp.isoformat() for stamp in (*kept, when)]
         table = {**file_origin(RESUMES_SCHEMA), "resumed_utc": stamps}

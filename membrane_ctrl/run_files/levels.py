@@ -66,7 +66,10 @@ def first_level(ticks: Mapping[str, Column]) -> Columns:
     level: Columns = {"time_s": window, "rows": _count_rows(starts, time_s.size)}
     level |= _reduce_codes(ticks, starts)
     for name in SIGNALS:
-        values = telemetry.true_error_um(ticks) if name == TRUE_ERROR_COLUMN.name else ticks[name]
+        if name == TRUE_ERROR_COLUMN.name:
+            values = telemetry.true_error_um(ticks)
+        else:
+            values = ticks[name]
         level[f"min_{name}"] = np.fmin.reduceat(values, starts)
         mean = _weighted_mean(values, np.ones(values.size), starts)
         level[f"mean_{name}"] = mean

@@ -60,11 +60,10 @@ def named_table(columns: Mapping[str, NDArray[Any]], origin_utc: datetime) -> pa
         if name in WORDS:
             table[name] = _name_codes(values, WORDS[name])
         elif name not in TIMES:
-            table[name] = (
-                _null_non_finite(values).cast(pa.int64(), safe=False)
-                if name in _COUNTS
-                else _null_non_finite(values)
-            )
+            if name in _COUNTS:
+                table[name] = _null_non_finite(values).cast(pa.int64(), safe=False)
+            else:
+                table[name] = _null_non_finite(values)
     return pa.table(table)
 
 

@@ -37,7 +37,9 @@ def recorded_rate_hz(folder: Path) -> float | None:
     if spacing_s.size:
         return _require_whole(1 / float(np.median(spacing_s)))
     (rows,) = _first_rows(folder, table_specs.LEVELS[levels.WINDOWS_S[0]], ("rows",))
-    return _require_whole(float(np.median(rows))) if rows.size else None
+    if not rows.size:
+        return None
+    return _require_whole(float(np.median(rows)))
 
 
 def _first_rows(folder: Path, spec: TableSpec, names: Sequence[str]) -> list[FloatArray]:
@@ -55,4 +57,6 @@ def _spacing_s(dt_s: FloatArray, late_ms: FloatArray) -> FloatArray:
 
 def _require_whole(rate_hz: float) -> float:
     whole_hz = float(round(rate_hz))
-    return whole_hz if abs(rate_hz - whole_hz) <= _WHOLE * rate_hz else rate_hz
+    if abs(rate_hz - whole_hz) <= _WHOLE * rate_hz:
+        return whole_hz
+    return rate_hz

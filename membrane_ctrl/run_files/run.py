@@ -3,6 +3,7 @@ writes.
 """
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -201,7 +202,10 @@ class Run:
             return labelled.make_cycles_dataset(
                 self.shapes(), (start_s, end_s), self.origin_utc, about
             )
-        spec = table_specs.TICKS if table == "ticks" else table_specs.LEVELS[window_s]
+        if table == "ticks":
+            spec = table_specs.TICKS
+        else:
+            spec = table_specs.LEVELS[window_s]
         named = self._make_named_table(table, names, start_s, end_s, window_s)
         return labelled.make_dataset(named, labelled.labels_of(spec), about)
 
@@ -282,7 +286,9 @@ class Run:
         if not blocks:
             return {name: np.empty(0) for name in names}
         level = {name: np.concatenate([block[name] for block in blocks]) for name in names}
-        order = np.argsort(level["time_s"], kind="stable") if missing else slice(None)
+        if not missing:
+            return level
+        order = np.argsort(level["time_s"], kind="stable")
         return {name: values[order] for name, values in level.items()}
 
     def _made_level(
@@ -339,12 +345,15 @@ class Run:
         if not whole:
             return []
         joined = pa.concat_tables(whole)
-        time_s, patterns = joined["time_s"].to_numpy(), joined["pattern"].to_numpy()
+        time_s = joined["time_s"].to_numpy()
+        patterns = joined["pattern"].to_numpy()
+        all_numbers = joined["number"].to_numpy()
         within = (time_s >= start_s) & (time_s < end_s) & (np.abs(time_s) < _RUN_MAX_S)
         numbers: list[int] = []
         for pattern in dict.fromkeys(patterns[within].tolist()):
-            of_pattern = joined["number"].to_numpy()[within & (patterns == pattern)]
-            numbers += of_pattern[:: max(1, -(-of_pattern.size // most))].tolist()
+            of_pattern = all_numbers[within & (patterns == pattern)]
+            every = max(1, math.ceil(of_pattern.size / most))
+            numbers += of_pattern[::every].tolist()
         return list(self._read_pictures(numbers))
 
     def _read_pictures(self, numbers: Sequence[int]) -> Iterator[dict[str, Any]]:
@@ -410,7 +419,9 @@ def _find_missing_parts(folder: Path, summary: dict[str, Any] | None) -> list[st
 
 def _plausible_count(value: object) -> int:
     """Number of parts according to the summary, if plausible."""
-    return value if isinstance(value, int) and 0 <= value <= _PARTS_MAX else 0
+    if isinstance(value, int) and 0 <= value <= _PARTS_MAX:
+        return value
+    return 0
 
 
 def origin_of(folder: Path, log: Sequence[event_log.LoggedEvent]) -> datetime:
@@ -441,7 +452,9 @@ def _find_gaps(time_s: Column, window_s: float, start_s: float) -> list[tuple[fl
     least_s = window_s + _HOLE_S
     ends = np.flatnonzero(np.diff(time_s) > least_s)
     holes = [(float(time_s[row]) + window_s, float(time_s[row + 1])) for row in ends]
-    begins = [(start_s, float(time_s[0]))] if time_s[0] - max(start_s, 0.0) > least_s else []
+    begins = []
+    if time_s[0] - max(start_s, 0.0) > least_s:
+        begins = [(start_s, float(time_s[0]))]
     return begins + holes
 
 
@@ -456,4 +469,6 @@ def _to_array(table: pa.Table, name: str) -> Column:
     if name not in table.column_names:
         return np.full(table.num_rows, np.nan)
     values = np.asarray(table.column(name).to_numpy())
-    return values if values.dtype.kind == "f" else values.astype(np.float64)
+    if values.dtype.kind == "f":
+        return values
+    return values.astype(np.float64)

@@ -60,7 +60,9 @@ def _remove_key(tables: dict[str, Any], location: Sequence[int | str]) -> str:
 def _copy_value(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _copy_value(inner) for key, inner in value.items()}
-    return [_copy_value(inner) for inner in value] if isinstance(value, list) else value
+    if not isinstance(value, list):
+        return value
+    return [_copy_value(inner) for inner in value]
 
 
 def read_exact_config(folder: Path) -> Config:
@@ -98,8 +100,6 @@ def _config_damage(path: Path) -> list[str]:
     if not text:
         return ["config.toml: empty; all defaults are used"]
     right = file_checksums.is_comment_checksum_correct(text)
-    return (
-        []
-        if right
-        else ["config.toml: checksum mismatch (damaged or edited); its values are doubtful"]
-    )
+    if right:
+        return []
+    return ["config.toml: checksum mismatch (damaged or edited); its values are doubtful"]

@@ -42,7 +42,9 @@ def read_run_head(folder: Path, notes: list[str]) -> RunHead:
     except (OSError, ValueError) as error:
         notes.append(f"{HEAD_FILE}: cannot be read ({error})")
         return RunHead()
-    found = _SCHEMA.fullmatch(str(table.get("schema"))) if isinstance(table, dict) else None
+    found = None
+    if isinstance(table, dict):
+        found = _SCHEMA.fullmatch(str(table.get("schema")))
     if found is None or not file_checksums.pop_checksum(table):
         notes.append(f"{HEAD_FILE}: damaged or edited; it is not used")
         return RunHead()

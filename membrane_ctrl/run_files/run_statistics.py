@@ -53,7 +53,9 @@ class Moments(StateNode):
     @property
     def std(self) -> float:
         """Standard deviation about the mean (divisor n, as `numpy.std`); NaN without values."""
-        return math.sqrt(self.squares / self.count) if self.count else math.nan
+        if not self.count:
+            return math.nan
+        return math.sqrt(self.squares / self.count)
 
 
 @dataclass(slots=True)
@@ -116,14 +118,16 @@ class SecondMeans(StateNode):
     last: float = math.nan
 
     def add(self, time_s: Column, values: Column) -> None:
-        """Take in (n,) values at their times, which rise;
-        those that are not finite are left out.
-        """
-        there = np.isfinite(values)
-        second = np.append(self.second, np.floor(time_s[there] + 1e-9))
+        """Add (n,) values at their times, which rise; those that are not finite are omitted."""
+        finite = np.isfinite(values)
+        # The second that is not complete yet goes before the new values
+        second = np.append(self.second, np.floor(time_s[finite] + 1e-9))
+        count = np.append(self.count, np.ones(second.size - 1))
+        value = np.append(self.sum, values[finite])
+        # Count and sum of each second; the last one may continue in the next block
         starts = np.flatnonzero(np.diff(second, prepend=np.nan))
-        counts = np.add.reduceat(np.append(self.count, np.ones(second.size - 1)), starts)
-        sums = np.add.reduceat(np.append(self.sum, values[there]), starts)
+        counts = np.add.reduceat(count, starts)
+        sums = np.add.reduceat(value, starts)
         self.second = float(second[-1])
         self.count = float(counts[-1])
         self.sum = float(sums[-1])

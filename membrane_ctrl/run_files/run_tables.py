@@ -82,7 +82,10 @@ class RunTables:
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Add the result of a measurement cycle, or of a tracked frame."""
-        spec = table_specs.TRACKED if estimate.kind == "track" else table_specs.SHAPES
+        if estimate.kind == "track":
+            spec = table_specs.TRACKED
+        else:
+            spec = table_specs.SHAPES
         row = {
             name: getattr(estimate, name) for name in spec.schema.names if hasattr(estimate, name)
         }
@@ -127,7 +130,9 @@ class RunTables:
 
     def _event_row(self, number: int, line: EventLine) -> dict[str, Any]:
         time_s = float(line.get("mono_s") or 0.0)
-        moment = None if self._origin_utc is None else self._origin_utc + timedelta(seconds=time_s)
+        moment = None
+        if self._origin_utc is not None:
+            moment = self._origin_utc + timedelta(seconds=time_s)
         return {
             "number": number,
             "time_s": time_s,

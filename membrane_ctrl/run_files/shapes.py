@@ -141,9 +141,10 @@ def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) ->
     empty: dict[str, Any] = {
         name: np.empty((0, ZERNIKE_TERMS) if name == "coeffs_um" else 0) for name in names
     }
-    joined = (
-        {name: np.concatenate([part[name] for part in parts]) for name in names} if parts else empty
-    )
+    if parts:
+        joined = {name: np.concatenate([part[name] for part in parts]) for name in names}
+    else:
+        joined = empty
     order = np.argsort(joined["time_s"], kind="stable")
     matrices = [_to_matrix(table.column("covariance_um2"), ZERNIKE_TERMS**2) for table in kept]
     return Shapes(
@@ -159,9 +160,10 @@ def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) ->
 
 def _read_figures(table: pa.Table) -> dict[str, AnyArray]:
     count = table.num_rows
-    verdicts = (
-        table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count
-    )
+    if "verdict" in table.column_names:
+        verdicts = table.column("verdict").to_pylist()
+    else:
+        verdicts = ["ok"] * count
     figures: dict[str, AnyArray] = {name: _read_numbers(table, name) for name in NUMBERS}
     return figures | {
         "coeffs_um": _to_matrix(table.column("coeffs_um"), ZERNIKE_TERMS),
@@ -176,9 +178,8 @@ def read_estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
     names = ESTIMATE_COLUMNS[:-2]
     heads = zip(*(table.column(name).to_pylist() for name in names), strict=True)
     coeffs = _to_matrix(table.column("coeffs_um"), ZERNIKE_TERMS)
-    uppers = _to_matrix(
-        table.column("upper_um2"), table.schema.field("upper_um2").type.list_size
-    ).astype(np.float32)
+    upper_size = table.schema.field("upper_um2").type.list_size
+    uppers = _to_matrix(table.column("upper_um2"), upper_size).astype(np.float32)
     for head, row, upper in zip(heads, coeffs, uppers, strict=True):
         named = dict(zip(names, head, strict=True))
         named |= {name: math.nan for name in shape_estimate.NUMBERS if named[name] is None}
@@ -193,11 +194,10 @@ def _read_numbers(table: pa.Table, name: str) -> Column:
 
 def _to_matrix(cells: pa.ChunkedArray, width: int) -> Column:
     """A column of fixed-size lists as (n, width) numbers; a missing list is a row of NaN."""
-    rows = (
-        cells.combine_chunks().fill_null([math.nan] * width)
-        if cells.null_count
-        else cells.combine_chunks()
-    )
+    if cells.null_count:
+        rows = cells.combine_chunks().fill_null([math.nan] * width)
+    else:
+        rows = cells.combine_chunks()
     return np.asarray(rows.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(
         -1, width
     )
@@ -241,12 +241,15 @@ def without_terms(height: AnyArray, terms: int) -> AnyArray:
 
     3 terms are piston and tilt, 4 defocus as well.
     """
-    there = np.isfinite(height)
-    x, y = (axis[there] for axis in _disc_grid(len(height)))
-    # spans the same as the Zernike terms, which take 70 ms
-    basis, left = np.stack((np.ones_like(x), x, y, x**2 + y**2))[:terms], height.copy()
-    left[there] -= np.linalg.lstsq(basis.T, height[there].astype(np.float64), rcond=None)[0] @ basis
-    return left
+    finite = np.isfinite(height)
+    x, y = (axis[finite] for axis in _disc_grid(len(height)))
+    # These span the same as the Zernike terms, which take 70 ms to compute
+    basis = np.stack((np.ones_like(x), x, y, x**2 + y**2))[:terms]
+    values = height[finite].astype(np.float64)
+    coeffs, *_ = np.linalg.lstsq(basis.T, values, rcond=None)
+    residual = height.copy()
+    residual[finite] -= coeffs @ basis
+    return residual
 
 
 def without_noll_terms(height: AnyArray, indices: Sequence[int]) -> AnyArray:

@@ -90,7 +90,8 @@ class Summary(StateNode):
         self.time_s = max(self.time_s, float(time_s[-1]))
         leak = telemetry.get_column(rows, "leak_um_per_s")
         leak = leak[np.isfinite(leak)]
-        self.leak_um_per_s = float(leak[-1]) if leak.size else self.leak_um_per_s
+        if leak.size:
+            self.leak_um_per_s = float(leak[-1])
 
     def add_event(self, line: EventLine) -> None:
         """Add one event; only those of faults and states, the geometry and the end of the run
@@ -113,7 +114,9 @@ class Summary(StateNode):
         if self.standing_fault is None:
             return None
         event = event_lines.from_dict(self.standing_fault)
-        return event if isinstance(event, events.Fault) else None
+        if isinstance(event, events.Fault):
+            return event
+        return None
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Add the result of a measurement cycle."""

@@ -26,7 +26,9 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
         return None
     if not isinstance(summary, dict) or summary.get("schema") != _SUMMARY_SCHEMA:
         notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
-        return {} if not isinstance(summary, dict) else summary
+        if not isinstance(summary, dict):
+            return {}
+        return summary
     if not file_checksums.pop_checksum(summary):
         notes.append("summary.json: checksum mismatch (damaged or edited); it is not used")
         return None

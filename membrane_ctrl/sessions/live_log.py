@@ -84,11 +84,9 @@ class LiveLog:
         try:
             given = plain_json.loads(text)
             fits = given["to"] == question and given["said"] in ("", *among)
-            return (
-                PageAnswer(given["said"], terminal.one_line(_parse_line(given["by"])))
-                if fits
-                else None
-            )
+            if not fits:
+                return None
+            return PageAnswer(given["said"], terminal.one_line(_parse_line(given["by"])))
         except (ValueError, TypeError, KeyError):
             return None
 
@@ -122,7 +120,9 @@ def write_answer(session: Path, question: str, given: PageAnswer) -> None:
 
 def _mean_of_finite(values: list[float]) -> float | None:
     good = [value for value in values if math.isfinite(value)]
-    return round(sum(good) / len(good), 4) if good else None
+    if not good:
+        return None
+    return round(sum(good) / len(good), 4)
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,17 +57,17 @@ def build_value(kind: type[T], data: Any) -> T:
 def _build_plain(kind: Any, data: Any) -> Any:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
-        return (
-            None
-            if data is None
-            else _build_plain(next(a for a in arguments if a is not type(None)), data)
-        )
+        if data is None:
+            return None
+        return _build_plain(next(a for a in arguments if a is not type(None)), data)
     if origin is Literal:
         if data not in arguments:
             raise ValueError(f"{data!r} is not one of {arguments}")
         return data
     if origin is tuple:
-        inner = [arguments[0]] * len(data) if arguments[-1] is Ellipsis else arguments
+        inner = arguments
+        if arguments[-1] is Ellipsis:
+            inner = (arguments[0],) * len(data)
         return tuple(_build_plain(a, item) for a, item in zip(inner, data, strict=True))
     if origin is np.ndarray:
         return np.array(data, dtype=float)

@@ -121,11 +121,13 @@ class PressureWeather:
 
     def apply(self, on: Surroundings) -> None:
         """Add the weather."""
+        # A sum of sines of equal amplitude with random phases, 0 at the start
         periods_s = np.geomspace(0.5 * _DAY_S, 10 * _DAY_S, 12)
         phases = np.random.default_rng(self.seed).uniform(0, 2 * np.pi, periods_s.size)
+        amplitude_pa = self.std_pa * np.sqrt(2 / periods_s.size)
         for period_s, phase in zip(periods_s, phases, strict=True):
             wave = np.sin(2 * np.pi / period_s * on.time_s + phase) - np.sin(phase)
-            on.ambient_pa[:] += self.std_pa * np.sqrt(2 / periods_s.size) * wave
+            on.ambient_pa[:] += amplitude_pa * wave
 
 
 def _event_share(time_s: Series, at_s: float, over_s: float) -> Series:

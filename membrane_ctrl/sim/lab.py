@@ -221,9 +221,9 @@ class Lab:
                     serial_port.SerialSettings(section.baud),
                 )
             case settings.ExternalConfig():
-                end = (
-                    self._make_actuator(role) if role in self._outputs else self._read_sensor(role)
-                )
+                end: Callable[..., float | None] = self._read_sensor(role)
+                if role in self._outputs:
+                    end = self._make_actuator(role)
                 made: serial_device.SerialDevice = driver_loading.make_emulator(
                     section, f"devices.{role}", drivers.INSTRUMENTS, end
                 )
@@ -276,7 +276,9 @@ class Lab:
 
     def _read_sensor(self, role: str) -> Callable[[], float]:
         """Present value of a role's sensor, in the role's unit."""
-        name = "displacement_um" if role == "displacement" else ROLES[role].reads
+        name = "displacement_um"
+        if role != "displacement":
+            name = ROLES[role].reads
         return lambda: float(getattr(self._plant.sample(), name))
 
     def _make_actuator(self, role: str) -> Callable[[float], None]:

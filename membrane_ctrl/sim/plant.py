@@ -141,13 +141,12 @@ class Plant:
 
     def _run_steps(self, start: int, stop: int) -> None:
         """Steps `start` to `stop` of the block."""
-        gas_step, gas, pump_step, pump = (
-            self._gas.step,
-            self._gas,
-            self._pump.step,
-            self._pump_fraction,
-        )
-        leak, vent = self._leak_ml_per_s_per_pa, self._vent_ml_per_s_per_pa * self._vent_fraction
+        gas_step = self._gas.step
+        gas = self._gas
+        pump_step = self._pump.step
+        pump = self._pump_fraction
+        leak = self._leak_ml_per_s_per_pa
+        vent = self._vent_ml_per_s_per_pa * self._vent_fraction
         follow = -math.expm1(-STEP_S / GAS_FOLLOWS_AIR_S)
         inflow = self._inflow_ml_per_s
         for i in range(start, stop):

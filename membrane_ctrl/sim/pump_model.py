@@ -73,15 +73,15 @@ class PumpModel:
         self._running = command >= (self._stall if self._running else self._start)
         if self._branches is None:
             delivers = self._running and command > self._dead
-            target = self._ml_per_s_per_fraction * (command - self._dead) if delivers else 0.0
+            target = 0.0
+            if delivers:
+                target = self._ml_per_s_per_fraction * (command - self._dead)
         else:
             rising, falling = self._branches
             level = round(command * _LEVELS)
-            target = (
-                min(max(self._play_ml_per_s, rising[level]), falling[level])
-                if self._running
-                else 0.0
-            )
+            target = 0.0
+            if self._running:
+                target = min(max(self._play_ml_per_s, rising[level]), falling[level])
             self._play_ml_per_s = target
         self._flow_ml_per_s += (target - self._flow_ml_per_s) * self._follow
         self._tube.append(self._flow_ml_per_s)

@@ -43,4 +43,6 @@ class Sensors:
 
 
 def _quantise_value(value: float, resolution: float) -> float:
-    return round(value / resolution) * resolution if resolution > 0 else value
+    if resolution > 0:
+        return round(value / resolution) * resolution
+    return value

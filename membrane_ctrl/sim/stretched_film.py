@@ -78,21 +78,25 @@ def solve_stretched_film(
 
     def gradient(scaled: FloatArray) -> FloatArray:
         """Derivatives of the energy by the shapes of u and w, and the depth less the wanted one."""
-        u, w, push = np.split(scaled * units, [_SHAPES, 2 * _SHAPES])
-        push = push * area / r
+        u, w, load = np.split(scaled * units, [_SHAPES, 2 * _SHAPES])
+        # Displacements and their slopes at the nodes
         out = u @ wide
         out_r = u @ wide_r
         down = w @ deep
         down_r = w @ deep_r
-        pull, hoop = (area * force for force in forces(out, out_r, down_r))
-        of_u = wide_r @ (pull * (1 + out_r) - push * down * (r + out)) + wide / r @ (
-            hoop * (1 + out / r)
-        )
+        # Forces at the nodes, with the weights of the integral
+        radial, hoop = (area * force for force in forces(out, out_r, down_r))
+        push = load * area / r
+        # Elastic energy less the work of the pressure on the volume, by u
+        of_u = wide_r @ (radial * (1 + out_r) - push * down * (r + out))
+        of_u = of_u + wide / r @ (hoop * (1 + out / r))
         of_u -= wide @ (push * down * (1 + out_r))
-        of_w = deep_r @ (pull * down_r) - deep @ (push * (r + out) * (1 + out_r))
-        return np.concatenate([of_u / strain, of_w / (strain * depth), [w @ vertex / depth - 1]])
+        # and by w
+        of_w = deep_r @ (radial * down_r) - deep @ (push * (r + out) * (1 + out_r))
+        too_deep = w @ vertex / depth - 1
+        return np.concatenate([of_u / strain, of_w / (strain * depth), [too_deep]])
 
-    # Its zero; slow progress at the last bits is no fault.
+    # The film in equilibrium is the zero; slow progress at the last bits is no fault.
     start = np.zeros(2 * _SHAPES + 1)
     start[_SHAPES] = 1.0
     start[-1] = 4.0
@@ -104,9 +108,9 @@ def solve_stretched_film(
         raise ValueError(f"prestrain = {prestrain:g}: the film would be slack at its ring")
 
     # The height over the place under load, as a power series.
-    at = (chebyshev.chebpts2(8 * _PROFILE_DEGREE) + 1) / 2
-    (out, _), (down, _) = _shape_functions(at)
-    rho2 = (np.sqrt(at) + u @ out) ** 2
+    nodes = (chebyshev.chebpts2(8 * _PROFILE_DEGREE) + 1) / 2
+    (out, _), (down, _) = _shape_functions(nodes)
+    rho2 = (np.sqrt(nodes) + u @ out) ** 2
     profile = Chebyshev.fit(rho2, 1 - w @ down / depth, _PROFILE_DEGREE, domain=[0, 1])
     powers = profile.convert(domain=[-1, 1], kind=Polynomial, window=[-1, 1]).coef
     return float(load[0]), np.concatenate([[0.0], powers[1:]])

@@ -22,4 +22,6 @@ def serve_twin(config: Config, speed: float) -> int:
         terminal.print_progress("stop it with Ctrl-C")
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
         stopped = signal.sigwait(_STOPS)
-    return errors.Exit.INTERRUPTED if stopped == signal.SIGINT else errors.Exit.DONE
+    if stopped == signal.SIGINT:
+        return errors.Exit.INTERRUPTED
+    return errors.Exit.DONE

@@ -31,7 +31,9 @@ def start_bench(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
     if report.error:
         raise errors.DeviceError(report.error)
     if spec.lab is None:
-        moved = f" (port {spec.port} is taken)" if spec.port not in (0, report.port) else ""
+        moved = ""
+        if spec.port not in (0, report.port):
+            moved = f" (port {spec.port} is taken)"
         terminal.print_progress(f"the twin listens on {report.url}{moved}, Modbus unit 1")
     return report
 
@@ -70,11 +72,9 @@ class TwinProcess:
         truth = stack.enter_context(ring.open_ring(_TRUTHS_KEPT, TRUTH_BYTES))
         spec = replace(bench_spec(config, clock), truth=truth, lab=config.devices if lab else None)
         report = start_bench(spec, stack)
-        watchdog = (
-            {}
-            if config.devices is None
-            else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
-        )
+        watchdog = {}
+        if config.devices is not None:
+            watchdog = config.devices.model_dump(include={"timeout_s", "watchdog_s"})
         devices = report.lab or DevicesConfig(
             board=report.url, interlocks=_at_board_inputs(config.interlocks), **watchdog
         )

@@ -85,7 +85,8 @@ class VirtualBench:
     def drive_actuators(self) -> None:
         """Drive the actuators as the board commands, as far as they follow."""
         wrong = self.wrong
-        pump, vent = self.board.pump_fraction * wrong.pump_share, self.board.vent_fraction
+        pump = self.board.pump_fraction * wrong.pump_share
+        vent = self.board.vent_fraction
         self.plant.actuate(
             pump if math.isnan(wrong.pump_stuck_fraction) else wrong.pump_stuck_fraction,
             vent if math.isnan(wrong.vent_stuck_fraction) else wrong.vent_stuck_fraction,

@@ -50,5 +50,5 @@ def test_no_creep_is_reported_for_a_film_that_does_not_creep() -> None:
 def test_too_few_readings_and_too_far_ahead_are_errors() -> None:
     with pytest.raises(ValueError, match="too few for a law of creep"):
         fit_creep(np.arange(3.0), np.zeros(3), 1.0)
-    with pytest.raises(ValueError, match="say nothing of 24 h ahead"):
+    with pytest.raises(ValueError, match="do not predict 24 h ahead"):
         fit_creep(np.linspace(0, 3600.0, 50), np.zeros(50), DAY_S)

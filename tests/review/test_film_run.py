@@ -78,5 +78,5 @@ def test_tomorrow_is_within_its_interval(
 
 def test_an_hour_does_not_predict_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film_run, "open_run", lambda folder: run_of(folder, 1.0))
-    with pytest.raises(RejectedError, match="say nothing of 24 h ahead"):
+    with pytest.raises(RejectedError, match="do not predict 24 h ahead"):
         film_run.film_run_command([tmp_path], PRESTRAIN, POISSON, None, False, False)

@@ -51,10 +51,8 @@ class PumpSteps:
 
     def _is_step_over(self) -> bool:
         """Whether the present step is."""
-        now, off_um = (
-            self._steps[self.memory.steps_done],
-            self._motion.position_um - self._centre_um,
-        )
+        now = self._steps[self.memory.steps_done]
+        off_um = self._motion.position_um - self._centre_um
         if now.until_um is not None and (
             off_um <= now.until_um if now.fraction == 0 else off_um >= now.until_um
         ):

@@ -104,7 +104,9 @@ class Relay:
             open_bleed = describe_bleed_remedy(
                 around.holding_flow_um_per_s, around.least_flow_um_per_s
             )
-            remedy = "check the pump, its tube and the leak" if memory.rises else open_bleed
+            remedy = "check the pump, its tube and the leak"
+            if not memory.rises:
+                remedy = open_bleed
             still = (
                 f"the mirror did not {way} by {self._threshold_um:g} µm in {_PATIENCE_S:g} s: "
                 f"{remedy}"
@@ -118,7 +120,10 @@ class Relay:
     def _switch_relay(self) -> None:
         """Reverse; adapt the flow of the previous half cycle, whose overshoot is now known."""
         memory = self.memory
-        half, before = (memory.up, memory.down) if memory.rises else (memory.down, memory.up)
+        if memory.rises:
+            half, before = memory.up, memory.down
+        else:
+            half, before = memory.down, memory.up
         wanted_um = OVERSHOOT_SHARE * self._around.limit_um
         # the guard stops anything that would coast further, however short the true delay
         fastest_um_per_s = wanted_um / self._motion.coast_s

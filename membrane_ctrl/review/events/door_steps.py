@@ -95,7 +95,9 @@ def update_s(mean_pa: Column) -> int:
         return 1
     between_s = int(np.quantile(np.diff(begins), _LOW_SHARE, method="lower"))
     # two seconds also result from a coarse barometer that alternates between two values
-    return between_s if 2 < between_s <= _SLOWEST_S else 1
+    if 2 < between_s <= _SLOWEST_S:
+        return between_s
+    return 1
 
 
 def reading_resolution_pa(reading_pa: Column) -> float:

@@ -29,7 +29,10 @@ def find_excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -
     ramped = np.abs(mean_differences(setpoint_um, RAMP_HALF_S, 1)) > band_um
     out &= ~widen_flags((level["fault"] > 0) | paused | ramped, BACK_S)
     for event in known:
-        from_s = event.start_s if event.kind in _TIMED_TO_MINUTES else event.time_s - TIMED_S
+        if event.kind in _TIMED_TO_MINUTES:
+            from_s = event.start_s
+        else:
+            from_s = event.time_s - TIMED_S
         first, end = np.searchsorted(time_s, [from_s, event.end_s + BACK_S])
         out[first:end] = False
     found = []

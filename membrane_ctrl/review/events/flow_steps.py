@@ -39,7 +39,9 @@ def find_flow_steps(held: found_event.Level) -> list[found_event.FoundEvent]:
         The 1 s level, NaN where the mirror was not held.
     """
     held_s = float(np.isfinite(held["mean_flow_um_per_s"]).sum())
-    return _find_long_steps(held) if held_s >= NEEDED_S else _find_short_steps(held)
+    if held_s >= NEEDED_S:
+        return _find_long_steps(held)
+    return _find_short_steps(held)
 
 
 def _holding_flow(level: found_event.Level) -> Column:

@@ -94,7 +94,9 @@ def find_events(
 
 def list_unjudged(level: found_event.Level) -> tuple[str, ...]:
     """Kinds of events that a run is too short to show, with the time that each needs."""
-    held_s = float((level["state"] == State.HOLD).sum()) if level["time_s"].size else 0.0
+    held_s = 0.0
+    if level["time_s"].size:
+        held_s = float((level["state"] == State.HOLD).sum())
     needed_s = {
         f"flow step below {100 * flow_steps.SHORT_LEAST_SHARE:.0f} %": flow_steps.NEEDED_S,
         "noise change": 60.0 * (2 * SPREAD_HALF_MIN + 1),
@@ -157,7 +159,8 @@ def find_laser_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
     """The laser flagged its reading as bad, or gave none; on a bench held without one,
     the optics.
     """
-    quality, seen = level["max_displacement_quality"], np.isfinite(level["mean_displacement_um"])
+    quality = level["max_displacement_quality"]
+    seen = np.isfinite(level["mean_displacement_um"])
     bad = (quality > 0) | ~seen
     bad &= (level["state"] == State.HOLD) & (level["rows"] > 0)
     by_optics = seen.any() and not np.isfinite(quality).any()  # their readings have no code
@@ -188,7 +191,9 @@ def _find_losses(
 def find_lateness_bursts(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Several late ticks close together; single ones occur on any machine."""
     worst = level["max_lateness_ms"]
-    usual = float(np.nanmedian(worst)) if np.isfinite(worst).any() else 0.0
+    usual = 0.0
+    if np.isfinite(worst).any():
+        usual = float(np.nanmedian(worst))
     late = worst > max(LATE_LEAST_MS, LATE_LEAST_RATIO * usual)
     return [
         found_event.FoundEvent(

@@ -32,11 +32,9 @@ def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
     sigma = _SIGMA_OVER_MAD * float(np.nanmedian(np.abs(size - scale))) + 1e-12
     score = np.nan_to_num((size - scale) / sigma)
     rows = np.flatnonzero((np.nan_to_num(size) >= JUMP_LEAST_UM) & (score >= JUMP_LEAST_SIGMAS))
-    groups = (
-        np.split(rows, np.flatnonzero(np.diff(rows) > 2 * JUMP_HALF_CYCLES) + 1)
-        if rows.size
-        else []
-    )
+    groups = []
+    if rows.size:
+        groups = np.split(rows, np.flatnonzero(np.diff(rows) > 2 * JUMP_HALF_CYCLES) + 1)
     best = [int(group[np.argmax(size[group])]) for group in groups]
     time_s = {"time_s": shapes.time_s[good]}
     return [

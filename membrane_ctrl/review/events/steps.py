@@ -82,9 +82,10 @@ def local_sigma(values: Column, share: float = 0.5) -> Column:
         start = max(0, min(first, values.size - _STRETCH))
         part = values[start : first + _STRETCH]
         part = np.abs(part[np.isfinite(part)])
-        result[first : first + _STRETCH] = (
-            np.quantile(part, share) / sigmas if part.size else np.nan
-        )
+        if part.size:
+            result[first : first + _STRETCH] = np.quantile(part, share) / sigmas
+        else:
+            result[first : first + _STRETCH] = np.nan
     return result
 
 

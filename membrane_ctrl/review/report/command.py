@@ -31,12 +31,12 @@ def report_command(
     began_s = time.monotonic()
     opened = open_run(catalogue.resolve_run(run))
     analysis = analyse_run(opened, *part_s(opened.origin_utc, start, end))
-    other = (
-        None
-        if compare_with is None
-        else _open_other(open_run(catalogue.resolve_run(compare_with)), start, end)
-    )
-    differences = [] if other is None else compare.compare_analyses(analysis, other)
+    other = None
+    if compare_with is not None:
+        other = _open_other(open_run(catalogue.resolve_run(compare_with)), start, end)
+    differences = []
+    if other is not None:
+        differences = compare.compare_analyses(analysis, other)
     history = pump_history(opened.folder)
     table = report_table(analysis) | {"pump_over_runs": [asdict(seen) for seen in history]}
     if other is not None:
@@ -76,7 +76,9 @@ def _open_other(run: Run, start: str | None, end: str | None) -> Analysis:
     differ.
     """
     from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
-    return analyse_run(run, *part_s(run.origin_utc, start, end)) if from_start else analyse_run(run)
+    if from_start:
+        return analyse_run(run, *part_s(run.origin_utc, start, end))
+    return analyse_run(run)
 
 
 def _print_result(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:

@@ -166,7 +166,9 @@ def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> 
     """
     time_s = columns[time_name]
     steps_s = np.diff(time_s)
-    longest_s = max(_LEAST_S, _STEPS * float(np.median(steps_s))) if steps_s.size else np.inf
+    longest_s = np.inf
+    if steps_s.size:
+        longest_s = max(_LEAST_S, _STEPS * float(np.median(steps_s)))
     before = np.flatnonzero(steps_s > longest_s)
     broken = {
         name: np.insert(np.asarray(values, np.float64), before + 1, np.nan, axis=0)
@@ -188,14 +190,16 @@ def draw_overview(analysis: Analysis) -> Markup:
     """Error with its envelope, the band, states, detected events and marks: HTML with a picture for
     wide pages and one for phones.
     """
-    wide, narrow = _draw_overview(analysis, WIDTH_IN, 4.2), _draw_overview(analysis, PANEL_IN, 4.0)
+    wide = _draw_overview(analysis, WIDTH_IN, 4.2)
+    narrow = _draw_overview(analysis, PANEL_IN, 4.0)
     return Markup("<div class='on-wide'>{}</div><div class='on-phone'>{}</div>").format(
         wide, narrow
     )
 
 
 def _draw_overview(analysis: Analysis, width_in: float, height_in: float) -> Markup:
-    level, band_um = broken_at_gaps(analysis.level), analysis.run.config.limits.band_um
+    level = broken_at_gaps(analysis.level)
+    band_um = analysis.run.config.limits.band_um
     span_s = analysis.ticks.end_s - analysis.ticks.start_s
     time, unit = hours_or_less(level["time_s"], span_s)
     with make_picture(2, 1, height_in, width_in, sharex=True, height_ratios=[8, 1.1]) as (
@@ -215,7 +219,9 @@ def _draw_overview(analysis: Analysis, width_in: float, height_in: float) -> Mar
         most_um = _SHOWN_BANDS * band_um
         plot.set_ylim(-most_um, most_um)
         largest_um = float(np.nanmax(np.abs(ends), initial=0.0))
-        beyond = f" (up to {largest_um:.3g} µm, beyond the scale)" if largest_um > most_um else ""
+        beyond = ""
+        if largest_um > most_um:
+            beyond = f" (up to {largest_um:.3g} µm, beyond the scale)"
         plot.set(ylabel=plot_title(ERROR), title=f"The run at a glance{beyond}")
         _draw_found_events(plot, analysis, span_s)
         plot.legend(loc="upper right", ncols=3 if width_in == WIDTH_IN else 1)
@@ -234,9 +240,10 @@ def _draw_found_events(plot: Any, analysis: Analysis, span_s: float) -> None:
     for noted in make_timeline(analysis):
         if isinstance(event := noted.event, (events.Fault, run_events.Mark)):
             at, _ = hours_or_less(noted.mono_s, span_s)
-            colour, text = (
-                (RED, event.name) if isinstance(event, events.Fault) else ("black", event.text)
-            )
+            if isinstance(event, events.Fault):
+                colour, text = RED, event.name
+            else:
+                colour, text = "black", event.text
             plot.axvline(at, color=colour, lw=1)
             text = one_line(text)
             if len(text) > _LETTERS_MOST:
@@ -316,7 +323,8 @@ def _draw_columns(
         )
     if len(columns) == 1:
         (each,) = columns
-        lowest, highest = level[f"min_{each.name}"], level[f"max_{each.name}"]
+        lowest = level[f"min_{each.name}"]
+        highest = level[f"max_{each.name}"]
         axis.fill_between(time, lowest, highest, color=on_white(each.colour), alpha=0.2, lw=0)
     if len(columns_of(columns[0].plot)) > 1:
         axis.legend(loc="upper right", ncols=len(columns))
@@ -333,7 +341,8 @@ def draw_distributions(analysis: Analysis) -> Markup:
     ]
 
     def draw_histogram(_: Figure, plot: Any) -> None:
-        edges, counts = analysis.ticks.histogram_um, analysis.ticks.histogram_counts
+        edges = analysis.ticks.histogram_um
+        counts = analysis.ticks.histogram_counts
         merged = counts.reshape(-1, 5).sum(axis=1)
         middle = edges[:-1].reshape(-1, 5).mean(axis=1) + (edges[1] - edges[0]) / 2
         share = 100 * merged / max(1, counts.sum())
@@ -380,7 +389,8 @@ def pump_history(history: Sequence[PumpSeen], change_max: float) -> Markup:
     days = [seen.started_utc for seen in history]
 
     def draw_scale(_: Figure, plot: Any) -> None:
-        scales, sigmas = [seen.scale for seen in history], [seen.sigma for seen in history]
+        scales = [seen.scale for seen in history]
+        sigmas = [seen.sigma for seen in history]
         plot.errorbar(days, scales, sigmas, fmt="o-", color=BLUE, ms=4)
         for limit in (1 - change_max, 1 + change_max):
             plot.axhline(first.scale * limit, color=RED, lw=0.8, ls="--")

@@ -103,10 +103,8 @@ def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
         analysis = analyse_run(run, *part_s(run.origin_utc, start, end))
         history = pump_history(folder)
         table = report_table(analysis) | {"pump_over_runs": [asdict(seen) for seen in history]}
-        text, curve = (
-            plain_json.dumps(table, indent=1),
-            render_sparkline(analysis.level["mean_error_um"]),
-        )
+        text = plain_json.dumps(table, indent=1)
+        curve = render_sparkline(analysis.level["mean_error_um"])
         return RunReport(
             _make_fleet_entry(analysis, table),
             text,
@@ -169,7 +167,9 @@ def fleet_command(options: FleetOptions) -> int:
     folders, out = list_fleet_folders(options.runs), options.out.resolve()
     common = Path(os.path.commonpath([folder.parent for folder in folders]))
     workers = options.workers or min(os.cpu_count() or 1, len(folders))
-    job, rows, entries = partial(run_report, options.start, options.end), [], []
+    job = partial(run_report, options.start, options.end)
+    rows = []
+    entries = []
     with (
         errors.convert_write_errors(out, errors.DeviceError, "; choose another folder with --out"),
         run_jobs(job, folders, workers, options.scheduler) as results,
@@ -234,7 +234,9 @@ def _make_row(entry: dict[str, Any], curve: str) -> list[str]:
 def _make_page(entries: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
     failed = sum("problem" in entry for entry in entries)
     unusual = sum(entry.get("verdict") in ("look", "bad") for entry in entries)
-    word = "look" if unusual else "good"
+    word = "good"
+    if unusual:
+        word = "look"
     if failed:
         word = "bad"
     sentence = f"{len(entries)} runs: {unusual} to look at, {failed} cannot be reported."

@@ -57,7 +57,9 @@ def make_verdict(analysis: Analysis) -> tuple[Word, str]:
 
 
 def _join_names(names: list[str]) -> str:
-    return f"; check: {', '.join(dict.fromkeys(names))}" if names else "; nothing unusual"
+    if not names:
+        return "; nothing unusual"
+    return f"; check: {', '.join(dict.fromkeys(names))}"
 
 
 def report_table(analysis: Analysis) -> dict[str, Any]:

@@ -40,11 +40,10 @@ def explain_pump_change(history: Sequence[PumpSeen], change_max: float) -> str:
     """
     if not history:
         return ""
-    newest, first = history[-1], next(seen for seen in history if seen.same_curve)
-    change, sigma = (
-        newest.scale / first.scale - 1,
-        math.hypot(newest.sigma, first.sigma) / first.scale,
-    )
+    newest = history[-1]
+    first = next(seen for seen in history if seen.same_curve)
+    change = newest.scale / first.scale - 1
+    sigma = math.hypot(newest.sigma, first.sigma) / first.scale
     if abs(change) <= max(change_max, _CERTAIN_SIGMAS * sigma):
         return ""
     return (
@@ -66,7 +65,8 @@ def pump_history(newest: Path) -> list[PumpSeen]:
         with contextlib.suppress(OSError):
             if folder.name.startswith(".") or not run_folder.is_run(folder):
                 continue
-            log, config = event_log.read_events(folder, []), run_config.read_config(folder, [])
+            log = event_log.read_events(folder, [])
+            config = run_config.read_config(folder, [])
             last = _last_learned(log)
             if last is None or config.devices != devices:
                 continue
@@ -94,4 +94,6 @@ def _last_learned(log: Sequence[LoggedEvent]) -> tuple[events.PumpLearned, dict[
 
 
 def _to_finite(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
+    if not isinstance(value, int | float):
+        return math.nan
+    return float(value)

@@ -110,7 +110,9 @@ def _describe_time(analysis: Analysis) -> str:
 
 def _describe_origin(analysis: Analysis) -> str:
     run = analysis.run
-    recorded = f", recorded by {run.recorded_by}" if run.recorded_by else ""
+    recorded = ""
+    if run.recorded_by:
+        recorded = f", recorded by {run.recorded_by}"
     return f"{program.program_identity()}, report of {run.folder.name}{recorded}"
 
 
@@ -179,7 +181,10 @@ def _tabulate_windows(analysis: Analysis) -> PageTable:
 
 
 def _list_details(analysis: Analysis) -> list[PageBlock]:
-    series, name = (analysis.reading, READING) if analysis.true is None else (analysis.true, TRUE)
+    if analysis.true is None:
+        series, name = analysis.reading, READING
+    else:
+        series, name = analysis.true, TRUE
     if series is None:
         return []
     ticks = analysis.ticks
@@ -351,7 +356,9 @@ def _format_slope(slope: drift.FittedSlope, unit: str) -> str:
         return "too short to say"
     rate, low, high = map(format_signed, (slope.per_hour, slope.low, slope.high))
     text = f"{rate} {unit} (95 %: {low} to {high})"
-    return text if slope.is_significant else f"{text}, not significant"
+    if slope.is_significant:
+        return text
+    return f"{text}, not significant"
 
 
 def _list_rest(count: int) -> list[PageBlock]:

@@ -36,29 +36,33 @@ def allan_deviation(values: AnyArray, period_s: float, lengths: IntArray | None 
         Samples in each tau; by default powers of two up to a quarter of the series, which leaves
         about four independent means.
     """
-    there = np.isfinite(values)
-    count = int(there.sum())
-    if lengths is None:
-        lengths = 2 ** np.arange(max(0, int(np.log2(max(values.size, 4) / 4)) + 1))
-    if count < 3:
+    finite = np.isfinite(values)
+    if int(finite.sum()) < 3:
         return Allan(np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
-    mean = float(values[there].mean(dtype=np.float64))
+    if lengths is None:
+        octaves = int(np.log2(max(values.size, 4) / 4))
+        lengths = 2 ** np.arange(max(0, octaves + 1))
+    samples = np.array([m for m in lengths if 2 * m <= values.size], dtype=np.int64)
+    # Running sums of the values without their mean, and of the gaps: a triple of running sums spans
+    # no gap if the count of gaps is the same at both ends
+    mean = float(values[finite].mean(dtype=np.float64))
     total = np.zeros(values.size + 1)
-    np.cumsum(np.where(there, values - mean, 0.0), out=total[1:])
+    np.cumsum(np.where(finite, values - mean, 0.0), out=total[1:])
     gaps = np.zeros(values.size + 1, dtype=np.int32)
-    np.cumsum(~there, out=gaps[1:])
-    found = [_second_differences(total, gaps, int(m)) for m in lengths if 2 * m <= values.size]
-    tau = np.array([m * period_s for m in lengths if 2 * m <= values.size])
-    windows = np.array([pairs for _, pairs in found], dtype=np.int64)
-    samples = np.array([m for m in lengths if 2 * m <= values.size], dtype=np.float64)
-    squares = np.array([square for square, _ in found])
-    kept = windows > 0
-    deviation = np.sqrt(squares[kept] / windows[kept] / 2) / samples[kept]
-    return Allan(tau[kept], deviation, windows[kept])
+    np.cumsum(~finite, out=gaps[1:])
+    # The equation above, for each averaging time
+    squares = np.zeros(samples.size)
+    triples = np.zeros(samples.size, dtype=np.int64)
+    for k, m in enumerate(samples):
+        squares[k], triples[k] = _second_differences(total, gaps, int(m))
+    kept = triples > 0
+    deviation = np.sqrt(squares[kept] / triples[kept] / 2) / samples[kept]
+    return Allan(np.asarray(samples[kept] * period_s), deviation, triples[kept])
 
 
 @compile_loop()
 def _second_differences(total: Column, gaps: AnyArray, m: int) -> tuple[float, int]:
+    """Sum of the squared second differences of running sums m apart, and how many span no gap."""
     square = 0.0
     count = 0
     for i in range(total.size - 2 * m):

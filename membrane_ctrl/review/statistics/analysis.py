@@ -156,7 +156,9 @@ def _compute_benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
     without = np.stack(
         window_means(second, counts, error + sums[KEPT_AWAY], 1, run.config.loop.rate_hz)
     )
-    return Benefit(float(held.std()), float(without[1].std()), without) if held.size else None
+    if not held.size:
+        return None
+    return Benefit(float(held.std()), float(without[1].std()), without)
 
 
 def _compute_leak(level: Block) -> tuple[float, float, float]:
@@ -171,4 +173,6 @@ def _tracking_share(level: Block) -> float:
     """Share of the held time in which the shape loop moved the setpoint."""
     state = level["shape_state"][level["state"] == telemetry.State.HOLD]
     state = state[np.isfinite(state)]
-    return float((state == telemetry.ShapeState.TRACKING).mean()) if state.size else math.nan
+    if not state.size:
+        return math.nan
+    return float((state == telemetry.ShapeState.TRACKING).mean())

@@ -40,7 +40,9 @@ class Difference:
             return ""
         if self.p_value >= _SIGNIFICANT:
             return "no significant difference"
-        return "larger" if self.ours > self.theirs else "smaller"
+        if self.ours > self.theirs:
+            return "larger"
+        return "smaller"
 
 
 def compare_analyses(ours: Analysis, theirs: Analysis) -> list[Difference]:
@@ -56,11 +58,9 @@ def compare_analyses(ours: Analysis, theirs: Analysis) -> list[Difference]:
         ("true centre", ours.true, theirs.true),
     ):
         if a is not None and b is not None:
-            offset_um = (
-                math.hypot(_reference_um(ours), _reference_um(theirs))
-                if name == "true centre"
-                else 0.0
-            )
+            offset_um = 0.0
+            if name == "true centre":
+                offset_um = math.hypot(_reference_um(ours), _reference_um(theirs))
             tracks = name == "true centre" and (_is_tracking(ours) or _is_tracking(theirs))
             found += _compare_series(name, a, b, offset_um, tracks)
     if ours.benefit is not None and theirs.benefit is not None:
@@ -113,7 +113,9 @@ def _compare_series(
 def _of_mean(offset_um: float, tracks: bool) -> str:
     if offset_um > 0:
         return f"with ±{offset_um:.2g} µm for the references of the shape loops"
-    return f"{_STRETCHES}, and ignores the reference of the shape loop" if tracks else ""
+    if not tracks:
+        return ""
+    return f"{_STRETCHES}, and ignores the reference of the shape loop"
 
 
 def _compare_loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
@@ -231,8 +233,9 @@ def _reference_um(analysis: Analysis) -> float:
 
 def _slope_p(a: FittedSlope, b: FittedSlope) -> float:
     sigmas = [(slope.high - slope.low) / 2 / 1.96 for slope in (a, b)]
-    if not all(map(math.isfinite, sigmas)):
+    sigma = math.hypot(*sigmas)
+    if not math.isfinite(sigma):
         return math.nan
-    if not any(sigmas):
+    if sigma == 0.0:
         return float(a.per_hour == b.per_hour)
-    return float(2 * stats.norm.sf(abs(a.per_hour - b.per_hour) / math.hypot(*sigmas)))
+    return float(2 * stats.norm.sf(abs(a.per_hour - b.per_hour) / sigma))

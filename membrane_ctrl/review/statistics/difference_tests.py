@@ -14,15 +14,10 @@ from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.review.statistics.drift import correlation_time, correlation_times
 from membrane_ctrl.review.statistics.window_means import group_starts
 
-# Tests whether two series differ, using blocks of time that count as independent.
-# After five minutes the effects of weather (30 s) and air (300 s) have decayed enough for
-# independence; a short run is cut into eight blocks, which makes its test a rough one.
-_BLOCK_S = 300.0
-_LEAST_BLOCKS = 8
-# Least number of values in a block for a variance.
-_LEAST_VALUES = 5
-# Fewer blocks have no usable variance.
-_LEAST_TESTED = 3
+_BLOCK_S = 300.0  # length of a block that counts as independent
+_LEAST_BLOCKS = 8  # a short run is cut into this many
+_LEAST_VALUES = 5  # of a block, for a variance
+_LEAST_TESTED = 3  # blocks; fewer have no usable variance
 
 
 def block_s(a_s: Column, b_s: Column, window_s: float) -> float:
@@ -37,20 +32,26 @@ def block_statistics(time_s: Column, values: Column, length_s: float) -> tuple[C
     """Mean and log variance of each block; the logarithm is corrected for its bias from the number
     of values.
     """
-    there = np.isfinite(values)
-    time_s, values = time_s[there], values[there]
+    finite = np.isfinite(values)
+    time_s = time_s[finite]
+    values = values[finite]
     if values.size < _LEAST_TESTED or length_s <= 0:
         return np.empty(0), np.empty(0)
-    number = np.floor((time_s - time_s[0]) / length_s).astype(np.int64)
-    number = np.minimum(number, max(0, int(np.ptp(time_s) / length_s) - 1))
-    count = np.bincount(number)
-    mean = np.bincount(number, values) / np.maximum(count, 1)
+    # The block of each value; the last block takes the remainder
+    block = np.floor((time_s - time_s[0]) / length_s).astype(np.int64)
+    last_block = max(0, int(np.ptp(time_s) / length_s) - 1)
+    block = np.minimum(block, last_block)
+    count = np.bincount(block)
+    mean = np.bincount(block, values) / np.maximum(count, 1)
     freedom = np.maximum(count - 1, 1)
-    variance = np.bincount(number, (values - mean[number]) ** 2) / freedom
+    variance = np.bincount(block, (values - mean[block]) ** 2) / freedom
+    # Blocks that are half empty count for nothing
     kept = count >= 0.5 * np.median(count[count > 0])
     varies = kept & (variance > 0)
+    # Mean of the logarithm of a chi-square variable over its degrees of freedom
     bias = special.digamma(freedom / 2) - np.log(freedom / 2)
-    return np.asarray(mean[kept], dtype=np.float64), np.log(variance[varies]) - bias[varies]
+    log_variance = np.log(variance[varies]) - bias[varies]
+    return np.asarray(mean[kept], dtype=np.float64), log_variance
 
 
 def window_means(time_s: Column, values: Column, window_s: float) -> tuple[Column, Column]:
@@ -69,17 +70,21 @@ def spread_p(a: Column, b: Column, window_s: float = 1.0) -> float:
     """Chance of spreads as different between equal processes (2, n) of times and values; NaN: too
     short.
 
-    Two tests, each of half the level. Within blocks: Welch's of log variances, which sees any
-    difference of the usual motion. Of the whole: the ratio of the variances against F with their
-    effective degrees of freedom, the fewer of n / (1 + 2 sum r_k^2) and what the scatter of the
-    squares says; it sees what is slower or rarer than a block.
+    Two tests, each of half the level. Within blocks: Welch's test of log variances, which detects
+    any difference of the usual motion. Of the whole: the ratio of the variances against F with
+    their effective degrees of freedom, the smaller of n / (1 + 2 sum r_k^2) and the number that
+    follows from the scatter of the squares; it detects motion slower or rarer than a block.
     """
     length_s = block_s(a[0], b[0], window_s)
-    within = welch_p(
-        block_statistics(a[0], a[1], length_s)[1], block_statistics(b[0], b[1], length_s)[1]
-    )
-    both = [p for p in (within, _variances_p(a[1], b[1])) if math.isfinite(p)]
-    return min(1.0, len(both) * min(both)) if both else math.nan
+    _, log_variances_a = block_statistics(a[0], a[1], length_s)
+    _, log_variances_b = block_statistics(b[0], b[1], length_s)
+    within_blocks = welch_p(log_variances_a, log_variances_b)
+    of_the_whole = _variances_p(a[1], b[1])
+    found = [p for p in (within_blocks, of_the_whole) if math.isfinite(p)]
+    if not found:
+        return math.nan
+    # Bonferroni: the smaller of two chances, times the number of tests
+    return min(1.0, len(found) * min(found))
 
 
 def _variances_p(a: Column, b: Column) -> float:
@@ -92,15 +97,19 @@ def _variances_p(a: Column, b: Column) -> float:
         square = float((residual**2).mean())
         if square <= 0:
             return math.nan
+        # Independent values a sample: of a Gaussian series (Bartlett 1946), and by the measured
+        # scatter of the squares, which rare excursions increase
+        _, of_square = correlation_times(residual)
+        gaussian = 1 / of_square
         excess = residual**2 - square
-        # of a Gaussian series (Bartlett 1946), and of its squares as they are: rare excursions make
-        # them few
-        gaussian = 1 / correlation_times(residual)[1]
-        seen = 2 * square**2 / (max(float(excess.var()), 1e-300) * correlation_time(excess))
-        freedoms.append(max(values.size * min(gaussian, seen) - 1, 1.0))
+        excess_variance = max(float(excess.var()), 1e-300)
+        measured = 2 * square**2 / (excess_variance * correlation_time(excess))
+        freedoms.append(max(values.size * min(gaussian, measured) - 1, 1.0))
         variances.append(square)
     ratio = variances[0] / variances[1]
-    return 2 * float(min(stats.f.cdf(ratio, *freedoms), stats.f.sf(ratio, *freedoms)))
+    below = stats.f.cdf(ratio, *freedoms)
+    above = stats.f.sf(ratio, *freedoms)
+    return 2 * float(min(below, above))
 
 
 def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> float:
@@ -131,11 +140,14 @@ def welch_p(a: Column, b: Column, offset: float = 0.0, correlated: bool = False)
         return math.nan
     variance, weights = offset**2, 0.0
     for part in (a, b):
-        size = part.size / (correlation_time(part - part.mean()) if correlated else 1.0)
-        own = float(part.var(ddof=1)) / size
-        variance += own
-        weights += own**2 / max(size - 1, 1.0)
-    if variance <= 0:  # what never varies differs, or does not
+        size = float(part.size)
+        if correlated:
+            size /= correlation_time(part - part.mean())
+        of_mean = float(part.var(ddof=1)) / size
+        variance += of_mean
+        weights += of_mean**2 / max(size - 1, 1.0)
+    if variance <= 0:  # two constant series are equal, or differ for certain
         return float(a.mean() == b.mean())
+    # Welch-Satterthwaite
     freedom = variance**2 / weights if weights > 0 else math.inf
     return float(2 * stats.t.sf(abs(a.mean() - b.mean()) / math.sqrt(variance), freedom))

@@ -44,22 +44,24 @@ def fit_slope(time_s: Column, values: Column) -> FittedSlope:
 
     `time_s` (n,) is equally spaced except for gaps; values that are not finite are ignored.
     """
-    there = np.isfinite(values)
-    hours, values = time_s[there] / 3600.0, values[there]
+    finite = np.isfinite(values)
+    hours = time_s[finite] / 3600.0
+    values = values[finite]
     if hours.size < 5 or np.ptp(hours) <= 0:
         return FittedSlope(np.nan, np.nan, np.nan, np.nan)
+    # Ordinary least squares
     hours = hours - hours.mean()
     spread = float((hours**2).sum())
     rate = float((hours * values).sum()) / spread
     residual = values - values.mean() - rate * hours
+    # Correlated samples count for fewer
     factor = correlation_time(residual)
     effective = values.size / factor
     freedom = max(effective - 2, 1.0)
-    sigma = np.sqrt(
-        float((residual**2).sum()) / (values.size - 2) * effective / freedom * factor / spread
-    )
-    reach = float(stats.t.ppf(0.975, freedom) * sigma)
-    return FittedSlope(rate, rate - reach, rate + reach, effective)
+    variance = float((residual**2).sum()) / (values.size - 2)
+    sigma = np.sqrt(variance * effective / freedom * factor / spread)
+    half_width = float(stats.t.ppf(0.975, freedom) * sigma)
+    return FittedSlope(rate, rate - half_width, rate + half_width, effective)
 
 
 def correlation_time(residual: Column) -> float:
@@ -70,19 +72,29 @@ def correlation_time(residual: Column) -> float:
 def correlation_times(residual: Column) -> tuple[float, float]:
     """1 + 2 sum of the autocorrelation, and of its square, for a variance; in samples,
     at least 1.
+
+    Source: Geyer, Statistical Science 7 (1992) 473, initial monotone sequence; `fit_slope`
+    describes the correction of the bias.
     """
     size = residual.size
+    # Autocovariance by the Wiener-Khinchin theorem, padded against wrapping around
     power = np.abs(np.fft.rfft(residual, 2 * size)) ** 2
     covariance = np.fft.irfft(power)[:size]
     if covariance[0] <= 0:
         return 1.0, 1.0
-    seen, factor, of_square = covariance / covariance[0], 1.0, 1.0
+    measured = covariance / covariance[0]
+    factor = 1.0
+    of_square = 1.0
     for _ in range(_BIAS_ROUNDS):
+        # Put back the share of the variance that the fitted line has taken
         taken = min(2 * factor / size, _TAKEN_MOST)
-        correlation = seen * (1 - taken) + taken
+        correlation = measured * (1 - taken) + taken
+        # Sum while the sums of neighbouring pairs are positive, and let them only fall
         pairs = correlation[: size // 2 * 2].reshape(-1, 2).sum(axis=1)
-        ends = np.flatnonzero(pairs <= 0)
-        count = int(ends[0]) if ends.size else pairs.size
-        sums = np.minimum.accumulate(pairs[:count]).sum(), (correlation[: 2 * count] ** 2).sum()
-        factor, of_square = (float(np.clip(2 * total - 1, 1.0, size / 3)) for total in sums)
+        negative = np.flatnonzero(pairs <= 0)
+        count = int(negative[0]) if negative.size else pairs.size
+        total = np.minimum.accumulate(pairs[:count]).sum()
+        total_of_square = (correlation[: 2 * count] ** 2).sum()
+        factor = float(np.clip(2 * total - 1, 1.0, size / 3))
+        of_square = float(np.clip(2 * total_of_square - 1, 1.0, size / 3))
     return factor, of_square

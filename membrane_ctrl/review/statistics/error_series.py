@@ -94,11 +94,16 @@ def slow_spectrum(time_s: Column, means: Column) -> power_spectrum.Spectrum:
 def fill_short_gaps(values: Singles, most: int) -> Singles:
     """Gaps of at most `most` values filled with straight lines; longer ones stay NaN."""
     gap = ~np.isfinite(values)
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], gap, [False])).astype(np.int8)))
+    # Where gaps begin and end, in turn
+    padded = np.concatenate(([False], gap, [False])).astype(np.int8)
+    edges = np.flatnonzero(np.diff(padded))
     filled = values.copy()
     for start, end in edges.reshape(-1, 2):
-        if end - start <= most and start > 0 and end < values.size:
-            filled[start:end] = np.linspace(values[start - 1], values[end], end - start + 2)[1:-1]
+        length = end - start
+        is_inside = start > 0 and end < values.size
+        if length <= most and is_inside:
+            line = np.linspace(values[start - 1], values[end], length + 2)
+            filled[start:end] = line[1:-1]
     return filled
 
 

@@ -44,6 +44,17 @@ class FilmCreep:
         return abs(self.drift) > 2 * self.drift_sigma
 
 
+@dataclass(frozen=True)
+class _LawFit:
+    """The law for one onset, one bend and one correlation of the noise."""
+
+    log_evidence: float
+    drift: float  # from the last reading to the time ahead
+    drift_variance: float
+    per_decade: float
+    scatter: float
+
+
 def fit_creep(time_s: FloatArray, y: FloatArray, ahead_s: float) -> FilmCreep:
     """Fit the law to readings (n,) of the logarithm of the stiffness.
 
@@ -59,16 +70,25 @@ def fit_creep(time_s: FloatArray, y: FloatArray, ahead_s: float) -> FilmCreep:
     span_s = float(time_s[-1] - time_s[0])
     if ahead_s > _AHEAD * span_s:
         raise ValueError(
-            f"readings over {span_s / 3600:.1f} h say nothing of {ahead_s / 3600:.0f} h ahead"
+            f"readings over {span_s / 3600:.1f} h do not predict {ahead_s / 3600:.0f} h ahead"
         )
     t = np.append((time_s - time_s[0]) / span_s, 1 + ahead_s / span_s)
-    found = np.array([_fit_law(t, y, *each) for each in product(_ONSETS, _BENDS, _LASTING)])
-    weight = np.exp(found[:, 0] - np.max(found[:, 0]))
+    # One fit for each combination of the three unknown settings, weighted with its evidence
+    fits = [
+        _fit_law(t, y, onset, bend, lasting)
+        for onset, bend, lasting in product(_ONSETS, _BENDS, _LASTING)
+    ]
+    evidence = np.array([fit.log_evidence for fit in fits])
+    weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
-    _, drifts, variances, decades, scatters = found.T
+    drifts = np.array([fit.drift for fit in fits])
+    variances = np.array([fit.drift_variance for fit in fits])
     drift = float(weight @ drifts)
-    sigma = math.sqrt(float(weight @ (variances + (drifts - drift) ** 2)))
-    return FilmCreep(span_s, float(weight @ decades), drift, sigma, float(weight @ scatters))
+    # The variance of a mixture: that of each fit, and the scatter between the fits
+    variance = float(weight @ (variances + (drifts - drift) ** 2))
+    per_decade = float(weight @ np.array([fit.per_decade for fit in fits]))
+    scatter = float(weight @ np.array([fit.scatter for fit in fits]))
+    return FilmCreep(span_s, per_decade, drift, math.sqrt(variance), scatter)
 
 
 def _average_blocks(time_s: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -76,40 +96,74 @@ def _average_blocks(time_s: FloatArray, y: FloatArray) -> tuple[FloatArray, Floa
     span_s = float(np.ptp(time_s)) if time_s.size else 0.0
     if time_s.size <= _BLOCKS or span_s == 0:
         return time_s, y
-    block = np.minimum(((time_s - time_s[0]) / span_s * _BLOCKS).astype(int), _BLOCKS - 1)
+    block = ((time_s - time_s[0]) / span_s * _BLOCKS).astype(int)
+    block = np.minimum(block, _BLOCKS - 1)
     count = np.bincount(block)
     full = count > 0
-    return np.bincount(block, time_s)[full] / count[full], np.bincount(block, y)[full] / count[full]
+    mean_time_s = np.bincount(block, time_s)[full] / count[full]
+    mean_y = np.bincount(block, y)[full] / count[full]
+    return mean_time_s, mean_y
 
 
-def _fit_law(
-    t: FloatArray, y: FloatArray, onset: float, bend: float, lasting: float
-) -> tuple[float, float, float, float, float]:
-    """One law: log evidence, drift to the last t from the one before, its variance, drift per
-    decade, scatter.
+def _fit_law(t: FloatArray, y: FloatArray, onset: float, bend: float, lasting: float) -> _LawFit:
+    """Fit one law by generalised least squares, and predict its drift.
 
-    t (n + 1,) is in units of the readings' time; the last one is ahead of the n readings y.
+    Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006): covariance of
+    the cubic spline in section 6.3.1, explicit basis functions in section 2.7.
+
+    Parameters
+    ----------
+    t : (n + 1,) array
+        Times in units of the readings' time; the last one is ahead of the n readings.
+    y : (n,) array
+        Readings.
+    onset : float
+        t0, in the unit of t.
+    bend : float
+        Scale of W, in sigma of the noise.
+    lasting : float
+        Correlation of the noise from one reading to the next.
     """
     u = np.log(t + onset) - math.log(onset)
-    less, more = np.minimum.outer(u, u), np.maximum.outer(u, u)
-    curve = bend**2 * less**2 * (3 * more - less) / 6
-    noise = lasting ** np.abs(np.subtract.outer(np.arange(y.size), np.arange(y.size)))
+    # Covariance of W, an integrated random walk from u = 0
+    earlier = np.minimum.outer(u, u)
+    later = np.maximum.outer(u, u)
+    curve = bend**2 * earlier**2 * (3 * later - earlier) / 6
+    # Covariance of the noise, in its own variance: a first-order autoregressive process
+    number = np.arange(y.size)
+    noise = lasting ** np.abs(np.subtract.outer(number, number))
+    # Whiten the line's two columns, the readings, and the covariance of the drift with the readings
     root = np.linalg.cholesky(curve[:-1, :-1] + noise)
-    design = np.stack([np.ones(y.size), u[:-1] - u[-2]], axis=1)
-    both = np.linalg.solve(root, np.column_stack([design, y, curve[:-1, -1] - curve[:-1, -2]]))
-    a, b, onto = both[:, :2], both[:, 2], both[:, 3]
-    inverse = np.linalg.inv(a.T @ a)
-    line = inverse @ (a.T @ b)
-    left, free = b - a @ line, y.size - 2
-    variance = max(float(left @ left), 1e-30) / free
+    line_columns = np.stack([np.ones(y.size), u[:-1] - u[-2]], axis=1)
+    drift_covariance = curve[:-1, -1] - curve[:-1, -2]
+    whitened = np.linalg.solve(root, np.column_stack([line_columns, y, drift_covariance]))
+    columns = whitened[:, :2]
+    readings = whitened[:, 2]
+    gain = whitened[:, 3]
+    # Least squares for the line a + b u; its residual carries W
+    normal = columns.T @ columns
+    inverse = np.linalg.inv(normal)
+    line = inverse @ (columns.T @ readings)
+    residual = readings - columns @ line
+    freedom = y.size - 2
+    variance = max(float(residual @ residual), 1e-30) / freedom
+    # Drift from the last reading to the time ahead: of the line, and of W
     step = np.array([0.0, u[-1] - u[-2]])
-    drift = float(step @ line + onto @ left)
-    short = step - a.T @ onto
-    own = curve[-1, -1] + curve[-2, -2] - 2 * curve[-1, -2] - onto @ onto + short @ inverse @ short
+    drift = float(step @ line + gain @ residual)
+    # Its variance: of W given the readings, and of the line that is estimated from them
+    of_curve = curve[-1, -1] + curve[-2, -2] - 2 * curve[-1, -2] - gain @ gain
+    untaken = step - columns.T @ gain
+    of_line = untaken @ inverse @ untaken
+    # Marginal likelihood, with the line and the noise's variance integrated out
     evidence = (
         -np.sum(np.log(np.diag(root)))
-        - np.linalg.slogdet(a.T @ a)[1] / 2
-        - free / 2 * math.log(variance)
+        - np.linalg.slogdet(normal)[1] / 2
+        - freedom / 2 * math.log(variance)
     )
-    decade = math.log(10) * drift / float(u[-1] - u[-2])
-    return float(evidence), drift, variance * float(own), decade, math.sqrt(variance)
+    return _LawFit(
+        log_evidence=float(evidence),
+        drift=drift,
+        drift_variance=variance * float(of_curve + of_line),
+        per_decade=math.log(10) * drift / float(u[-1] - u[-2]),
+        scatter=math.sqrt(variance),
+    )

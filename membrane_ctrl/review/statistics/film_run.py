@@ -99,18 +99,21 @@ def _make_table(
 
 
 def _format_table(table: dict[str, Any]) -> list[str]:
-    drift = table["tomorrow_um"]
-    low, high = (drift["value"] + sign * _SURE * drift["sigma"] for sign in (-1, 1))
-    creeps = f"creep      {table['percent_per_decade']:+.3g} % of E t in a decade of time"
+    creep = "none that these readings show"
+    if table["creeps"]:
+        creep = f"{table['percent_per_decade']:+.3g} % of E t in a decade of time"
+    change_um = table["tomorrow_um"]["value"]
+    half_width_um = _SURE * table["tomorrow_um"]["sigma"]
+    low_um = change_um - half_width_um
+    high_um = change_um + half_width_um
     return [
         f"runs       {len(table['runs'])}, over {table['hours']:.1f} h; each reading scatters by "
         f"{table['scatter_percent']:.2g} %",
         f"E t        {table['stiffness_n_per_m'] / 1e3:.2f} kN/m, if the pre-strain is "
         f"{1e6 * table['prestrain']:g} µm/m and nu {table['poisson']:g}",
-        creeps if table["creeps"] else "creep      none that these readings show",
-        f"tomorrow   at the same pressure the sag changes by {drift['value']:+.3g} µm in 24 "
-        f"h; 95 %: {low:+.3g} to "
-        f"{high:+.3g} µm, without the weather",
+        f"creep      {creep}",
+        f"tomorrow   at the same pressure the sag changes by {change_um:+.3g} µm in 24 h; "
+        f"95 %: {low_um:+.3g} to {high_um:+.3g} µm, without the weather",
     ]
 
 

@@ -17,12 +17,15 @@ class HeldTime:
         self.held_s = 0.0
 
     def add_times(self, time_s: Column, held: BoolArray) -> None:
-        """Take in (n,) times and whether the mirror was held."""
+        """Add (n,) times and whether the mirror was held at each."""
         if not time_s.size:
             return
-        lasted_s = np.diff(np.concatenate(([self._last[0]], time_s)))
-        first = np.concatenate(([self._last[1]], held[:-1]))
-        self.held_s += float(lasted_s[first & (lasted_s <= _LONGEST_S)].clip(0.0).sum())
+        # Intervals that begin with the last time of the block before; longer ones are gaps
+        last_time_s, last_held = self._last
+        interval_s = np.diff(np.concatenate(([last_time_s], time_s)))
+        held_at_start = np.concatenate(([last_held], held[:-1]))
+        counts = held_at_start & (interval_s <= _LONGEST_S)
+        self.held_s += float(interval_s[counts].clip(0.0).sum())
         self._last = float(time_s[-1]), bool(held[-1])
 
     def result_s(self, period_s: float) -> float:

@@ -121,9 +121,8 @@ class _Collector:
             self._times[name].add_times(time_s, part)
         missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
         if missed.size:
-            self._missed_before = (
-                float(missed[0]) if math.isnan(self._missed_before) else self._missed_before
-            )
+            if math.isnan(self._missed_before):
+                self._missed_before = float(missed[0])
             self._missed = max(self._missed, float(missed.max()) - self._missed_before)
         self._lateness.add(block["lateness_ms"])
         held = {name: np.asarray(block[name][mask], dtype=np.float64) for name in NAMES}

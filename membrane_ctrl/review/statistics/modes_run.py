@@ -79,7 +79,9 @@ class SeenMode:
         """
         values = np.array([line.frequency_hz for line in self.lines])[np.argsort(self.time_s)]
         ends = min(_ENDS, len(values) // 3)
-        return float(np.median(values[-ends:]) / np.median(values[:ends]) - 1) if ends > 1 else 0.0
+        if ends > 1:
+            return float(np.median(values[-ends:]) / np.median(values[:ends]) - 1)
+        return 0.0
 
     def _weights(self) -> FloatArray:
         return np.array([line.sigma_hz for line in self.lines]) ** -2.0
@@ -123,7 +125,9 @@ def _read_frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
     if is_run(folder):
         run = open_run(folder)
         shapes, origin_s = run.shapes(), run.origin_utc.timestamp()
-        time_s, coeffs_um, verdict = shapes.time_s, shapes.coeffs_um, shapes.verdict
+        time_s = shapes.time_s
+        coeffs_um = shapes.coeffs_um
+        verdict = shapes.verdict
     else:
         path = next(
             (p for p in (folder / "track.npz", folder / "result" / "track.npz") if p.exists()), None

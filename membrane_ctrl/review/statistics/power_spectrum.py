@@ -53,7 +53,10 @@ def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) 
         Length of a segment; by default an eighth of the series, at most 32768.
     """
     if length is None:
-        length = min(_LONGEST, 1 << max(3, int(np.log2(max(values.size, 8) * 2 / (_SEGMENTS + 1)))))
+        # The power of two that leaves about `_SEGMENTS` half overlapping segments
+        most = max(values.size, 8) * 2 / (_SEGMENTS + 1)
+        power_of_two = max(3, int(np.log2(most)))
+        length = min(_LONGEST, 2**power_of_two)
     frequency_hz = np.asarray(np.fft.rfftfreq(length, 1 / rate_hz), dtype=np.float64)
     if values.size < length:
         return Spectrum(frequency_hz, np.full(frequency_hz.size, np.nan), 0)
@@ -63,14 +66,21 @@ def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) 
     count = 0
     for first in range(0, len(pieces), _BATCH):
         batch = np.asarray(pieces[first : first + _BATCH], dtype=np.float64)
-        batch = batch[np.isfinite(batch).all(axis=1)]
+        whole = np.isfinite(batch).all(axis=1)
+        batch = batch[whole]
         batch = batch - batch.mean(axis=1, keepdims=True)
         power += (np.abs(np.fft.rfft(batch * window)) ** 2).sum(axis=0)
         count += len(batch)
+    if not count:
+        return Spectrum(frequency_hz, np.full(frequency_hz.size, np.nan), 0)
     scale = 1.0 / (rate_hz * (window**2).sum())
-    density = power * scale / count if count else np.full(frequency_hz.size, np.nan)
-    # add the negative frequencies; 0 and, for an even length, half the rate have none
-    density[1 : -1 if length % 2 == 0 else None] *= 2
+    density = power * scale / count
+    # Add the negative frequencies; 0 and, for an even length, half the rate have none
+    has_negative = np.ones(frequency_hz.size, dtype=bool)
+    has_negative[0] = False
+    if length % 2 == 0:
+        has_negative[-1] = False
+    density[has_negative] *= 2
     return Spectrum(frequency_hz, density, count)
 
 
@@ -109,18 +119,15 @@ def combine_densities(fast: Spectrum, slow: Spectrum) -> tuple[Column, Column]:
     spectrum.
     """
     resolved_hz = min(_RESOLVED_LINES * float(fast.frequency_hz[1]), _SLOW_MOST_HZ)
-    below = (
-        slow.frequency_hz < resolved_hz
-        if slow.segments
-        else np.zeros(slow.frequency_hz.size, dtype=bool)
-    )
+    if slow.segments:
+        below = slow.frequency_hz < resolved_hz
+    else:
+        below = np.zeros(slow.frequency_hz.size, dtype=bool)
     above = fast.frequency_hz >= (resolved_hz if slow.segments else 0.0)
-    joined = [
-        (x[below], y[above])
-        for x, y in ((slow.frequency_hz, fast.frequency_hz), (slow.density, fast.density))
-    ]
-    frequency_hz, together = (np.concatenate(parts) for parts in joined)
-    return frequency_hz[frequency_hz > 0], together[frequency_hz > 0]
+    frequency_hz = np.concatenate([slow.frequency_hz[below], fast.frequency_hz[above]])
+    density = np.concatenate([slow.density[below], fast.density[above]])
+    positive = frequency_hz > 0
+    return frequency_hz[positive], density[positive]
 
 
 def _is_slow(fast: Spectrum, slow: Spectrum, low_hz: float, high_hz: float) -> bool:

@@ -44,12 +44,12 @@ class PumpSums:
         self._travel += float(np.abs(np.diff(pump)).sum())
         self._starts += int((running[1:] & ~running[:-1]).sum())
         self._running += int(running.sum())
-        wanted, since = (
-            held["flow_wanted_um_per_s"],
-            np.searchsorted(self._since_s, held["mono_s"], "right"),
-        )
-        most = self._most_um_per_s[since - 1] + _SATURATED_UM_PER_S
-        self._saturated += int(((wanted < -_SATURATED_UM_PER_S) | (wanted > most)).sum())
+        # Ticks whose wanted flow is beyond the pump's range with the gains of that time
+        wanted = held["flow_wanted_um_per_s"]
+        gains_number = np.searchsorted(self._since_s, held["mono_s"], "right") - 1
+        most = self._most_um_per_s[gains_number] + _SATURATED_UM_PER_S
+        is_saturated = (wanted < -_SATURATED_UM_PER_S) | (wanted > most)
+        self._saturated += int(is_saturated.sum())
 
     def result(self, period_s: float) -> PumpActivity:
         count = self._fraction.count

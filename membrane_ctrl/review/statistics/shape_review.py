@@ -118,16 +118,23 @@ def _choose_pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) ->
     """The pair nearest to the run's middle, and the RMS of all pairs as far apart (within half a
     cycle).
     """
+    # For each cycle, the one that comes `lag_s` later
     time_s = good.time_s
     half_s = 0.5 * float(np.median(np.diff(time_s)))
-    other = np.minimum(np.searchsorted(time_s, time_s + lag_s - half_s), time_s.size - 1)
-    near = np.abs(time_s[other] - time_s - lag_s) <= 1.1 * half_s
-    firsts = np.flatnonzero(near)
+    other = np.searchsorted(time_s, time_s + lag_s - half_s)
+    other = np.minimum(other, time_s.size - 1)
+    is_pair = np.abs(time_s[other] - time_s - lag_s) <= 1.1 * half_s
+    firsts = np.flatnonzero(is_pair)
     if not firsts.size:
         return None
+    # RMS over the area of the change in each pair
     changes = parameters[other[firsts]] - parameters[firsts]
-    all_rms = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", changes, area.gram, changes), 0.0))
-    first = int(firsts[np.argmin(np.abs(time_s[firsts] + lag_s / 2 - time_s[[0, -1]].mean()))])
+    mean_squares = np.einsum("ij,jk,ik->i", changes, area.gram, changes)
+    all_rms = np.sqrt(np.maximum(mean_squares, 0.0))
+    # The pair nearest to the middle, and its map with a standard deviation
+    middle_s = time_s[[0, -1]].mean()
+    distance_s = np.abs(time_s[firsts] + lag_s / 2 - middle_s)
+    first = int(firsts[np.argmin(distance_s)])
     second = int(other[first])
     change_um = (parameters[second] - parameters[first]) @ area.basis
     covariances = [good.covariance_near(float(time_s[k])) for k in (first, second)]

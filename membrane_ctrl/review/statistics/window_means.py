@@ -81,7 +81,8 @@ def window_means(
         return np.empty(0), np.empty(0)
     number = second // window_s
     starts = group_starts(number)
-    ticks, total = np.add.reduceat(counts, starts), np.add.reduceat(sums, starts)
+    ticks = np.add.reduceat(counts, starts)
+    total = np.add.reduceat(sums, starts)
     whole = (ticks >= count_least_ticks(window_s, rate_hz)) & np.isfinite(total)
     return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[
         whole

@@ -55,7 +55,9 @@ class ReviewBlueprint:
             "faults": self._make_faults_tab,
             "tuning": self._make_tuning_tab,
         }
-        selection = None if self.span_ns is None else AbsoluteTimeRange(*self.span_ns)
+        selection = None
+        if self.span_ns is not None:
+            selection = AbsoluteTimeRange(*self.span_ns)
         return rrb.Blueprint(
             rrb.Tabs(*(makers[name]() for name in tabs), active_tab=tabs.index(tab)),
             rrb.TimePanel(state="collapsed", timeline=self.timeline, time_selection=selection),
@@ -65,7 +67,8 @@ class ReviewBlueprint:
         )
 
     def _make_axis(self) -> rrb.TimeAxis:
-        start, end = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite()
+        start = rr.TimeRangeBoundary.infinite()
+        end = rr.TimeRangeBoundary.infinite()
         if self.span_ns is not None:
             start, end = (rr.TimeRangeBoundary.absolute(nanos=nanos) for nanos in self.span_ns)
         return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))

@@ -99,11 +99,9 @@ def _show_file(file: Path, options: ReviewOptions, cursor: viewer.CursorTime | N
     if options.save is not None:
         print(file)
         return 0
-    return (
-        viewer.serve_source(file, options.bind, options.port)
-        if options.web
-        else viewer.show_source(file, cursor)
-    )
+    if options.web:
+        return viewer.serve_source(file, options.bind, options.port)
+    return viewer.show_source(file, cursor)
 
 
 def _write_picture(
@@ -209,20 +207,20 @@ def make_review(
     labels = blueprints.labels_of([run.name for run in runs])
     layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(labels))
     for run, label, zero_s in zip(runs, labels, zeros_s, strict=True):
-        part_s = (
-            ALL
-            if span_s is None
-            else (span_s[0] - zeros_s[0] + zero_s, span_s[1] - zeros_s[0] + zero_s)
-        )
+        if span_s is None:
+            part_s = ALL
+        else:
+            part_s = (span_s[0] - zeros_s[0] + zero_s, span_s[1] - zeros_s[0] + zero_s)
         layer.add_run(run, label, zero_s, part_s)
     by_clock = len(runs) == 1 or options.align == "utc"
     timeline = "utc" if by_clock else "run_time"
-    zero_ns = round(1e9 * runs[0].origin_utc.timestamp()) if by_clock else -round(1e9 * zeros_s[0])
-    shown_ns = (
-        None
-        if span_s is None
-        else (zero_ns + round(1e9 * span_s[0]), zero_ns + round(1e9 * span_s[1]))
-    )
+    if by_clock:
+        zero_ns = round(1e9 * runs[0].origin_utc.timestamp())
+    else:
+        zero_ns = -round(1e9 * zeros_s[0])
+    shown_ns = None
+    if span_s is not None:
+        shown_ns = (zero_ns + round(1e9 * span_s[0]), zero_ns + round(1e9 * span_s[1]))
     blueprint = blueprints.ReviewBlueprint(labels, timeline, shown_ns, runs[0].config)
     layer.send_blueprint(blueprint.make_blueprint(options.tab))
     layer.close()
@@ -393,7 +391,10 @@ def _write_properties(entry: catalogue.RunEntry, file: Path) -> Path:
     """Write a recording that has only the run's properties; unknown ones are omitted."""
     values = catalogue.as_dict(entry) | {"started_utc": f"{entry.started_utc:%Y-%m-%d %H:%M:%S}"}
     values["geometry"] = entry.geometry[:8]
-    values["faults_share"] = entry.faults_s / entry.duration_s if entry.duration_s else float("nan")
+    if entry.duration_s:
+        values["faults_share"] = entry.faults_s / entry.duration_s
+    else:
+        values["faults_share"] = float("nan")
     # more digits would make the table's columns too wide to compare
     values |= {
         name: float(f"{value:.4g}") for name, value in values.items() if isinstance(value, float)

@@ -67,15 +67,12 @@ def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
     by_entity: dict[str, list[streams.Line]] = {}
     for each in kept:
         lines = by_entity.setdefault(streams.mean_path(each.entity), [])
-        for kind, name in _EXTREMES.items() if alone and not each.twin_only else ():
-            lines.append(
-                streams.Line(f"{kind}_{each.name}", f"{each.label}, {name} {each.unit}", GREY, 1.0)
-            )
-        lines.append(
-            streams.Line(
-                f"mean_{each.name}", f"{each.label}, mean {each.unit}", each.colour, each.width
-            )
-        )
+        if alone and not each.twin_only:
+            for kind, name in _EXTREMES.items():
+                label = f"{each.label}, {name} {each.unit}"
+                lines.append(streams.Line(f"{kind}_{each.name}", label, GREY, 1.0))
+        label = f"{each.label}, mean {each.unit}"
+        lines.append(streams.Line(f"mean_{each.name}", label, each.colour, each.width))
     return tuple(streams.Stream(path, tuple(lines)) for path, lines in by_entity.items())
 
 
@@ -127,10 +124,16 @@ class Layer:
         self._number += 1
         self._origin = np.datetime64(run.origin_utc.replace(tzinfo=None), "ns")
         span_s = _end_s(run)
-        rows_most = OVERVIEW_ROWS_MOST if self._overview_only else LEVEL_ROWS_MOST
+        if self._overview_only:
+            rows_most = OVERVIEW_ROWS_MOST
+        else:
+            rows_most = LEVEL_ROWS_MOST
         level_s = next((w for w in (1.0, 10.0) if span_s / w <= rows_most), 60.0)
         level = run.level(level_s)
-        seconds = level if level_s == 1.0 else run.level(1.0, names=LEVEL_COLUMNS)
+        if level_s == 1.0:
+            seconds = level
+        else:
+            seconds = run.level(1.0, names=LEVEL_COLUMNS)
         cycles = run.shapes()
         found = find_events(seconds, cycles, run.config.limits.band_um)
         self._send_page(SUMMARY_PATH, _summary_page(run))
@@ -149,7 +152,10 @@ class Layer:
             if np.isfinite(values).any():
                 self._send_style(stream.path, _names_and_colours(stream))
                 self._send_scalars(stream.path, level["time_s"], values)
-        ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
+        if level["time_s"].size:
+            ends = level["time_s"][[0, -1]]
+        else:
+            ends = np.empty(0)
         band = streams.make_band(band_um)
         square = np.full((ends.size, 1), band_um**2)
         self._send_measured(
@@ -227,7 +233,10 @@ class Layer:
             ends = " to ".join(
                 dict.fromkeys(_format_size(f.size, f.unit) for f in (of_kind[0], of_kind[-1]))
             )
-            name = f"{kind}, {ends}" if len(of_kind) == 1 else f"{len(of_kind)} of {kind}, {ends}"
+            if len(of_kind) == 1:
+                name = f"{kind}, {ends}"
+            else:
+                name = f"{len(of_kind)} of {kind}, {ends}"
             path = f"/found/lines/{kind.replace(' ', '_')}"
             self._send_style(
                 path, [(name, _FOUND_COLOURS.get(kind, _OTHER_FOUND))], 1.0, vertical=True
@@ -320,7 +329,8 @@ class Layer:
         self, kind: str, values: shapes.Map, span: tuple[float, float], at_s: float | None = None
     ) -> None:
         """Log a map at a second of the run, or for all of it."""
-        path, picture = f"{self._prefix}/shape/map/{kind}", np.nan_to_num(values).astype(np.float16)
+        path = f"{self._prefix}/shape/map/{kind}"
+        picture = np.nan_to_num(values).astype(np.float16)
         outside = rr.SegmentationImage(shapes.outside_disc(), opacity=1.0, draw_order=1.0)
         self._stream.log(f"{path}/outside", outside, static=True)
         if at_s is not None:
@@ -395,7 +405,9 @@ def _names_and_colours(stream: streams.Stream) -> list[tuple[str, Colour]]:
 
 def prefix_of(label: str) -> str:
     """Before the paths of a run among several."""
-    return f"/{rr.escape_entity_path_part(label)}" if label else ""
+    if not label:
+        return ""
+    return f"/{rr.escape_entity_path_part(label)}"
 
 
 def _summary_page(run: Run) -> str:
@@ -430,7 +442,9 @@ def _coefficient_variances(cycles: shapes.Shapes) -> Column:
 def _of_run(colour: Colour, number: int) -> Colour:
     """Colours of overlaid runs; a signal that is grey in a single run gets the dark shade."""
     red, green, blue = _RUN_COLOURS[number % len(_RUN_COLOURS)]
-    return (red // 2, green // 2, blue // 2) if colour == GREY else (red, green, blue)
+    if colour == GREY:
+        return (red // 2, green // 2, blue // 2)
+    return (red, green, blue)
 
 
 def _to_nanoseconds(time_s: Column) -> AnyArray:
@@ -440,7 +454,9 @@ def _to_nanoseconds(time_s: Column) -> AnyArray:
 def _end_s(run: Run) -> float:
     """End of the run, from its summary or, for a killed run, its levels."""
     duration = (run.summary or {}).get("duration_s")
-    return float(duration) if isinstance(duration, (int, float)) else end_s(run)
+    if isinstance(duration, (int, float)):
+        return float(duration)
+    return end_s(run)
 
 
 def _thin_evenly(count: int, most: int) -> BoolArray:

@@ -164,7 +164,9 @@ def follow_run(
 
 def _open_newest(folder: Path, name: str, spec: TableSpec) -> float:
     found = TableReader(folder, spec, []).read_newest(name)
-    return 0.0 if found is None or found.as_py() is None else float(found.as_py())
+    if found is None or found.as_py() is None:
+        return 0.0
+    return float(found.as_py())
 
 
 def _read_rows(tables: Sequence[pa.Table]) -> telemetry.Rows:

@@ -91,7 +91,9 @@ def _connect_viewer(port: int, process: subprocess.Popen[bytes]) -> ViewerClient
         else:
             return viewer
     process.terminate()
-    reason = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
+    reason = ""
+    if process.stderr:
+        reason = process.stderr.read().decode(errors="replace").strip()
     raise RuntimeError(
         f"the headless viewer did not start (Vulkan driver installed?): {reason[-300:]}"
     )

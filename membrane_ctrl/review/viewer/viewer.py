@@ -107,7 +107,10 @@ def serve_source(
     port = port or free_port()
     _require_listening(bind, port)
     data_port = free_port()
-    url = source if isinstance(source, str) else make_proxy_url(_find_host(bind), data_port)
+    if isinstance(source, str):
+        url = source
+    else:
+        url = make_proxy_url(_find_host(bind), data_port)
     _print_address(bind, port, url)
     options = [
         "--serve-web",
@@ -130,7 +133,10 @@ def show_live_run(run: Run, web: bool, port: int = 0) -> int:
     The view is sent to a separate server, to which the viewer (or, with `web`, a browser) connects.
     """
     data_port, port = free_port(), port or free_port()
-    kind = ["--serve-web", "--web-viewer-port", str(port)] if web else ["--serve-grpc"]
+    if web:
+        kind = ["--serve-web", "--web-viewer-port", str(port)]
+    else:
+        kind = ["--serve-grpc"]
     server = viewer_command(*kind, "--bind", "127.0.0.1", "--port", str(data_port))
     proxy = make_proxy_url("127.0.0.1", data_port)
     if web:
@@ -144,7 +150,10 @@ def show_live_run(run: Run, web: bool, port: int = 0) -> int:
             viewer = viewer_command(
                 "--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy
             )
-            watched = served if web else subprocess.Popen(viewer, env=viewer_environment())
+            if web:
+                watched = served
+            else:
+                watched = subprocess.Popen(viewer, env=viewer_environment())
             try:
                 view = LiveView(run, LiveRecording(run, proxy))
                 follow_run(view, run.folder, lambda: watched.poll() is None)
@@ -181,7 +190,9 @@ def _require_screen() -> None:
 
 
 def _find_host(bind: str) -> str:
-    return "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
+    if bind == "127.0.0.1":
+        return "127.0.0.1"
+    return socket.gethostname()
 
 
 def make_proxy_url(host: str, port: int) -> str:

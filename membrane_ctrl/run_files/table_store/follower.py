@@ -40,7 +40,10 @@ class TableFollower:
     def read_new(self) -> list[pa.Table]:
         """Return the rows since the last call, in order. Damaged rows are left out."""
         parts = len(list(self._folder.glob(f"*{spec.PART_SUFFIX}")))
-        tables = self._read_files() if parts != self._parts else self._read_journals()
+        if parts != self._parts:
+            tables = self._read_files()
+        else:
+            tables = self._read_journals()
         self._parts = parts
         return [newer for table in tables if (newer := self._keep_newer(table)).num_rows]
 

@@ -13,7 +13,12 @@ _DEPTH_MAX = 8
 _LIST_MAX = 1000  # a page header has no lists today
 _VARINT_BYTES_MAX = 10
 # Fields of `PageHeader`, and `num_values` of the headers within it.
-_TYPE, _UNPACKED, _PACKED, _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_2 = 1, 2, 3, 5, 7, 8
+_TYPE = 1
+_UNPACKED = 2
+_PACKED = 3
+_DATA_PAGE = 5
+_DICTIONARY_PAGE = 7
+_DATA_PAGE_2 = 8
 _NUM_VALUES = 1
 _DICTIONARY_TYPE = 2
 

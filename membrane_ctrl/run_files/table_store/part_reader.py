@@ -85,7 +85,9 @@ class PartReader:
     def first_row(self) -> int:
         """Number of the first row in the table; 0 if the file does not state it."""
         text = (self.schema.metadata or {}).get(FIRST_ROW, b"0")
-        return int(text) if text.isdigit() and len(text) < 18 else 0
+        if text.isdigit() and len(text) < 18:
+            return int(text)
+        return 0
 
     def iterate_groups(
         self, names: Sequence[str], start_s: float, end_s: float
@@ -95,19 +97,18 @@ class PartReader:
         """
         metadata = self._parquet.metadata
         for number in range(metadata.num_row_groups):
-            known = (
-                self._entry.groups[number]
-                if self._entry and number < len(self._entry.groups)
-                else None
-            )
+            known = None
+            if self._entry and number < len(self._entry.groups):
+                known = self._entry.groups[number]
             if known is not None and (known.last_s < start_s or known.first_s >= end_s):
                 continue
             try:
                 yield self._read_group(number, metadata.row_group(number), names)
             except _FAULTS as error:
-                first_s, last_s = (
-                    (known.first_s, known.last_s) if known is not None else (None, None)
-                )
+                if known is not None:
+                    first_s, last_s = known.first_s, known.last_s
+                else:
+                    first_s, last_s = None, None
                 yield LostGroup(first_s, last_s, _first_line(error))
 
     def _read_footer(self) -> bytes:

@@ -53,7 +53,9 @@ def write_part(
     try:
         times_s = _write_groups(file, first_row, groups, time_name)
         disk.sync(file.descriptor)
-        entry = _make_entry(scratch, number, first_row, file, times_s) if times_s else None
+        entry = None
+        if times_s:
+            entry = _make_entry(scratch, number, first_row, file, times_s)
     except Exception:
         disk.remove(scratch)
         raise
@@ -162,12 +164,9 @@ def _list_candidates(kind: pa.DataType) -> list[str]:
 def _trial_bytes(values: pa.ChunkedArray, path: str, encoding: str) -> int:
     table = pa.table([values], names=[path.partition(".")[0]])
     sink = pa.BufferOutputStream()
-    chosen = (
-        {"use_dictionary": True}
-        if encoding == _DICTIONARY
-        else {"column_encoding": {path: encoding}}
-    )
-    options = {"use_dictionary": False, **chosen}
+    options: dict[str, Any] = {"use_dictionary": True}
+    if encoding != _DICTIONARY:
+        options = {"use_dictionary": False, "column_encoding": {path: encoding}}
     pq.write_table(
         table,
         sink,

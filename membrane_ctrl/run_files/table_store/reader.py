@@ -62,14 +62,13 @@ class TableReader:
 
     def note_missing(self, count: int = 0) -> None:
         """Note the parts that are missing, of `count` known ones."""
-        for number in range(max([count, *(n + 1 for n in self.numbers)])):
+        highest = max(self.numbers, default=-1)
+        for number in range(max(count, highest + 1)):
             if not self._read_part(number).exists() and not self._read_journal(number).exists():
                 entry = self._entries.get(number)
-                rows = (
-                    f"rows from {entry.first_s:.2f} s to {entry.last_s:.2f} s are"
-                    if entry
-                    else "its rows are"
-                )
+                rows = "its rows are"
+                if entry:
+                    rows = f"rows from {entry.first_s:.2f} s to {entry.last_s:.2f} s are"
                 self._note_damage(self._read_part(number), f"missing; {rows} left out")
 
     def iterate_tables(
@@ -133,7 +132,9 @@ class TableReader:
             frames = journal.find_frames(
                 read_bytes(self._read_journal(number), journal.FILE_BYTES_MAX)
             )
-            return journal.read_schema(frames[0]) if frames and not frames[0].rows else None
+            if frames and not frames[0].rows:
+                return journal.read_schema(frames[0])
+            return None
         except _FAULTS:
             return None
 
@@ -225,7 +226,9 @@ class TableReader:
         absent = sorted(set(names) - set(known))
         if absent:
             self._note_damage(path, f"without {', '.join(absent)}")
-        return known if self._table.time_name in known or self._table.time_name not in names else []
+        if self._table.time_name in known or self._table.time_name not in names:
+            return known
+        return []
 
     def _other_layout(self, schema: pa.Schema) -> str | None:
         """How a file's layout differs from the program's; None if it does not, or states none."""

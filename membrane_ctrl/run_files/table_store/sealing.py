@@ -26,7 +26,8 @@ def seal_journal(disk: Disk, folder: Path, number: int, table: spec.TableSpec) -
     A journal without any intact row stays, for people. Raises OSError (full disk, or a journal that
     cannot be read): the journal stays as well.
     """
-    source, target = spec.journal_path(folder, number), spec.part_path(folder, number)
+    source = spec.journal_path(folder, number)
+    target = spec.part_path(folder, number)
     if target.exists() and number in read_manifest(folder, []):
         disk.remove(source)
         return
@@ -51,7 +52,10 @@ class _JournalRows:
         self._group_rows = table.group_rows
         self._blocks = read_journal(data, table.group_rows, table.schema)
         self._first = self._next_block()
-        self.first_row = self._first.first_row if self._first is not None else 0
+        if self._first is not None:
+            self.first_row = self._first.first_row
+        else:
+            self.first_row = 0
 
     def iterate_groups(self) -> Iterator[pa.Table]:
         """Tables of about `group_rows` rows."""

@@ -64,4 +64,6 @@ def file_number(path: Path) -> int | None:
         digits.isascii() and digits.isdigit() and len(digits) >= _DIGITS
     ):
         return None
-    return int(digits) if len(digits) <= 2 * _DIGITS else None
+    if len(digits) <= 2 * _DIGITS:
+        return int(digits)
+    return None

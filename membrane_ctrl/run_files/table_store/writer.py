@@ -186,9 +186,11 @@ class TableWriter:
         with contextlib.suppress(OSError, ValueError, pa.ArrowException):
             data = read_bytes(spec.journal_path(self._folder, number), journal.FILE_BYTES_MAX)
             for block in journal.read_journal(data, self._table.group_rows, self._table.schema):
-                if isinstance(block, journal.JournalBlock):
-                    last_s = float(block.table.column(self._table.time_name)[-1].as_py())
-                    self._note_rows(block.first_row + block.table.num_rows, last_s)
+                if not isinstance(block, journal.JournalBlock):
+                    continue
+                times = block.table.column(self._table.time_name)
+                last_s = float(times[-1].as_py())
+                self._note_rows(block.first_row + block.table.num_rows, last_s)
 
     def _note_rows(self, next_row: int, last_s: float) -> None:
         self._next_row = max(self._next_row, next_row)
