@@ -57,7 +57,7 @@ class ValueMap:
             raise ValueError(f"{value:g} is not within {self.limits[0]:g} .. {self.limits[1]:g}")
         raw_0, raw_1 = self.raw
         value_0, value_1 = self.value
-        raw: float = raw_0 + (value - value_0) * (raw_1 - raw_0) / (value_1 - value_0)
+        raw = raw_0 + (value - value_0) * (raw_1 - raw_0) / (value_1 - value_0)
         if self.type != "f32":
             raw = round(raw)
         packed = struct.pack(">" + _FORMATS[self.type], raw)

@@ -9,8 +9,9 @@ from typing import Any
 from membrane_ctrl.bridges.command_lanes import CommandLanes
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.outcome import Outcome
-from membrane_ctrl.control_port.protocol import TEXT_BYTES, role_includes
+from membrane_ctrl.control_port.protocol import TEXT_BYTES
 from membrane_ctrl.control_port.safety_commands import is_safety_command
+from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model.numbers import parse_number
 from membrane_ctrl.service.access import (

@@ -7,17 +7,13 @@ to goodbye.
 
 from __future__ import annotations
 
-import asyncio
 import json
-import socket
-from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file
-from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.controller.commands import SAME_AS, TABLE, Kind, Role
 
 VERSION = 1
@@ -32,6 +28,8 @@ WHO_BYTES, WHY_BYTES, TEXT_BYTES = 64, 300, 500
 
 Errand = Literal["status", "watch", "release", "quiet", "claim"]
 RequestName = Literal[Kind, Errand]
+# The fields that a request of this name must have, beside those of commands
+_ERRAND_NEEDS: dict[str, tuple[str, ...]] = {"claim": ("text",)}
 
 
 class RequestError(ValueError):
@@ -69,9 +67,6 @@ class OnBehalf(Section):
     # for whom a program asks, as it states itself
     viewer: Annotated[str, _words(WHO_BYTES - 8)] = ""
     role: Role
-
-
-_ERRAND_NEEDS: dict[str, tuple[str, ...]] = {"claim": ("text",)}
 
 
 class Request(Section):
@@ -165,175 +160,3 @@ def _short(reason: str, most: int = 300) -> str:
     if len(clean) <= most:
         return clean
     return clean[: most - 3] + "..."
-
-
-_LINE_S = 5.0  # to complete a line
-_CHUNK_BYTES = 4096  # read at once: at most a few hundred short lines, 0.3 ms
-# A reader this far behind is dropped: a 10 Hz watcher after a minute
-_UNREAD_BYTES = 1 << 20
-
-
-class SlowReaderError(ConnectionError):
-    """The peer has not read for too long."""
-
-
-class Wire:
-    """Reads and writes lines."""
-
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._reader = reader
-        self._writer = writer
-        self._part = b""  # of a line that is not complete yet
-
-    @classmethod
-    async def on(cls, connection: socket.socket) -> Wire:
-        """Take over an accepted connection. Raises OSError."""
-        loop = asyncio.get_running_loop()
-        reader = asyncio.StreamReader(limit=MESSAGE_BYTES, loop=loop)
-        protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
-        transport, _ = await loop.connect_accepted_socket(lambda: protocol, connection)
-        return cls(reader, asyncio.StreamWriter(transport, protocol, reader, loop))
-
-    async def lines(self) -> list[bytes] | None:
-        """The complete lines that have arrived, at least one; None when the peer has gone.
-
-        Raises RequestError if a line is too long or too slow.
-        """
-        begun_s: float | None = None
-        while True:
-            # A peer may be silent for hours between lines, but not within one.
-            now_s = asyncio.get_running_loop().time()
-            if self._part and begun_s is None:
-                begun_s = now_s
-            left_s = None if begun_s is None else begun_s + _LINE_S - now_s
-            try:
-                # not `wait_for`, which loses a cancellation that coincides with its result
-                async with asyncio.timeout(left_s):
-                    chunk = await self._reader.read(_CHUNK_BYTES)
-            except TimeoutError:
-                raise RequestError(f"a message must be complete within {_LINE_S:g} s") from None
-            except OSError:
-                return None
-            if not chunk:
-                return None
-            *complete, self._part = (self._part + chunk).split(b"\n")
-            longest = max(map(len, (*complete, self._part)))
-            if longest >= MESSAGE_BYTES:
-                raise RequestError(f"a message may have at most {MESSAGE_BYTES} bytes")
-            if complete:
-                return complete
-
-    @property
-    def unread_bytes(self) -> int:
-        """What was sent and not yet taken by the peer's system."""
-        return self._writer.transport.get_write_buffer_size()
-
-    def send(self, message: dict[str, Any]) -> None:
-        """Send without waiting. Raises SlowReaderError (and ends the connection) if too much is
-        unread.
-        """
-        transport = self._writer.transport
-        if transport.is_closing():
-            return
-        if transport.get_write_buffer_size() > _UNREAD_BYTES:
-            transport.abort()
-            raise SlowReaderError("does not read its messages")
-        self._writer.write(encode(message))
-
-    async def close(self) -> None:
-        """Send remaining data if possible without waiting, and end."""
-        self._writer.close()
-        try:
-            async with asyncio.timeout(1.0):
-                await self._writer.wait_closed()
-        except (TimeoutError, OSError):
-            self._writer.transport.abort()
-
-    def abort(self) -> None:
-        """End the connection now."""
-        self._writer.transport.abort()
-
-
-_RANK: dict[str, int] = {"read": 0, "operate": 1, "tune": 2}
-_ERRANDS: dict[str, Role] = {
-    "status": "read",
-    "watch": "read",
-    "claim": "operate",
-    "release": "operate",
-    "quiet": "operate",
-}
-
-# These need no command: what makes the mirror safe is always accepted, and the others move nothing
-FREE = frozenset({"status", "watch", "unlock", "mark", "release", "quiet"}) | SAFETY
-
-
-@dataclass(frozen=True, slots=True)
-class Peer:
-    """The peer of a connection: `unix:NAME`, as given by the system."""
-
-    who: str
-    role: Role
-    pid: int | None = field(default=None, compare=False)  # of its process, if it is on this machine
-    is_own_user: bool = False  # a process of the hold's own user on the socket file
-
-    @property
-    def session(self) -> str:
-        """What identifies the sender of a lock for people: its process;
-        empty if that is unknown.
-        """
-        if self.pid is None:
-            return ""
-        return f"process {self.pid}"
-
-
-@dataclass(frozen=True, slots=True)
-class Sender:
-    """Who sends a request: the peer itself, or somebody for whom it sends it."""
-
-    who: str  # for people and for the record
-    role: Role
-    account: str = ""  # login, by which an author is known; empty: none, or not proven
-    session: str = ""
-    from_person: bool = True  # False: a bridge's
-
-
-def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
-    """Return who sends a request, with the lower of the two roles.
-
-    Parameters
-    ----------
-    peer : Peer
-        Of the connection, as the system identifies it.
-    on_behalf : OnBehalf or None
-        What the request itself states.
-
-    Returns
-    -------
-    Sender
-    """
-    if on_behalf is None:
-        return Sender(peer.who, peer.role, account=peer.who, session=peer.session)
-    role = min(peer.role, on_behalf.role, key=_RANK.__getitem__)
-    from_person = on_behalf.via != "bridge"
-    if (
-        not peer.is_own_user
-    ):  # anybody could state this: it proves no login, and the peer sends it for somebody else
-        return Sender(peer.who, role, session=peer.session, from_person=from_person)
-    who = f"{on_behalf.via}:{on_behalf.account or on_behalf.name}"
-    account = who if from_person and on_behalf.account else ""
-    if on_behalf.viewer:
-        who = f"{who} for {on_behalf.viewer}"
-    return Sender(who, role, account, on_behalf.session, from_person)
-
-
-def role_includes(role: str, needed: Role) -> bool:
-    """Whether a role includes the needed one; an unknown role is `read`."""
-    return _RANK.get(role, 0) >= _RANK[needed]
-
-
-def explain_missing_role(sender: Peer | Sender, do: RequestName) -> str:
-    """Why the sender's role forbids this request; empty if it does not."""
-    needed = TABLE[do].role if do in TABLE else _ERRANDS[do]
-    if role_includes(sender.role, needed):
-        return ""
-    return f"{do} needs the role {needed}; {sender.who} has {sender.role}"

@@ -24,7 +24,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from membrane_ctrl.control_port.fair_queue import FairQueue
-from membrane_ctrl.control_port.protocol import Request, RequestError, Wire, parse
+from membrane_ctrl.control_port.line_connection import LineConnection
+from membrane_ctrl.control_port.protocol import Request, RequestError, parse
 from membrane_ctrl.control_port.safety_commands import is_safety_command, may_hold_safety_command
 
 _PAUSE_S = 0.1  # after an ordinary request: all requests together cost less than a tick in fifty
@@ -61,7 +62,7 @@ class RequestIntake:
 
     Parameters
     ----------
-    wire : Wire
+    connection : LineConnection
         Where the answers go.
     answer : callable
         Executes a request and returns its answer.
@@ -72,9 +73,13 @@ class RequestIntake:
     """
 
     def __init__(
-        self, wire: Wire, answer: AnswerRequest, record_refusal: RecordRefusal, turns: ReadingTurns
+        self,
+        connection: LineConnection,
+        answer: AnswerRequest,
+        record_refusal: RecordRefusal,
+        turns: ReadingTurns,
     ) -> None:
-        self._wire = wire
+        self._connection = connection
         self._answer = answer
         self._record_refusal = record_refusal
         self._turns = turns
@@ -198,7 +203,7 @@ class RequestIntake:
                 continue
             request = self._ordinary.popleft()
             answer = await self._answer(request)
-            self._wire.send({"number": request.number, **answer})
+            self._connection.send({"number": request.number, **answer})
             await asyncio.sleep(_PAUSE_S)
 
     async def _serve_safety(self) -> None:
@@ -212,7 +217,7 @@ class RequestIntake:
                 continue
             answer = await self._answer(waiting.request)
             for number in waiting.numbers:
-                self._wire.send({"number": number, **answer})
+                self._connection.send({"number": number, **answer})
             await asyncio.sleep(_SAFETY_PAUSE_S)
 
     def _refuse_unread(self, line: bytes) -> None:
@@ -225,13 +230,15 @@ class RequestIntake:
         self._record_refusal(command, reason)
         # A client that sends a flood without reading must not lose its connection by the answers to
         # it.
-        if self._wire.unread_bytes > _UNREAD_MOST:
+        if self._connection.unread_bytes > _UNREAD_MOST:
             self._unreported += 1
             return
         if self._unreported:
-            self._wire.send({"notice": f"{self._unreported} more requests were refused: {reason}"})
+            self._connection.send(
+                {"notice": f"{self._unreported} more requests were refused: {reason}"}
+            )
             self._unreported = 0
-        self._wire.send({"number": number, "ok": False, "refused": reason})
+        self._connection.send({"number": number, "ok": False, "refused": reason})
 
 
 def _too_many(most: int) -> str:

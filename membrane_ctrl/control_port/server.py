@@ -21,9 +21,10 @@ from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.commander import Commander, CommandSession
 from membrane_ctrl.control_port.endpoint import Endpoint, Refusals
-from membrane_ctrl.control_port.protocol import FREE, Peer, Sender, explain_missing_role
+from membrane_ctrl.control_port.line_connection import LineConnection
 from membrane_ctrl.control_port.request_intake import ReadingTurns
 from membrane_ctrl.control_port.safety_commands import is_safety_command
+from membrane_ctrl.control_port.sender import FREE, Peer, Sender, explain_missing_role, sender_of
 from membrane_ctrl.control_port.session import PortSession
 from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.controller import commands, cross_check_plant, tick
@@ -145,11 +146,11 @@ class Port:
     async def _welcome_unix(self, connection: socket.socket) -> None:
         assert self._listeners.unix is not None
         peer = self._listeners.unix.peer(connection)
-        await self._serve(await protocol.Wire.on(connection), peer)
+        await self._serve(await LineConnection.on(connection), peer)
 
-    async def _serve(self, wire: protocol.Wire, peer: Peer) -> None:
+    async def _serve(self, connection: LineConnection, peer: Peer) -> None:
         self._make_room(peer)
-        session = PortSession(wire, peer, self.status, self._turns)
+        session = PortSession(connection, peer, self.status, self._turns)
         self._sessions.append(session)
         greeting = {
             "membrane_ctrl": protocol.VERSION,
@@ -192,7 +193,7 @@ class Port:
     async def _answer(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
         """Execute a request or answer why not; the controller records its own refusals."""
         peer = session.peer
-        sender = protocol.sender_of(peer, request.on_behalf)
+        sender = sender_of(peer, request.on_behalf)
         refusal = (
             explain_missing_role(sender, request.do)
             or self._expired(request)
@@ -373,7 +374,3 @@ class Port:
             self._waiting.pop(command.number, None)
 
 
-# Prometheus text on localhost: every field of the newest tick as a gauge, and a few counts. Names
-# carry the units (`membrane_error_um`), as in alarms and telemetry. Counts that only grow have
-# other names, as
-# Prometheus wants it.

@@ -9,8 +9,10 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from membrane_ctrl.control_port.answers import COMMAND_TAKEN
-from membrane_ctrl.control_port.protocol import Peer, Request, RequestError, SlowReaderError, Wire
+from membrane_ctrl.control_port.line_connection import LineConnection, SlowReaderError
+from membrane_ctrl.control_port.protocol import Request, RequestError
 from membrane_ctrl.control_port.request_intake import ReadingTurns, RequestIntake
+from membrane_ctrl.control_port.sender import Peer
 from membrane_ctrl.model.events import Event
 
 Answer = Callable[["PortSession", Request], Awaitable[dict[str, Any]]]
@@ -21,12 +23,16 @@ class PortSession:
     """A connection whose peer is known; `watch` streams `status`."""
 
     def __init__(
-        self, wire: Wire, peer: Peer, status: Callable[[], dict[str, Any]], turns: ReadingTurns
+        self,
+        connection: LineConnection,
+        peer: Peer,
+        status: Callable[[], dict[str, Any]],
+        turns: ReadingTurns,
     ) -> None:
         self.peer = peer
         self.id = secrets.token_hex(4)  # of the connection
         self.heard_s = asyncio.get_running_loop().time()  # time of the peer's last request
-        self._wire = wire
+        self._connection = connection
         self._status = status
         self._turns = turns
         self._intake: RequestIntake | None = None
@@ -35,31 +41,31 @@ class PortSession:
     async def run(self, greeting: dict[str, Any], answer: Answer, refused: Refused) -> None:
         """Answer requests until the peer disconnects."""
         try:
-            self._wire.send(greeting)
+            self._connection.send(greeting)
             await self._converse(answer, refused)
         except SlowReaderError as error:
             refused(self.peer.who, "", str(error))
         except RequestError as error:
             refused(self.peer.who, "", str(error))
             with contextlib.suppress(SlowReaderError):
-                self._wire.send({"number": 0, "ok": False, "refused": str(error)})
+                self._connection.send({"number": 0, "ok": False, "refused": str(error)})
         finally:
             self.watch(None)
-            await self._wire.close()
+            await self._connection.close()
 
     async def _converse(self, answer: Answer, refused: Refused) -> None:
         async def answer_request(request: Request) -> dict[str, Any]:
             return await answer(self, request)
 
         async def read_lines() -> list[bytes] | None:
-            lines = await self._wire.lines()
+            lines = await self._connection.lines()
             self.heard_s = asyncio.get_running_loop().time()
             return lines
 
         def record_refusal(command: str, reason: str) -> None:
             refused(self.peer.who, command, reason)
 
-        self._intake = RequestIntake(self._wire, answer_request, record_refusal, self._turns)
+        self._intake = RequestIntake(self._connection, answer_request, record_refusal, self._turns)
         await self._intake.serve(read_lines)
 
     def refuse_waiting(self, winner: str) -> None:
@@ -71,18 +77,18 @@ class PortSession:
     def notice(self, text: str) -> None:
         """Send an unsolicited notice."""
         with contextlib.suppress(SlowReaderError):
-            self._wire.send({"notice": text})
+            self._connection.send({"notice": text})
 
     def command_taken(self, text: str) -> None:
         """Send the notice that this connection has lost command to another."""
         with contextlib.suppress(SlowReaderError):
-            self._wire.send({"notice": text, "code": COMMAND_TAKEN})
+            self._connection.send({"notice": text, "code": COMMAND_TAKEN})
 
     def event(self, event: Event) -> None:
         """Send an event to a watching peer."""
         if self._watch is not None:
             with contextlib.suppress(SlowReaderError):
-                self._wire.send({"event": event.to_dict()})
+                self._connection.send({"event": event.to_dict()})
 
     def watch(self, period_s: float | None) -> None:
         """Stream the status from now on; None ends it."""
@@ -97,9 +103,9 @@ class PortSession:
         with contextlib.suppress(SlowReaderError):
             while True:
                 await asyncio.sleep(period_s)
-                self._wire.send({"status": self._status()})
+                self._connection.send({"status": self._status()})
 
     def drop(self, why: str) -> None:
         """End the connection with a last message."""
         self.notice(why)
-        self._wire.abort()
+        self._connection.abort()

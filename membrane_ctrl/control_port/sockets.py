@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from membrane_ctrl.config.port import PortConfig
-from membrane_ctrl.control_port import endpoint, protocol
+from membrane_ctrl.control_port import endpoint, sender
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model.errors import DeviceError, InputError, os_reason
 
@@ -51,13 +51,13 @@ class UnixListener:
             ) from None
         self._inode = path.stat().st_ino
 
-    def peer(self, connection: socket.socket) -> protocol.Peer:
+    def peer(self, connection: socket.socket) -> sender.Peer:
         """Identity of the client, from the kernel."""
         raw = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         pid, uid, _ = _CREDENTIALS.unpack(raw)
         role: Role = "tune" if uid in (0, os.getuid()) else self._group_role
         who = f"unix:{self._names.get(uid, uid)}"
-        return protocol.Peer(
+        return sender.Peer(
             who, role, pid or None, is_own_user=uid == os.getuid()
         )  # pid 0: in another container
 

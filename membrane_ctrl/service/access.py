@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, cast
 
-from membrane_ctrl.control_port.protocol import role_includes
+from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.controller.commands import ANY, TABLE, Kind, Role
 from membrane_ctrl.model.columns import unit_of
 from membrane_ctrl.model.numbers import parse_number

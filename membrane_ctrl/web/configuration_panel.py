@@ -12,7 +12,7 @@ from typing import Any
 from nicegui import ui
 
 from membrane_ctrl.config.reference import Key, TableHelp, list_tables
-from membrane_ctrl.control_port.protocol import role_includes
+from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.service.access import STOP, WebUser, request

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nicegui import ui
 
-from membrane_ctrl.control_port.protocol import role_includes
+from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.model import errors
 from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.feed import HoldFeed

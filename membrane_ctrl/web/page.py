@@ -12,7 +12,7 @@ from urllib.parse import urlencode
 from nicegui import ui
 
 from membrane_ctrl.control_port.outcome import Outcome
-from membrane_ctrl.control_port.protocol import role_includes
+from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.model.columns import MISSING, PUBLISHED, TelemetryColumn
 from membrane_ctrl.service.access import (

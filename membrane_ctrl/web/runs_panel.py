@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from nicegui import ui
 
-from membrane_ctrl.control_port.protocol import role_includes
+from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.run_files.run import open_run

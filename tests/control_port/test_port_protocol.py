@@ -14,13 +14,12 @@ from membrane_ctrl.control_port.protocol import (
     WHO_BYTES,
     WHY_BYTES,
     Errand,
-    Peer,
     Request,
     RequestError,
     encode,
-    explain_missing_role,
     parse,
 )
+from membrane_ctrl.control_port.sender import Peer, explain_missing_role
 from membrane_ctrl.controller.commands import TABLE, Kind
 from membrane_ctrl.hold.child_processes import EVENT_BYTES
 from membrane_ctrl.model.events import CommandTaken

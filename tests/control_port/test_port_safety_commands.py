@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.control_port.fair_queue import FairQueue
-from membrane_ctrl.control_port.protocol import Peer
 from membrane_ctrl.control_port.safety_commands import SAFETY, may_hold_safety_command
+from membrane_ctrl.control_port.sender import Peer
 from membrane_ctrl.model.telemetry import State
 from tests.worlds.port_run import LineClient, PortRun, client, port_run
 

@@ -16,7 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.protocol import MESSAGE_BYTES, Peer
+from membrane_ctrl.control_port.protocol import MESSAGE_BYTES
+from membrane_ctrl.control_port.sender import Peer
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.event_lines import from_dict
@@ -213,7 +214,7 @@ async def test_a_huge_message_ends_the_connection(tmp_path: Path) -> None:
 async def test_a_message_that_does_not_end_ends_the_connection(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("membrane_ctrl.control_port.protocol._LINE_S", 0.05)
+    monkeypatch.setattr("membrane_ctrl.control_port.line_connection._LINE_S", 0.05)
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         ann.put(b'{"do": "st')
         assert "complete within" in (await ann.answer())["refused"]
@@ -223,7 +224,7 @@ async def test_a_message_that_does_not_end_ends_the_connection(
 async def test_who_does_not_read_is_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("membrane_ctrl.control_port.protocol._UNREAD_BYTES", 10_000)
+    monkeypatch.setattr("membrane_ctrl.control_port.line_connection._UNREAD_BYTES", 10_000)
     async with port_run(tmp_path) as run, client(run, EVE) as eve, client(run, ANN) as ann:
         assert (await eve.ask(do="watch", period_s=3600))["ok"]
         eve.writer.transport.pause_reading()  # type: ignore[attr-defined]

@@ -15,7 +15,7 @@ from typing import Any
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.control_port.protocol import Peer
+from membrane_ctrl.control_port.sender import Peer
 from membrane_ctrl.control_port.server import Port, RunHooks
 from membrane_ctrl.control_port.sockets import Listeners, UnixListener
 from membrane_ctrl.controller.commands import Command, explain_refusal
