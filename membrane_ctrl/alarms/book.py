@@ -18,6 +18,7 @@ from membrane_ctrl.model.notices import NoticeChanges, Severity
 
 # Keys of the configuration that name the lists of services
 LAB, ESCALATION = "urls_file", "escalation_urls_file"
+MessageKind = Literal["raised", "escalated", "reminder", "cleared"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +76,6 @@ def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:
     if standing and side * value < side * rule.clear_at:
         return Sign(rule.name, False)
     return None
-
-
-MessageKind = Literal["raised", "escalated", "reminder", "cleared"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,6 +63,8 @@ __all__ = [
 INTERLOCKS_MAX = 32  # bits of a mask that telemetry carries as a double
 # required before any gas moves: the loop's two ends, and the limit that protects the film
 NEEDED = tuple(name for name, role in ROLES.items() if role.needed)
+# keys of the estimator that state the pump's response
+_PUMP_RESPONSE_KEYS = frozenset({"pump_response", "pump_delay_s", "pump_lag_s"})
 
 if TYPE_CHECKING:  # `DevicesConfig.roles` gives their tables
     SensorTables = Section
@@ -396,9 +398,6 @@ class Config(Section):
         except ValidationError:
             return self
         return self.model_copy(update={"loop": loop, "pump": pump})
-
-
-_PUMP_RESPONSE_KEYS = frozenset({"pump_response", "pump_delay_s", "pump_lag_s"})
 
 
 def leave_to_start(config: Config) -> Config:

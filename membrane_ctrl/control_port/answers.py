@@ -1,111 +1,40 @@
 """What a hold may send to its clients, as schemas: greeting, answers, notices, status and events.
 
-A client talks to whatever listens at an address, which may be another program, a damaged hold or a
-hostile one. So every message is checked before any part of it is used: the syntax (`decode`),
-sizes, numbers and texts whatever their meaning (`_clean`), then the fields that clients read (the
-models). A hold of a later version may send further fields; they pass if they are plain.
+`message_syntax` has checked that a message is bounded, plain JSON; the schemas check the fields
+that clients read. A hold of a later version may send further fields; they pass.
 
 Messages stay dictionaries with the keys that were sent.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
+from membrane_ctrl.control_port.message_syntax import QUOTED_MAX, AnswerError, Message
 from membrane_ctrl.controller.commands import Role
-from membrane_ctrl.model import plain_json, terminal
+from membrane_ctrl.model import terminal
 
-Message = dict[str, Any]
-
-# A status has some 150 values, four levels deep, and its texts are sentences.
-_VALUES_MAX = 2000
-_DEPTH_MAX = 8
-_TEXT_MAX = 2000
-_KEY_MAX = 64
-_NUMBER_MAX = 1e16  # beyond any quantity, counter or time of a hold, and short enough to print
-_QUOTED_MAX = 120
-
-
-class AnswerError(ValueError):
-    """A message that no hold sends; the text names the field and the problem."""
-
-
-def decode(line: bytes) -> Message:
-    """Decode a message. Raises AnswerError unless it is a bounded, plain JSON object."""
-    try:
-        message = plain_json.loads(line.decode("utf-8"))
-    except (ValueError, OverflowError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
-        raise AnswerError("not JSON") from None
-    if not isinstance(message, dict):
-        raise AnswerError("not a JSON object")
-    budget = [_VALUES_MAX]
-    cleaned = _clean(message, "", 0, budget)
-    assert isinstance(cleaned, dict)
-    return cleaned
-
-
-def _clean(value: object, field: str, depth: int, budget: list[int]) -> object:
-    """Check a value of any meaning; texts lose what a terminal would execute."""
-    budget[0] -= 1
-    if budget[0] < 0:
-        raise AnswerError(f"more than {_VALUES_MAX} values")
-    if depth > _DEPTH_MAX:
-        raise AnswerError(f"{field}: nested too deep")
-    if isinstance(value, dict):
-        return {
-            _clean_key(key, field): _clean(item, _joined(field, key), depth + 1, budget)
-            for key, item in value.items()
-        }
-    if isinstance(value, list):
-        return [
-            _clean(item, _joined(field, str(place)), depth + 1, budget)
-            for place, item in enumerate(value)
-        ]
-    if isinstance(value, str):
-        return _clean_text(value, field)
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return _checked_number(value, field)
-    return value
-
-
-def _clean_key(key: str, field: str) -> str:
-    if len(key) > _KEY_MAX or not key.isprintable():
-        raise AnswerError(f"{field or 'message'}: a key that is not a name")
-    return key
-
-
-def _clean_text(text: str, field: str) -> str:
-    if len(text) > _TEXT_MAX:
-        raise AnswerError(f"{field}: a text of more than {_TEXT_MAX} characters")
-    return terminal.one_line(text)
-
-
-def _checked_number(value: int | float, field: str) -> int | float:
-    if not math.isfinite(value):
-        raise AnswerError(f"{field}: not a finite number")
-    if abs(value) > _NUMBER_MAX:
-        raise AnswerError(f"{field}: too large a number")
-    return value
-
-
-def _joined(field: str, key: str) -> str:
-    """The name of an inner field; a peer's own keys may appear in it, so it is kept short and
-    plain.
-    """
-    name = f"{field}.{key}" if field else key
-    return terminal.one_line(name[:_QUOTED_MAX])
-
-
-# The fields that clients read. Anything else is allowed, as long as it is plain.
-
+Kind = Literal["answer", "notice", "streamed", "unknown"]
+COMMAND_TAKEN = "command_taken"  # the code of a notice: another client has taken command
+# Short words for the kinds of problems that pydantic names
+_PROBLEMS = {
+    "missing": "missing",
+    "string_pattern_mismatch": "not a name",
+    "string_type": "not a text",
+    "float_type": "not a number",
+    "int_type": "not a whole number",
+    "bool_type": "neither true nor false",
+    "dict_type": "not a table",
+    "model_type": "not a table",
+}
+# Types of fields
 _Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
 _Number = Annotated[float, Field(strict=True)]
 _Count = Annotated[int, Field(strict=True, ge=0)]
 _Text = Annotated[str, Field(strict=True)]
-# The name of a folder: clients look for the run's files under it.
+# The name of a folder: clients look for the run's files under it
 RunName = Annotated[str, StringConstraints(strict=True, pattern=r"^[^/.\x00][^/\x00]{0,199}$")]
 
 
@@ -224,13 +153,8 @@ class NoticePart(_Part):
     code: _Name | None = None
 
 
-COMMAND_TAKEN = "command_taken"  # the code of a notice: another client has command now
-
-Kind = Literal["answer", "notice", "streamed", "unknown"]
-
-
 def kind_of(message: Message) -> Kind:
-    """What a message is, by its keys."""
+    """Return the kind of a message, which its keys show."""
     if "number" in message:
         return "answer"
     if "notice" in message:
@@ -271,21 +195,8 @@ def check(message: Message, model: type[BaseModel]) -> Message:
     return message
 
 
-# Short words for the kinds of problems that pydantic names.
-_PROBLEMS = {
-    "missing": "missing",
-    "string_pattern_mismatch": "not a name",
-    "string_type": "not a text",
-    "float_type": "not a number",
-    "int_type": "not a whole number",
-    "bool_type": "neither true nor false",
-    "dict_type": "not a table",
-    "model_type": "not a table",
-}
-
-
 def _described(error: ValidationError) -> str:
     first = error.errors(include_url=False, include_input=False, include_context=False)[0]
     field = ".".join(str(part) for part in first["loc"])
     problem = _PROBLEMS.get(first["type"]) or first["msg"][:1].lower() + first["msg"][1:]
-    return terminal.one_line(f"{field[:_QUOTED_MAX]}: {problem}"[: 2 * _QUOTED_MAX])
+    return terminal.one_line(f"{field[:QUOTED_MAX]}: {problem}"[: 2 * QUOTED_MAX])

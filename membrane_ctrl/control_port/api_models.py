@@ -15,6 +15,7 @@ from membrane_ctrl.controller.commands import Role
 
 _Line = Annotated[str, Field(max_length=2000)]
 _Lines = Annotated[list[_Line], Field(max_length=500)]
+Viewer = Annotated[str, Field(max_length=40, pattern=r"^[\w.@+ -]*$")]
 
 
 class _Answer(BaseModel):
@@ -125,9 +126,6 @@ class UserAnswer(_Answer):
     name: _Line
     role: Role
     via: _Line
-
-
-Viewer = Annotated[str, Field(max_length=40, pattern=r"^[\w.@+ -]*$")]
 
 
 class CommandBody(BaseModel):

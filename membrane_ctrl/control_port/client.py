@@ -17,8 +17,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.control_port import answers, lines, protocol, sockets
-from membrane_ctrl.control_port.answers import Message
+from membrane_ctrl.control_port import answers, lines, message_syntax, protocol, sockets
+from membrane_ctrl.control_port.message_syntax import Message
 from membrane_ctrl.model.errors import DeviceError, os_reason
 
 ANSWER_S = 10.0  # for a connection with its greeting, and for an answer
@@ -176,8 +176,8 @@ class PortClient:
         if line is None:  # the hold records the reason
             raise DeviceError(f"{self._where}: no greeting; see the events of the hold")
         try:
-            return answers.check_greeting(answers.decode(line))
-        except answers.AnswerError as error:
+            return answers.check_greeting(message_syntax.decode(line))
+        except message_syntax.AnswerError as error:
             raise self._not_of_a_hold(error) from None
 
     def _next(self, until_s: float) -> Message | None:
@@ -195,8 +195,8 @@ class PortClient:
         if line is None:
             return None
         try:
-            message = answers.check_message(answers.decode(line))
-        except answers.AnswerError as error:
+            message = answers.check_message(message_syntax.decode(line))
+        except message_syntax.AnswerError as error:
             raise self._not_of_a_hold(error) from None
         if answers.kind_of(message) == "notice":
             if message.get("code") == answers.COMMAND_TAKEN:
@@ -207,12 +207,12 @@ class PortClient:
     def _checked_answer(self, answer: Message, request: Message) -> Message:
         """Check what an answer must bring: the status that was asked for, or a reason."""
         if not answer["ok"] and answer.get("refused") is None:
-            raise self._not_of_a_hold(answers.AnswerError("refused: missing"))
+            raise self._not_of_a_hold(message_syntax.AnswerError("refused: missing"))
         if answer["ok"] and request.get("do") in _WITH_STATUS and answer.get("status") is None:
-            raise self._not_of_a_hold(answers.AnswerError("status: missing"))
+            raise self._not_of_a_hold(message_syntax.AnswerError("status: missing"))
         return answer
 
-    def _not_of_a_hold(self, error: answers.AnswerError) -> DeviceError:
+    def _not_of_a_hold(self, error: message_syntax.AnswerError) -> DeviceError:
         return DeviceError(f"{self._where}: not an answer of a hold ({error})")
 
     def _read_line(self, until_s: float) -> bytes | None:

@@ -105,36 +105,3 @@ class Endpoint:
             self._tell(port_events.PortFailed(self._name, f"{type(error).__name__}: {error}"))
         finally:
             connection.close()
-
-
-# Refusals are recorded, but cannot fill the record: ten mistakes all appear; of a flood, one in ten
-# seconds, with the count of the others
-_REFUSAL_BURST = 10.0
-_REFUSALS_PER_S = 0.1
-
-
-class Refusals:
-    """Records refusals at the rate of a token bucket; `count` counts all."""
-
-    def __init__(self, tell: Callable[[events.Event], None], now: Callable[[], float]) -> None:
-        self._tell = tell
-        self._now = now
-        self._left = _REFUSAL_BURST
-        self._since_s = now()
-        self._unsaid = 0
-        self.count = 0
-
-    def record(self, who: str, command: str, reason: str, why: str = "") -> None:
-        """Count a refusal, and record it if the rate allows."""
-        self.count += 1
-        now_s = self._now()
-        self._left = min(_REFUSAL_BURST, self._left + _REFUSALS_PER_S * (now_s - self._since_s))
-        self._since_s = now_s
-        if self._left < 1.0:
-            self._unsaid += 1
-            return
-        self._left -= 1.0
-        self._tell(
-            port_events.Refused(who, command, why, reason, and_unrecorded=self._unsaid or None)
-        )
-        self._unsaid = 0

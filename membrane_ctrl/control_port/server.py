@@ -20,8 +20,9 @@ from membrane_ctrl.config import port, schema, toml_file
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.commander import Commander, CommandSession
-from membrane_ctrl.control_port.endpoint import Endpoint, Refusals
+from membrane_ctrl.control_port.endpoint import Endpoint
 from membrane_ctrl.control_port.line_connection import LineConnection
+from membrane_ctrl.control_port.refusal_record import Refusals
 from membrane_ctrl.control_port.request_intake import ReadingTurns
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.sender import FREE, Peer, Sender, explain_missing_role, sender_of
@@ -372,5 +373,3 @@ class Port:
             return f"no tick took it within {_ANSWER_S:g} s; it may still be executed"
         finally:
             self._waiting.pop(command.number, None)
-
-

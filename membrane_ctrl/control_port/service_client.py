@@ -22,7 +22,7 @@ from urllib.parse import quote, urlsplit
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from membrane_ctrl.config.port import LOCAL_HOSTS
-from membrane_ctrl.control_port import answers
+from membrane_ctrl.control_port import answers, message_syntax
 from membrane_ctrl.control_port.api_models import (
     CommandAnswer,
     SignalAnswer,
@@ -149,7 +149,7 @@ class ServiceClient:
         if state.status:
             try:
                 answers.check_message({"status": state.status})
-            except answers.AnswerError as error:
+            except message_syntax.AnswerError as error:
                 raise self._not_of_a_service(str(error)) from None
         return state
 
@@ -256,8 +256,8 @@ class ServiceClient:
 
     def _decode(self, body: bytes) -> dict[str, Any]:
         try:
-            return answers.decode(body)
-        except answers.AnswerError as error:
+            return message_syntax.decode(body)
+        except message_syntax.AnswerError as error:
             raise self._not_of_a_service(str(error)) from None
 
     def _validate(self, message: dict[str, Any], model: type[Model]) -> Model:

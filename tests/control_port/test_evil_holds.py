@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.control_port import answers, ctl
+from membrane_ctrl.control_port import answers, ctl, message_syntax
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.errors import DeviceError
@@ -277,4 +277,4 @@ def test_a_fleet_lists_the_honest_hold_beside_any_peers(
 def test_an_honest_message_passes_unchanged() -> None:
     status = evil.STATUS | {"gains": {"kp_per_s": 1, "ti_s": 2.5, "td_s": 0.0}, "commander": None}
     message = {"number": 3, "ok": True, "status": status, "loop": {"rate_hz": 50.0}, "pump": {}}
-    assert answers.check_message(answers.decode(json.dumps(message).encode())) == message
+    assert answers.check_message(message_syntax.decode(json.dumps(message).encode())) == message

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from membrane_ctrl.control_port.commander import Commander
-from membrane_ctrl.control_port.endpoint import Refusals
+from membrane_ctrl.control_port.refusal_record import Refusals
 from membrane_ctrl.control_port.sender import Peer, explain_missing_role
 from membrane_ctrl.model.events import Event
 
