@@ -32,7 +32,8 @@ class BoardUnderTest:
         self._gauge_timeout_s = 0.0
         self._interlocks_fitted = 0
         self._heartbeat = 0
-        self._id, self._key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))
+        self._id = 1 + secrets.randbelow(_U32_MAX)
+        self._key = 1 + secrets.randbelow(_U32_MAX)
 
     @property
     def _claims(self) -> bool:

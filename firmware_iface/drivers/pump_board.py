@@ -63,7 +63,8 @@ class PumpBoard:
         self._watchdog_s = period.to_value(period.to_raw(watchdog_s))
         # The same for every opening by this object, so that a claim whose answer was lost can be
         # repeated. The name is public, the key is secret.
-        self._claim_id, self._claim_key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))
+        self._claim_id = 1 + secrets.randbelow(_U32_MAX)
+        self._claim_key = 1 + secrets.randbelow(_U32_MAX)
         self._armed = False  # by this object, since it last connected
         self._heartbeat = 0
         self._busy_writes = 0  # in a row

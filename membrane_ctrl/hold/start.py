@@ -20,8 +20,8 @@ from membrane_ctrl.geometry.run_geometry import read_configured_geometry
 from membrane_ctrl.hold import child_processes, page_service
 from membrane_ctrl.hold.autotune import start_autotune
 from membrane_ctrl.hold.closing_words import PageAtEnd, RunEnd, print_closing_report
+from membrane_ctrl.hold.fault_latch import FaultLatch
 from membrane_ctrl.hold.hold_options import HoldOptions
-from membrane_ctrl.hold.listeners import FaultLatch
 from membrane_ctrl.hold.lock_keeper import LockKeeper
 from membrane_ctrl.hold.start_checks import (
     find_locks,

@@ -16,11 +16,12 @@ from membrane_ctrl.controller import commands, tick
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.hold import child_processes
 from membrane_ctrl.hold.closing_words import RunEnd
+from membrane_ctrl.hold.fault_latch import FaultLatch
 from membrane_ctrl.hold.hold_options import HoldOptions
-from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.lock_keeper import LockKeeper
 from membrane_ctrl.hold.start_checks import BoardAtStart
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
+from membrane_ctrl.hold.systemd_notify import SystemdNotify
 from membrane_ctrl.instruments.bench import connect_bench
 from membrane_ctrl.model import errors, events, run_events
 from membrane_ctrl.model.clock import RunClock

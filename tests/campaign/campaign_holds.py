@@ -27,7 +27,7 @@ from firmware_iface.emulators.pumps import BronkhorstRegisters, Instrument
 from firmware_iface.roles import Bench, BenchCommand, DeviceRefusedError
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.hold.listeners import FaultLatch
+from membrane_ctrl.hold.fault_latch import FaultLatch
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.model.telemetry import State

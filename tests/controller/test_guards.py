@@ -32,11 +32,12 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.child_processes import ChildProcesses, make_rings
 from membrane_ctrl.hold.closing_words import RunEnd
+from membrane_ctrl.hold.fault_latch import FaultLatch
 from membrane_ctrl.hold.hold_options import HoldOptions
-from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.lock_keeper import LockKeeper
 from membrane_ctrl.hold.start_checks import BoardAtStart
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.hold.systemd_notify import SystemdNotify
 from membrane_ctrl.hold.tick_run import HoldResources, run_ticks
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit

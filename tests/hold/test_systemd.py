@@ -15,7 +15,7 @@ import pytest
 
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.hold.listeners import SystemdNotify
+from membrane_ctrl.hold.systemd_notify import SystemdNotify
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.telemetry import FIELDS, State, TelemetryRow
 from tests.support.machine_needs import needs

@@ -12,7 +12,7 @@ import pytest
 
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.controller.tick import TickOutputs
-from membrane_ctrl.hold.listeners import FaultLatch
+from membrane_ctrl.hold.fault_latch import FaultLatch
 from membrane_ctrl.model.events import CommandTaken, Event, Fault, Resumed, StateEntered
 from membrane_ctrl.model.program import file_origin, program_identity, stated_program
 from membrane_ctrl.model.run_events import LatchFailed, LatchWritten

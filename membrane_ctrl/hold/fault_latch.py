@@ -1,13 +1,11 @@
-"""Listeners to the ticks of a hold: the latched-fault file and systemd.
-No tick waits for either.
+"""The latched fault of a hold: written to its file when it latches, removed when it clears.
+
+Another thread writes the file; no tick waits for it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
-import os
-import socket
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,12 +13,8 @@ from datetime import UTC, datetime
 from functools import partial
 
 from membrane_ctrl.controller import tick
-from membrane_ctrl.model import events, run_events, telemetry
-from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
-
-_CLOSING_US = 120_000_000  # longer than `TimeoutStopSec=` of the unit
-_NOTIFY_S = 0.5  # far below any sensible WatchdogSec=, and cheap
 
 
 class FaultLatch:
@@ -144,61 +138,3 @@ class FaultLatch:
     def _report_failure(self) -> None:
         while self._pending:
             self._report(self._pending.popleft())
-
-
-class SystemdNotify:
-    """Tells systemd that ticks continue (`Type=notify`, `WatchdogSec=`), with a status line, and
-    when they end.
-
-    The protocol is a datagram of KEY=VALUE lines to the socket in NOTIFY_SOCKET (sd_notify(3));
-    "@name" means an abstract one. Without a socket nothing is sent. systemd restarts a loop that
-    hangs and so sends nothing.
-    """
-
-    def __init__(self, address: str | None = None) -> None:
-        self._address = (address or os.environ.get("NOTIFY_SOCKET", "")).replace("@", "\0", 1)
-        self._next_s = -math.inf
-        self._state = -1.0
-        self._status = RunStatus()
-
-    def __enter__(self) -> SystemdNotify:
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        # The recording is closed without ticks; `TimeoutStopSec=` limits how long that takes.
-        self._send_message(f"STOPPING=1\nWATCHDOG_USEC={_CLOSING_US}")
-        self._socket.close()
-
-    def note_report(self, event: events.Event) -> None:
-        """Note a child's report for the next status line."""
-        self._status = self._status.after_event(event)
-
-    def handle_tick(self, outputs: tick.TickOutputs) -> None:
-        """After a tick: notify, at most twice a second unless the state changes."""
-        for event in outputs.events:
-            self._status = self._status.after_event(event)
-        row = outputs.row
-        if row.mono_s < self._next_s and row.state == self._state:
-            return
-        ready = "READY=1\n" if math.isinf(self._next_s) else ""
-        self._next_s = row.mono_s + _NOTIFY_S
-        self._state = row.state
-        error = ""
-        if math.isfinite(row.error_um):
-            error = f", {row.format_labelled('error_um', sign=True)}"
-        fault = f", fault {row.fault:g}" if row.fault else ""
-        locked = ""
-        if self._status.locks:
-            locked = f", {len(self._status.locks)} locks"
-        problems = self._status.recording_problems
-        trouble = f", recording: {'; '.join(problems)}" if problems else ""
-        self._send_message(
-            f"{ready}WATCHDOG=1\nSTATUS={telemetry.State(int(row.state)).name.lower()}{error}{fault}{locked}{trouble}"
-        )
-
-    def _send_message(self, message: str) -> None:
-        if self._address:
-            with contextlib.suppress(OSError):
-                # a path need not be valid text
-                self._socket.sendto(message.encode(errors="replace"), self._address)
