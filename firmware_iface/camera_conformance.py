@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from firmware_iface import roles
+from firmware_iface import optical_roles, roles
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.requirement import overrides, require, require_error, require_identity
 
@@ -52,16 +52,16 @@ class CameraBench:
         What the sensor sees.
     """
 
-    sensor = roles.SensorFormat(48, 32)
+    sensor = optical_roles.SensorFormat(48, 32)
     exposure_s = 0.0
 
     def __init__(self) -> None:
         time = VirtualTime()
-        self.clock = roles.DriverClock(time.now, time.sleep)
+        self.clock = optical_roles.DriverClock(time.now, time.sleep)
         self._random = np.random.default_rng(1)
-        self.scene: roles.Pixels = np.zeros(self.sensor.shape, self.sensor.dtype)
+        self.scene: optical_roles.Pixels = np.zeros(self.sensor.shape, self.sensor.dtype)
 
-    def make(self, sensor: roles.SensorFormat) -> roles.OpticalDevice:
+    def make(self, sensor: optical_roles.SensorFormat) -> optical_roles.OpticalDevice:
         """Make a driver that is configured for this sensor, not yet connected."""
         raise NotImplementedError
 
@@ -85,11 +85,11 @@ class CameraBench:
         """Bring it back."""
         raise NotImplementedError
 
-    def view(self) -> roles.Pixels:
+    def view(self) -> optical_roles.Pixels:
         """What the sensor sees now: for the emulator."""
         return self.scene.copy()
 
-    def change_scene(self) -> roles.Pixels:
+    def change_scene(self) -> optical_roles.Pixels:
         """Show another scene, and return it."""
         top = min(1 << self.sensor.bits, 1 << 16)
         self.scene = self._random.integers(0, top, self.sensor.shape).astype(self.sensor.dtype)
@@ -167,12 +167,12 @@ def check_screen_may_change_after_exposure(bench: CameraBench) -> None:
     with _open_camera(bench) as camera:
         scene = bench.change_scene()
         camera.expose()
-        if isinstance(camera.driver, roles.ExposingCamera):
+        if isinstance(camera.driver, optical_roles.ExposingCamera):
             bench.change_scene()
         _require_picture(
             camera.fetch(), scene, "a frame whose exposure was over before the scene changed"
         )
-        if isinstance(camera.driver, roles.ExposingCamera):
+        if isinstance(camera.driver, optical_roles.ExposingCamera):
             fetch = camera.driver.fetch
         else:
             fetch = camera.fetch
@@ -196,7 +196,7 @@ def check_lost_frame(bench: CameraBench) -> None:
         bench.change_scene()
         bench.lose_frame()
         camera.expose()
-        require_error(camera.fetch, roles.FrameLostError)
+        require_error(camera.fetch, optical_roles.FrameLostError)
         scene = bench.change_scene()
         _require_picture(_capture_again(camera), scene, "the frame after a lost one")
 
@@ -208,7 +208,7 @@ def check_late_frame(bench: CameraBench) -> None:
         bench.change_scene()
         bench.delay_frame()
         camera.expose()
-        require_error(camera.fetch, roles.FrameLostError)
+        require_error(camera.fetch, optical_roles.FrameLostError)
         for _ in range(_REPEATS):
             scene = bench.change_scene()
             _require_picture(_capture_again(camera), scene, "a frame after a late one")
@@ -282,8 +282,8 @@ _CHECKS: dict[Check, tuple[str, ...]] = {
 
 @contextmanager
 def _open_driver(
-    bench: CameraBench, sensor: roles.SensorFormat | None = None
-) -> Iterator[roles.OpticalDevice]:
+    bench: CameraBench, sensor: optical_roles.SensorFormat | None = None
+) -> Iterator[optical_roles.OpticalDevice]:
     driver = bench.make(sensor or bench.sensor)
     try:
         yield driver
@@ -299,10 +299,10 @@ def _open_camera(bench: CameraBench) -> Iterator[GuardedCamera]:
         yield camera
 
 
-def _capture_again(camera: GuardedCamera) -> roles.Frame:
+def _capture_again(camera: GuardedCamera) -> optical_roles.Frame:
     camera.expose()
     return camera.fetch()
 
 
-def _require_picture(frame: roles.Frame, scene: roles.Pixels, what: str) -> None:
+def _require_picture(frame: optical_roles.Frame, scene: optical_roles.Pixels, what: str) -> None:
     require(np.array_equal(frame.pixels, scene), f"{what} is not what the sensor saw")

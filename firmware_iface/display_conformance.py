@@ -11,8 +11,9 @@ from contextlib import contextmanager
 import numpy as np
 
 from firmware_iface.display_patterns import make_checkerboard
+from firmware_iface.optical_roles import Display, Levels
 from firmware_iface.requirement import overrides, require, require_error, require_identity
-from firmware_iface.roles import DeviceRefusedError, Display, Levels, LinkDownError, LinkError
+from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 
 _REPEATS = 3
 

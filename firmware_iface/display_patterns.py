@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.arrays import FloatArray
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 
 _GRAY_BITS = 4
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from firmware_iface.roles import Pixels
+from firmware_iface.optical_roles import Pixels
 
 _SATURATED_SHARE = 0.001  # of the pixels: dust and glints
 _TARGET = 0.8  # of full scale, for the 99th percentile

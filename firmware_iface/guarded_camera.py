@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface import roles
+from firmware_iface import optical_roles, roles
 from firmware_iface.driver_calls import call_driver, close_driver
 
 # A camera's clock, converted to the run's clock, may be off by this; a frame of an earlier trigger
@@ -26,10 +26,14 @@ class GuardedCamera:
     """
 
     def __init__(
-        self, driver: roles.OpticalDevice, sensor: roles.SensorFormat, now: roles.Clock, name: str
+        self,
+        driver: optical_roles.OpticalDevice,
+        sensor: optical_roles.SensorFormat,
+        now: roles.Clock,
+        name: str,
     ) -> None:
-        self._overlaps = isinstance(driver, roles.ExposingCamera)
-        if not self._overlaps and not isinstance(driver, roles.Camera):
+        self._overlaps = isinstance(driver, optical_roles.ExposingCamera)
+        if not self._overlaps and not isinstance(driver, optical_roles.Camera):
             raise ValueError(
                 f"{name}: the driver has neither grab nor expose and fetch, so it is no camera"
             )
@@ -39,7 +43,7 @@ class GuardedCamera:
         self._name = name
         self._opened = False
         self._triggered_s = math.nan
-        self._grabbed: roles.Frame | roles.FrameLostError | None = None
+        self._grabbed: optical_roles.Frame | optical_roles.FrameLostError | None = None
 
     def open(self) -> roles.DeviceIdentity:
         """Connect and apply the settings. Raises LinkError."""
@@ -49,7 +53,7 @@ class GuardedCamera:
         self._opened = True
         return identity
 
-    def expose(self, out: roles.Pixels | None = None) -> None:
+    def expose(self, out: optical_roles.Pixels | None = None) -> None:
         """Trigger, and return when the exposure is over. Raises LinkError."""
         if not self._opened:
             self.open()
@@ -59,33 +63,33 @@ class GuardedCamera:
             self._call_camera("expose", out)
             return
         try:
-            self._grabbed = self._call_camera("grab", out, returns=roles.Frame)
-        except roles.FrameLostError as error:
+            self._grabbed = self._call_camera("grab", out, returns=optical_roles.Frame)
+        except optical_roles.FrameLostError as error:
             self._grabbed = error
 
-    def fetch(self) -> roles.Frame:
+    def fetch(self) -> optical_roles.Frame:
         """The frame of the last `expose`. Raises FrameLostError (expose again), LinkError."""
         if math.isnan(self._triggered_s):
             raise roles.LinkError(f"{self._name}: no exposure to fetch")
         triggered_s, self._triggered_s = self._triggered_s, math.nan
         found, self._grabbed = self._grabbed, None
         if self._overlaps:
-            found = self._call_camera("fetch", returns=roles.Frame)
-        if isinstance(found, roles.FrameLostError):
+            found = self._call_camera("fetch", returns=optical_roles.Frame)
+        if isinstance(found, optical_roles.FrameLostError):
             raise found
         assert found is not None
         self._check_frame(found, triggered_s)
         return found
 
-    def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
+    def grab(self, out: optical_roles.Pixels | None = None) -> optical_roles.Frame:
         """One exposure, taken again when it is lost. Raises LinkError (no camera, or three frames
         lost in a row).
         """
-        for _ in range(roles.TRIES - 1):
+        for _ in range(optical_roles.TRIES - 1):
             try:
                 self.expose(out)
                 return self.fetch()
-            except roles.FrameLostError:
+            except optical_roles.FrameLostError:
                 continue
         self.expose(out)
         return self.fetch()
@@ -105,13 +109,13 @@ class GuardedCamera:
     def _call_camera(self, method: str, *arguments: object, returns: type[object] = object) -> Any:
         try:
             return call_driver(self._name, self.driver, method, *arguments, returns=returns)
-        except roles.FrameLostError:
+        except optical_roles.FrameLostError:
             raise
         except roles.LinkError:
             self.close()
             raise
 
-    def _check_frame(self, frame: roles.Frame, triggered_s: float) -> None:
+    def _check_frame(self, frame: optical_roles.Frame, triggered_s: float) -> None:
         """Refuse a frame of another size or type, and one that was
         not exposed after its trigger.
         """
@@ -130,7 +134,7 @@ class GuardedCamera:
         earliest_s = triggered_s - _CLOCK_TOLERANCE_S
         latest_s = self._now() + _CLOCK_TOLERANCE_S
         if not isinstance(frame.time_s, int | float) or not earliest_s <= frame.time_s <= latest_s:
-            raise roles.FrameLostError(
+            raise optical_roles.FrameLostError(
                 f"{self._name}: gave a frame of {frame.time_s} s for the trigger at "
                 f"{triggered_s:.3f} s: late, or "
                 "its time is not on the run's clock"

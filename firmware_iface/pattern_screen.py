@@ -11,7 +11,8 @@ from typing import Any
 from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light
 from firmware_iface.display_response import DisplayResponse, make_linear_response
 from firmware_iface.driver_calls import call_driver, close_driver
-from firmware_iface.roles import DeviceIdentity, Display, DriverClock, Levels, LinkError, Pattern
+from firmware_iface.optical_roles import Display, DriverClock, Levels, Pattern
+from firmware_iface.roles import DeviceIdentity, LinkError
 
 SETTLE_S = 0.3  # until it is measured
 

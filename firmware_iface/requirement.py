@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Iterable
 
-from firmware_iface.roles import LinkError, OpticalDevice
+from firmware_iface.optical_roles import OpticalDevice
+from firmware_iface.roles import LinkError
 
 
 class ConformanceError(Exception):

@@ -25,8 +25,8 @@ from firmware_iface.display_patterns import ScreenRaster
 from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.drivers.screen_pygame import PygameDisplay
 from firmware_iface.guarded_camera import GuardedCamera
+from firmware_iface.optical_roles import DriverClock, Pattern, SensorFormat
 from firmware_iface.pattern_screen import PatternScreen
-from firmware_iface.roles import DriverClock, Pattern, SensorFormat
 from firmware_iface.settings import AravisCameraConfig, PygameScreenConfig
 from membrane_ctrl.acquisition.cycle import CycleDone, ShapeCycle
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan

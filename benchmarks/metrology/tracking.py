@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface

@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.metrology.acquisition import LaserAtRest
 from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.guarded_camera import GuardedCamera
-from firmware_iface.roles import DriverClock, Pattern, SensorFormat
+from firmware_iface.optical_roles import DriverClock, Pattern, SensorFormat
 from firmware_iface.settings import AravisCameraConfig
 from membrane_ctrl.acquisition.cycle import CycleDone, ShapeCycle
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan

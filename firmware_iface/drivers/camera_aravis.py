@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface import roles, settings
+from firmware_iface import optical_roles, roles, settings
 from firmware_iface.links import aravis as arv
 
 # One frame being filled and one to spare; each is copied out at once
@@ -31,7 +31,7 @@ _ADJUST_NEVER = 0
 _NO_PACKET_SOCKET = 1
 _RANGE_CHECKED = 1  # arvdevice.h; by default the library writes values outside the camera's range
 _SUCCESS = 0  # ArvBufferStatus
-_REAL_TIME = roles.DriverClock()
+_REAL_TIME = optical_roles.DriverClock()
 _GONE = (arv.NOT_CONNECTED, arv.TRANSFER_ERROR, arv.TIMEOUT)
 _TAKEN = (arv.NOT_CONTROLLER, arv.ACCESS_DENIED, arv.BUSY)
 
@@ -57,8 +57,8 @@ class AravisCamera:
     def __init__(
         self,
         config: settings.AravisCameraConfig,
-        sensor: roles.SensorFormat,
-        clock: roles.DriverClock = _REAL_TIME,
+        sensor: optical_roles.SensorFormat,
+        clock: optical_roles.DriverClock = _REAL_TIME,
     ) -> None:
         self.config = config
         self.counts = FrameCounts()
@@ -69,7 +69,7 @@ class AravisCamera:
         self._camera: int | None = None
         self._stream: int | None = None
         self._opened = False
-        self._pending: tuple[float, roles.Pixels | None] | None = None
+        self._pending: tuple[float, optical_roles.Pixels | None] | None = None
 
     def open(self) -> roles.DeviceIdentity:
         """Connect, apply the settings, read them back, start the stream.
@@ -94,7 +94,7 @@ class AravisCamera:
         self._opened = True
         return identity
 
-    def expose(self, out: roles.Pixels | None = None) -> None:
+    def expose(self, out: optical_roles.Pixels | None = None) -> None:
         """Trigger, and return when the exposure is over: the screen may change while the frame is
         transferred.
 
@@ -116,7 +116,7 @@ class AravisCamera:
         self._pending = time_s, out
         self._sleep(max(0.0, time_s + self.config.exposure_ms / 1000.0 - self._now()))
 
-    def fetch(self) -> roles.Frame:
+    def fetch(self) -> optical_roles.Frame:
         """The frame of the last `expose`, in its `out` if one was given.
 
         Raises FrameLostError (it did not come, or not whole: show the pattern again and expose
@@ -131,18 +131,18 @@ class AravisCamera:
         if not buffer:
             self.counts.missing += 1
             self._restart_stream()
-            raise roles.FrameLostError(
+            raise optical_roles.FrameLostError(
                 f"{self._name}: no frame within {self.config.timeout_s:g} s of its trigger"
             )
         try:
             status = library.call("arv_buffer_get_status", buffer)
             if status != _SUCCESS:
                 self.counts.incomplete += 1
-                raise roles.FrameLostError(
+                raise optical_roles.FrameLostError(
                     f"{self._name}: frame not whole (aravis status {status}); cable, packet "
                     "size, other traffic?"
                 )
-            frame = roles.Frame(self._copy_pixels(buffer, out), time_s)
+            frame = optical_roles.Frame(self._copy_pixels(buffer, out), time_s)
         finally:
             library.call("arv_stream_push_buffer", self._stream, buffer)
         self.counts.taken += 1
@@ -307,7 +307,7 @@ class AravisCamera:
         except roles.LinkError:
             self._drop_camera()
 
-    def _copy_pixels(self, buffer: int, out: roles.Pixels | None) -> roles.Pixels:
+    def _copy_pixels(self, buffer: int, out: optical_roles.Pixels | None) -> optical_roles.Pixels:
         """Copy a whole frame's pixels."""
         library = arv.load_aravis()
         found = tuple(
@@ -329,7 +329,7 @@ class AravisCamera:
                 f"{self._name}: sent {size.value} bytes instead of {count * dtype.itemsize}"
             )
         memory = memoryview((ctypes.c_char * (count * dtype.itemsize)).from_address(start))
-        seen: roles.Pixels = np.ndarray(count, dtype, memory).reshape(height_px, width_px)
+        seen: optical_roles.Pixels = np.ndarray(count, dtype, memory).reshape(height_px, width_px)
         if out is None:
             return seen.copy()
         if out.shape != seen.shape or out.dtype != seen.dtype:

@@ -16,11 +16,11 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from firmware_iface import roles, settings
+from firmware_iface import optical_roles, roles, settings
 
 # One in the driver's queue, although its length is set to one, and one whose exposure has started
 _STALE_FRAMES = 2
-_REAL_TIME = roles.DriverClock()
+_REAL_TIME = optical_roles.DriverClock()
 _EXPOSURE_MANUAL = 1.0  # V4L2's number; 3 is automatic
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 
@@ -53,8 +53,8 @@ class UvcCamera:
     def __init__(
         self,
         config: settings.UvcCameraConfig,
-        sensor: roles.SensorFormat,
-        clock: roles.DriverClock = _REAL_TIME,
+        sensor: optical_roles.SensorFormat,
+        clock: optical_roles.DriverClock = _REAL_TIME,
         capture: Callable[[int | str], VideoCapture] = cv2.VideoCapture,  # type: ignore[assignment]  # the stubs differ
     ) -> None:
         self._config = config
@@ -98,7 +98,7 @@ class UvcCamera:
                 )
         return roles.DeviceIdentity("UVC camera", "", "", self.describe()["settings"])
 
-    def grab(self, out: roles.Levels | None = None) -> roles.Frame:
+    def grab(self, out: optical_roles.Levels | None = None) -> optical_roles.Frame:
         """The next complete frame that starts after the call, as grey (the green channel of a
         colour camera).
 
@@ -114,17 +114,17 @@ class UvcCamera:
             if not good:
                 self.close()
                 raise roles.LinkDownError(f"camera {self._config.port}: no frame; unplugged?")
-        pixels: roles.Levels = np.asarray(image)
+        pixels: optical_roles.Levels = np.asarray(image)
         if pixels.ndim == 3:
             pixels = pixels[:, :, 1]
         if out is None:
-            return roles.Frame(pixels.copy(), time_s)
+            return optical_roles.Frame(pixels.copy(), time_s)
         if out.shape != pixels.shape:
             raise roles.DeviceRefusedError(
                 f"camera {self._config.port}: sent {pixels.shape}, expected {out.shape}"
             )
         np.copyto(out, pixels)
-        return roles.Frame(out, time_s)
+        return optical_roles.Frame(out, time_s)
 
     def close(self) -> None:
         """Release the camera. Never raises."""
@@ -152,8 +152,8 @@ class FolderCamera:
     def __init__(
         self,
         config: settings.FolderCameraConfig,
-        sensor: roles.SensorFormat,
-        clock: roles.DriverClock = _REAL_TIME,
+        sensor: optical_roles.SensorFormat,
+        clock: optical_roles.DriverClock = _REAL_TIME,
     ) -> None:
         self._folder = Path(config.folder).expanduser()
         self._size = sensor.shape
@@ -178,7 +178,7 @@ class FolderCamera:
             "folder of frames", "", "", f"{len(self._files)} pictures in {self._folder}"
         )
 
-    def show(self, pattern: roles.Pattern) -> None:
+    def show(self, pattern: optical_roles.Pattern) -> None:
         """Role Screen: choose the picture of this name; without one the next in the order comes."""
         if not self._files:
             self.open()
@@ -186,7 +186,7 @@ class FolderCamera:
         if pattern.name in names:
             self._next = names.index(pattern.name)
 
-    def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
+    def grab(self, out: optical_roles.Pixels | None = None) -> optical_roles.Frame:
         """The next picture. Raises LinkError if it cannot be read or has another size."""
         if not self._files:
             self.open()
@@ -194,14 +194,14 @@ class FolderCamera:
         pixels = self._read(self._files[self._next % len(self._files)])
         self._next = (self._next + 1) % len(self._files)
         if out is None:
-            return roles.Frame(pixels, time_s)
+            return optical_roles.Frame(pixels, time_s)
         if out.dtype != pixels.dtype:
             raise roles.LinkError(
                 f"camera: {self._folder}: pictures are {pixels.dtype}, [optics.camera] bits "
                 f"requires {out.dtype}"
             )
         np.copyto(out, pixels)
-        return roles.Frame(out, time_s)
+        return optical_roles.Frame(out, time_s)
 
     def close(self) -> None:
         """Start from the first picture next time."""
@@ -212,7 +212,7 @@ class FolderCamera:
         """For people."""
         return {"port": str(self._folder), "settings": f"{self._size[1]} x {self._size[0]}"}
 
-    def _read(self, path: Path) -> roles.Pixels:
+    def _read(self, path: Path) -> optical_roles.Pixels:
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise roles.LinkError(f"camera: {path}: cannot be read as a picture")

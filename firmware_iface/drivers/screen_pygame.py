@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, Levels, LinkError
+from firmware_iface.optical_roles import Levels
+from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkError
 from firmware_iface.settings import PygameScreenConfig
 
 MISSING = "pygame-ce is not installed: pip install 'membrane-ctrl[screen]'"

@@ -11,7 +11,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from firmware_iface.roles import Camera, Pixels, Screen
+from firmware_iface.optical_roles import Camera, Pixels, Screen
 from membrane_ctrl.acquisition import exposures, stage_errors
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.model.arrays import FloatArray

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from firmware_iface import (
     display_response,
     display_settling,
     exposure_check,
-    roles,
+    optical_roles,
 )
 from firmware_iface.pattern_screen import PatternScreen
 from membrane_ctrl.acquisition.exposures import CycleClock
@@ -36,7 +36,7 @@ class DisplayTest:
     def __init__(
         self,
         screen: PatternScreen,
-        camera: roles.Camera,
+        camera: optical_roles.Camera,
         clock: CycleClock,
         width_px: int,
         height_px: int,
@@ -101,13 +101,15 @@ class DisplayTest:
         light = [float(np.mean(frame[is_lit])) for frame in frames]
         return display_response.make_measured_response(levels, light)
 
-    def _expose_still(self, levels: roles.Levels) -> roles.Pixels:
+    def _expose_still(self, levels: optical_roles.Levels) -> optical_roles.Pixels:
         """Take a picture of levels that have settled."""
         self._screen.show_levels(levels)
         self._clock.sleep(self.settle_s)
         return self._camera.grab().pixels
 
-    def _expose_series(self, levels: roles.Levels) -> Iterator[tuple[float, roles.Pixels]]:
+    def _expose_series(
+        self, levels: optical_roles.Levels
+    ) -> Iterator[tuple[float, optical_roles.Pixels]]:
         """Take frames one after the other, each with the time from the command to its exposure."""
         self._screen.show_levels(levels)
         begun_s = self._clock.now()
@@ -115,11 +117,11 @@ class DisplayTest:
             frame = self._camera.grab()
             yield frame.time_s - begun_s, _thin_pixels(frame.pixels)
 
-    def _make_grey(self, level: int) -> roles.Levels:
+    def _make_grey(self, level: int) -> optical_roles.Levels:
         """A screen of one level."""
         return np.full(self._size, level, np.uint8)
 
 
-def _thin_pixels(pixels: roles.Pixels) -> roles.Pixels:
+def _thin_pixels(pixels: optical_roles.Pixels) -> optical_roles.Pixels:
     """Some of the pixels, enough for means over blocks."""
     return pixels[::_THINNING, ::_THINNING].copy()

@@ -12,7 +12,7 @@ thread (aravis fills buffers outside Python), the consumer is the cycle.
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
-from firmware_iface.roles import (
+from firmware_iface.optical_roles import (
     TRIES,
     Camera,
     ExposingCamera,

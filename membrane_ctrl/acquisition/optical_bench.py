@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from firmware_iface import display_patterns, drivers, roles
+from firmware_iface import display_patterns, drivers, optical_roles, roles
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.pattern_screen import PatternScreen
 from firmware_iface.settings import ExternalCameraConfig, ExternalScreenConfig, ScreenSection
@@ -100,8 +100,8 @@ def exposure_s(config: Config) -> float:
 def _make_camera(config: Config, section: Any, clock: CycleClock, *library: Any) -> GuardedCamera:
     """The camera of a table; `library` stands for the library that its driver calls."""
     stated = config.optics.camera
-    sensor = roles.SensorFormat(stated.width_px, stated.height_px, stated.bits)
-    waits = roles.DriverClock(clock.now, clock.sleep)
+    sensor = optical_roles.SensorFormat(stated.width_px, stated.height_px, stated.bits)
+    waits = optical_roles.DriverClock(clock.now, clock.sleep)
     driver = driver_loading.make_driver(section, _CAMERA, drivers.CAMERAS, sensor, waits, *library)
     try:
         return GuardedCamera(driver, sensor, clock.now, f"camera {driver_loading.name_of(section)}")
@@ -115,7 +115,7 @@ def _make_screen(config: Config, section: Any, clock: CycleClock, *library: Any)
     if config.shape.mode == "track":
         patterns += crossed_patterns(config.shape.track_periods)
     shown = driver_loading.make_driver(section, _SCREEN, drivers.SCREENS, *library)
-    waits = roles.DriverClock(clock.now, clock.sleep)
+    waits = optical_roles.DriverClock(clock.now, clock.sleep)
     name = f"screen {driver_loading.name_of(section)}"
     return PatternScreen(shown, _make_raster(config, section), patterns, waits, name)
 

@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import tomli_w
 
-from firmware_iface.roles import Pattern, Pixels
+from firmware_iface.optical_roles import Pattern, Pixels
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
 from membrane_ctrl.model import acquisition_events, events, files, program, telemetry

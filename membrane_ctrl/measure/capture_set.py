@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.config.origin import OriginSection

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.roles import Pixels
+from firmware_iface.optical_roles import Pixels
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.processes.frame_address import FrameAddress
 
@@ -33,7 +33,7 @@ class FrameHead:
 
     # number of frames stored earlier in the run; identifies the frame for `FrameReader.copy`
     index: int
-    pattern: str  # pattern on the screen (`firmware_iface.roles.Pattern.name`)
+    pattern: str  # pattern on the screen (`firmware_iface.optical_roles.Pattern.name`)
     time_s: float  # start of exposure on the run's clock
     displacement_um: float  # laser reading then, if known when the frame arrived; else NaN
     cycle: int  # number of the measurement cycle

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Pixels
+from firmware_iface.optical_roles import Pixels
 from membrane_ctrl.processes.frame_address import FrameAddress
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
 

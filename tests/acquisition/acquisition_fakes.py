@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
+from firmware_iface.optical_roles import Frame, Pattern, Pixels
+from firmware_iface.roles import LinkError
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS

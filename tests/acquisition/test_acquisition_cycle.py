@@ -20,7 +20,7 @@ from acquisition_fakes import (
 )
 from acquisition_fakes import VirtualClock as Clock
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.acquisition.cycle import REJECTED_IN_A_ROW, CycleDone, CycleFailed, ShapeCycle
 from membrane_ctrl.model.durations import pause_s
 from membrane_ctrl.processes.frames import FrameReader, FrameRing, FrameWriter

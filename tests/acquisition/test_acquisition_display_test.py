@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from acquisition_fakes import VirtualClock
 
-from firmware_iface.roles import Frame
+from firmware_iface.optical_roles import Frame
 from membrane_ctrl.acquisition.display_test import DisplayTest
 from membrane_ctrl.acquisition.optical_bench import format_finding
 from tests.worlds.panel import EmulatedPanel, PanelResponse

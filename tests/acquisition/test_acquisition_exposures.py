@@ -17,7 +17,7 @@ from acquisition_fakes import (
     VirtualClock,
 )
 
-from firmware_iface.roles import Frame, FrameLostError, Pattern, Pixels
+from firmware_iface.optical_roles import Frame, FrameLostError, Pattern, Pixels
 from membrane_ctrl.acquisition.exposures import Exposures, StageError
 from membrane_ctrl.processes.frames import FrameReader, FrameRing, FrameWriter
 

@@ -16,14 +16,8 @@ from firmware_iface import camera_conformance
 from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.links import aravis
-from firmware_iface.roles import (
-    DeviceRefusedError,
-    DriverClock,
-    FrameLostError,
-    LinkDownError,
-    LinkError,
-    SensorFormat,
-)
+from firmware_iface.optical_roles import DriverClock, FrameLostError, SensorFormat
+from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import AravisCameraConfig
 from tests.support.machine_needs import program_path
 from tests.worlds.gige_camera import GigeCameraEmulator, gige_camera

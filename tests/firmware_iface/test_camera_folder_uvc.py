@@ -10,14 +10,8 @@ import numpy as np
 import pytest
 
 from firmware_iface.drivers.camera_opencv import FolderCamera, UvcCamera
-from firmware_iface.roles import (
-    DeviceRefusedError,
-    DriverClock,
-    LinkDownError,
-    LinkError,
-    Pattern,
-    SensorFormat,
-)
+from firmware_iface.optical_roles import DriverClock, Pattern, SensorFormat
+from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import FolderCameraConfig, UvcCameraConfig
 
 CLOCK = DriverClock(lambda: 3.5)

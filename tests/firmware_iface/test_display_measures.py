@@ -21,7 +21,7 @@ from firmware_iface.display_response import (
 )
 from firmware_iface.display_settling import fit_settling, share_left
 from firmware_iface.exposure_check import explain_exposure
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from tests.worlds.panel import EmulatedPanel, PanelResponse
 
 RASTER = ScreenRaster(341, 257, 0.25, periods=4, period_mm=14.0)

@@ -11,15 +11,8 @@ import numpy as np
 import pytest
 
 from firmware_iface.guarded_camera import GuardedCamera
-from firmware_iface.roles import (
-    DeviceIdentity,
-    DeviceRefusedError,
-    Frame,
-    FrameLostError,
-    LinkDownError,
-    LinkError,
-    SensorFormat,
-)
+from firmware_iface.optical_roles import Frame, FrameLostError, SensorFormat
+from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
 SENSOR = SensorFormat(6, 4)
 

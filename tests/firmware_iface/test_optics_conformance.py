@@ -11,16 +11,9 @@ import numpy as np
 import pytest
 
 from firmware_iface import camera_conformance, display_conformance
+from firmware_iface.optical_roles import Frame, FrameLostError, SensorFormat
 from firmware_iface.requirement import ConformanceError
-from firmware_iface.roles import (
-    DeviceIdentity,
-    DeviceRefusedError,
-    Frame,
-    FrameLostError,
-    LinkDownError,
-    LinkError,
-    SensorFormat,
-)
+from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
 EXPOSURE_S = 0.01
 

@@ -11,8 +11,9 @@ import pytest
 
 from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light
 from firmware_iface.display_response import DisplayResponse
+from firmware_iface.optical_roles import DriverClock, Pattern
 from firmware_iface.pattern_screen import SETTLE_S, PatternScreen
-from firmware_iface.roles import DeviceIdentity, DriverClock, LinkDownError, LinkError, Pattern
+from firmware_iface.roles import DeviceIdentity, LinkDownError, LinkError
 
 RASTER = ScreenRaster(64, 48, 1.0, periods=2, period_mm=16.0)
 PATTERNS = [Pattern("sin", "x", 0), Pattern("gray", "y", 2), Pattern("white"), Pattern("black")]

@@ -14,8 +14,9 @@ from firmware_iface import display_conformance
 from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light, make_checkerboard
 from firmware_iface.display_response import DisplayResponse
 from firmware_iface.drivers.screen_pygame import PygameDisplay
+from firmware_iface.optical_roles import DriverClock, Pattern
 from firmware_iface.pattern_screen import PatternScreen
-from firmware_iface.roles import DeviceRefusedError, DriverClock, LinkError, Pattern
+from firmware_iface.roles import DeviceRefusedError, LinkError
 from firmware_iface.settings import PygameScreenConfig
 from tests.support.virtual_display import screenshot, virtual_display
 

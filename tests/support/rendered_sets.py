@@ -9,7 +9,7 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.camera import OpticsRenderer

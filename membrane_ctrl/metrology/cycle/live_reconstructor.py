@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle import cycle_geometry, cycle_motion
 from membrane_ctrl.metrology.film import hencky_bowl

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.metrology.phase.bin_sums import Binner
 from membrane_ctrl.metrology.phase.clip_levels import ClipLevels, find_clip_levels
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES

@@ -6,7 +6,7 @@ images for N = 4. A fringes-only cycle is the 2 N sinusoids, x first.
 
 import math
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import PatternConfig
 
 GRAY_BITS = 4  # 16 half periods: enough for the 8 periods a configuration may ask for

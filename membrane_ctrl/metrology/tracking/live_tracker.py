@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle import live_reconstructor
 from membrane_ctrl.metrology.figure import bin_figure

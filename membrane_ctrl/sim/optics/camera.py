@@ -10,7 +10,8 @@ from typing import Protocol
 import numpy as np
 
 from firmware_iface.display_patterns import ScreenRaster
-from firmware_iface.roles import Frame, Levels, LinkError, Pattern, Pixels
+from firmware_iface.optical_roles import Frame, Levels, Pattern, Pixels
+from firmware_iface.roles import LinkError
 from membrane_ctrl.config.schema import DisturbancesConfig, OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.bench_poses import (

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.optics import DisturbancesConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.random_field import RandomField

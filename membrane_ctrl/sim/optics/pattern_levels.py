@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.model.arrays import FloatArray
 

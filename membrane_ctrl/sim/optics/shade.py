@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from firmware_iface.roles import Pixels
+from firmware_iface.optical_roles import Pixels
 from membrane_ctrl.model.arrays import FloatArray, Singles
 from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.sim.optics.node_interpolation import interpolate_cubic, interpolate_row

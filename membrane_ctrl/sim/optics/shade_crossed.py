@@ -7,7 +7,7 @@ node, then those at k + 1. A hold that tracks takes twenty such pictures a secon
 
 import numpy as np
 
-from firmware_iface.roles import Pixels
+from firmware_iface.optical_roles import Pixels
 from membrane_ctrl.model.arrays import FloatArray, Singles
 from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.sim.optics.node_interpolation import interpolate_row

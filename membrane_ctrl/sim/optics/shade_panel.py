@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from firmware_iface.display_patterns import ScreenRaster
-from firmware_iface.roles import Levels, Pixels
+from firmware_iface.optical_roles import Levels, Pixels
 from membrane_ctrl.model.arrays import FloatArray, Singles
 from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.sim.optics.node_interpolation import interpolate_cubic, interpolate_row

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import tomli_w
 
-from firmware_iface import roles, settings
+from firmware_iface import optical_roles, settings
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.program import describe_origin, file_origin
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
@@ -163,7 +163,7 @@ def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str,
 class _Exposure:
     """The true exposure of one file: pattern, place of the film, time and factor of the light."""
 
-    pattern: roles.Pattern
+    pattern: optical_roles.Pattern
     displacement_um: float
     time_s: float
     gain: float = 1.0
@@ -291,7 +291,7 @@ def simulate_track(
         if k < _STEPS:
             shift_x_rad = 1 * 2 * np.pi * (k % _STEPS) / _STEPS
             shift_y_rad = 2 * 2 * np.pi * (k % _STEPS) / _STEPS
-        pattern = roles.Pattern(
+        pattern = optical_roles.Pattern(
             "crossed", "", _CROSSED_PERIODS, shift_x_rad, shift_y_rad=shift_y_rad
         )
         row: dict[str, Any] = {
@@ -388,7 +388,7 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
     noise = np.random.default_rng(spec.seed).normal(0.0, spec.laser_noise_um, len(spec.patterns))
     readings_um = noise + [spec.displacement_um(frame) for frame in range(len(spec.patterns))]
     faults = {(fault.kind, fault.frame) for fault in spec.faults}
-    before: roles.Pixels | None = None
+    before: optical_roles.Pixels | None = None
     for pattern, exposure in zip(spec.patterns, _list_exposures(spec), strict=True):
         if ("stale", pattern.name) in faults and before is not None:
             picture = before
@@ -429,14 +429,14 @@ def _list_exposures(spec: SimulationSpec) -> list[_Exposure]:
     return exposures
 
 
-def _other_depth(picture: roles.Pixels) -> roles.Pixels:
+def _other_depth(picture: optical_roles.Pixels) -> optical_roles.Pixels:
     """The picture with the other number of bytes a pixel."""
     if picture.dtype == np.uint8:
         return picture.astype(np.uint16)
     return picture.astype(np.uint8)
 
 
-def _write_png(path: Path, picture: roles.Pixels) -> None:
+def _write_png(path: Path, picture: optical_roles.Pixels) -> None:
     """Write a picture. Raises OSError."""
     if not cv2.imwrite(str(path), picture, _PNG_SPEED):
         raise OSError(f"{path}: cannot be written")

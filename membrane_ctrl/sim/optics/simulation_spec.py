@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import DisturbancesConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film as gas_film

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.cli import run
 from membrane_ctrl.metrology.frame_checks.band_removal import remove_bands
 from membrane_ctrl.metrology.phase.clip_levels import ClipLevels

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.geometry.spread_file import geometry_spread
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full

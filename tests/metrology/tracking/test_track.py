@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene

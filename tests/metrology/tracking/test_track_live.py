@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection

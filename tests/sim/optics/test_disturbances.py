@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, DisturbancesConfig, OpticsConfig
 from membrane_ctrl.model.errors import Exit

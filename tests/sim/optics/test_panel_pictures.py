@@ -9,7 +9,7 @@ import pytest
 
 from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light, make_checkerboard
 from firmware_iface.display_response import make_linear_response
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.optics import CameraConfig, DisturbancesConfig, OpticsConfig
 from membrane_ctrl.config.schema import TwinConfig
 from membrane_ctrl.metrology.phase.pattern_sequence import full_sequence

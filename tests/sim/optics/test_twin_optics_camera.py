@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from firmware_iface.roles import Camera, LinkError, Pattern, Screen
+from firmware_iface.optical_roles import Camera, Pattern, Screen
+from firmware_iface.roles import LinkError
 from membrane_ctrl.config.schema import OpticsConfig, TwinConfig
 from membrane_ctrl.sim.optics.camera import OpticsRenderer, TwinOptics
 from membrane_ctrl.sim.optics.film_shape import FilmShape

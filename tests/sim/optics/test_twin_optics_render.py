@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig, PatternConfig
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, Ripple

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from firmware_iface import roles, settings
+from firmware_iface import optical_roles, roles, settings
 
 WHITE_ADU, DARK_ADU, NOISE_ADU = 200.0, 5.0, 0.5
 
@@ -72,8 +72,8 @@ class StudioCamera:
     def __init__(
         self,
         config: CameraSettings,
-        sensor: roles.SensorFormat,
-        clock: roles.DriverClock,
+        sensor: optical_roles.SensorFormat,
+        clock: optical_roles.DriverClock,
         library: CameraEmulator | None = None,
     ) -> None:
         self._config, self._sensor, self._clock, self._library = config, sensor, clock, library
@@ -86,7 +86,7 @@ class StudioCamera:
         self._open = True
         return roles.DeviceIdentity("Studio camera", "S1", f"process {os.getpid()}")
 
-    def grab(self, out: Any = None) -> roles.Frame:
+    def grab(self, out: Any = None) -> optical_roles.Frame:
         if not self._open:
             raise roles.LinkDownError("camera studio_cam: is not open")
         self._exposures += 1
@@ -96,8 +96,8 @@ class StudioCamera:
             self._library.view() if self._library else ROOM.see(self._sensor.shape, self._random)
         )
         if self._faults and self._exposures % self._config.fault_every == 0:
-            return self._fail(self._faults.pop(0), roles.Frame(pixels, time_s))
-        return roles.Frame(pixels, time_s)
+            return self._fail(self._faults.pop(0), optical_roles.Frame(pixels, time_s))
+        return optical_roles.Frame(pixels, time_s)
 
     def close(self) -> None:
         self._open = False
@@ -105,7 +105,7 @@ class StudioCamera:
     def describe(self) -> dict[str, str]:
         return {"port": "studio camera"}
 
-    def _fail(self, fault: str, frame: roles.Frame) -> Any:
+    def _fail(self, fault: str, frame: optical_roles.Frame) -> Any:
         match fault:
             case "raise":
                 raise RuntimeError("bus error 5")
@@ -118,9 +118,9 @@ class StudioCamera:
             case "nothing":
                 return None
             case "size":
-                return roles.Frame(frame.pixels[:-1], frame.time_s)
+                return optical_roles.Frame(frame.pixels[:-1], frame.time_s)
             case "late":
-                return roles.Frame(frame.pixels, frame.time_s - 1.0)
+                return optical_roles.Frame(frame.pixels, frame.time_s - 1.0)
             case "close":
                 self._open = False
                 raise roles.LinkDownError("unplugged")
