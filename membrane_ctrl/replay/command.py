@@ -149,26 +149,23 @@ def replay_command(
     took_s = time.perf_counter() - started_s
     if not found.ticks:
         part = "" if math.isinf(to_s) else f" up to {to_s:g} s"
-        why = "; ".join((*run.inputs.damage, *(gap.reason for gap in found.gaps[:1])))
-        raise InputError(f"{folder}: no tick to replay{part}{why and ': '}{why}")
+        reasons = [*run.inputs.damage, *(gap.reason for gap in found.gaps[:1])]
+        why = f": {'; '.join(reasons)}" if reasons else ""
+        raise InputError(f"{folder}: no tick to replay{part}{why}")
     if found.last_s < from_s:
         raise InputError(f"{folder}: --from {from_s:g}s: the record ends at {found.last_s:.1f} s")
     report = _make_report(run, found, begin, to_s)
     remembered = found.state if state else None
     if as_json:
-        print(
-            plain_json.dumps(
-                report if remembered is None else report | {"state": to_plain(remembered)}
-            )
-        )
+        printed = dict(report)
+        if remembered is not None:
+            printed["state"] = to_plain(remembered)
+        print(plain_json.dumps(printed))
     else:
         print("\n".join(_format_report(report)))
         if remembered is not None:
-            print(
-                f"state      after the tick at {found.last_s:.3f} s:",
-                *describe_tree(remembered),
-                sep="\n",
-            )
+            print(f"state      after the tick at {found.last_s:.3f} s:")
+            print("\n".join(describe_tree(remembered)))
     rate = found.ticks / took_s if took_s else math.inf
     print(f"{found.ticks} ticks in {took_s:.1f} s ({rate:.0f} a second)", file=sys.stderr)
     if to_test is not None:

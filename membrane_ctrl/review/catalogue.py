@@ -125,13 +125,16 @@ def read_entry(folder: Path) -> RunEntry:
     stored = summary.get("held")
     duration_s = _read_number(summary.get("duration_s"))
     held = stored if isinstance(stored, dict) else {}
-    pump = next(
-        (each.event for each in reversed(log) if isinstance(each.event, events.PumpLearned)), None
-    )
+    if not math.isfinite(duration_s):
+        duration_s = _recorded_s(folder)
+    newest_first = [each.event for each in reversed(log)]
+    pump = next((e for e in newest_first if isinstance(e, events.PumpLearned)), None)
+    geometries = (e for e in newest_first if isinstance(e, acquisition_events.GeometryInUse))
+    geometry = next(geometries, None)
     return RunEntry(
         folder=folder,
         started_utc=origin_of(folder, log),
-        duration_s=duration_s if math.isfinite(duration_s) else _recorded_s(folder),
+        duration_s=duration_s,
         std_um=_read_number(held.get("std_um")),
         in_band=_read_number(held.get("in_band")),
         faults=sum(isinstance(each.event, events.Fault) for each in log),
@@ -142,18 +145,11 @@ def read_entry(folder: Path) -> RunEntry:
         size_mb=retention.size_bytes(folder) / 1e6,
         marks=sum(isinstance(each.event, run_events.Mark) for each in log),
         kept=(folder / KEPT_FILE).exists(),
-        geometry=next(
-            (
-                e.event.hash
-                for e in reversed(log)
-                if isinstance(e.event, acquisition_events.GeometryInUse)
-            ),
-            "",
-        ),
-        **{
-            name: _read_number(held.get(name))
-            for name in ("held_s", "faults_s", "paused_s", "moving_s")
-        },
+        geometry="" if geometry is None else geometry.hash,
+        held_s=_read_number(held.get("held_s")),
+        faults_s=_read_number(held.get("faults_s")),
+        paused_s=_read_number(held.get("paused_s")),
+        moving_s=_read_number(held.get("moving_s")),
         pump_scale=math.nan if pump is None else _read_number(pump.scale),
         pump_sigma=math.nan if pump is None else _read_number(pump.sigma),
         ended_in=_fault_of_end(log, summary.get("exit")),

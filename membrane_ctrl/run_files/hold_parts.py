@@ -47,7 +47,8 @@ class HoldParts(StateNode):
 
     def classify_block(self, block: Mapping[str, Column]) -> dict[str, BoolArray]:
         """(n,) masks of the next block by the names of `PARTS`; no tick is in two."""
-        time_s, hold = block["mono_s"], block["state"] == telemetry.State.HOLD
+        time_s = block["mono_s"]
+        hold = block["state"] == telemetry.State.HOLD
         faults = block["safe_level"] > 0
         # a loop that follows its error has a proportional part; a lost reading alone is no pause
         open_loop = (
@@ -56,13 +57,18 @@ class HoldParts(StateNode):
             & np.isfinite(block["displacement_um"])
         )
         paused = hold & ~faults & open_loop
+        # Ticks of `hold` in which the mirror is not settled: the first one, on the ramp, away
         ramp_um = block["setpoint_um"] - np.nan_to_num(block["trim_um"]) - block["target_um"]
-        began = hold & ~np.concatenate(([not math.isnan(self.since_s)], hold[:-1]))
+        arrived = np.abs(ramp_um) <= ARRIVED_UM
+        was_in_hold = not math.isnan(self.since_s)
+        began = hold & ~np.concatenate(([was_in_hold], hold[:-1]))
         away = paused | faults | self._find_straying(block, paused | (faults & hold))
-        marks = np.where(hold & (began | away | ~(np.abs(ramp_um) <= ARRIVED_UM)), time_s, -np.inf)
-        if not math.isnan(self.since_s) and time_s.size and hold[0]:
-            marks[0] = max(marks[0], self.since_s)
-        since_s = np.maximum.accumulate(marks)
+        unsettled = hold & (began | away | ~arrived)
+        # Settled: for some seconds after the last of them, which may be in an earlier block
+        marks_s = np.where(unsettled, time_s, -np.inf)
+        if was_in_hold and time_s.size and hold[0]:
+            marks_s[0] = max(marks_s[0], self.since_s)
+        since_s = np.maximum.accumulate(marks_s)
         held = hold & (time_s - since_s >= telemetry.SETTLED_AFTER_S)
         if time_s.size:
             self.since_s = float(since_s[-1]) if hold[-1] else math.nan
@@ -80,23 +86,30 @@ class HoldParts(StateNode):
         time_s = block["mono_s"]
         outside = ~(np.abs(block["error_um"]) <= self.band_um)
         straying = np.zeros(time_s.size, dtype=bool)
-        for first in np.flatnonzero(
-            ~let_go & np.concatenate(([not math.isnan(self.let_go_s)], let_go[:-1]))
-        ):
+        was_let_go = np.concatenate(([not math.isnan(self.let_go_s)], let_go[:-1]))
+        for first in np.flatnonzero(was_let_go & ~let_go):
+            # When the mirror was last let go, and when it was last outside the band
             if first:
-                end_s, away_s = time_s[first - 1], time_s[first - 1]
+                let_go_s = time_s[first - 1]
+                away_s = time_s[first - 1]
             else:
-                end_s, away_s = self.let_go_s, self.away_s
-            rows = first + np.flatnonzero((outside & (time_s <= end_s + _BACK_WITHIN_S))[first:])
-            away = np.append(away_s, time_s[rows])
-            stayed = np.flatnonzero(np.diff(away, append=time_s[-1]) >= telemetry.SETTLED_AFTER_S)
+                let_go_s = self.let_go_s
+                away_s = self.away_s
+            # It strays until it has stayed in the band for some seconds, or the time has passed
+            counts = outside & (time_s <= let_go_s + _BACK_WITHIN_S)
+            rows = first + np.flatnonzero(counts[first:])
+            outside_s = np.append(away_s, time_s[rows])
+            inside_for_s = np.diff(outside_s, append=time_s[-1])
+            stayed = np.flatnonzero(inside_for_s >= telemetry.SETTLED_AFTER_S)
             count = int(stayed[0]) if stayed.size else rows.size
             straying[rows[:count]] = True
-            over = stayed.size or time_s[-1] > end_s + _BACK_WITHIN_S
-            if over:
-                self.let_go_s, self.away_s = math.nan, math.nan
+            is_over = stayed.size or time_s[-1] > let_go_s + _BACK_WITHIN_S
+            if is_over:
+                self.let_go_s = math.nan
+                self.away_s = math.nan
             else:
-                self.let_go_s, self.away_s = float(end_s), float(away[count])
+                self.let_go_s = float(let_go_s)
+                self.away_s = float(outside_s[count])
         if let_go.size and let_go[-1]:
             self.let_go_s = self.away_s = float(time_s[-1])
         return straying

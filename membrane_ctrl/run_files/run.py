@@ -266,23 +266,28 @@ class Run:
         """
         names = tuple(dict.fromkeys(("time_s", "rows", *names)))
         if window_s not in table_specs.LEVELS:
-            raise ValueError(
-                f"levels are {', '.join(f'{w:g}' for w in levels.WINDOWS_S)} s, not {window_s:g}"
-            )
+            known = ", ".join(f"{each:g}" for each in levels.WINDOWS_S)
+            raise ValueError(f"levels are {known} s, not {window_s:g}")
         spec = table_specs.LEVELS[window_s]
         blocks = list(self._iterate_blocks(spec, names, start_s, end_s))
+        # Windows that the table lacks: between its rows, and after the last of them
         time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
         missing = _find_gaps(time_s, window_s, start_s)
-        until_s = float(time_s[-1]) + window_s if time_s.size else start_s
+        until_s = start_s
+        if time_s.size:
+            until_s = float(time_s[-1]) + window_s
         continues = self._open_table(spec).known_until_s >= end_s
-        if not time_s.size or (
-            end_s - until_s > _HOLE_S if continues else not self._reaches_end(until_s)
-        ):
+        if not time_s.size:
+            lacks_end = True
+        elif continues:
+            lacks_end = end_s - until_s > _HOLE_S
+        else:
+            lacks_end = not self._reaches_end(until_s)
+        if lacks_end:
             missing.append((until_s, end_s))
         for begins_s, ends_s in missing:
-            blocks += (
-                self._made_level(window_s, begins_s, ends_s, names) if begins_s < ends_s else []
-            )
+            if begins_s < ends_s:
+                blocks += self._made_level(window_s, begins_s, ends_s, names)
         if not blocks:
             return {name: np.empty(0) for name in names}
         level = {name: np.concatenate([block[name] for block in blocks]) for name in names}

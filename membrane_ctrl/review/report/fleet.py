@@ -2,6 +2,7 @@
 beside it.
 """
 
+import math
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -207,23 +208,29 @@ def _make_row(entry: dict[str, Any], curve: str) -> list[str]:
     if "problem" in entry:
         cells = [entry["name"], "", "", _NOT_REPORTED, entry["problem"]]
         return cells + [""] * (len(_HEAD) - len(cells))
-    in_band = entry["in_band"]
-    known = in_band is not None and in_band == in_band
-    rest = format_time_beside(
+    in_band = "–"
+    if entry["in_band"] is not None and math.isfinite(entry["in_band"]):
+        in_band = f"{100 * entry['in_band']:.4g} %"
+    held = f"{format_span(entry['settled_s'])} of {format_span(entry['duration_s'])}"
+    not_held = format_time_beside(
         entry["faults_s"], entry["paused_s"], entry["moving_s"], entry["duration_s"]
     )
-    held = f"{format_span(entry['settled_s'])} of {format_span(entry['duration_s'])}"
-    faults = ", ".join(dict.fromkeys(entry["faults"]))
+    if not_held:
+        held += f" ({', '.join(not_held)})"
+    faults = "0"
+    if entry["faults"]:
+        names = ", ".join(dict.fromkeys(entry["faults"]))
+        faults = f"{len(entry['faults'])}: {names}"
     return [
         _LINK.format(address=quote(entry["report"]), name=entry["name"]),
         f"{datetime.fromisoformat(entry['started_utc']):%Y-%m-%d %H:%M}",
         Markup(curve),
         f"{entry['state']}, {entry['exit'] or 'open'}",
-        f"{held} ({', '.join(rest)})" if rest else held,
+        held,
         format_number(entry["std_um"]),
         format_number(entry["mean_um"]),
-        f"{100 * in_band:.4g} %" if known else "–",
-        f"{len(entry['faults'])}: {faults}" if faults else "0",
+        in_band,
+        faults,
         ", ".join(entry["alarms"]) or "none",
         str(entry["found"]),
         str(entry["ticks_missed"]),

@@ -10,9 +10,7 @@ from membrane_ctrl.review.formatting import format_signed, format_span
 from membrane_ctrl.review.statistics import shape_review
 from membrane_ctrl.review.statistics.drift import FittedSlope
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
-from membrane_ctrl.review.statistics.hold_pass import (
-    HoldPass,
-)
+from membrane_ctrl.review.statistics.hold_pass import HoldPass
 from membrane_ctrl.run_files.run import Run
 
 # Noise alone leaves 95 % of single ticks in the band; a hold keeps all of its seconds there.
@@ -50,78 +48,87 @@ def find_anomalies(
 ) -> tuple[Anomaly, ...]:
     """All anomalies of a part of a run, the gravest first."""
     anomalies = [Anomaly("incomplete recording", note) for note in run.notes]
-    names = Counter(
-        each.event.name for each in run.log_between(*part_s) if isinstance(each.event, events.Fault)
-    )
-    anomalies += [
-        Anomaly("fault", f"{name}, {count} time{'s' * (count > 1)}")
-        for name, count in names.most_common()
-    ]
+    anomalies += _list_faults(run, part_s)
     if reading is None:
         anomalies.append(
             Anomaly("never settled", "no tick counts as held: there are no hold statistics")
         )
     series = true or reading
     if series is not None:
-        seconds = series.windows[0]
-        if seconds.count and not seconds.in_band >= _IN_BAND_LEAST:
-            anomalies.append(
-                Anomaly("band left", f"{100 * seconds.in_band:.3g} % of 1 s means within the band")
-            )
-        if seconds.count and abs(seconds.mean_um) > _BIAS_MOST_UM:
-            anomalies.append(Anomaly("bias", f"{seconds.mean_um:+.3f} µm on average"))
-        if series.drift.is_significant:
-            anomalies.append(Anomaly("drift", _describe_slope(series.drift, "µm/h")))
-    if ticks.paused_s:
-        anomalies.append(
-            Anomaly(
-                "paused",
-                f"{format_span(ticks.paused_s)}: the pump gave its mean flow, "
-                "nothing held the mirror",
-            )
-        )
-    if ticks.missed_ticks:
-        anomalies.append(
-            Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}")
-        )
-    if ticks.lateness_ms.find_quantile(0.99) > _LATE_P99_MOST_MS:
-        anomalies.append(
-            Anomaly("late ticks", f"p99 is {ticks.lateness_ms.find_quantile(0.99):.1f} ms")
-        )
+        anomalies += _judge_error(series)
+    anomalies += _judge_ticks(ticks)
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
-        anomalies.append(
-            Anomaly(
-                "too tight", f"a leak of {leak_um_per_s:.2f} µm/s leaves the pump no way to lower"
-            )
-        )
-    if ticks.pump.saturated_share > _SATURATED_MOST:
-        anomalies.append(
-            Anomaly(
-                "saturation",
-                f"{100 * ticks.pump.saturated_share:.1f} % of ticks at a limit of the flow",
-            )
-        )
+        leak = f"a leak of {leak_um_per_s:.2f} µm/s leaves the pump no way to lower"
+        anomalies.append(Anomaly("too tight", leak))
+    saturated_share = ticks.pump.saturated_share
+    if saturated_share > _SATURATED_MOST:
+        saturation = f"{100 * saturated_share:.1f} % of ticks at a limit of the flow"
+        anomalies.append(Anomaly("saturation", saturation))
     untracked_s = (1 - tracking_share) * ticks.hold_s
-    if (
-        run.config.shape.enabled
-        and tracking_share < _TRACKING_LEAST
-        and untracked_s > _UNTRACKED_MOST_S
-    ):
-        seen = (
+    has_lost_time = tracking_share < _TRACKING_LEAST and untracked_s > _UNTRACKED_MOST_S
+    if run.config.shape.enabled and has_lost_time:
+        tracked = (
             f"tracked {100 * tracking_share:.0f} % of the time held; else the centre follows the "
             "laser's mount"
         )
-        anomalies.append(Anomaly("shape loop", seen))
+        anomalies.append(Anomaly("shape loop", tracked))
     if shape is not None:
-        if shape.rejected > _REJECTED_MOST * shape.cycles:
-            anomalies.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
-        if shape.disagreement.is_significant:
-            anomalies.append(
-                Anomaly("camera and laser diverge", _describe_slope(shape.disagreement, "µm/h"))
-            )
+        anomalies += _judge_shape(shape)
     counts = Counter(event.kind for event in found)
     anomalies += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
     return tuple(anomalies)
+
+
+def _list_faults(run: Run, part_s: tuple[float, float]) -> list[Anomaly]:
+    """One anomaly for each fault that occurred, the most frequent first."""
+    logged = run.log_between(*part_s)
+    names = Counter(each.event.name for each in logged if isinstance(each.event, events.Fault))
+    return [
+        Anomaly("fault", f"{name}, {count} time{'s' if count > 1 else ''}")
+        for name, count in names.most_common()
+    ]
+
+
+def _judge_error(series: ErrorSeries) -> list[Anomaly]:
+    """Anomalies of the error of the held mirror."""
+    anomalies = []
+    seconds = series.windows[0]
+    if seconds.count and not seconds.in_band >= _IN_BAND_LEAST:
+        in_band = f"{100 * seconds.in_band:.3g} % of 1 s means within the band"
+        anomalies.append(Anomaly("band left", in_band))
+    if seconds.count and abs(seconds.mean_um) > _BIAS_MOST_UM:
+        anomalies.append(Anomaly("bias", f"{seconds.mean_um:+.3f} µm on average"))
+    if series.drift.is_significant:
+        anomalies.append(Anomaly("drift", _describe_slope(series.drift, "µm/h")))
+    return anomalies
+
+
+def _judge_ticks(ticks: HoldPass) -> list[Anomaly]:
+    """Pauses, and ticks that were missed or late."""
+    anomalies = []
+    if ticks.paused_s:
+        paused = (
+            f"{format_span(ticks.paused_s)}: the pump gave its mean flow, nothing held the mirror"
+        )
+        anomalies.append(Anomaly("paused", paused))
+    if ticks.missed_ticks:
+        all_ticks = ticks.ticks + ticks.missed_ticks
+        anomalies.append(Anomaly("missed ticks", f"{ticks.missed_ticks} of {all_ticks}"))
+    late_ms = ticks.lateness_ms.find_quantile(0.99)
+    if late_ms > _LATE_P99_MOST_MS:
+        anomalies.append(Anomaly("late ticks", f"p99 is {late_ms:.1f} ms"))
+    return anomalies
+
+
+def _judge_shape(shape: shape_review.ShapeReview) -> list[Anomaly]:
+    """Anomalies of the measured figures."""
+    anomalies = []
+    if shape.rejected > _REJECTED_MOST * shape.cycles:
+        anomalies.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
+    if shape.disagreement.is_significant:
+        diverging = _describe_slope(shape.disagreement, "µm/h")
+        anomalies.append(Anomaly("camera and laser diverge", diverging))
+    return anomalies
 
 
 def _describe_slope(drift: FittedSlope, unit: str) -> str:

@@ -108,44 +108,59 @@ class _Collector:
         self._span = (math.nan, math.nan)
 
     def add(self, block: Mapping[str, Column]) -> None:
+        """Add the next block of ticks."""
         time_s = block["mono_s"]
         parts = self._parts.classify_block(block)
-        mask = parts["held"]
-        kept_away = self._without.estimate_kept_away_um(block["feedforward_um_per_s"])[mask]
+        is_held = parts["held"]
+        kept_away = self._without.estimate_kept_away_um(block["feedforward_um_per_s"])[is_held]
+        # Counts of all ticks
+        if not self._ticks:
+            self._span = (float(time_s[0]), math.nan)
+        self._span = (self._span[0], float(time_s[-1]))
         self._ticks += time_s.size
-        self._span = (
-            self._span[0] if self._ticks > time_s.size else float(time_s[0]),
-            float(time_s[-1]),
-        )
         for name, part in {"hold": block["state"] == State.HOLD, **parts}.items():
             self._times[name].add_times(time_s, part)
-        missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
-        if missed.size:
-            if math.isnan(self._missed_before):
-                self._missed_before = float(missed[0])
-            self._missed = max(self._missed, float(missed.max()) - self._missed_before)
+        self._add_missed(block["missed_ticks"])
         self._lateness.add(block["lateness_ms"])
-        held = {name: np.asarray(block[name][mask], dtype=np.float64) for name in NAMES}
+        # Errors of the ticks in which the mirror was held
+        held = {name: np.asarray(block[name][is_held], dtype=np.float64) for name in NAMES}
         self._pump.add(held)
         reading = held["setpoint_um"] - held["displacement_um"]
         true = telemetry.true_error_um(held)
-        place = np.rint((held["mono_s"] - self._grid_s) / self._period_s).astype(np.int64)
-        inside = (place >= 0) & (place < self._reading.size)
-        self._reading[place[inside]] = reading[inside]
-        self._true[place[inside]] = true[inside]
+        self._add_to_grid(held["mono_s"], reading, true)
         for sums, error in zip(self._seconds, (reading, true), strict=True):
             known = np.isfinite(error)
             sums.add(held["mono_s"][known], np.stack((error, kept_away))[:, known])
         self._raw_reading.add(reading)
         self._raw_true.add(true)
-        reading = reading[np.isfinite(reading)]
-        self._counted += reading.size
-        self._unread += true.size - reading.size
-        self._inside += int((np.abs(reading) <= self._band_um).sum())
-        scale = _HISTOGRAM_BINS / (self._edges_um[-1] - self._edges_um[0])
-        bins = np.clip((reading - self._edges_um[0]) * scale, 0, _HISTOGRAM_BINS - 1).astype(
-            np.int64
-        )
+        known_reading = reading[np.isfinite(reading)]
+        self._counted += known_reading.size
+        self._unread += true.size - known_reading.size
+        self._inside += int((np.abs(known_reading) <= self._band_um).sum())
+        self._add_to_histogram(known_reading)
+
+    def _add_missed(self, missed_ticks: Column) -> None:
+        """Count the missed ticks, of which each row has the running count."""
+        missed = missed_ticks[np.isfinite(missed_ticks)]
+        if not missed.size:
+            return
+        if math.isnan(self._missed_before):
+            self._missed_before = float(missed[0])
+        self._missed = max(self._missed, float(missed.max()) - self._missed_before)
+
+    def _add_to_grid(self, time_s: Column, reading: Column, true: Column) -> None:
+        """Place errors at their ticks, for spectra."""
+        place = np.rint((time_s - self._grid_s) / self._period_s).astype(np.int64)
+        is_inside = (place >= 0) & (place < self._reading.size)
+        self._reading[place[is_inside]] = reading[is_inside]
+        self._true[place[is_inside]] = true[is_inside]
+
+    def _add_to_histogram(self, reading: Column) -> None:
+        """Count readings by bins; those beyond the ends are in the last bins."""
+        low_um = self._edges_um[0]
+        high_um = self._edges_um[-1]
+        bins = (reading - low_um) * (_HISTOGRAM_BINS / (high_um - low_um))
+        bins = np.clip(bins, 0, _HISTOGRAM_BINS - 1).astype(np.int64)
         self._histogram += np.bincount(bins, minlength=_HISTOGRAM_BINS)
 
     def result(self) -> HoldPass:

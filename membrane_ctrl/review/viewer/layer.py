@@ -195,53 +195,62 @@ class Layer:
     def _send_events(
         self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]
     ) -> None:
+        """Send the reported events, the marks in the plots, and the detected events."""
+        start_s, end_s = part_s
         logged = [
-            e
-            for e in run.log
-            if not isinstance(e.event, events.Why) and part_s[0] <= e.mono_s <= part_s[1]
+            each
+            for each in run.log
+            if not isinstance(each.event, events.Why) and start_s <= each.mono_s <= end_s
         ]
         if logged:
+            time_s = np.array([each.mono_s for each in logged])
             levels = [each.event.level.value for each in logged]
             texts = [each.event.sentence for each in logged]
-            self._send_log(
-                run, "/events", np.array([each.mono_s for each in logged]), texts, levels
-            )
-        for stream, time_s, values in plot_marks.mark_lines(
-            [(each.mono_s, each.event) for each in run.log]
-        ):
+            self._send_log(run, "/events", time_s, texts, levels)
+        timed = [(each.mono_s, each.event) for each in run.log]
+        for stream, time_s, values in plot_marks.mark_lines(timed):
             self._send_style(stream.path, _names_and_colours(stream), 2.0, vertical=True)
             self._send_columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
-        pump = [(e.mono_s, e.event) for e in run.log if isinstance(e.event, events.PumpLearned)]
-        if pump:
-            values = np.array([(logged.scale, logged.correction) for _, logged in pump])
-            variances = np.array([(logged.sigma**2, 0.0) for _, logged in pump])
-            lines = _names_and_colours(streams.PUMP)
-            self._send_measured(
-                streams.PUMP.path, lines, np.array([at_s for at_s, _ in pump]), values, variances
-            )
-        seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
-        if seen:
+        self._send_pump_scale(run)
+        shown = [each for each in found if start_s <= each.time_s <= end_s]
+        if shown:
+            time_s = np.array([each.time_s for each in shown])
             texts = [
-                f"{f.kind}, {_format_size(f.size, f.unit)} (confidence {f.confidence:.3f})"
-                for f in seen
+                f"{each.kind}, {_format_size(each.size, each.unit)} "
+                f"(confidence {each.confidence:.3f})"
+                for each in shown
             ]
-            self._send_log(
-                run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen)
-            )
-        for kind in dict.fromkeys(f.kind for f in found):
+            self._send_log(run, "/found", time_s, texts, ["WARN"] * len(shown))
+        self._send_found_lines(found)
+
+    def _send_pump_scale(self, run: Run) -> None:
+        """Send what the hold has learned of the pump, with its standard deviation."""
+        learned = [each for each in run.log if isinstance(each.event, events.PumpLearned)]
+        if not learned:
+            return
+        time_s = np.array([each.mono_s for each in learned])
+        scales = [each.event for each in learned if isinstance(each.event, events.PumpLearned)]
+        values = np.array([(each.scale, each.correction) for each in scales])
+        variances = np.array([(each.sigma**2, 0.0) for each in scales])
+        lines = _names_and_colours(streams.PUMP)
+        self._send_measured(streams.PUMP.path, lines, time_s, values, variances)
+
+    def _send_found_lines(self, found: Sequence[FoundEvent]) -> None:
+        """Send a vertical line at each detected event; those of a kind have one name and colour."""
+        for kind in dict.fromkeys(each.kind for each in found):
             of_kind = sorted((f for f in found if f.kind == kind), key=lambda f: f.size)
-            ends = " to ".join(
-                dict.fromkeys(_format_size(f.size, f.unit) for f in (of_kind[0], of_kind[-1]))
-            )
-            if len(of_kind) == 1:
-                name = f"{kind}, {ends}"
-            else:
-                name = f"{len(of_kind)} of {kind}, {ends}"
+            smallest, largest = (_format_size(f.size, f.unit) for f in (of_kind[0], of_kind[-1]))
+            sizes = smallest
+            if largest != smallest:
+                sizes = f"{smallest} to {largest}"
+            name = f"{kind}, {sizes}"
+            if len(of_kind) > 1:
+                name = f"{len(of_kind)} of {kind}, {sizes}"
+            colour = _FOUND_COLOURS.get(kind, _OTHER_FOUND)
             path = f"/found/lines/{kind.replace(' ', '_')}"
-            self._send_style(
-                path, [(name, _FOUND_COLOURS.get(kind, _OTHER_FOUND))], 1.0, vertical=True
-            )
-            time_s, values = plot_marks.make_vertical_lines(np.array([f.time_s for f in of_kind]))
+            self._send_style(path, [(name, colour)], 1.0, vertical=True)
+            times_s = np.array([f.time_s for f in of_kind])
+            time_s, values = plot_marks.make_vertical_lines(times_s)
             self._send_columns(path, time_s, rr.Scalars.columns(scalars=values))
 
     def _send_log(
