@@ -106,14 +106,15 @@ class RoleBench:
         firmware = ", ".join(
             dict.fromkeys(i.firmware for i in self.identities.values() if i.firmware)
         )
+        displacement_range_um = _ANY
+        if "displacement" in self.identities:
+            displacement_range_um = self.identities["displacement"].shows
         return roles.BenchIdentity(
             f"composed of {kinds}",
             0,
             firmware,
             self._watchdog_s,
-            displacement_range_um=self.identities["displacement"].shows
-            if "displacement" in self.identities
-            else _ANY,
+            displacement_range_um=displacement_range_um,
             gauge_range_pa=self.identities["gauge_pressure"].shows,
         )
 

@@ -68,10 +68,8 @@ def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:
         value = abs(value)
     side = 1.0 if rule.raise_at > rule.clear_at else -1.0
     if not standing and side * value > side * rule.raise_at:
-        text = (
-            f"{rule.field} = {value:.4g}, {'above' if side > 0 else 'below'} {rule.raise_at:g} "
-            f"for {rule.for_s:g} s"
-        )
+        side_name = "above" if side > 0 else "below"
+        text = f"{rule.field} = {value:.4g}, {side_name} {rule.raise_at:g} for {rule.for_s:g} s"
         return Sign(rule.name, True, rule.severity, text, rule.for_s)
     if standing and side * value < side * rule.clear_at:
         return Sign(rule.name, False)

@@ -199,20 +199,23 @@ def _describe_hold(config: Config) -> dict[str, str]:
         )
         if on
     ]
-    cycle = f"a cycle every {shape.period_s:g} s"
-    if shape.mode == "track":
-        figures = f"{shape.track_rate_hz:g} figures/s, tracked"
-    else:
-        figures = cycle
+    shape_loop = "off"
+    if shape.enabled and shape.mode == "track":
+        shape_loop = f"{shape.track_rate_hz:g} figures/s, tracked"
+    elif shape.enabled:
+        shape_loop = f"a cycle every {shape.period_s:g} s"
+    devices = "none: only `hold --twin` can run"
+    if config.devices:
+        devices = config.devices.name
     return {
-        "devices": config.devices.name if config.devices else "none: only `hold --twin` can run",
+        "devices": devices,
         "hold": f"{loop.setpoint_um:g} µm at {loop.rate_hz:g} Hz, limits "
         f"{limits.displacement_min_um:g} .. "
         f"{limits.displacement_max_um:g} µm and {limits.gauge_pressure_max_pa:g} Pa",
         "gains": run_status.gains_words(loop.model_dump(), None),
         "feed-forward": " and ".join(feedforward) or "off",
         "geometry": _describe_geometry(config),
-        "shape loop": figures if shape.enabled else "off",
+        "shape loop": shape_loop,
         "locks": _describe_locks(config),
         "control port": _describe_port(config.port),
         "alarms": _describe_alarms(config.alarms),

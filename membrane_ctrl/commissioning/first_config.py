@@ -77,9 +77,12 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
     board = _ask_question(
         "pump board, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200 (empty: single instruments)"
     )
-    section: TomlTable = {"board": board} if board else {}
-    for role in () if board else roles.ROLES.values():
-        section |= _ask_role(role.name, optional=not role.needed)
+    section: TomlTable = {}
+    if board:
+        section["board"] = board
+    else:
+        for role in roles.ROLES.values():
+            section |= _ask_role(role.name, optional=not role.needed)
     section |= (camera := _ask_role("camera", optional=True))
     if camera and not _shows_patterns(camera["camera"]):
         section |= _ask_role("screen", optional=False)
@@ -89,7 +92,8 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
     if not board:
         sensors = {"feedforward_barometer": "barometer", "feedforward_temperature": "thermometer"}
         missing = {key: False for key, role in sensors.items() if role not in section}
-        tables |= {"loop": missing} if missing else {}
+        if missing:
+            tables["loop"] = missing
         if _sections_by_driver("pump")[section["pump"]["driver"]] in settings.FLOW_CONTROLLERS:
             tables["pump"] = dict.fromkeys(
                 ("dead_fraction", "start_fraction", "stall_fraction"), 0.0

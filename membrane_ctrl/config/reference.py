@@ -287,17 +287,19 @@ def _describe_range(field: Any) -> str:
 
 def _list_limits(field: Any) -> str:
     """Return the limits of a number; a key of another package may lack one or both."""
-    lows = []
+    low = "any"
     if "exclusiveMinimum" in field:
-        lows = [f"above {field['exclusiveMinimum']:g}"]
-    lows += [f"{field['minimum']:g}"] if "minimum" in field else []
-    highs = []
+        low = f"above {field['exclusiveMinimum']:g}"
+    elif "minimum" in field:
+        low = f"{field['minimum']:g}"
+    high = "any"
     if "exclusiveMaximum" in field:
-        highs = [f"below {field['exclusiveMaximum']:g}"]
-    highs += [f"{field['maximum']:g}"] if "maximum" in field else []
-    if not lows and not highs:
+        high = f"below {field['exclusiveMaximum']:g}"
+    elif "maximum" in field:
+        high = f"{field['maximum']:g}"
+    if low == "any" and high == "any":
         return "any number"
-    return f"{lows[0] if lows else 'any'} .. {highs[0] if highs else 'any'}"
+    return f"{low} .. {high}"
 
 
 def _format_default(default: Any) -> str:

@@ -45,16 +45,18 @@ def format_line(view: model.ConsoleView) -> str:
     if view.silent_s or row is None:
         silent = f"no tick for {view.silent_s:.1f} s" if row else view.why
         return f"{view.elapsed_s:9.1f} s  {silent}"
+    leak = row.format_labelled("leak_um_per_s")
+    if view.too_tight:
+        leak += " TOO TIGHT"
     parts = [
         f"{view.elapsed_s:9.1f} s  {view.state.name.lower():7}",
         row.format_labelled("error_um", sign=True, width=7),
         f"pump {why.format_percent(row.pump_fraction):>5}",
-        row.format_labelled("leak_um_per_s") + (" TOO TIGHT" if view.too_tight else ""),
-        *(
-            [f"held by {why.list_used_sensors(row)}"]
-            if math.isfinite(row.estimate_sigma_um)
-            else []
-        ),
+        leak,
+    ]
+    if math.isfinite(row.estimate_sigma_um):
+        parts.append(f"held by {why.list_used_sensors(row)}")
+    parts += [
         f"shape {_shape_words(view)} {row.format_labelled('trim_um', sign=True)}",
         row.format_labelled("lateness_ms"),
         view.why,

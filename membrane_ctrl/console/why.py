@@ -75,10 +75,8 @@ def explain_state(
         return reported
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
-        return (
-            f"{_describe_pump_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, "
-            f"{abs(to_go_um):.1f} µm to go"
-        )
+        phase = "filling" if to_go_um > 0 else "waiting for the leak"
+        return f"{_describe_pump_flow(row)}: {phase}, {abs(to_go_um):.1f} µm to go"
     if abs(row.error_um) > config.limits.band_um:
         return f"outside the band: {_describe_deviation(row)}"
     if state == State.HOLD:
@@ -127,17 +125,14 @@ def explain_next_step(
 
 def _describe_deviation(row: TelemetryRow) -> str:
     """Direction of the deviation, and the pump's response to it (error = setpoint - reading)."""
+    pump = _describe_pump_flow(row)
     if row.error_um > 0:
-        at_limit = row.flow_wanted_um_per_s > row.flow_um_per_s + 1e-6
-        return (
-            f"bowl {row.error_um:.1f} µm too shallow, "
-            f"{_describe_pump_flow(row)}{', its limit' if at_limit else ''}"
-        )
-    waits = row.flow_um_per_s <= 0
-    return (
-        f"bowl {-row.error_um:.1f} µm too deep, "
-        f"{_describe_pump_flow(row)}{', only the leak can lower it' if waits else ''}"
-    )
+        if row.flow_wanted_um_per_s > row.flow_um_per_s + 1e-6:
+            pump += ", its limit"
+        return f"bowl {row.error_um:.1f} µm too shallow, {pump}"
+    if row.flow_um_per_s <= 0:
+        pump += ", only the leak can lower it"
+    return f"bowl {-row.error_um:.1f} µm too deep, {pump}"
 
 
 def _describe_flow_terms(row: TelemetryRow) -> str:
@@ -149,12 +144,9 @@ def _describe_flow_terms(row: TelemetryRow) -> str:
         "feed-forward": row.feedforward_um_per_s,
     }
     least = _WORTH_NAMING * max(abs(row.flow_um_per_s), abs(row.i_um_per_s))
-    named = sorted(
-        ((v, k) for k, v in parts.items() if abs(v) > least), key=lambda part: -abs(part[0])
-    )
-    return f"{_describe_pump_flow(row)}: " + ", ".join(
-        f"{value:+.2f} {name}" for value, name in named
-    )
+    largest_first = sorted(parts.items(), key=lambda part: -abs(part[1]))
+    named = [f"{value:+.2f} {name}" for name, value in largest_first if abs(value) > least]
+    return f"{_describe_pump_flow(row)}: {', '.join(named)}"
 
 
 def _describe_pump_flow(row: TelemetryRow) -> str:
@@ -167,7 +159,8 @@ def format_number(value: float, digits: int, unit: str = "", sign: bool = False)
     """Format `value` with its unit."""
     if not math.isfinite(value):
         return MISSING
-    figure = f"{value:{'+' if sign else ''}.{digits}f}"
+    sign_option = "+" if sign else ""
+    figure = f"{value:{sign_option}.{digits}f}"
     return f"{figure} {unit}" if unit else figure
 
 

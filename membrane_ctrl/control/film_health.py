@@ -117,16 +117,19 @@ class FilmHealth:
             ),
         )
         warned = self.memory.warned
-        bad = [
-            name for name, over, _ in found if over > (WITHDRAWN_BELOW if name in warned else 1.0)
-        ]
-        changed = set(bad) ^ set(warned)
+        bad = []
+        notices = []
+        for name, over, description in found:
+            # A warning is withdrawn lower than it is given, so that it does not flicker
+            threshold = WITHDRAWN_BELOW if name in warned else 1.0
+            is_bad = over > threshold
+            if is_bad:
+                bad.append(name)
+            if is_bad != (name in warned):
+                text = description if is_bad else "no longer so"
+                notices.append(MaintenanceNotice(name, text, is_bad))
         self.memory.warned = bad
-        return [
-            MaintenanceNotice(name, describe if name in bad else "no longer so", name in bad)
-            for name, _, describe in found
-            if name in changed
-        ]
+        return notices
 
     def _describe_leak(self, leak_um_per_s: float) -> str:
         """The leak, and how long the pump can keep up at this growth."""

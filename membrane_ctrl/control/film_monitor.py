@@ -198,9 +198,8 @@ class FilmMonitor:
             since.find_contradiction(kept, laser_um, trim_um, root, sag_um, dt_s)
             for since, kept in spans
         ]
-        memory.drifting = memory.day.share > (
-            DRIFTING_OVER_SHARE if memory.drifting else DRIFTING_SHARE
-        )
+        threshold = DRIFTING_OVER_SHARE if memory.drifting else DRIFTING_SHARE
+        memory.drifting = memory.day.share > threshold
         return next(filter(None, contradictions), "")
 
     @property

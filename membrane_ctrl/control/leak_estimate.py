@@ -52,9 +52,8 @@ class LeakEstimate(StateNode):
     def too_tight(self) -> bool:
         """Whether the mirror loses too little gas to be held within the band."""
         if self.elapsed_s >= JUDGE_S:
-            self.warned = self.mean_um_per_s < (
-                TOO_TIGHT_END_UM_PER_S if self.warned else TOO_TIGHT_UM_PER_S
-            )
+            threshold_um_per_s = TOO_TIGHT_END_UM_PER_S if self.warned else TOO_TIGHT_UM_PER_S
+            self.warned = self.mean_um_per_s < threshold_um_per_s
         return self.warned
 
     def update(

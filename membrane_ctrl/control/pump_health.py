@@ -38,9 +38,10 @@ class PumpHealth:
         memory = self.memory
         memory.count += 1
         change = known.scale - 1.0
-        bad = abs(change) > max(self._change_max, _PUMP_SIGMAS * known.sigma) * (
-            WITHDRAWN_BELOW if memory.warned else 1.0
-        )
+        threshold = max(self._change_max, _PUMP_SIGMAS * known.sigma)
+        if memory.warned:
+            threshold *= WITHDRAWN_BELOW
+        bad = abs(change) > threshold
         notices: tuple[MaintenanceNotice, ...] = ()
         if bad != memory.warned:
             side = "less" if change < 0 else "more"

@@ -26,10 +26,11 @@ def discard_impossible_weather(
     ambient_pressure_pa: float, air_temperature_c: float
 ) -> tuple[float, float]:
     """The readings, an impossible one as NaN."""
-    return (
-        ambient_pressure_pa if _is_possible(ambient_pressure_pa, _PRESSURE_PA) else math.nan,
-        air_temperature_c if _is_possible(air_temperature_c, _TEMPERATURE_C) else math.nan,
-    )
+    if not _is_possible(ambient_pressure_pa, _PRESSURE_PA):
+        ambient_pressure_pa = math.nan
+    if not _is_possible(air_temperature_c, _TEMPERATURE_C):
+        air_temperature_c = math.nan
+    return ambient_pressure_pa, air_temperature_c
 
 
 def _is_possible(value: float, within: tuple[float, float]) -> bool:

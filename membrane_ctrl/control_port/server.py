@@ -319,24 +319,26 @@ class Port:
         pump = None
         if request.pump is not None:
             pump = toml_file.parse_tables(request.pump, schema.PumpConfig, "gains: pump")
-        value, shape_s, step_um = (
-            math.nan if number is None else number
-            for number in (request.value, request.shape_time_constant_s, request.setpoint_step_um)
-        )
+        lock = None
+        if kind == "latch":
+            lock = self._new_lock(sender, request)
+        account = ""
+        if kind == "unlock":
+            account = sender.account
         return commands.Command(
             kind,
             sender.who,
             request.why,
-            value,
+            _nan_for_none(request.value),
             request.text,
             loop,
             experiment,
             next(self._numbers),
-            shape_s,
+            _nan_for_none(request.shape_time_constant_s),
             pump,
-            step_um,
-            lock=self._new_lock(sender, request) if kind == "latch" else None,
-            account=sender.account if kind == "unlock" else "",
+            _nan_for_none(request.setpoint_step_um),
+            lock=lock,
+            account=account,
             from_person=sender.from_person,
         )
 
@@ -373,3 +375,7 @@ class Port:
             return f"no tick took it within {_ANSWER_S:g} s; it may still be executed"
         finally:
             self._waiting.pop(command.number, None)
+
+
+def _nan_for_none(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -18,29 +18,32 @@ def status_table(status: RunStatus) -> dict[str, Any]:
     row = status.row
     if row is None:
         return {"state": "starting", "why": "no tick has run yet"}
-    fault, geometry = status.fault, status.geometry
+    locks = [
+        {**asdict(lock), "problem": status.unstored.get(lock.word, "")} for lock in status.locks
+    ]
+    fault = None
+    if status.fault:
+        fault = {key: getattr(status.fault, key) for key in ("code", "name", "cause", "remedy")}
+    trial_left_s = None
+    if math.isfinite(status.trial_left_s):
+        trial_left_s = round(status.trial_left_s, 1)
+    columns = {key: value if math.isfinite(value) else None for key, value in asdict(row).items()}
     return {
         "state": telemetry.State(int(row.state)).name.lower(),
         "state_age_s": round(row.mono_s - status.since_s, 3),
         "why": status.why,
         "paused": status.paused,
-        "locks": [
-            {**asdict(lock), "problem": status.unstored.get(lock.word, "")} for lock in status.locks
-        ],
+        "locks": locks,
         "latched": status.latched,
-        "fault": {key: getattr(fault, key) for key in ("code", "name", "cause", "remedy")}
-        if fault
-        else None,
+        "fault": fault,
         "notices": [_notice_table(notice) for notice in status.other_notices],
         "recording_ok": not status.recording_problems,
         "safe_level": telemetry.SafeLevel(int(row.safe_level)).name.lower(),
         "shape": telemetry.ShapeState(int(row.shape_state)).name.lower(),
         "shape_reason": status.shape_reason,
-        "trial_left_s": round(status.trial_left_s, 1)
-        if math.isfinite(status.trial_left_s)
-        else None,
-        "geometry": asdict(geometry) if geometry else None,
-        "row": {key: value if math.isfinite(value) else None for key, value in asdict(row).items()},
+        "trial_left_s": trial_left_s,
+        "geometry": asdict(status.geometry) if status.geometry else None,
+        "row": columns,
     }
 
 

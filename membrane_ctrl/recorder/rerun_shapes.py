@@ -134,7 +134,8 @@ class ShapeStreams:
         """
         if not self._fall or time_s < self._next_fall_s:
             return
-        self._next_fall_s = time_s + (WATERFALL_EARLY_S if early else WATERFALL_INTERVAL_S)
+        interval_s = WATERFALL_EARLY_S if early else WATERFALL_INTERVAL_S
+        self._next_fall_s = time_s + interval_s
         terms = np.zeros((self._fall[0].size, WATERFALL_COLUMNS), np.float16)
         terms[:, -len(self._fall) :] = np.array(self._fall).T
         most_um = max(WATERFALL_LEAST_UM, float(np.abs(terms).max()))
@@ -149,16 +150,16 @@ class ShapeStreams:
         time_s = estimate.time_s
         early = time_s - reference.time_s < EARLY_S
         if time_s >= self._next_map_s:
-            self._next_map_s = time_s + (DIFFERENCE_INTERVAL_S if early else MAP_INTERVAL_S)
+            interval_s = DIFFERENCE_INTERVAL_S if early else MAP_INTERVAL_S
+            self._next_map_s = time_s + interval_s
             self._send_map("height", "mm", time_s, shapes.height_map_mm(estimate))
             self._send_map(
                 "uncertainty", "µm", time_s, shapes.uncertainty_map_um(estimate.covariance_um2)
             )
             self._send_map("scatter", "µm", time_s, self._scatter.map_um())
         if time_s >= self._next_difference_s:
-            self._next_difference_s = time_s + (
-                DIFFERENCE_EARLY_S if early else DIFFERENCE_INTERVAL_S
-            )
+            interval_s = DIFFERENCE_EARLY_S if early else DIFFERENCE_INTERVAL_S
+            self._next_difference_s = time_s + interval_s
             difference_um = shapes.difference_map_um(estimate, reference)
             for kind, (terms, least_um) in CHANGES.items():
                 self._send_map(

@@ -28,29 +28,36 @@ def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) 
     config : Config
         Of the run.
     """
-    held, states = summary["held"], summary["states"]
-    faults_s, whole_s = held["faults_s"], max(summary["duration_s"], 1e-9)
+    held = summary["held"]
+    states = summary["states"]
+    of = "true centre" if held["of"] == "true" else "reading"
+    last_fault = ""
+    if summary["faults"]:
+        last_fault = str(summary["faults"][-1].get("name", ""))
+    time_in_faults = ""
+    if held["faults_s"]:
+        share = held["faults_s"] / max(summary["duration_s"], 1e-9)
+        time_in_faults = f"{_format_span(held['faults_s'])} ({_format_share(share)})"
+    paused = ""
+    if held["paused_s"] >= 1.0:
+        paused = _format_span(held["paused_s"])
+    cycles = ""
+    if summary["cycles"]:
+        cycles = f"{summary['cycles']}, {summary['cycles_rejected']} rejected"
+    trial_left_s = status.trial_ends_s - summary["duration_s"]
     rows = {
         "held": _format_span(held["held_s"]),
-        f"std of 1 s means, {'true centre' if held['of'] == 'true' else 'reading'}": _format_um(
-            held["std_um"]
-        ),
+        f"std of 1 s means, {of}": _format_um(held["std_um"]),
         "mean error": _format_um(held["mean_um"], "+"),
         f"1 s means within ±{config.limits.band_um:g} µm": _format_share(held["in_band"]),
         "faults": str(summary["fault_count"] or "none"),
-        "last fault": str(summary["faults"][-1].get("name", "")) if summary["faults"] else "",
-        "time in faults": f"{_format_span(faults_s)} ({_format_share(faults_s / whole_s)})"
-        if faults_s
-        else "",
-        "paused": _format_span(held["paused_s"]) if held["paused_s"] >= 1.0 else "",
+        "last fault": last_fault,
+        "time in faults": time_in_faults,
+        "paused": paused,
         "leak": _format_um(summary["leak_um_per_s"], unit="µm/s"),
-        "shape cycles": f"{summary['cycles']}, {summary['cycles_rejected']} rejected"
-        if summary["cycles"]
-        else "",
+        "shape cycles": cycles,
         "geometry": _format_geometry(summary["geometry"]),
-        "gains": gains_words(
-            status.loop or vars(config.loop), status.trial_ends_s - summary["duration_s"]
-        ),
+        "gains": gains_words(status.loop or vars(config.loop), trial_left_s),
         "ticks missed": f"{summary['missed_ticks']} of {summary['ticks']}",
         "not recorded": "; ".join(status.recording_problems),
     }
@@ -62,7 +69,9 @@ def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) 
 def _format_geometry(geometry: Mapping[str, Any]) -> str:
     words = [str(geometry[key]) for key in ("hash", "file") if geometry.get(key)]
     calibrated = geometry.get("calibrated_utc")
-    return ", ".join([*words, f"calibrated {calibrated}"] if calibrated else words)
+    if calibrated:
+        words.append(f"calibrated {calibrated}")
+    return ", ".join(words)
 
 
 def _format_um(value: float | None, sign: str = "", unit: str = "µm") -> str:

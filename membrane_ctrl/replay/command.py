@@ -223,7 +223,13 @@ def _make_report(
         recorded[: max(in_time, len(today))], today, DECISION_SLACK_S
     )
     first = found.different_rows[0] if found.different else None
+    first_different = None
+    if first is not None:
+        first_different = {"tick": int(first.tick), "time_s": first.mono_s}
     differences = run.find_differences(found.different_rows)
+    state_differences = None
+    if found.state_differences is not None:
+        state_differences = asdict(found.state_differences)
     return {
         "verdict": _make_verdict(found, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
@@ -235,14 +241,10 @@ def _make_report(
         "unknown_columns": list(ColumnChoice(run.inputs.columns).unknown),
         "near": found.near,
         "different": found.different,
-        "first_different": None
-        if first is None
-        else {"tick": int(first.tick), "time_s": first.mono_s},
+        "first_different": first_different,
         "fields": differences[0] if differences else None,
         "decisions": decisions,
-        "state_differences": None
-        if found.state_differences is None
-        else asdict(found.state_differences),
+        "state_differences": state_differences,
         "gaps": [
             {"after_tick": g.after_tick, "time_s": g.time_s, "ticks": g.ticks, "why": g.reason}
             for g in found.gaps

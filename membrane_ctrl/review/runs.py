@@ -86,16 +86,14 @@ def prune_command(
         ]
         print(plain_json.dumps({"deleted": delete, "runs": table}, indent=1))
     else:
+        action = "deleted" if delete else "would delete"
         for run, why in expired:
-            print(
-                f"{'deleted' if delete else 'would delete'} {run.folder.name}, "
-                f"{run.size_bytes / 1e6:.0f} MB: {why}"
-            )
+            print(f"{action} {run.folder.name}, {run.size_bytes / 1e6:.0f} MB: {why}")
         freed_mb = sum(run.size_bytes for run, _ in expired) / 1e6
-        print(
-            f"{len(expired)} runs, {freed_mb:.0f} MB"
-            + ("" if delete or not expired else "; --delete deletes them")
-        )
+        hint = ""
+        if expired and not delete:
+            hint = "; --delete deletes them"
+        print(f"{len(expired)} runs, {freed_mb:.0f} MB{hint}")
     for folder, why in stay.items():
         print(f"{folder}: cannot be deleted ({why}); check its permissions", file=sys.stderr)
     return errors.Exit.DEVICE_FAILED if stay else 0
@@ -142,9 +140,18 @@ def _make_table(found: list[catalogue.RunEntry]) -> Table:
             format_number(entry.ti_s),
             entry.configuration,
             f"{entry.size_mb:.1f}",
-            one_line(entry.exit)
-            + (f" ({one_line(entry.ended_in)})" if entry.ended_in else "")
-            + (f", {entry.marks} marked" if entry.marks else "")
-            + (", kept" if entry.kept else ""),
+            _describe_end(entry),
         )
     return table
+
+
+def _describe_end(entry: catalogue.RunEntry) -> str:
+    """How a run ended, and what people noted of it."""
+    end = one_line(entry.exit)
+    if entry.ended_in:
+        end += f" ({one_line(entry.ended_in)})"
+    if entry.marks:
+        end += f", {entry.marks} marked"
+    if entry.kept:
+        end += ", kept"
+    return end

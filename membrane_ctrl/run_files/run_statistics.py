@@ -139,7 +139,8 @@ class SecondMeans(StateNode):
         self.means.add(means)
         self.inside += int((np.abs(means) <= self.band).sum())
         if means.size:
-            self.first = float(means[0]) if math.isnan(self.first) else self.first
+            if math.isnan(self.first):
+                self.first = float(means[0])
             self.last = float(means[-1])
 
     def result(self) -> dict[str, float]:

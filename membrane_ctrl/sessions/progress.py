@@ -35,7 +35,10 @@ class Progress:
         self._planned_s = planned_s
         self._after_s = after_s
         self._done_s = self._shown_s = 0.0
-        self._print_text(f"{step}" + (f": about {_format_clock(planned_s)}" if planned_s else ""))
+        line = step
+        if planned_s:
+            line = f"{step}: about {_format_clock(planned_s)}"
+        self._print_text(line)
         self.log_entry("step", step, planned_s=planned_s, after_s=after_s)
 
     def __call__(self, seconds: float) -> None:
@@ -52,7 +55,10 @@ class Progress:
             f"{self._step}: {_format_clock(self._done_s)}, {_format_clock(left_s)} left, session "
             f"{_format_clock(left_s + self._after_s)}"
         )
-        terminal.live_line(line) if self._live else self._print_text(line)
+        if self._live:
+            terminal.live_line(line)
+        else:
+            self._print_text(line)
 
     def print_line(self, line: str) -> None:
         """Print a permanent line, and note it in the log."""
@@ -65,7 +71,10 @@ class Progress:
             self.log.log_entry(what, line, **more)
 
     def _print_text(self, line: str) -> None:
-        terminal.live_line(line, "\n") if self._live else print(line, file=sys.stderr, flush=True)
+        if self._live:
+            terminal.live_line(line, "\n")
+        else:
+            print(line, file=sys.stderr, flush=True)
 
     def ask_question(self, question: str, among: Sequence[str] = ()) -> str:
         """Ask on the terminal, and on the page too if the answers are `among` some; the first

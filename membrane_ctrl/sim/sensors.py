@@ -1,5 +1,7 @@
 """The sensors of the simulated bench: their noise, their resolution and the laser's dropouts."""
 
+import math
+
 import numpy as np
 
 from firmware_iface.emulators.pump_board import BoardSample
@@ -26,13 +28,17 @@ class Sensors:
         config = self._config
         laser, gauge, ambient, air, gas = self._rng.standard_normal(5).tolist()
         lost = truth.laser_lost > 0 or not config.laser
-        reading_um = truth.displacement_um + truth.laser_bias_um + config.laser_noise_um * laser
+        displacement_um = math.nan
+        quality = LASER_NO_LIGHT
+        if not lost:
+            noise_um = config.laser_noise_um * laser
+            reading_um = truth.displacement_um + truth.laser_bias_um + noise_um
+            displacement_um = _quantise_value(reading_um, config.laser_resolution_um)
+            quality = LASER_GOOD
         self._counter += 1
         return BoardSample(
-            displacement_um=float("nan")
-            if lost
-            else _quantise_value(reading_um, config.laser_resolution_um),
-            displacement_quality=LASER_NO_LIGHT if lost else LASER_GOOD,
+            displacement_um=displacement_um,
+            displacement_quality=quality,
             gauge_pressure_pa=truth.gauge_pressure_pa + GAUGE_NOISE_PA * gauge,
             ambient_pressure_pa=truth.ambient_pressure_pa + config.barometer_noise_pa * ambient,
             air_temperature_c=truth.air_temperature_c + config.thermometer_noise_k * air,

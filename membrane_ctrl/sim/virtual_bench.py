@@ -86,11 +86,12 @@ class VirtualBench:
         """Drive the actuators as the board commands, as far as they follow."""
         wrong = self.wrong
         pump = self.board.pump_fraction * wrong.pump_share
+        if not math.isnan(wrong.pump_stuck_fraction):
+            pump = wrong.pump_stuck_fraction
         vent = self.board.vent_fraction
-        self.plant.actuate(
-            pump if math.isnan(wrong.pump_stuck_fraction) else wrong.pump_stuck_fraction,
-            vent if math.isnan(wrong.vent_stuck_fraction) else wrong.vent_stuck_fraction,
-        )
+        if not math.isnan(wrong.vent_stuck_fraction):
+            vent = wrong.vent_stuck_fraction
+        self.plant.actuate(pump, vent)
 
     def power_cycle(self) -> None:
         """The board restarts: outputs off, watchdog off, faults lost."""
@@ -129,21 +130,26 @@ class VirtualBench:
             return last
         sample = self.plant.sample_of(self.truth)
         displacement_um = sample.displacement_um + wrong.laser_offset_um
+        quality = sample.displacement_quality
         if wrong.laser_stuck and last is not None:
             displacement_um = last.displacement_um
+        if wrong.no_light:
+            displacement_um = math.nan
+            quality = _LASER_NO_LIGHT
         gauge_pa = sample.gauge_pressure_pa + wrong.gauge_offset_pa
         if wrong.gauge_stuck and last is not None:
             gauge_pa = last.gauge_pressure_pa
+        if wrong.gauge_lost:
+            gauge_pa = math.nan
+        closed = sample.interlock_inputs & ~int(wrong.open_interlocks)
         return replace(
             sample,
-            displacement_um=math.nan if wrong.no_light else displacement_um,
-            displacement_quality=_LASER_NO_LIGHT if wrong.no_light else sample.displacement_quality,
-            gauge_pressure_pa=math.nan if wrong.gauge_lost else gauge_pa,
+            displacement_um=displacement_um,
+            displacement_quality=quality,
+            gauge_pressure_pa=gauge_pa,
             ambient_pressure_pa=math.nan if wrong.barometer_lost else sample.ambient_pressure_pa,
             air_temperature_c=math.nan if wrong.thermometer_lost else sample.air_temperature_c,
-            interlock_inputs=self.interlocks.board_word(
-                sample.interlock_inputs & ~int(wrong.open_interlocks)
-            ),
+            interlock_inputs=self.interlocks.board_word(closed),
         )
 
 

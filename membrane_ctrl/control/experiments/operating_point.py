@@ -53,15 +53,13 @@ def require_room(around: OperatingPoint) -> tuple[float, float]:
     up = around.full_flow_um_per_s - around.holding_flow_um_per_s
     down = around.holding_flow_um_per_s - around.least_flow_um_per_s
     if min(up, down) <= 0:
+        remedy = "find the leak"
+        if down <= 0:
+            remedy = describe_bleed_remedy(around.holding_flow_um_per_s, around.least_flow_um_per_s)
         raise ValueError(
             f"no room around the holding flow of {around.holding_flow_um_per_s:.2f} µm/s in "
-            "the pump's range of "
-            f"{around.least_flow_um_per_s:.2f} .. {around.full_flow_um_per_s:.2f} µm/s: "
-            + (
-                describe_bleed_remedy(around.holding_flow_um_per_s, around.least_flow_um_per_s)
-                if down <= 0
-                else "find the leak"
-            )
+            f"the pump's range of {around.least_flow_um_per_s:.2f} .. "
+            f"{around.full_flow_um_per_s:.2f} µm/s: {remedy}"
         )
     return up, down
 

@@ -50,11 +50,13 @@ class PumpSteps:
         return self._steps[memory.steps_done].fraction
 
     def _is_step_over(self) -> bool:
-        """Whether the present step is."""
+        """Whether the present step has reached its position or its duration."""
         now = self._steps[self.memory.steps_done]
         off_um = self._motion.position_um - self._centre_um
-        if now.until_um is not None and (
-            off_um <= now.until_um if now.fraction == 0 else off_um >= now.until_um
-        ):
-            return True
+        if now.until_um is not None:
+            falls = now.fraction == 0
+            if falls and off_um <= now.until_um:
+                return True
+            if not falls and off_um >= now.until_um:
+                return True
         return self.memory.in_step_s > now.duration_s

@@ -131,16 +131,13 @@ def _make_fleet_entry(analysis: Analysis, table: dict[str, Any]) -> dict[str, An
         for event in log
         if isinstance(event, port_events.AlarmSent) and event.what == "raised"
     }
+    timeline = [each.event for each in make_timeline(analysis)]
     return {
         **{name: table[name] for name in _SAME},
         **{name: seconds.get(name) for name in ("mean_um", "std_um", "in_band")},
         "of": "true centre" if table["true"] else "reading",
         "state": states[-1] if states else "",
-        "faults": [
-            each.event.name
-            for each in make_timeline(analysis)
-            if isinstance(each.event, events.Fault)
-        ],
+        "faults": [event.name for event in timeline if isinstance(event, events.Fault)],
         "alarms": sorted(alarms),
         "found": len(table["found"]),
         "anomalies": [anomaly["name"] for anomaly in table["anomalies"]],

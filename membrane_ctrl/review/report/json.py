@@ -28,7 +28,9 @@ def make_verdict(analysis: Analysis) -> tuple[Word, str]:
     series = analysis.true or analysis.reading
     whole = format_span(ticks.end_s - ticks.start_s)
     names = [anomaly.name for anomaly in analysis.anomalies]
-    word: Word = "look" if names else "good"
+    word: Word = "good"
+    if names:
+        word = "look"
     if _GRAVE & set(names):
         word = "bad"
     if series is None or not series.windows[0].count:
@@ -67,6 +69,12 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
     run, ticks = analysis.run, analysis.ticks
     word, sentence = make_verdict(analysis)
     late = ticks.lateness_ms
+    feedforward = None
+    if analysis.benefit is not None:
+        feedforward = {
+            "std_1s_with_um": analysis.benefit.with_um,
+            "std_1s_without_um": analysis.benefit.without_um,
+        }
     return {
         **program.file_origin(SCHEMA),
         "run": run.name,
@@ -96,12 +104,7 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         },
         "pump": asdict(ticks.pump),
         "leak_um_per_s": dict(zip(("median", "min", "max"), analysis.leak_um_per_s, strict=True)),
-        "feedforward": None
-        if analysis.benefit is None
-        else {
-            "std_1s_with_um": analysis.benefit.with_um,
-            "std_1s_without_um": analysis.benefit.without_um,
-        },
+        "feedforward": feedforward,
         "lateness_ms": {
             "p50": late.find_quantile(0.5),
             "p99": late.find_quantile(0.99),

@@ -100,11 +100,12 @@ def band_rms(fast: Spectrum, slow: Spectrum) -> list[Band]:
     """RMS in each of `BANDS_HZ`: from the ticks' spectrum where it resolves a band, else from the 1
     s means.
     """
-    edges = [*BANDS_HZ, float(fast.frequency_hz[-1])]
-    return [
-        _integrate_band(slow if _is_slow(fast, slow, low, high) else fast, low, high)
-        for low, high in pairwise(edges)
-    ]
+    edges_hz = [*BANDS_HZ, float(fast.frequency_hz[-1])]
+    bands = []
+    for low_hz, high_hz in pairwise(edges_hz):
+        spectrum = slow if _is_slow(fast, slow, low_hz, high_hz) else fast
+        bands.append(_integrate_band(spectrum, low_hz, high_hz))
+    return bands
 
 
 def unseen_s(found: list[Band]) -> float:
@@ -118,12 +119,12 @@ def combine_densities(fast: Spectrum, slow: Spectrum) -> tuple[Column, Column]:
     """Frequencies (Hz) and one density, which uses the 1 s means below the resolution of the ticks'
     spectrum.
     """
-    resolved_hz = min(_RESOLVED_LINES * float(fast.frequency_hz[1]), _SLOW_MOST_HZ)
+    # Where the ticks' spectrum begins to count: everywhere if there is no slower one
+    from_hz = 0.0
     if slow.segments:
-        below = slow.frequency_hz < resolved_hz
-    else:
-        below = np.zeros(slow.frequency_hz.size, dtype=bool)
-    above = fast.frequency_hz >= (resolved_hz if slow.segments else 0.0)
+        from_hz = min(_RESOLVED_LINES * float(fast.frequency_hz[1]), _SLOW_MOST_HZ)
+    below = slow.frequency_hz < from_hz
+    above = fast.frequency_hz >= from_hz
     frequency_hz = np.concatenate([slow.frequency_hz[below], fast.frequency_hz[above]])
     density = np.concatenate([slow.density[below], fast.density[above]])
     positive = frequency_hz > 0
@@ -139,4 +140,6 @@ def _is_slow(fast: Spectrum, slow: Spectrum, low_hz: float, high_hz: float) -> b
 def _integrate_band(spectrum: Spectrum, low_hz: float, high_hz: float) -> Band:
     first_hz = max(low_hz, float(spectrum.frequency_hz[1]))
     rms_um = spectrum.band_rms(low_hz, high_hz)
-    return Band(low_hz, high_hz, first_hz if rms_um == rms_um else math.nan, rms_um)
+    if math.isnan(rms_um):
+        first_hz = math.nan
+    return Band(low_hz, high_hz, first_hz, rms_um)

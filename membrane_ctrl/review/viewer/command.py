@@ -252,9 +252,11 @@ def _requested_part(run: Run, options: ReviewOptions) -> tuple[float, float] | N
             raise run_times.make_outside_error(run, f"--from {options.start}")
         if end_s <= 0:
             raise run_times.make_outside_error(run, f"--to {options.end}")
-        return (0.0 if options.start is None else start_s), (
-            run_times.end_s(run) if options.end is None else end_s
-        )
+        if options.start is None:
+            start_s = 0.0
+        if options.end is None:
+            end_s = run_times.end_s(run)
+        return start_s, end_s
     if options.at is not None:
         at_s = run_times.moment_s(options.at, run.origin_utc)
         if not -_AROUND_S <= at_s <= run_times.end_s(run) + _AROUND_S:
