@@ -40,7 +40,7 @@ def table(found: list[Comparison]) -> str:
             rows = "no row of its own"
         numbers = f"{one.stated_um:.3g} | {one.caused_um:.3g} | {one.ratio:.2f}"
         verdict = "" if one.agrees else "**missed**"
-        lines.append(f"| {one.plant.says} | {rows} | {numbers} | {verdict} |")
+        lines.append(f"| {one.plant.description} | {rows} | {numbers} | {verdict} |")
     return "\n".join(lines)
 
 
@@ -48,8 +48,8 @@ def page(found: list[Comparison]) -> str:
     """The page."""
     agreeing = sum(one.agrees for one in found)
     missed = [one for one in found if not one.agrees]
-    narrow = [one.plant.says for one in missed if one.ratio < 1]
-    wide = [one.plant.says for one in missed if one.ratio > 1]
+    narrow = [one.plant.description for one in missed if one.ratio < 1]
+    wide = [one.plant.description for one in missed if one.ratio > 1]
     summary = f"{agreeing} of {len(found)} agree."
     misses = [
         f"Bar too narrow: {'; '.join(narrow) or 'none'}.",

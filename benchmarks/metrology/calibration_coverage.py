@@ -304,7 +304,7 @@ def bench(seed: int) -> dict[str, Any]:
         findings = verdict.check_solution(solution)
     except (ValueError, RejectedSetError) as error:
         return answer | {"refused": str(error)}
-    if fatal := [finding.says for finding in findings if finding.fatal]:
+    if fatal := [finding.description for finding in findings if finding.fatal]:
         return answer | {"refused": fatal[0]}
     middle = solution.problem.middle
     phases = _still(solution, middle)
@@ -316,7 +316,7 @@ def bench(seed: int) -> dict[str, Any]:
         "sag_um": [sag_um, claim.sag_um],
         "figure_um": [figure_um, claim.figure_rms_um],
         "z": z,
-        "notes": [finding.says for finding in findings],
+        "notes": [finding.description for finding in findings],
     }
 
 

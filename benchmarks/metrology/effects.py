@@ -22,7 +22,7 @@ def row(effect: Effect) -> str:
     good = [each for each in found if not isinstance(each, str)]
     said = {each if isinstance(each, str) else "; ".join((each[2], *each[3])) for each in found}
     if not good:
-        return f"| {effect.says} | - | - | - | rejected: {' / '.join(sorted(said))} |"
+        return f"| {effect.description} | - | - | - | rejected: {' / '.join(sorted(said))} |"
     errors, sigmas = (np.array([each[k] for each in good]) for k in (0, 1))
     worst = float(np.max(np.abs(errors) / sigmas))
     cells = [
@@ -31,7 +31,7 @@ def row(effect: Effect) -> str:
         for part in (errors, sigmas)
     ]
     figures = f"{cells[0]}, {cells[1]} | {cells[2]}, {cells[3]} | {worst:.1f}"
-    return f"| {effect.says} | {figures} | {' / '.join(sorted(said))} |"
+    return f"| {effect.description} | {figures} | {' / '.join(sorted(said))} |"
 
 
 def _rms(values: FloatArray) -> float:

@@ -82,12 +82,12 @@ class GeometryWatch:
         residual, ring = self._monitors
         residual.add(estimate.slope_residual_urad, self.noise_urad(estimate))
         ring.add(self._surface(estimate))
-        says = ring.says or residual.says
-        if bool(says) == self._said:
+        description = ring.description or residual.description
+        if bool(description) == self._said:
             return None
         self._said = not self._said
         news = events.Maintenance if self._said else events.MaintenanceOver
-        return news("calibrate", says or "the geometry fits again")
+        return news("calibrate", description or "the geometry fits again")
 
     def _surface(self, estimate: shape_estimate.ShapeEstimate) -> Surface:
         return Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, self._radius_mm)

@@ -35,7 +35,7 @@ def _judge_sets(
         doubt = f"{bundle.apart}; if it was not: "
         for k, finding in enumerate(findings):
             if finding.fatal:
-                judged[k] = replace(finding, says=doubt + finding.says)
+                judged[k] = replace(finding, description=doubt + finding.description)
     elif bundle.apart:
         notes.insert(0, bundle.apart)
     return (*judged, *(verdict.CalibrationFinding(False, note) for note in notes))

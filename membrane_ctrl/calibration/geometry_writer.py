@@ -39,7 +39,7 @@ def write_geometry(
         slope_residual_urad=1e6 * float(np.median(slopes)),
         slope_noise_urad=float(np.median(noises)),
         condition=weak_combinations.condition_number(solution),
-        notes=tuple(finding.says for finding in findings),
+        notes=tuple(finding.description for finding in findings),
     )
     tables = geometry_tables.tables_of(solution, optics, origin)
     with errors.convert_write_errors(path):

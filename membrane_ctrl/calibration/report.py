@@ -39,7 +39,9 @@ def calibration_report(
     table: dict[str, Any] = {
         **program.file_origin("membrane-calibration/1"),
         "verdict": "rejected" if any(finding.fatal for finding in findings) else "ok",
-        "findings": [{"fatal": finding.fatal, "says": finding.says} for finding in findings],
+        "findings": [
+            {"fatal": finding.fatal, "description": finding.description} for finding in findings
+        ],
     }
     if solution is None or not solution.converged:
         return table
@@ -57,7 +59,7 @@ def calibration_report(
                 "sigma_left": each.left,
                 "height_um": each.height_um,
                 "figure_um": each.figure_um,
-                "says": each.words,
+                "description": each.words,
             }
             for each in weak_combinations.weak_combinations(solution, middle, analysis_radius_mm)
         ],

@@ -21,7 +21,7 @@ def format_report(report: dict[str, Any]) -> list[str]:
     lines = [f"verdict: {report['verdict']}"]
     for finding in report["findings"]:
         mark = "  ! " if finding["fatal"] else "  note: "
-        lines.append(mark + finding["says"])
+        lines.append(mark + finding["description"])
     if "parameters" not in report:
         return lines
 
@@ -40,7 +40,7 @@ def format_report(report: dict[str, Any]) -> list[str]:
         lines.append(f"laser against optics: {laser['scale']:.5f} +- {laser['sigma']:.5f}")
     lines.append(f"condition number {report['condition']:.2g}; not determined by the sets:")
     for each in report["not_determined"]:
-        lines.append(f"  {each['sigma_left']:.0%} left: {each['says']}")
+        lines.append(f"  {each['sigma_left']:.0%} left: {each['description']}")
     if not report["not_determined"]:
         lines.append("  nothing")
     if report.get("out"):
@@ -52,10 +52,10 @@ def _format_parameters(rows: Sequence[dict[str, Any]]) -> list[str]:
     """The table of the free parameters."""
     lines = ["what           stated wrong by   +-        known before"]
     for row in rows:
-        says = bench_parameters.ALL[bench_parameters.NAMES.index(row["name"])].says
+        description = bench_parameters.ALL[bench_parameters.NAMES.index(row["name"])].description
         lines.append(
             f"{row['name']:<18}{row['value']:>+11.4f}  {row['sigma']:<9.4f} "
-            f"{row['sigma_before']:<8.4g} {says}"
+            f"{row['sigma_before']:<8.4g} {description}"
         )
     return lines
 

@@ -47,8 +47,8 @@ class ArtefactTable(Section):
             ("curvature_radius_sigma_mm", spread),
         ):
             if (value is None) != (self.form == "flat"):
-                says = "a sphere needs it" if value is None else "a flat has none"
-                raise errors.InputError(f"{path}: artefact.{name}: {says}")
+                description = "a sphere needs it" if value is None else "a flat has none"
+                raise errors.InputError(f"{path}: artefact.{name}: {description}")
         known = {"form_sigma_mm": 1e-3 * self.form_sigma_um, "vertex_mm": self.vertex_mm}
         known |= {"vertex_sigma_mm": self.vertex_sigma_mm, "radius_mm": radius_mm}
         if curvature is None or spread is None:

@@ -17,12 +17,23 @@ def fleet_rows(feeds: Mapping[str, HoldFeed]) -> list[dict[str, object]]:
     for name, feed in feeds.items():
         seen = feed.seen
         if seen.silent:
-            rows.append({"hold": name, "state": "no contact", "error": None, "says": seen.silent})
+            rows.append(
+                {"hold": name, "state": "no contact", "error": None, "description": seen.silent}
+            )
             continue
         error_um = (seen.status.get("row") or {}).get("error_um")
-        says = "; ".join(alarm_lines(seen.status)) or seen.status.get("why") or "as it should be"
+        description = (
+            "; ".join(alarm_lines(seen.status)) or seen.status.get("why") or "as it should be"
+        )
         error = None if error_um is None else round(error_um, 2)
-        rows.append({"hold": name, "state": seen.status.get("state"), "error": error, "says": says})
+        rows.append(
+            {
+                "hold": name,
+                "state": seen.status.get("state"),
+                "error": error,
+                "description": description,
+            }
+        )
     return rows
 
 
@@ -32,7 +43,7 @@ def fleet_panel(feeds: Mapping[str, HoldFeed]) -> None:
         "hold": "mirror",
         "state": "state",
         "error": COLUMNS["error_um"].title,
-        "says": "alarms, or why",
+        "description": "alarms, or why",
     }
     columns = [
         {"name": key, "label": label, "field": key, "align": "left"}

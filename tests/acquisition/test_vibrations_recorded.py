@@ -293,7 +293,7 @@ def test_a_shift_of_a_per_cent_within_a_week_of_pictures_is_reported_everywhere(
     hold.end()
     capsys.readouterr()
     assert command_line(["modes", str(hold.folder), "--no-pictures"]) == 0
-    says = capsys.readouterr().out
+    message = capsys.readouterr().out
     assert command_line(["modes", str(hold.folder), "--no-pictures", "--json"]) == 0
     table = json.loads(capsys.readouterr().out)
     reported = report_of(hold.folder, capsys)
@@ -307,10 +307,10 @@ def test_a_shift_of_a_per_cent_within_a_week_of_pictures_is_reported_everywhere(
     assert last / first == pytest.approx(np.full(4, 1 + change), abs=5e-4)
     if abs(change) < 0.01:
         assert hold.told == hold.alarmed("film_tension") == reported == []
-        assert "moved" not in says
+        assert "moved" not in message
         assert not any("Maintenance" in text for text in words)
         return
-    assert says.count(f"it moved by {change:+.1%}: the film's tension by {2 * change:+.1%}") == 4
+    assert message.count(f"it moved by {change:+.1%}: the film's tension by {2 * change:+.1%}") == 4
     (told,) = hold.told
     assert (told["kind"], told["name"]) == ("maintenance", "film_tension")
     # the first five searches end on day 1, and their median is of day 0

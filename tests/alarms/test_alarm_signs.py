@@ -86,17 +86,17 @@ def test_events_as_signs(event: EventLine, expected: list[tuple[str, bool, str]]
 
 
 @pytest.mark.parametrize(
-    ("faulty", "says"),
+    ("faulty", "message"),
     [
         ("laser", "the laser is wrong"),
         ("optics", "the camera is wrong"),
         ("unknown", "disagree (laser"),
     ],
 )
-def test_who_is_wrong_is_said_in_the_operators_words(faulty: str, says: str) -> None:
+def test_who_is_wrong_is_said_in_the_operators_words(faulty: str, message: str) -> None:
     line = {"kind": "plausibility", "faulty": faulty, "readings": "laser +20.0 µm, camera +0.1 µm"}
     (sign,) = signs_of(from_dict(line).notice_changes({}))
-    assert says in sign.text
+    assert message in sign.text
     assert "laser +20.0 µm" in sign.text
 
 
@@ -129,7 +129,7 @@ def test_the_text_names_value_and_limit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("alarms", "says"),
+    ("alarms", "message"),
     [
         (
             {"rules": [{"name": "a", "field": "nothing", "raise_at": 1, "clear_at": 0}]},
@@ -143,8 +143,8 @@ def test_the_text_names_value_and_limit() -> None:
         ({"escalation_urls_file": "x"}, "needs urls_file"),
     ],
 )
-def test_rules_that_are_none_are_one_line(alarms: dict[str, object], says: str) -> None:
-    with pytest.raises(InputError, match=says):
+def test_rules_that_are_none_are_one_line(alarms: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
         parse_tables({"alarms": alarms}, Config, "lab.toml")
 
 

@@ -25,7 +25,7 @@ def warnings(**bridges: object) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("bridges", "says"),
+    ("bridges", "message"),
     [
         (
             {"opcua": OpcuaConfig()},
@@ -43,10 +43,10 @@ def warnings(**bridges: object) -> list[str]:
 )
 @pytest.mark.parametrize("role", ["operate", "tune"])
 def test_a_bridge_through_which_anybody_acts_gives_a_warning(
-    bridges: dict[str, object], says: str, role: str
+    bridges: dict[str, object], message: str, role: str
 ) -> None:
     (found,) = warnings(role=role, **bridges)
-    assert found.startswith(says)
+    assert found.startswith(message)
 
 
 @pytest.mark.parametrize(

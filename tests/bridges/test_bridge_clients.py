@@ -285,13 +285,13 @@ async def test_mqtt_tells_obeys_and_survives_restarts(tmp_path: Path) -> None:
             assert (values["error_um"], values["run"]) == (0.25, "the-run")
             await told(port, f"{base}/do/setpoint", "1.5")
             assert (await answer()).endswith("mqtt: setpoint: done")
-            for command, text, says in (
+            for command, text, message in (
                 ("setpoint", "nan", f"mqtt: Setpoint: enter a number in µm: 'nan' {NO_NUMBER}"),
                 ("open_the_roof", "", "mqtt: no such command"),
                 ("mark", "x" * 100_000, "mqtt: mark refused: longer than 500 bytes"),
             ):
                 await told(port, f"{base}/do/{command}", text)
-                assert (await answer()).endswith(says)
+                assert (await answer()).endswith(message)
         assert [(each.kind, each.value) for each in run.asked] == [("setpoint", 1.5)]
         found = json.loads(await heard(port, "homeassistant/device/membrane_bench/config"))
         assert found["availability_topic"] == f"{base}/availability"

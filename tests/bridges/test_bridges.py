@@ -216,7 +216,7 @@ async def test_a_safety_command_is_sent_before_the_first_contact(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("command", "given", "says"),
+    ("command", "given", "message"),
     [
         ("setpoint", "", "enter a number"),
         *(("setpoint", text, "Setpoint: enter a number in µm") for text in STRANGE_NUMBERS),
@@ -238,13 +238,13 @@ async def test_a_safety_command_is_sent_before_the_first_contact(tmp_path: Path)
     ],
 )
 async def test_nonsense_gets_an_answer(
-    tmp_path: Path, command: str, given: object, says: str
+    tmp_path: Path, command: str, given: object, message: str
 ) -> None:
     async with port_run(tmp_path) as run:
         bridge = bridge_with(
             "tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock"
         )
-        assert says in await bridge.ask("opcua", command, given)
+        assert message in await bridge.ask("opcua", command, given)
         assert run.asked == [] or given == "1e9", "the tick judges limits"
 
 

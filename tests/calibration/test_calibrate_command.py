@@ -219,14 +219,14 @@ def test_a_set_with_a_bad_frame_is_used_with_a_word(
     report = json.loads(capsys.readouterr().out)
     (finding,) = report["findings"]
     assert not finding["fatal"]
-    assert finding["says"].startswith("spoilt: x_sin_2.png omitted: "), finding
+    assert finding["description"].startswith("spoilt: x_sin_2.png omitted: "), finding
 
 
 def test_one_pressure_is_not_enough(
     folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["calibrate", str(folders[0]), "--out", str(tmp_path / "g.toml"), "--json"]) == 3
-    assert "only 0 µm apart" in json.loads(capsys.readouterr().out)["findings"][0]["says"]
+    assert "only 0 µm apart" in json.loads(capsys.readouterr().out)["findings"][0]["description"]
 
 
 def test_sets_of_different_rigs_are_named(
@@ -241,7 +241,7 @@ def test_sets_of_different_rigs_are_named(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["--free", "radius_mm"], "radius_mm is not a parameter"),
         (["--free", "bow_mm=wide"], "wide is not a number"),
@@ -253,10 +253,10 @@ def test_sets_of_different_rigs_are_named(
     ],
 )
 def test_wrong_options_are_said(
-    folders: list[Path], capsys: pytest.CaptureFixture[str], arguments: list[str], says: str
+    folders: list[Path], capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     assert run(["calibrate", str(folders[0]), *arguments]) == 2
-    assert says in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -288,14 +288,14 @@ def test_a_refusal_of_sets_with_different_references_names_these_first() -> None
     )
     bundle = sets.Bundle((), OpticsConfig(), 0.0, ("no rim",), "the sets state two references")
     found = calibrate._judge_sets([crept, wide], bundle)
-    assert [(each.fatal, each.says) for each in found] == [
+    assert [(each.fatal, each.description) for each in found] == [
         (True, "the sets state two references; if it was not: camera or screen crept"),
         (False, "wide"),
         (False, "no rim"),
     ]
     assert found[0].sets == (1,)
     one = calibrate._judge_sets([crept], replace(bundle, apart=""))
-    assert [each.says for each in one] == ["camera or screen crept", "no rim"]
+    assert [each.description for each in one] == ["camera or screen crept", "no rim"]
 
 
 def test_a_set_given_twice_is_refused(
@@ -371,7 +371,7 @@ def test_a_sphere_beside_the_film_sharpens_the_sag(
 
 
 @pytest.mark.parametrize(
-    ("was", "becomes", "says"),
+    ("was", "becomes", "message"),
     [
         (
             "curvature_radius_sigma_mm = 0.34",
@@ -393,13 +393,13 @@ def test_an_artefact_that_is_not_described_is_refused(
     capsys: pytest.CaptureFixture[str],
     was: str,
     becomes: str,
-    says: str,
+    message: str,
 ) -> None:
     text = (sphere / "capture.toml").read_text()
     assert was in text
     (tmp_path / "capture.toml").write_text(text.replace(was, becomes))
     assert run(["calibrate", str(tmp_path), "--out", str(tmp_path / "g.toml")]) == 2
-    assert says in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_artefacts_alone_are_refused(
@@ -487,7 +487,7 @@ def test_a_moved_screen_and_the_screen_itself_sharpen_the_sag(
 
 
 @pytest.mark.parametrize(
-    ("which", "was", "becomes", "says"),
+    ("which", "was", "becomes", "message"),
     [
         (0, "shift_mm", "shift", "screen_moved.shift_mm"),
         (0, "shift_sigma_mm = 0.05", "shift_sigma_mm = 0.0", "screen_moved.shift_sigma_mm"),
@@ -506,13 +506,13 @@ def test_a_screen_that_is_not_described_is_refused(
     which: int,
     was: str,
     becomes: str,
-    says: str,
+    message: str,
 ) -> None:
     text = (far_and_near[which] / "capture.toml").read_text()
     assert was in text
     (tmp_path / "capture.toml").write_text(text.replace(was, becomes, 1))
     assert run(["calibrate", str(tmp_path), "--out", str(tmp_path / "g.toml")]) == 2
-    assert says in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_moved_screen_needs_the_film_with_the_screen_in_its_place(

@@ -196,7 +196,7 @@ def test_somebody_elses_setpoint_ends_it(
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         ([], "or use --live to take them from a running hold"),
         (["--live", "set"], "omit SET... and --out"),
@@ -206,10 +206,10 @@ def test_somebody_elses_setpoint_ends_it(
         (["--live", "--session", "nowhere", "--sets", "3"], "omit --range-um and --sets"),
     ],
 )
-def test_bad_usage(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_usage(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["calibrate", *words]) == 2
     said = capsys.readouterr().err
-    assert says in said
+    assert message in said
     assert len(said.splitlines()) == 1
 
 

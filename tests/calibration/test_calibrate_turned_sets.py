@@ -107,7 +107,7 @@ def test_the_report_states_the_turn_that_was_found(
 
 
 @pytest.mark.parametrize(
-    ("becomes", "exit_code", "says"),
+    ("becomes", "exit_code", "message"),
     [
         ("angle_deg = 1200.0", 2, "mirror_turned.angle_deg"),
         ("angle_deg = 120.0\nangle_sigma_deg = 0.0", 2, "mirror_turned.angle_sigma_deg"),
@@ -120,7 +120,7 @@ def test_a_turn_that_cannot_be_is_refused(
     capsys: pytest.CaptureFixture[str],
     becomes: str,
     exit_code: int,
-    says: str,
+    message: str,
 ) -> None:
     wrong = tmp_path / "turned"
     wrong.mkdir()
@@ -131,7 +131,7 @@ def test_a_turn_that_cannot_be_is_refused(
     (wrong / "capture.toml").write_text(text.replace("angle_deg = 120.0", becomes))
     assert run(calibrate([*sets[:3], wrong], tmp_path / "g.toml")) == exit_code
     said = capsys.readouterr()
-    assert says in said.err + said.out
+    assert message in said.err + said.out
     assert not (tmp_path / "g.toml").exists()
 
 

@@ -55,7 +55,7 @@ def test_the_range_is_moved_into_the_reach_and_the_nearer_end_comes_first() -> N
 
 
 @pytest.mark.parametrize(
-    ("reach", "range_um", "says"),
+    ("reach", "range_um", "message"),
     [
         (WIDE, 10_001.0, "low and high leave 10000 µm"),
         (WIDE, 999.0, "closer together than 1000 µm add nothing to one set"),
@@ -67,8 +67,8 @@ def test_the_range_is_moved_into_the_reach_and_the_nearer_end_comes_first() -> N
         (Reach(300.0, -300.0, "low", "high"), None, "leave 0 µm"),
     ],
 )
-def test_no_room(reach: Reach, range_um: float | None, says: str) -> None:
-    with pytest.raises(InputError, match=says):
+def test_no_room(reach: Reach, range_um: float | None, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         plan_setpoints_um(HELD, reach, range_um, 5)
 
 

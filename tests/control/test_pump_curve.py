@@ -160,7 +160,7 @@ NAN = float("nan")
 
 
 @pytest.mark.parametrize(
-    ("table", "says"),
+    ("table", "message"),
     [
         (
             {"curve_fraction": (0.1, 0.3, 0.2), "curve_um_per_s": (0, 1, 2)},
@@ -191,8 +191,8 @@ NAN = float("nan")
         ),
     ],
 )
-def test_an_invalid_curve_is_refused(table: dict[str, object], says: str) -> None:
-    with pytest.raises(ValidationError, match=says):
+def test_an_invalid_curve_is_refused(table: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         PumpConfig.model_validate(table)
 
 

@@ -86,7 +86,7 @@ def test_options_stand_anywhere(words: list[str], asked: Asked) -> None:
 
 
 @pytest.mark.parametrize(
-    ("action", "argument", "says"),
+    ("action", "argument", "message"),
     [
         ("explode", None, "No such command 'explode'"),
         ("tune", None, "No such command 'tune'"),
@@ -108,11 +108,15 @@ def test_options_stand_anywhere(words: list[str], asked: Asked) -> None:
     ],
 )
 def test_what_cannot_be_meant_is_one_line(
-    action: str, argument: str | None, says: str, asked: Asked, capsys: pytest.CaptureFixture[str]
+    action: str,
+    argument: str | None,
+    message: str,
+    asked: Asked,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert run(["ctl", action, *([] if argument is None else [argument])]) == 2
     printed = capsys.readouterr().err
-    assert says in printed
+    assert message in printed
     assert len(printed.splitlines()) == 1
     assert asked == []
 

@@ -235,9 +235,9 @@ def test_feeds_outlive_every_peer_and_leave_others_alone(
                     *(f"answers_{a}" for a in evil.ANSWERS),
                 ):
                     assert rows[name]["state"] == "no contact", name
-                    assert ".sock: " in str(rows[name]["says"]), rows[name]
+                    assert ".sock: " in str(rows[name]["description"]), rows[name]
                 for row in rows.values():
-                    assert str(row["says"]).isprintable()
+                    assert str(row["description"]).isprintable()
                 for feed in feeds.values():
                     await asyncio.to_thread(feed.close)
                     assert not feed._thread.is_alive()

@@ -45,7 +45,7 @@ def test_every_command_of_the_table_can_be_asked() -> None:
 
 
 @pytest.mark.parametrize(
-    ("message", "says"),
+    ("message", "expected"),
     [
         (b"", "invalid JSON"),
         (b"\n", "invalid JSON"),
@@ -76,10 +76,10 @@ def test_every_command_of_the_table_can_be_asked() -> None:
         (line(do="watch", period_s=0.0), "period_s"),
     ],
 )
-def test_what_is_no_request_is_refused_in_one_line(message: bytes, says: str) -> None:
+def test_what_is_no_request_is_refused_in_one_line(message: bytes, expected: str) -> None:
     with pytest.raises(RequestError) as refused:
         parse(message)
-    assert says in str(refused.value)
+    assert expected in str(refused.value)
     assert str(refused.value).isprintable()
 
 

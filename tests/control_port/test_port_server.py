@@ -132,7 +132,7 @@ async def test_gains_change_what_they_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("loop", "says"),
+    ("loop", "message"),
     [
         ({"kp": 1.0}, "kp: unknown key; known: rate_hz"),
         ({"kp_per_s": -1.0}, "kp_per_s: input should be greater"),
@@ -147,12 +147,12 @@ async def test_gains_change_what_they_name(tmp_path: Path) -> None:
     ],
 )
 async def test_gains_that_are_none_are_one_line(
-    tmp_path: Path, loop: dict[str, float], says: str
+    tmp_path: Path, loop: dict[str, float], message: str
 ) -> None:
     async with port_run(tmp_path) as run, client(run, TOM) as tom:
         answer = await tom.ask(do="gains", loop=loop)
         if loop:
-            assert says in answer["refused"]
+            assert message in answer["refused"]
         else:
             assert answer["ok"], "no change is no harm"
 

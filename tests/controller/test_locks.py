@@ -137,7 +137,7 @@ def test_two_locks_of_two_authors_need_two_unlocks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "says"),
+    ("asked", "message"),
     [
         (unlock("wrong", "unix:ann"), "no lock has the word 'wrong'"),
         (unlock("", "unix:eve"), "none of the locks is set by the login of unix:eve"),
@@ -146,11 +146,11 @@ def test_two_locks_of_two_authors_need_two_unlocks() -> None:
         (unlock("hands inside", "unix:eve"), "no lock has the word"),
     ],
 )
-def test_a_refused_unlock_changes_nothing_and_is_recorded(asked: Command, says: str) -> None:
+def test_a_refused_unlock_changes_nothing_and_is_recorded(asked: Command, message: str) -> None:
     mirror = locked(ANN, LINK)
     outputs = give(mirror, asked)
     (event,) = [event for event in outputs.events if isinstance(event, CommandTaken)]
-    assert says in (event.refused or "")
+    assert message in (event.refused or "")
     assert event.text == (asked.text or None)
     assert words(mirror) == ["bofak", "tarep"]
 

@@ -303,17 +303,17 @@ def test_a_replay_begins_with_the_last_snapshot_before(
 
 
 @pytest.mark.parametrize(
-    ("window", "says"),
+    ("window", "message"),
     [
         (("--from", "99h"), "the record ends at 22.5 s"),
         (("--from", "9s", "--to", "8s"), "--from 9s is not before --to 8s"),
     ],
 )
 def test_a_part_outside_the_run_is_a_one_line_error(
-    record: Path, window: tuple[str, ...], says: str, capsys: pytest.CaptureFixture[str]
+    record: Path, window: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["replay", str(record), *window]) == Exit.BAD_INPUT
-    assert says in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_snapshot_of_another_layout_is_reported_and_the_replay_begins_with_the_run(

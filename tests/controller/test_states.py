@@ -236,18 +236,18 @@ def test_stopping_with_a_running_pump_is_not_a_success() -> None:
 
 
 @pytest.mark.parametrize("lower_s", [0.0, 20.0])
-@pytest.mark.parametrize("says", [1.0, 0.0])
-def test_a_pump_that_starts_by_itself_is_a_fault_in_standby(lower_s: float, says: float) -> None:
+@pytest.mark.parametrize("readback", [1.0, 0.0])
+def test_a_pump_that_starts_by_itself_is_a_fault_in_standby(lower_s: float, readback: float) -> None:
     """Whether its read-back shows it, or only the rising mirror."""
     outcome = played(
         {"time_s": lower_s, "command": "lower"},
         {"time_s": 60.0, "wrong": "pump_stuck_fraction", "value": 1.0},
-        {"time_s": 60.0, "wrong": "readback_fraction", "value": says},
+        {"time_s": 60.0, "wrong": "readback_fraction", "value": readback},
         duration_s=150.0,
     )
     (fault,) = outcome.of("fault")
-    assert fault["name"] == ("pump_runs_on" if says else "gas_comes_in")
-    assert fault["mono_s"] < (64.0 if says else 90.0)
+    assert fault["name"] == ("pump_runs_on" if readback else "gas_comes_in")
+    assert fault["mono_s"] < (64.0 if readback else 90.0)
     assert max(tick.row.truth_displacement_um for tick in outcome.ticks) < 150.0
     assert outcome.ticks[-1].outputs.command.vent_fraction == 1.0
     assert State.STANDBY in {tick.row.state for tick in outcome.ticks if tick.row.mono_s > 59.0}

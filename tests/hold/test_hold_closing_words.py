@@ -68,7 +68,7 @@ FAULT = Fault(
 
 
 @pytest.mark.parametrize(
-    ("exit_", "fault", "says"),
+    ("exit_", "fault", "message"),
     [
         (
             Exit.SAFETY_TRIP,
@@ -87,7 +87,7 @@ FAULT = Fault(
 def test_a_run_that_ends_in_a_fault_states_the_fault_first(
     exit_: Exit,
     fault: Fault | None,
-    says: list[str],
+    message: list[str],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -97,8 +97,8 @@ def test_a_run_that_ends_in_a_fault_states_the_fault_first(
     lines = capsys.readouterr().err.splitlines()
     count = len(make_closing_lines(closing))
     first = "\n".join(lines[:count])
-    assert all(part in first for part in says)
-    assert (count > 0) == bool(says)
+    assert all(part in first for part in message)
+    assert (count > 0) == bool(message)
     assert lines[count].startswith("held:")
     assert lines[count + 1].startswith("missed ticks:")
 

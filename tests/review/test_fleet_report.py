@@ -154,7 +154,7 @@ def test_what_no_run_can_break(lab: Path, tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (["--fleet", "empty", "missing", "--workers", "1"], "not a run"),
         (["north", "south"], "--fleet makes one page of several"),
@@ -167,11 +167,11 @@ def test_impossible_options_are_refused(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     words: list[str],
-    says: str,
+    message: str,
 ) -> None:
     monkeypatch.chdir(lab)
     assert command(["report", *words]) == Exit.BAD_INPUT
-    assert says in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (lab / "fleet").exists()
 
 

@@ -78,7 +78,7 @@ def test_a_run_without_vibrations_is_reported_as_such(
 
 
 @pytest.mark.parametrize(
-    ("arrays", "code", "says"),
+    ("arrays", "code", "message"),
     [
         (None, Exit.BAD_INPUT, "neither a run nor the result of `membrane-ctrl track`"),
         ({"time_s": np.arange(5.0)}, Exit.BAD_INPUT, "lacks an array"),
@@ -139,7 +139,7 @@ def test_what_shows_no_vibrations_is_one_line(
     capsys: pytest.CaptureFixture[str],
     arrays: dict[str, np.ndarray] | None,
     code: Exit,
-    says: str,
+    message: str,
 ) -> None:
     if arrays is not None:
         np.savez(tmp_path / "track.npz", **arrays)
@@ -148,5 +148,5 @@ def test_what_shows_no_vibrations_is_one_line(
         line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: ")
     ]
     assert len(errors) == (code != Exit.DONE)
-    assert all(says in line for line in errors)
+    assert all(message in line for line in errors)
     assert (tmp_path / "modes").exists() == (code == Exit.DONE)

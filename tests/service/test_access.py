@@ -248,7 +248,7 @@ def test_a_damaged_users_file_is_named_with_its_line(line: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "role", "password", "says"),
+    ("name", "role", "password", "message"),
     [
         ("", "read", "long enough", "1 to 32 printable"),
         ("a:b", "read", "long enough", "colon"),
@@ -257,8 +257,8 @@ def test_a_damaged_users_file_is_named_with_its_line(line: str) -> None:
         ("a", "read", "short", "at least 8"),
     ],
 )
-def test_a_user_that_cannot_be(name: str, role: str, password: str, says: str) -> None:
-    with pytest.raises(InputError, match=says):
+def test_a_user_that_cannot_be(name: str, role: str, password: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         known_user(name, role, password)
 
 

@@ -64,7 +64,7 @@ def test_what_somebody_else_has_saved_meanwhile_is_not_overwritten(folder: Path)
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("[loop\n", "not valid TOML"),
         ("[loop]\nkp = 1\n", "kp"),
@@ -75,11 +75,11 @@ def test_what_somebody_else_has_saved_meanwhile_is_not_overwritten(folder: Path)
         ("a = " + "[" * 5000, "not valid TOML"),
     ],
 )
-def test_what_fails_the_check_is_not_saved(folder: Path, text: str, says: str) -> None:
+def test_what_fails_the_check_is_not_saved(folder: Path, text: str, message: str) -> None:
     editor = ConfigurationEditor(folder)
     checked = editor.check("lab", text)
     assert not checked.is_usable
-    assert any(says in line for line in checked.errors), checked
+    assert any(message in line for line in checked.errors), checked
     assert not any(str(folder) in line for line in checked.errors)
     with pytest.raises(InputError):
         editor.save("lab", text, editor.read("lab").digest, "anna")

@@ -86,12 +86,12 @@ async def test_a_command_that_arrives_after_its_time_is_refused_by_the_hold(tmp_
 async def test_a_command_is_not_sent_after_its_deadline_or_another_decision(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
         feed = feed_of("the-run", tmp_path / "control.sock")
-        for given, says in (
+        for given, message in (
             (limits(-0.1), "the hold answered too late"),
             (limits(2.0, "latch came meanwhile"), "hold refused: latch came meanwhile"),
         ):
             said = await asyncio.to_thread(feed.ask, {"do": "hold"}, given)
-            assert says in said.text
+            assert message in said.text
             assert not said.done
         other = feed_of("another-run", tmp_path / "control.sock")
         said = await asyncio.to_thread(other.ask, {"do": "hold"}, limits(2.0))

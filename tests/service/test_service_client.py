@@ -128,7 +128,7 @@ async def test_a_person_and_another_service_reach_a_hold_through_its_service(
 
 
 @pytest.mark.parametrize(
-    ("url", "says"),
+    ("url", "message"),
     [
         ("bench2.lab:7480", "write it like https"),
         ("ftp://bench2.lab/", "write it like https"),
@@ -137,8 +137,8 @@ async def test_a_person_and_another_service_reach_a_hold_through_its_service(
         ("http://bench2.lab:7480/", "the token would cross the network; use https"),
     ],
 )
-def test_an_address_that_cannot_be_is_refused(url: str, says: str) -> None:
-    with pytest.raises(InputError, match=says):
+def test_an_address_that_cannot_be_is_refused(url: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         ServiceClient(ServiceAddress(url, "token"))
     ServiceClient(ServiceAddress("http://127.0.0.1:7480/mirror/", "token"))
 
@@ -239,10 +239,10 @@ async def test_garbage_is_one_line_and_one_red_row(name: str) -> None:
         (row,) = fleet_rows({"far": feed})
         assert row["state"] == "no contact"
         assert row["error"] is None
-        says = str(row["says"])
-        assert says.startswith(url.rstrip("/"))
-        assert says.isprintable()
-        assert len(says) < 500
+        message = str(row["description"])
+        assert message.startswith(url.rstrip("/"))
+        assert message.isprintable()
+        assert len(message) < 500
         with pytest.raises(DeviceError):
             await asyncio.to_thread(ServiceClient(ServiceAddress(url, "t")).read_state)
 

@@ -25,7 +25,7 @@ POINTS = 200  # of the map
 class Effect:
     """What is wrong, and nothing else."""
 
-    says: str
+    description: str
     off: Mapping[str, float] = field(default_factory=dict)  # by how much the bench is stated wrong
     room: Mapping[str, Any] = field(default_factory=dict)  # what differs from `STEADY`
     between_um: float = 0.0  # by how much the film is deeper in the y frames than in the x frames

@@ -72,7 +72,7 @@ class Plant:
     ----------
     rows : tuple of str
         Names in the budget; their variances are added.
-    says : str
+    description : str
         The cause with its size.
     errors : mapping
         Errors of the bench, named as in `HAND_SIGMAS`.
@@ -86,7 +86,7 @@ class Plant:
     """
 
     rows: tuple[str, ...]
-    says: str
+    description: str
     errors: dict[str, float] = field(default_factory=dict)
     effects: Callable[[int], Effects] = lambda _: STILL
     film: Mirror | None = None

@@ -75,7 +75,7 @@ def test_files_are_beside_the_fleet_file(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("", "holds"),
         ("holds = []\n", "holds"),
@@ -92,9 +92,9 @@ def test_files_are_beside_the_fleet_file(tmp_path: Path, monkeypatch: pytest.Mon
         ('[[holds]]\nname = "<b>"\nsocket = "s"\n', "name"),
     ],
 )
-def test_a_fleet_that_cannot_be_is_refused(tmp_path: Path, text: str, says: str) -> None:
+def test_a_fleet_that_cannot_be_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "fleet.toml").write_text(text)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         fleet(tmp_path / "fleet.toml")
 
 
@@ -109,9 +109,14 @@ def test_the_table_shows_alarms_first_and_no_old_numbers() -> None:
     )
     feeds["gone"].seen = dataclasses.replace(good, seen_s=now_s - 100.0)
     assert fleet_rows(feeds) == [
-        {"hold": "good", "state": "hold", "error": 0.26, "says": "as it should be"},
-        {"hold": "bad", "state": "hold", "error": 0.26, "says": "the leak grows"},
-        {"hold": "gone", "state": "no contact", "error": None, "says": "no status for 100 s"},
+        {"hold": "good", "state": "hold", "error": 0.26, "description": "as it should be"},
+        {"hold": "bad", "state": "hold", "error": 0.26, "description": "the leak grows"},
+        {
+            "hold": "gone",
+            "state": "no contact",
+            "error": None,
+            "description": "no status for 100 s",
+        },
     ]
 
 

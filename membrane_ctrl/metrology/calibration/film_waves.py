@@ -150,9 +150,9 @@ def _note_on_waves(solution: Solution) -> verdict.CalibrationFinding:
     orders = np.array([abs(wave.azimuthal_order) for wave in terms_beyond_fit.WAVES])
     most = int(orders[np.argmax(np.abs(waves_mm))])
     rms_um = 1e3 * float(np.sqrt(np.sum(waves_mm**2)))
-    says = (
+    description = (
         f"the film has waves beyond the fitted terms, {rms_um:.2g} µm RMS, most of azimuthal order "
         f"{most}; they are part of the solution. It looks like a film that is stiffer in one "
         "direction, or a ring that is not flat"
     )
-    return verdict.CalibrationFinding(False, says)
+    return verdict.CalibrationFinding(False, description)

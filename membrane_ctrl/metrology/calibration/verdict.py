@@ -38,7 +38,7 @@ class CalibrationFinding:
     """Something that is wrong."""
 
     fatal: bool  # whether the old geometry stays in force
-    says: str  # one line for a person
+    description: str  # one line for a person
     sets: tuple[int, ...] = ()  # sets it is about; empty for all of them
 
 
@@ -61,13 +61,13 @@ def check_before_solving(problem: Problem) -> tuple[CalibrationFinding, ...]:
     if max(spread_um, seen_um) < LEAST_SPREAD_UM:
         if problem.with_artefact:
             return ()  # the artefacts add what the film does not
-        says = (
+        description = (
             f"the sets are only {max(spread_um, seen_um):.0f} µm apart: they add nothing to "
             "one of them; "
             f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, "
             f"{GOOD_SPREAD_UM / 1000:.0f} mm are good"
         )
-        return (CalibrationFinding(True, says),)
+        return (CalibrationFinding(True, description),)
     if np.count_nonzero(known) < 2:
         return ()  # nothing to compare
     slope = float(np.polyfit(moved[known], sag_um[known], 1)[0]) if spread_um > 0 else np.inf
@@ -78,9 +78,11 @@ def check_before_solving(problem: Problem) -> tuple[CalibrationFinding, ...]:
             ),
         )
     if abs(slope - 1) > _SLOPE_OFF:
-        says = f"its readings are {spread_um:.4g} µm apart, the sags {seen_um:.4g} µm"
+        description = f"its readings are {spread_um:.4g} µm apart, the sags {seen_um:.4g} µm"
         return (
-            CalibrationFinding(True, f"the laser's unit or scale is wrong, or it is stuck: {says}"),
+            CalibrationFinding(
+                True, f"the laser's unit or scale is wrong, or it is stuck: {description}"
+            ),
         )
     return ()
 
@@ -117,12 +119,14 @@ def list_causes_besides_turns(solution: Solution) -> list[tuple[float, Calibrati
 
 def _judge_screen_positions(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     """A screen that stood elsewhere than a set states, with the share that it explains."""
-    says = "the screen was not where screen_moved says beside {}: correct shift_mm, or its sigmas"
+    description = (
+        "the screen was not where screen_moved says beside {}: correct shift_mm, or its sigmas"
+    )
     names = [phases.name for phases in solution.problem.sets]
     return [
         (
             fall - 2 * bench_poses.SCREEN_MOVE,
-            CalibrationFinding(True, says.format(names[k]), (k,)),
+            CalibrationFinding(True, description.format(names[k]), (k,)),
         )
         for k, fall in model_tests.find_moved_screens(solution)
     ]
@@ -140,13 +144,13 @@ def describe_unturned(problem: Problem, index: int, found_deg: float | None) -> 
     """Finding on a figure that did not turn as stated; None: no other angle fits better."""
     if found_deg is not None:
         return CalibrationFinding(True, _describe_angle(problem, index, found_deg), (index,))
-    says = (
+    description = (
         f"{problem.sets[index].name}: the film's figure did not turn with the mirror, cause "
         "unknown; it looks like a ring that bends in its seat, a film that changed meanwhile, or "
         "an error of the bench that no parameter describes: seat the mirror anew, wait, and take "
         "the set again"
     )
-    return CalibrationFinding(True, says, (index,))
+    return CalibrationFinding(True, description, (index,))
 
 
 def _describe_angle(problem: Problem, index: int, found_deg: float) -> str:
@@ -174,11 +178,11 @@ def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> Calibrati
     if causes:
         return replace(max(causes, key=lambda each: each[0])[1], sets=())
     most = sets[max(moved, key=lambda k: sets[k].moved_um)]
-    says = (
+    description = (
         f"the film moved by {most.moved_um:.0f} µm RMS while {most.name} was taken: hold it "
         "still, and take it anew"
     )
-    return CalibrationFinding(True, says, tuple(moved))
+    return CalibrationFinding(True, description, tuple(moved))
 
 
 def _judge_film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
@@ -199,8 +203,8 @@ def _judge_film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
         "hencky": "Hencky's without pre-strain and nu = 0.3",
         "prestressed": "of the law, whatever its pre-strain",
     }
-    says = f"the film's figure is not {name[film_kind]}: use --film free"
-    return [(fall - 2 * freedom, CalibrationFinding(True, says))]
+    description = f"the film's figure is not {name[film_kind]}: use --film free"
+    return [(fall - 2 * freedom, CalibrationFinding(True, description))]
 
 
 def _judge_sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
@@ -224,19 +228,19 @@ def _judge_sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
         where = (
             f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
         )
-        says = (
+        description = (
             f"the camera had moved {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} "
             "degrees"
         )
-        out.append((bump.fall - 2 * 3, CalibrationFinding(True, says, bump.sets)))
+        out.append((bump.fall - 2 * 3, CalibrationFinding(True, description, bump.sets)))
     if (crept := model_tests.find_mount_creep(solution)) is not None:
         parameter = bench_parameters.ALL[bench_parameters.NAMES.index(crept.name)]
-        says = (
+        description = (
             f"camera or screen crept from {names[0]} to {names[-1]}, as if by "
-            f"{crept.amount:+.2g} {parameter.unit} "
-            f"of {crept.name} ({parameter.says}): let the mounts settle, and take the sets anew"
+            f"{crept.amount:+.2g} {parameter.unit} of {crept.name} ({parameter.description}): let "
+            "the mounts settle, and take the sets again"
         )
-        out.append((crept.fall - 2 * crept.freedom, CalibrationFinding(True, says)))
+        out.append((crept.fall - 2 * crept.freedom, CalibrationFinding(True, description)))
     worst = max(model_tests.compare_left_out_sets(solution), key=lambda each: each.fall)
     if worst.disagrees:
         explained = worst.fall - 2 * worst.freedom
@@ -247,14 +251,14 @@ def _judge_sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
             )
         ):
             wrong_part = _name_wrong_part(solution, worst.index)
-            says = f"{names[worst.index]} disagrees with all the others: {wrong_part}"
-            out.append((explained, CalibrationFinding(True, says, (worst.index,))))
+            description = f"{names[worst.index]} disagrees with all the others: {wrong_part}"
+            out.append((explained, CalibrationFinding(True, description, (worst.index,))))
         else:
-            says = (
+            description = (
                 "the sets contradict each other: they are not of one bench, or several of them "
                 "are bad"
             )
-            out.append((explained, CalibrationFinding(True, says)))
+            out.append((explained, CalibrationFinding(True, description)))
     return out
 
 
@@ -283,22 +287,22 @@ def _judge_divergence(solution: Solution) -> CalibrationFinding:
     for k in range(count if count > 2 else 0):
         if _have_common_bench(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
             doubt = _describe_doubt(problem, k)
-            says = f"{problem.sets[k].name} disagrees with all the others: {doubt}"
-            return CalibrationFinding(True, says, (k,))
+            description = f"{problem.sets[k].name} disagrees with all the others: {doubt}"
+            return CalibrationFinding(True, description, (k,))
     for k in range(2, count - 1):
         if all(
             _have_common_bench(replace(problem, sets=part))
             for part in (problem.sets[:k], problem.sets[k:])
         ):
-            says = (
+            description = (
                 f"the bench was changed between {problem.sets[k - 1].name} and "
                 f"{problem.sets[k].name}"
             )
-            return CalibrationFinding(True, says, tuple(range(k, count)))
-    says = (
+            return CalibrationFinding(True, description, tuple(range(k, count)))
+    description = (
         "the sets do not show one bench: they are of different benches, or several of them are bad"
     )
-    return CalibrationFinding(True, says)
+    return CalibrationFinding(True, description)
 
 
 def _have_common_bench(problem: Problem) -> bool:
@@ -338,19 +342,21 @@ def _judge_scatter(solution: Solution) -> list[CalibrationFinding]:
     ratios = np.sqrt([each.variance for each in solution.equations])
     worse = np.flatnonzero(ratios > _SCATTER * np.median(ratios))
     names = [phases.name for phases in solution.problem.sets]
-    says = "{} scatters {:.1f} times as much as its camera should"
-    return [CalibrationFinding(False, says.format(names[k], ratios[k]), (int(k),)) for k in worse]
+    description = "{} scatters {:.1f} times as much as its camera should"
+    return [
+        CalibrationFinding(False, description.format(names[k], ratios[k]), (int(k),)) for k in worse
+    ]
 
 
 def _judge_laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     laser = model_tests.laser_scale(solution)
     if not laser.sure:
         return []
-    says = (
+    description = (
         f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} µm "
         "per µm of it"
     )
-    return [(laser.fall - 2, CalibrationFinding(True, says))]
+    return [(laser.fall - 2, CalibrationFinding(True, description))]
 
 
 def _judge_model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
@@ -361,13 +367,13 @@ def _judge_model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     parameter = bench_parameters.ALL[bench_parameters.NAMES.index(first.name)]
     unit = f" {parameter.unit}" if parameter.unit else ""
     also = f" (or {', '.join(other.name for other in others)})" if others else ""
-    says = (
+    description = (
         f"the residuals have the pattern of {first.name} = {first.value:.3g} +- "
         f"{first.sigma:.2g}{unit} "
-        f"({parameter.says}){also}, {first.figure_um:.1f} µm of figure: free it with --free "
+        f"({parameter.description}){also}, {first.figure_um:.1f} µm of figure: free it with --free "
         f"{first.name}"
     )
-    return [(first.fall - 2, CalibrationFinding(first.figure_um > _HARMLESS_UM, says))]
+    return [(first.fall - 2, CalibrationFinding(first.figure_um > _HARMLESS_UM, description))]
 
 
 def _judge_spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
@@ -377,13 +383,15 @@ def _judge_spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     if problem.with_artefact:
         return ()  # the sag rests on the artefacts
     if np.count_nonzero(np.isfinite(moved)) < 2:
-        says = "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"
-        return (CalibrationFinding(False, says),)
+        description = (
+            "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"
+        )
+        return (CalibrationFinding(False, description),)
     spread_um = float(np.ptp(moved[np.isfinite(moved)]))
     if spread_um >= GOOD_SPREAD_UM / 2:
         return ()
-    says = (
+    description = (
         f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would "
         "determine the sag better"
     )
-    return (CalibrationFinding(False, says),)
+    return (CalibrationFinding(False, description),)

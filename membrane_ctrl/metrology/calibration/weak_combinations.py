@@ -125,7 +125,7 @@ def _describe_combination(
     descriptions = []
     for name, amount in parts:
         parameter = bench_parameters.ALL[bench_parameters.NAMES.index(name)]
-        descriptions.append(f"{amount:+.2g} {parameter.unit}: {parameter.says}")
+        descriptions.append(f"{amount:+.2g} {parameter.unit}: {parameter.description}")
     effect = _name_effect(solution, index, moved_um, figure_um, plane)
     words = f"{effect} ({'; '.join(descriptions)})"
     return Combination(

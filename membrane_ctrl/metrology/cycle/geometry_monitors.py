@@ -42,7 +42,7 @@ class DriftMonitor:
 
     calibrated_urad: float
     calibrated_noise_urad: float
-    says: str = ""  # why it is time to calibrate again; empty while it is not
+    description: str = ""  # why it is time to calibrate again; empty while it is not
     _seen: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=CYCLES))
 
     def add(self, residual_urad: float, live_noise_urad: float) -> None:
@@ -57,9 +57,9 @@ class DriftMonitor:
         model_urad = np.sqrt(max(0.0, self.calibrated_urad**2 - self.calibrated_noise_urad**2))
         ratio = now_urad / float(np.hypot(model_urad, live_urad))
         if ratio < FINE:
-            self.says = ""
-        elif ratio > GROWN and not self.says:
-            self.says = (
+            self.description = ""
+        elif ratio > GROWN and not self.description:
+            self.description = (
                 f"calibrate again: the fit leaves {now_urad:.2f} µrad of slope, "
                 f"the calibrated geometry predicts {now_urad / ratio:.2f}"
             )
@@ -77,7 +77,7 @@ class RingMonitor:
     """
 
     calibrated_um: FloatArray
-    says: str = ""  # as for `DriftMonitor`
+    description: str = ""  # as for `DriftMonitor`
     _seen: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=CYCLES))
 
     def add(self, surface: Surface) -> None:
@@ -88,9 +88,9 @@ class RingMonitor:
         change = np.median(np.array(self._seen), axis=0) - self.calibrated_um
         moved_um = float(np.sqrt(np.sum(change**2) / 2))  # RMS around the rim
         if moved_um < RING_BACK_UM:
-            self.says = ""
-        elif moved_um > RING_MOVED_UM and not self.says:
-            self.says = (
+            self.description = ""
+        elif moved_um > RING_MOVED_UM and not self.description:
+            self.description = (
                 f"calibrate again: the ring is seen {moved_um:.1f} µm RMS from where it was when "
                 "the geometry was calibrated; camera or screen has moved"
             )

@@ -30,12 +30,12 @@ class Parameter:
     ----------
     name : str
         Name, which ends in the unit.
-    says : str
+    description : str
         Description for people.
     """
 
     name: str
-    says: str
+    description: str
 
     @property
     def sigma(self) -> float:

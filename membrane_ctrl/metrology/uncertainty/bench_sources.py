@@ -45,14 +45,14 @@ def geometry_sources(
             several = "calibrated"
         root = spread.root()[np.ix_(is_linked, is_linked)]
         effects = jacobian[:, is_linked] @ root
-        says = f"poses and optics, with their correlations: {several}"
-        yield Source("geometry", says, math.nan, effects)
-    descriptions = {parameter.name: parameter.says for parameter in bench_parameters.ALL}
+        description = f"poses and optics, with their correlations: {several}"
+        yield Source("geometry", description, math.nan, effects)
+    descriptions = {parameter.name: parameter.description for parameter in bench_parameters.ALL}
     for k in np.flatnonzero(~is_linked):
         name = spread.names[k]
         sigma = float(spread.sigmas[k])
-        says = descriptions.get(name, name)
-        yield Source(name, says, widened * sigma, jacobian[:, [k]] * sigma)
+        description = descriptions.get(name, name)
+        yield Source(name, description, widened * sigma, jacobian[:, [k]] * sigma)
 
 
 def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
@@ -71,14 +71,14 @@ def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
     # Glass: the tangents of the ray in it, with sines of 1 / n.
     sines = (geometry.screen_axes @ leaving)[:2]
     tangents = sines / np.sqrt(_GLASS_INDEX**2 - np.sum(sines**2, axis=0))
-    says = "glass in front of the screen's pixels"
-    yield disturbed_source(bench, "glass_mm", says, sigmas.glass_mm, tangents)
+    description = "glass in front of the screen's pixels"
+    yield disturbed_source(bench, "glass_mm", description, sigmas.glass_mm, tangents)
 
     # Air: rays bent on both ways.
     to_screen_mm = _shift_on_screen(geometry, leaving, _BEND * path_mm**2 / 2)
     air_mm = _bent_to_film_mm(bench) + to_screen_mm
-    says = "vertical temperature gradient of the air"
-    yield disturbed_source(bench, "air_k_per_m", says, sigmas.air_k_per_m, air_mm)
+    description = "vertical temperature gradient of the air"
+    yield disturbed_source(bench, "air_k_per_m", description, sigmas.air_k_per_m, air_mm)
 
     # Temperature: a steel frame grows, with both distances.
     growth = _STEEL_PER_K * sigmas.temperature_k
@@ -87,8 +87,8 @@ def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
     for name, length_mm in lengths_mm.items():
         values[bench_parameters.NAMES.index(name)] = growth * float(np.linalg.norm(length_mm))
     effect = bench.solve(bench_poses.bench_at(geometry, values)) - bench.surface.parameters
-    says = "growth of the frame since its distances were measured"
-    yield Source("temperature_k", says, sigmas.temperature_k, effect[:, None])
+    description = "growth of the frame since its distances were measured"
+    yield Source("temperature_k", description, sigmas.temperature_k, effect[:, None])
 
 
 def _bent_to_film_mm(bench: TrialBench) -> FloatArray:
@@ -118,15 +118,17 @@ def _shift_on_screen(geometry: Geometry, leaving: FloatArray, shift_mm: FloatArr
 
 
 def disturbed_source(
-    bench: TrialBench, name: str, says: str, sigma: float, per_unit_mm: FloatArray
+    bench: TrialBench, name: str, description: str, sigma: float, per_unit_mm: FloatArray
 ) -> Source:
     """A row for an input that moves the screen points by `per_unit_mm` (2, n), mm per its unit."""
     solved = bench.solve(bench.geometry(), sigma * per_unit_mm, linear=True)
     effect = solved - bench.surface.parameters
-    return Source(name, says, sigma, effect[:, None])
+    return Source(name, description, sigma, effect[:, None])
 
 
-def film_source(bench: TrialBench, sigmas_um: tuple[float, ...], says: str, paired: bool) -> Source:
+def film_source(
+    bench: TrialBench, sigmas_um: tuple[float, ...], description: str, paired: bool
+) -> Source:
     """The row for motion of the film from the x frames to the y frames that is not corrected.
 
     Parameters
@@ -135,7 +137,7 @@ def film_source(bench: TrialBench, sigmas_um: tuple[float, ...], says: str, pair
         Some points of the set.
     sigmas_um : tuple of float
         Independent parts of the motion.
-    says : str
+    description : str
         Description of the row.
     paired : bool
         As `Source.paired`.
@@ -144,11 +146,16 @@ def film_source(bench: TrialBench, sigmas_um: tuple[float, ...], says: str, pair
     per_um = bench.solve(bench.geometry(), half_mm, linear=True) - bench.surface.parameters
     sigma_um = math.hypot(*sigmas_um)
     return Source(
-        "film_x_to_y_um", says, sigma_um, np.outer(per_um, sigmas_um), common=False, paired=paired
+        "film_x_to_y_um",
+        description,
+        sigma_um,
+        np.outer(per_um, sigmas_um),
+        common=False,
+        paired=paired,
     )
 
 
-def vertex_source(bench: TrialBench, sigma_um: float, says: str) -> Source:
+def vertex_source(bench: TrialBench, sigma_um: float, description: str) -> Source:
     """The row for a vertex that is nearer to camera and screen, or further from them, than the
     laser measures.
     """
@@ -162,4 +169,4 @@ def vertex_source(bench: TrialBench, sigma_um: float, says: str) -> Source:
     )
     solved = bench.solve(replace(nominal, geometry=farther), linear=True)
     effect = solved - bench.surface.parameters
-    return Source("vertex_um", says, sigma_um, effect[:, None], common=False, paired=False)
+    return Source("vertex_um", description, sigma_um, effect[:, None], common=False, paired=False)

@@ -30,7 +30,7 @@ class Source:
     ----------
     name : str
         Name, which ends in the unit of `sigma`.
-    says : str
+    description : str
         Description for people.
     sigma : float
         Standard uncertainty of the input; NaN for several at once.
@@ -45,7 +45,7 @@ class Source:
     """
 
     name: str
-    says: str
+    description: str
     sigma: float
     effects_mm: FloatArray
     common: bool = True
@@ -141,7 +141,7 @@ class Budget:
         for source in self.sources:
             about: dict[str, Any] = {
                 "name": source.name,
-                "says": source.says,
+                "description": source.description,
                 "sigma": source.sigma if math.isfinite(source.sigma) else None,
                 "common": source.common,
             }

@@ -210,6 +210,6 @@ def film_shape_sources(full: FullResult, slope_variance: FloatArray) -> tuple[bu
         ("film_waves", "film or ring that is not even: waves that no term explains", of_waves),
     )
     return tuple(
-        budget.Source(name, says, math.nan, effects, common=False, noise_mm2=noise)
-        for name, says, (effects, noise) in rows
+        budget.Source(name, description, math.nan, effects, common=False, noise_mm2=noise)
+        for name, description, (effects, noise) in rows
     )

@@ -135,5 +135,5 @@ def frame_sources(
         False,
         False,
     )
-    says = "motion of the film from frame to frame that no laser has measured"
-    yield Source("film_um", says, film_um, film_um * effects.film, False, False)
+    description = "motion of the film from frame to frame that no laser has measured"
+    yield Source("film_um", description, film_um, film_um * effects.film, False, False)

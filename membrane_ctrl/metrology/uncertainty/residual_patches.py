@@ -40,8 +40,8 @@ def pixel_sources(
     left = Patches.of_grid(full.fit_grid).effects(full.surface.radius_mm, inverse)
     left_urad = 1e6 * math.hypot(fit.residual_x, fit.residual_y)
     noise_mm2 = float(np.sum(noise**2))
-    says = "slopes that the fit leaves: gamma, light, dust, ripple"
-    yield Source("slope_urad", says, left_urad, left, common=False, noise_mm2=noise_mm2)
+    description = "slopes that the fit leaves: gamma, light, dust, ripple"
+    yield Source("slope_urad", description, left_urad, left, common=False, noise_mm2=noise_mm2)
 
 
 @dataclass(frozen=True)

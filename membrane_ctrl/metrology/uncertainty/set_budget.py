@@ -182,11 +182,11 @@ def _vertex_source(
     readings_um = checked.stack.readings_um
     noise_um = vertex_um(readings_um, LASER_NOISE_UM)
     if not np.isfinite(readings_um).all():
-        says = "place of the vertex, without a laser"
-        return bench_sources.vertex_source(bench, math.hypot(noise_um, moved_um / 2), says)
+        description = "place of the vertex, without a laser"
+        return bench_sources.vertex_source(bench, math.hypot(noise_um, moved_um / 2), description)
     scale_um = 1e3 * sigmas.laser_relative * abs(bench.vertex_z_mm)
-    says = "place of the vertex, by the laser's noise and scale"
-    return bench_sources.vertex_source(bench, math.hypot(noise_um, scale_um), says)
+    description = "place of the vertex, by the laser's noise and scale"
+    return bench_sources.vertex_source(bench, math.hypot(noise_um, scale_um), description)
 
 
 def _left_film_um(motion: FilmMotion) -> float:
@@ -215,16 +215,16 @@ def _film_rows(
         share_left = _X_TO_Y_SHARE if motion.is_worth_correcting else 1.0
         left_um = share_left * float(x_um.mean() - y_um.mean())
         sigma_um = math.hypot(motion.x_to_y_sigma_um, left_um)
-        says = "motion of the film from x to y, by the laser"
-        return [bench_sources.film_source(bench, (sigma_um,), says, paired=False)], []
+        description = "motion of the film from x to y, by the laser"
+        return [bench_sources.film_source(bench, (sigma_um,), description, paired=False)], []
 
     # Without a laser: the motion and the geometry's part of its error, which sets share; the noise
     # of the fringes, which they do not.
-    says = "motion of the film from x to y, without a laser"
+    description = "motion of the film from x to y, without a laser"
     sigmas_um = (unseen.moved_um, unseen.shared_um)
-    source = bench_sources.film_source(bench, sigmas_um, says, paired=True)
-    says = "noise of the fringes that show the film's motion from x to y"
-    noise = bench_sources.film_source(bench, (unseen.noise_um,), says, paired=False)
+    source = bench_sources.film_source(bench, sigmas_um, description, paired=True)
+    description = "noise of the fringes that show the film's motion from x to y"
+    noise = bench_sources.film_source(bench, (unseen.noise_um,), description, paired=False)
     rows = [source, replace(noise, name="film_seen_um")]
     if not unseen.is_sure:
         return rows, []

@@ -111,7 +111,7 @@ def moment_source(
         if not film.is_worth_correcting or count_used == stack.readings_um.size:
             return None
         sigma_um = left_out_sigma_um(count_used, stack.readings_um.size, LASER_NOISE_UM)
-        says = "the laser's noise where a frame is left out while the film moves"
+        description = "the laser's noise where a frame is left out while the film moves"
     else:
         frames = used[0], used[1]
         count_frames = len(stack.patterns)
@@ -121,6 +121,8 @@ def moment_source(
             step_um = seen.moved_um - apart * drift_um(frames, checked.film_um)
             stepped_um = step_sigma_um(frames, step_um, seen.sigma_um, count_frames)
             sigma_um = math.hypot(sigma_um, stepped_um)
-        says = "motion of the film during the set, without a laser"
+        description = "motion of the film during the set, without a laser"
     deeper_mm = Surface.hencky_bowl(1e-3 * sigma_um, radius_mm).parameters
-    return Source("moment_um", says, sigma_um, deeper_mm[:, None], common=False, paired=False)
+    return Source(
+        "moment_um", description, sigma_um, deeper_mm[:, None], common=False, paired=False
+    )

@@ -146,22 +146,22 @@ def test_bad_input_is_one_line(
             "cannot be written",
         ),
     )
-    for arguments, code, says in cases:
+    for arguments, code, message in cases:
         assert run(arguments) == code, arguments
         error = capsys.readouterr().err
-        assert says in error
+        assert message in error
         assert len(error.splitlines()) == 1, error
     assert not out.exists()
 
 
 def test_invalid_prior_files_are_refused(tmp_path: Path) -> None:
-    for text, says in (
+    for text, message in (
         ('schema = "membrane-geometry/1"', "pass a geometry with --geometry"),
         ('schema = "membrane-prior/1"\n[sigmas]\nb_m = 1.0', "sigmas.b_m: not a parameter"),
         ('schema = "membrane-prior/1"\n[sigmas]\nb_mm = 0.0', "sigmas.b_mm"),
     ):
         (tmp_path / "p.toml").write_text(text)
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             read_prior(tmp_path / "p.toml")
 
 

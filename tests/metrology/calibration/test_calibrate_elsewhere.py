@@ -226,7 +226,7 @@ def test_a_screen_at_another_place_than_stated_is_reported() -> None:
         replace(problem, sets=(seen_directly(values, (0.0, 25.0), 4), first, moved))
     )
     (finding,) = (each for each in check_solution(solution) if each.fatal)
-    assert finding.says.startswith("the screen was not where screen_moved says beside set1")
+    assert finding.description.startswith("the screen was not where screen_moved says beside set1")
 
 
 @pytest.mark.campaign
@@ -236,14 +236,14 @@ def test_a_screen_seen_through_another_lens_is_reported() -> None:
     other[NAMES.index("focal_relative")] += 0.01
     known = seen_directly(values, (0.0, 25.0), 5), seen_directly(values, (25.0, 0.0), 6)
     wrong = seen_directly(other, (-20.0, 10.0), 7, "later")
-    says = [
-        each.says
+    message = [
+        each.description
         for each in check_solution(
             solve_calibration(replace(problem, sets=(*known, *problem.sets, wrong)))
         )
         if each.fatal
     ]
-    assert says == [
+    assert message == [
         "later disagrees with all the others: it shows another lens, another screen, or it "
         "was out of focus"
     ]

@@ -50,7 +50,7 @@ def test_a_film_that_is_not_henckys_is_refused_and_the_advice_holds() -> None:
     truth = make(VALUES, 4, points=600, prestrain=1e-3, poisson=0.35)
     (finding,) = check_solution(solved(truth, "hencky"))
     assert finding.fatal
-    assert finding.says.endswith("use --film free")
+    assert finding.description.endswith("use --film free")
     obeyed = solved(truth, "free")
     assert check_solution(obeyed) == ()
     sag_um, figure_um = calibrated_errors_um(obeyed, truth)
@@ -92,7 +92,7 @@ def test_an_orthotropic_film_in_an_uneven_ring_is_accepted_with_true_bars(seed: 
     solution, findings = solve_any_film(truth.problem(every))
     (note,) = findings
     assert not note.fatal
-    assert "the film has waves beyond the fitted terms" in note.says
+    assert "the film has waves beyond the fitted terms" in note.description
     sag_um, figure_um = calibrated_errors_um(solution, truth)
     claim = propagate_to_figure(solution, 2, 475.0)
     assert abs(sag_um) < 3 * claim.sag_um < 3 * 25
@@ -126,7 +126,7 @@ def test_a_mount_that_creeps_is_reported() -> None:
     truth = make(VALUES, 5, points=600, bumped=moved)
     (finding,) = solve_any_film(truth.problem(SIGMAS))[1]  # waves do not explain it better
     assert finding.fatal
-    assert finding.says.startswith("camera or screen crept from set0 to set4")
+    assert finding.description.startswith("camera or screen crept from set0 to set4")
 
 
 def test_the_rim_determines_the_size_and_better_measurements_are_advised() -> None:

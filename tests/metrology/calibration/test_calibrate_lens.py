@@ -138,7 +138,7 @@ def test_the_picture_is_exact_to_the_pixel() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "square_px", "says"),
+    ("text", "square_px", "message"),
     [
         ("charuco:11", 48, "not a board"),
         ("charuco:3x9", 48, "at least 4 squares"),
@@ -146,8 +146,8 @@ def test_the_picture_is_exact_to_the_pixel() -> None:
         ("charuco:11x9", 80, "880 x 720 pixels, the screen 640 x 480"),
     ],
 )
-def test_impossible_boards_are_refused(text: str, square_px: int, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_impossible_boards_are_refused(text: str, square_px: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         on_screen(Board.parse(text), square_px, 640, 480)
 
 

@@ -142,7 +142,7 @@ def test_a_set_whose_light_differed_between_its_frames_is_not_of_another_bench()
     truth = make(drawn(9), seed=9, points=30_000)
     spoilt = with_waves(truth, 6 * float(truth.sets[3].sigma_mm.mean()))
     solution = solve_calibration(spoilt.problem(prior_sigmas()))
-    assert not [finding.says for finding in check_solution(solution) if finding.fatal]
+    assert not [finding.description for finding in check_solution(solution) if finding.fatal]
     clean = np.sqrt([each.variance for each in solution.equations])
     assert clean[3] < 2.5 * np.median(clean)  # second order is left
     unknown = solve_calibration(

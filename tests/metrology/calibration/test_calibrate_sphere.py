@@ -153,7 +153,7 @@ def test_a_sphere_that_is_not_as_stated_is_refused_by_its_name() -> None:
     stated = sphere(200.0, 3400.0, 1e-4, 0.05)
     (finding,) = check_solution(with_known(problem, looked_at(values, stated, 1 / 3460.0, 0.0, 4)))
     assert finding.fatal
-    assert finding.says == (
+    assert finding.description == (
         "known disagrees with all the others: it is not the sphere that its file states, it "
         "stood elsewhere, or it "
         "was out of focus"

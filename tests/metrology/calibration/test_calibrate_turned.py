@@ -105,7 +105,7 @@ def test_turned_sets_of_an_orthotropic_film_sharpen_what_is_not_round(seed: int)
     ]
     truth = make_foreign_film(mirror, values, seed, 600, sags_mm=SAGS_MM, turned=turned)
     solution, findings = solve_any_film(truth.problem(EVERY))
-    assert not [finding.says for finding in findings if finding.fatal]
+    assert not [finding.description for finding in findings if finding.fatal]
     claim = propagate_to_figure(solution, 1, 475.0)
     # `calibration_truth` counts the film of 37 mm as set 2
     middle = replace(solution.problem, sets=(solution.problem.sets[1],) * 3)
@@ -135,9 +135,9 @@ def test_a_mirror_that_was_turned_otherwise_is_named_before_anything_is_solved(
 ) -> None:
     (finding,) = check_before_solving(turned_truth(3, stated_deg).problem(EVERY))
     assert finding.fatal
-    found_deg = float(finding.says.split("turned by ")[1].split()[0])
+    found_deg = float(finding.description.split("turned by ")[1].split()[0])
     assert found_deg == pytest.approx(120.0, abs=5.0)
-    assert f"mirror_turned says {stated_deg:g}" in finding.says
+    assert f"mirror_turned says {stated_deg:g}" in finding.description
 
 
 def test_a_mirror_that_was_turned_a_little_otherwise_is_named_with_its_angle() -> None:
@@ -145,8 +145,8 @@ def test_a_mirror_that_was_turned_a_little_otherwise_is_named_with_its_angle() -
     problem = turned_truth(3, 115.0, SMOOTH).problem(EVERY)
     assert check_before_solving(problem) == ()
     (finding,) = (each for each in solve_any_film(problem)[1] if each.fatal)
-    assert finding.says.startswith("set3: the film's figure is turned by 1")
-    found_deg = float(finding.says.split("turned by ")[1].split()[0])
+    assert finding.description.startswith("set3: the film's figure is turned by 1")
+    found_deg = float(finding.description.split("turned by ")[1].split()[0])
     assert found_deg == pytest.approx(120.0, abs=1.0)
 
 
@@ -155,15 +155,15 @@ def test_a_ring_that_bends_in_its_seat_is_no_wrong_angle() -> None:
     bent = replace(SMOOTH, ring=Ring({**SMOOTH.ring.height, 2: (9e-5, 2e-5)}))
     problem = turned_truth(4, 120.0, SMOOTH, bent).problem(EVERY)
     (finding,) = (each for each in solve_any_film(problem)[1] if each.fatal)
-    assert finding.says.startswith("set3: the film's figure did not turn with the mirror")
-    assert "cause unknown" in finding.says
+    assert finding.description.startswith("set3: the film's figure did not turn with the mirror")
+    assert "cause unknown" in finding.description
 
 
 def test_the_figure_of_another_film_is_no_set_of_another_bench() -> None:
     """The turned ring has waves of 0.5 mm: without that figure the sets agree."""
     problem = turned_truth(3, 120.0, SMOOTH, EVEN).problem(EVERY)
     (finding,) = (each for each in solve_any_film(problem)[1] if each.fatal)
-    assert finding.says.startswith("set3: the film's figure did not turn with the mirror")
+    assert finding.description.startswith("set3: the film's figure did not turn with the mirror")
 
 
 def test_a_camera_that_was_bumped_is_no_unturned_figure() -> None:
@@ -176,7 +176,7 @@ def test_a_camera_that_was_bumped_is_no_unturned_figure() -> None:
     other = make_foreign_film(SMOOTH, bumped, 3, 500, sags_mm=SAGS_MM, turned=turned)
     problem = truth.problem(EVERY, (*truth.sets[:3], other.sets[3]))
     (finding,) = (each for each in solve_any_film(problem)[1] if each.fatal)
-    assert "the film's figure" not in finding.says
+    assert "the film's figure" not in finding.description
 
 
 def test_a_set_of_the_mirror_as_it_stands_is_needed() -> None:

@@ -68,7 +68,7 @@ def test_good_sets_have_nothing_against_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("edit", "which", "says"),
+    ("edit", "which", "message"),
     [
         (reading(lambda d: -d), ALL_SETS, "the laser counts the wrong way"),
         (reading(lambda d: 10 * d), ALL_SETS, "the laser's unit or scale is wrong"),
@@ -86,14 +86,14 @@ def test_good_sets_have_nothing_against_them() -> None:
         (reading(lambda d: d + 50), (1,), "set1 disagrees with all the others: its laser reads +"),
     ],
 )
-def test_laser_faults_are_reported(edit: Edit, which: tuple[int, ...], says: str) -> None:
+def test_laser_faults_are_reported(edit: Edit, which: tuple[int, ...], message: str) -> None:
     (finding,) = judged(good(), edited(edit, *which))
     assert finding.fatal
-    assert finding.says.startswith(says)
+    assert finding.description.startswith(message)
 
 
 @pytest.mark.parametrize(
-    ("edit", "which", "says"),
+    ("edit", "which", "message"),
     [
         (
             reading(lambda d: d + 50),
@@ -104,21 +104,21 @@ def test_laser_faults_are_reported(edit: Edit, which: tuple[int, ...], says: str
     ],
 )
 def test_only_a_moved_film_is_reported_unless_the_sets_at_rest_show_a_cause(
-    edit: Edit, which: tuple[int, ...], says: str
+    edit: Edit, which: tuple[int, ...], message: str
 ) -> None:
     sets = list(edited(edit, *which))
     sets[1] = replace(sets[1], moved_um=9.0)
     (finding,) = judged(good(), tuple(sets))
     assert finding.fatal
-    assert finding.says.startswith(says)
-    assert "or:" not in finding.says
+    assert finding.description.startswith(message)
+    assert "or:" not in finding.description
 
 
 def test_sets_that_are_too_close_are_refused() -> None:
     (finding,) = judged(make(VALUES, 3, points=800, sags_mm=(36.8, 37.0, 37.2)))
     assert finding.fatal
-    assert finding.says.startswith("the sets are only 400 µm apart")
-    assert "at least 1 mm" in finding.says
+    assert finding.description.startswith("the sets are only 400 µm apart")
+    assert "at least 1 mm" in finding.description
 
 
 def test_without_a_laser_fringes_and_ring_say_it() -> None:
@@ -127,7 +127,7 @@ def test_without_a_laser_fringes_and_ring_say_it() -> None:
     solution = solve_calibration(held)
     (finding,) = check_before_solving(held) or check_solution(solution)
     assert not finding.fatal
-    assert "the sag rests on fringes and ring alone" in finding.says
+    assert "the sag rests on fringes and ring alone" in finding.description
     error = (solution.values - VALUES)[:11] / solution.sigmas[:11]
     assert np.sqrt(np.mean(error**2)) < 2
 
@@ -136,20 +136,20 @@ def test_a_bumped_camera_is_reported_with_its_turn() -> None:
     (finding,) = judged(yawed(0.02, 3, 4))
     assert finding.fatal
     assert finding.sets == (3, 4)
-    assert finding.says.startswith("the camera had moved from set3 on: yaw +0.0")
+    assert finding.description.startswith("the camera had moved from set3 on: yaw +0.0")
 
 
 def test_a_camera_bumped_and_put_back_is_reported() -> None:
     (finding,) = judged(yawed(0.02, 2))
     assert finding.fatal
-    assert finding.says.startswith("the camera had moved in set2")
+    assert finding.description.startswith("the camera had moved in set2")
 
 
 @pytest.mark.campaign
 def test_a_camera_that_moved_far_is_found_by_comparing_the_halves() -> None:
     (finding,) = judged(yawed(1.0, 3, 4))
     assert finding.fatal
-    assert "between set2 and set3" in finding.says
+    assert "between set2 and set3" in finding.description
 
 
 @pytest.mark.campaign
@@ -177,15 +177,15 @@ def test_sets_of_many_rigs_are_refused() -> None:
     others = {k: VALUES + 2 * SIGMAS * rng.normal(size=len(NAMES)) for k in (1, 2, 4)}
     (finding,) = judged(make(VALUES, 3, points=600, bumped=others))
     assert finding.fatal
-    assert "bench" in finding.says or "one bench" in finding.says
+    assert "bench" in finding.description or "one bench" in finding.description
 
 
 def test_a_bow_is_found_by_its_pattern() -> None:
     bent = make(VALUES, 3, points=600, bow_mm=1.0)
     (finding,) = judged(bent)
     assert finding.fatal
-    assert "the pattern of bow_mm = " in finding.says
-    assert "--free bow_mm" in finding.says
+    assert "the pattern of bow_mm = " in finding.description
+    assert "--free bow_mm" in finding.description
     solution = solve_calibration(bent.problem(SIGMAS))
     assert find_suspects(solution)[0].value == pytest.approx(1.0, abs=0.15)
     # a tenth of a hundredth is seen by nobody
@@ -200,38 +200,38 @@ def test_a_set_with_bad_fringes_has_little_weight_and_is_reported() -> None:
     (finding,) = judged(good(), noisy)
     assert not finding.fatal
     assert finding.sets == (3,)
-    assert "scatters" in finding.says
+    assert "scatters" in finding.description
 
 
 def test_sets_that_are_close_are_used_with_a_word() -> None:
     near = make(VALUES, 3, points=600, sags_mm=(36.0, 36.5, 37.0, 37.5, 38.0))
     (finding,) = judged(near)
     assert not finding.fatal
-    assert "8 mm would determine the sag better" in finding.says
+    assert "8 mm would determine the sag better" in finding.description
 
 
 def test_the_monitor_waits_for_many_cycles_and_forgives_one() -> None:
     monitor = DriftMonitor(1.0, 0.6)  # 0.8 of it is film and geometry
     for residual_urad in [1.05] * CYCLES + [40.0, float("nan")]:
         monitor.add(residual_urad, 0.6)
-        assert monitor.says == ""
+        assert monitor.description == ""
     monitor.add(1.4, 0.6)
-    assert monitor.says == ""
+    assert monitor.description == ""
     for _ in range(CYCLES):
         monitor.add(1.4, 0.6)
-    assert monitor.says.startswith("calibrate again: the fit leaves 1.40 µrad")
-    assert monitor.says.endswith("predicts 1.00")
+    assert monitor.description.startswith("calibrate again: the fit leaves 1.40 µrad")
+    assert monitor.description.endswith("predicts 1.00")
 
 
 def test_the_monitor_distinguishes_the_cameras_noise_from_the_film() -> None:
     noisy = DriftMonitor(1.0, 0.6)
     for _ in range(CYCLES):
         noisy.add(2.15, 2.0)  # 0.8 of film and 2.0 of noise
-    assert noisy.says == ""
+    assert noisy.description == ""
     binned = DriftMonitor(1.0, 0.9)
     for _ in range(CYCLES):
         binned.add(0.9, 0.1)  # less than was calibrated, but the noise has gone
-    assert binned.says
+    assert binned.description
 
 
 def test_a_warning_ends_well_below_where_it_began() -> None:
@@ -240,5 +240,5 @@ def test_a_warning_ends_well_below_where_it_began() -> None:
     for residual_urad in (1.3, 1.2, 1.05):
         for _ in range(CYCLES):
             monitor.add(residual_urad, 0.0)
-        said.append(bool(monitor.says))
+        said.append(bool(monitor.description))
     assert said == [True, True, False]

@@ -73,18 +73,18 @@ def test_a_covariance_from_a_calibration_makes_it_calibrated() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "amount", "says"),
+    ("name", "amount", "message"),
     [("camera_yaw_deg", 1.5, "the rim is"), ("camera_roll_deg", 2.0, "belong to no surface")],
 )
 def test_a_geometry_that_the_frames_contradict_degrades_both_kinds_of_cycle(
-    name: str, amount: float, says: str
+    name: str, amount: float, message: str
 ) -> None:
     tight = GeometrySpread(PAPER_SPREAD.names, 1e-2 * PAPER_SPREAD.covariance)
     live = LiveReconstructor(misstated(name, amount), 1, spread=tight, known_by=KnownBy.CALIBRATION)
     full, fringes = cycles()
     for estimate in (live.full(*full), live.fringes(*fringes)):
         assert estimate.verdict == "degraded"
-        assert says in estimate.reason
+        assert message in estimate.reason
     statement = live.geometry_statement
     assert statement is not None
     assert statement.state is GeometryState.CONTRADICTED

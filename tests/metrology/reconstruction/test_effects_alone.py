@@ -16,7 +16,7 @@ from tests.studies.effects_alone import EFFECTS, Effect, answer
 from tests.studies.tracked_errors import CLEAN, SIZE
 from tests.worlds.crossed_fringes import CrossedWorld
 
-BY_NAME = {effect.says: effect for effect in EFFECTS}
+BY_NAME = {effect.description: effect for effect in EFFECTS}
 
 
 def assert_held(effect: Effect, doubt: str) -> None:

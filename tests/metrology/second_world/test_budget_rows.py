@@ -21,7 +21,7 @@ QUICK = (
     "glass_mm 1",
     "air_k_per_m 0.5",
 )
-BY_NAME = {plant.says: plant for plant in PLANTS}
+BY_NAME = {plant.description: plant for plant in PLANTS}
 
 
 @pytest.mark.parametrize("name", QUICK)
