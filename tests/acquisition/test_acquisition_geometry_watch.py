@@ -50,13 +50,15 @@ def in_force(calibration: CalibrationTable | None = CALIBRATION) -> RunGeometry:
 
 def test_a_residual_that_has_grown_is_reported_once_and_its_end_too() -> None:
     drift = GeometryWatch(in_force(), 4)
-    told = []
+    events = []
     for residual_urad in (2.9, 4.5, 2.9):
         cycle = replace(CYCLE, slope_residual_urad=residual_urad)
-        told += [event for _ in range(CYCLES) if (event := drift.check_estimate(cycle)) is not None]
-    assert [event.kind for event in told] == ["maintenance", "maintenance_over"]
-    assert {event.name for event in told} == {"calibrate"}
-    assert told[0].message.startswith("calibrate again: the fit leaves 4.50 µrad")
+        events += [
+            event for _ in range(CYCLES) if (event := drift.check_estimate(cycle)) is not None
+        ]
+    assert [event.kind for event in events] == ["maintenance", "maintenance_over"]
+    assert {event.name for event in events} == {"calibrate"}
+    assert events[0].message.startswith("calibrate again: the fit leaves 4.50 µrad")
 
 
 def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:

@@ -65,13 +65,13 @@ async def _held(kind: str, folder: Path) -> tuple[dict[str, Any], list[float]]:
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
     )
-    said, errors = await hold.communicate()
+    output, errors = await hold.communicate()
     bench.terminate()
     await bench.wait()
     assert hold.returncode == 0, errors.decode()[-2000:]
     rows = [line.split() for line in (folder / kind / "truth.txt").read_text().splitlines()]
     last_s = float(rows[-1][0])
-    return json.loads(said), [float(um) for s, um in rows if _SETTLE_S < float(s) < last_s - 15]
+    return json.loads(output), [float(um) for s, um in rows if _SETTLE_S < float(s) < last_s - 15]
 
 
 @pytest.mark.timeout(3600)

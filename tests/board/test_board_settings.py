@@ -15,7 +15,7 @@ _GOOD: dict[str, Any] = {"pressure_limit_pa": 800.0, "pump_limit_fraction": 0.5}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"unit_id": 0}, "unit_id is 0, expected a whole number within 1..247"),
         ({"unit_id": True}, "unit_id is True"),
@@ -66,10 +66,10 @@ _GOOD: dict[str, Any] = {"pressure_limit_pa": 800.0, "pump_limit_fraction": 0.5}
         ),
     ],
 )
-def test_a_wrong_table_is_refused_with_its_key(change: dict[str, Any], said: str) -> None:
+def test_a_wrong_table_is_refused_with_its_key(change: dict[str, Any], message: str) -> None:
     with pytest.raises(board_settings.BoardSettingsError) as found:
         board_settings.make_record({**_GOOD, **change})
-    assert str(found.value).startswith(said)
+    assert str(found.value).startswith(message)
 
 
 def test_the_command_writes_a_record_or_prints_one_line(

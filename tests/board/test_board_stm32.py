@@ -120,8 +120,8 @@ async def stm32(folder: Path) -> AsyncIterator[Stm32]:
     )
     try:
         assert process.stdout is not None
-        said = (await asyncio.wait_for(process.stdout.readline(), START_S)).decode()
-        line = next(word for word in said.split() if word.startswith("/dev/"))
+        output = (await asyncio.wait_for(process.stdout.readline(), START_S)).decode()
+        line = next(word for word in output.split() if word.startswith("/dev/"))
         kept = os.open(
             line, os.O_RDWR | os.O_NOCTTY
         )  # QEMU takes a second to notice a new client, and loses answers

@@ -99,9 +99,9 @@ def test_aborted_gone_on_with_and_adopted(logs: Path) -> None:
     wait_for(lambda: any(event["kind"] == "capture" for event in told(logs)))
     wait_for(lambda: any((logs / "calibration").glob("*/sets/set-1")))
     first.send_signal(signal.SIGINT)
-    said = first.communicate(timeout=PATIENCE_S)[1]
-    assert first.returncode == 130, said
-    assert "stopped with 2 sets missing" in said
+    output = first.communicate(timeout=PATIENCE_S)[1]
+    assert first.returncode == 130, output
+    assert "stopped with 2 sets missing" in output
 
     (session,) = (logs / "calibration").iterdir()
     done = subprocess.run(

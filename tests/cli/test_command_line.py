@@ -83,7 +83,7 @@ def test_a_group_without_a_command_prints_its_help(
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["holdd"], "Did you mean 'hold'?"),
         (["ctl", "statsu"], "Did you mean 'status'?"),
@@ -92,10 +92,10 @@ def test_a_group_without_a_command_prints_its_help(
     ids=str,
 )
 def test_a_misspelt_command_gets_a_suggestion(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(words) == Exit.BAD_INPUT
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_package_that_cannot_be_imported_takes_away_its_own_command_only(

@@ -123,9 +123,9 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
     assert not config.loop.feedforward_barometer
     assert not config.loop.feedforward_temperature
     assert config.pump.start_fraction == 0.0
-    told = capsys.readouterr().err
-    assert "did you mean optoncdt1420?" in told
-    assert "pump: link" in told
+    output = capsys.readouterr().err
+    assert "did you mean optoncdt1420?" in output
+    assert "pump: link" in output
     assert "# Modbus address of the device." in path.read_text()
 
 
@@ -195,10 +195,10 @@ def test_a_pump_and_a_gauge_on_one_register_write_nothing(
     pump = ["modbus_map", "tcp://10.0.0.1", "7", "[0, 20000]", "[0.0, 1.0]"]
     gauge = ["modbus_map", "tcp://10.0.0.1:502", "7", "[0, 20000]", "[0.0, 1000.0]"]
     assert answered(monkeypatch, path, "", *laser, *pump, *gauge, "", "", "", "", "") == 2
-    told = capsys.readouterr().err
+    output = capsys.readouterr().err
     assert (
         "devices.pump.address and devices.gauge_pressure.address name the same holding register 7"
-        in told
+        in output
     )
     assert not path.exists()
 

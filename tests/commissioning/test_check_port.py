@@ -74,9 +74,9 @@ def test_a_bridge_without_its_library_is_named_and_the_hold_is_possible(
     monkeypatch.setattr("importlib.util.find_spec", missing("aiomqtt", "asyncua"))
     config = Config(bridges=BridgesConfig(mqtt=MqttConfig(host="broker"), opcua=OpcuaConfig()))
     assert check_config(config, "lab.toml", as_json=False) == Exit.DONE
-    said = " ".join(capsys.readouterr().out.split())
-    assert "lab.toml: [bridges.mqtt] needs aiomqtt: pip install 'membrane-ctrl[mqtt]'" in said
-    assert "lab.toml: [bridges.opcua] needs asyncua: pip install 'membrane-ctrl[opcua]'" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "lab.toml: [bridges.mqtt] needs aiomqtt: pip install 'membrane-ctrl[mqtt]'" in output
+    assert "lab.toml: [bridges.opcua] needs asyncua: pip install 'membrane-ctrl[opcua]'" in output
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:

@@ -128,8 +128,8 @@ async def test_the_command_lists_them_and_asks_for_a_test(
 ) -> None:
     rig.air_closed = False
     await asyncio.to_thread(check_config, rig.config, "lab.toml", False)
-    told = " ".join(capsys.readouterr().out.split())
-    assert " ".join(HOW_TO_TEST.split()) in told
+    output = " ".join(capsys.readouterr().out.split())
+    assert " ".join(HOW_TO_TEST.split()) in output
     await asyncio.to_thread(check_config, rig.config, "lab.toml", True)
     report = json.loads(capsys.readouterr().out)
     assert [(one["name"], one["state"], one["safe_level"]) for one in report["interlocks"]] == [

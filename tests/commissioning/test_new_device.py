@@ -158,10 +158,10 @@ def test_devices_and_config_know_an_installed_driver(
     assert driver["paste"] == 'driver = "external"\nname = "acme_gauge"'
     assert "acme_gauge" not in sys.modules  # listed from its metadata
     assert run(["config", "explain", "acme_gauge"]) == 0
-    told = capsys.readouterr().out
-    assert '[devices.gauge_pressure] driver = "external"' in told
-    assert "offset_mbar: -10000 .. 10000; default 0.0" in told
-    assert "Reading without pressure" in told
+    output = capsys.readouterr().out
+    assert '[devices.gauge_pressure] driver = "external"' in output
+    assert "offset_mbar: -10000 .. 10000; default 0.0" in output
+    assert "Reading without pressure" in output
 
 
 def configured(**keys: object) -> Config:
@@ -306,7 +306,7 @@ async def test_a_driver_that_fails_to_close_leaves_the_others_closed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["Acme"], "not a name"),
         (["acme-gauge"], "not a name"),
@@ -321,11 +321,11 @@ async def test_a_driver_that_fails_to_close_leaves_the_others_closed() -> None:
     ids=str,
 )
 def test_a_bad_name_or_role_is_one_line(
-    words: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["devices", "new", *words, "--to", str(tmp_path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert told in line
+    assert message in line
     assert list(tmp_path.iterdir()) == []
 
 

@@ -75,11 +75,11 @@ def test_devices_and_config_know_an_installed_camera_and_screen(
     assert listed["screen driver"]["paste"] == 'driver = "external"\nname = "studio_wall"'
     assert "studio_optics" not in sys.modules  # listed from its metadata
     assert run(["config", "explain", "studio_cam"]) == 0
-    told = capsys.readouterr().out
-    assert '[devices.camera] driver = "external"' in told
-    assert "exposure_ms: above 0 .. 1000 ms; default 10.0" in told
+    output = capsys.readouterr().out
+    assert '[devices.camera] driver = "external"' in output
+    assert "exposure_ms: above 0 .. 1000 ms; default 10.0" in output
     assert run(["config", "explain", "studio_wall"]) == 0
-    told = capsys.readouterr().out
-    assert '[devices.screen] driver = "external"' in told
-    assert "Pitch of its pixels." in told  # a key of every screen
-    assert "Full light." in told
+    output = capsys.readouterr().out
+    assert '[devices.screen] driver = "external"' in output
+    assert "Pitch of its pixels." in output  # a key of every screen
+    assert "Full light." in output

@@ -210,7 +210,7 @@ def serve_once(
 
 
 @pytest.mark.parametrize(
-    ("run", "answer", "said", "requests"),
+    ("run", "answer", "message", "requests"),
     [
         ("demo", {"ok": True, "state": "standby"}, "hold: done", 1),
         ("demo", {"ok": False, "refused": "ann has command"}, "hold refused: ann has command", 1),
@@ -218,10 +218,10 @@ def serve_once(
     ],
 )
 def test_a_request_goes_to_the_port_of_the_own_run_only(
-    tmp_path: Path, run: str, answer: dict[str, object], said: str, requests: int
+    tmp_path: Path, run: str, answer: dict[str, object], message: str, requests: int
 ) -> None:
     thread, taken = serve_once(tmp_path / "sock", run, answer)
-    assert said in send_request(tmp_path / "sock", "demo", {"do": "hold"})
+    assert message in send_request(tmp_path / "sock", "demo", {"do": "hold"})
     thread.join()
     assert taken == [{"do": "hold", "why": "key", "number": 1}] * requests
 

@@ -187,9 +187,9 @@ def test_a_console_that_replaces_another_does_not_repeat_old_events(
     with ours, theirs, redirect_stderr(sys.stdout):
         console_main(spec, theirs)
         assert ours.recv()["kind"] == "alive"
-    told = capsys.readouterr().out
-    assert "Run ended: done" in told
-    assert "Fault link_lost" not in told
+    output = capsys.readouterr().out
+    assert "Run ended: done" in output
+    assert "Fault link_lost" not in output
 
 
 def test_the_terminal_of_a_killed_console_is_given_back(

@@ -31,16 +31,16 @@ def test_settle_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("target_um", "flow_um_per_s", "said"),
+    ("target_um", "flow_um_per_s", "message"),
     [
         (25.0, 5.3, "pump gives 5.30 µm/s: filling, 24.9 µm to go"),
         (-25.0, 0.0, "pump is at 0: waiting for the leak, 25.1 µm to go"),
     ],
 )
 def test_inflate_states_the_remaining_distance(
-    target_um: float, flow_um_per_s: float, said: str
+    target_um: float, flow_um_per_s: float, message: str
 ) -> None:
-    assert line(state=State.INFLATE, target_um=target_um, flow_um_per_s=flow_um_per_s) == said
+    assert line(state=State.INFLATE, target_um=target_um, flow_um_per_s=flow_um_per_s) == message
 
 
 def test_outside_the_band_the_direction_and_the_response_are_named() -> None:

@@ -85,8 +85,8 @@ async def test_a_session_that_hangs_up_or_releases_gives_up_command(tmp_path: Pa
                     await asyncio.sleep(0.02)
             assert (await call(second.status))["status"]["commander"] is None
             first.close()
-        said = [(event["who"], event["why"]) for event in run.of_kind("commander")]
-        assert (None, "its connection is closed") in said
+        events = [(event["who"], event["why"]) for event in run.of_kind("commander")]
+        assert (None, "its connection is closed") in events
         second.close()
 
 

@@ -69,9 +69,9 @@ def test_a_session_command_prints_one_line(
     with evil.peer(tmp_path / "control.sock", evil.answering(evil.ANSWERS["status_list"])) as path:
         for words in (["tune", "run", "--yes"], ["calibrate", "--live"]):
             assert run([*words, "--socket", str(path), "--logs", str(tmp_path)]) == 4
-            (said,) = [
+            (lines,) = [
                 line
                 for line in capsys.readouterr().err.splitlines()
                 if line.startswith("membrane-ctrl:")
             ]
-            assert "not an answer of a hold (status" in said
+            assert "not an answer of a hold (status" in lines

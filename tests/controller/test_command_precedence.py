@@ -204,14 +204,14 @@ def test_a_lowering_command_overrules_a_lifting_one_in_either_order(state: State
         for batch in orders(down, lifting):  # type: ignore[arg-type]  # literals of the table
             mirror = in_state(state)
             outputs = mirror.tick(*batch)
-            told = {
+            events = {
                 event.command: bool(event.refused)
                 for event in outputs.events
                 if isinstance(event, CommandTaken)
             }
-            answers.append(told)
-            assert told[lifting] or told[down], batch
-            if not told[down]:
+            answers.append(events)
+            assert events[lifting] or events[down], batch
+            if not events[down]:
                 assert mirror.controller.state not in MOVING | {State.CHECK}
         assert answers[0] == answers[1]
 

@@ -113,14 +113,14 @@ def test_the_operator_line_names_the_sender_of_the_command_only() -> None:
         1000: Command("pause", "ann"),
         1001: Command("shape_off", "bob"),
     }
-    said = [
+    events = [
         event.why
         for number in range(1, 1200)
         if (tick := run.run_tick((asked[number],) if number in asked else ())) is not None
         for event in tick.events
         if isinstance(event, Why)
     ]
-    assert said[-1].startswith("paused by ann")
+    assert events[-1].startswith("paused by ann")
 
 
 def test_one_or_two_repeated_samples_are_no_fault() -> None:

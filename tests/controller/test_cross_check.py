@@ -422,11 +422,11 @@ async def test_a_limit_beyond_that_of_the_board_is_refused_after_reading_the_boa
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
         )
-        _, said = await process.communicate()
+        _, output = await process.communicate()
     finally:
         await board.stop()
     assert process.returncode == 2
-    (line,) = (line for line in said.decode().splitlines() if line.startswith("membrane-ctrl: "))
+    (line,) = (line for line in output.decode().splitlines() if line.startswith("membrane-ctrl: "))
     assert "limits.gauge_pressure_max_pa = 801: the board itself vents at 800 Pa" in line
     assert os.listdir(tmp_path) == ["lab.toml"]  # noqa: PTH208
     assert max(plant.outputs) == 0.0

@@ -195,8 +195,8 @@ def test_a_start_passes_the_resumes_of_the_day_to_the_controller(bench: Bench) -
     for hours in (30.0, 2.0, 1.0):
         ResumeLog(bench.folder).add_resume(datetime.now(UTC) - timedelta(hours=hours))
     bench.hold(lambda bench: None)
-    told = [event["value"] for event in bench.events if event.get("command") == "resumed"]
-    assert told == [pytest.approx(7200.0, abs=60.0), pytest.approx(3600.0, abs=60.0)]
+    events = [event["value"] for event in bench.events if event.get("command") == "resumed"]
+    assert events == [pytest.approx(7200.0, abs=60.0), pytest.approx(3600.0, abs=60.0)]
 
 
 def test_a_software_watchdog_that_ended_is_a_fault(bench: Bench) -> None:
@@ -254,12 +254,12 @@ def test_the_last_command_of_every_run_is_pump_off_with_the_vent_unchanged() -> 
 
 def test_a_thread_that_raises_is_reported(tmp_path: Path) -> None:
     """Nobody sees what a thread raises: any error is reported as a disk error is."""
-    told: list[EventLine] = []
+    events: list[EventLine] = []
     with FaultLatch(
-        LatchedFile(tmp_path), None, "run", LoopClock().utc, told.append
+        LatchedFile(tmp_path), None, "run", LoopClock().utc, events.append
     ) as fault_latch:
         fault_latch._disk.submit(fault_latch._try_write, raises)
-    assert told[0] == LatchFailed("broken")
+    assert events[0] == LatchFailed("broken")
 
 
 def test_missed_deadlines_are_skipped_and_lateness_is_reported_in_milliseconds() -> None:

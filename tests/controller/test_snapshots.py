@@ -383,10 +383,10 @@ def test_unreadable_inputs_are_reported(
 ) -> None:
     (record / "inputs" / "inputs-0000.parquet").write_bytes(left)
     assert run(["replay", str(record)]) == Exit.BAD_INPUT
-    said = capsys.readouterr().err
-    assert "no tick to replay" in said
-    assert "inputs-0000.parquet" in said
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert "no tick to replay" in output
+    assert "inputs-0000.parquet" in output
+    assert output.count("\n") == 1
 
 
 def test_the_state_at_the_end_of_a_part_is_printed(

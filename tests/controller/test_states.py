@@ -237,7 +237,9 @@ def test_stopping_with_a_running_pump_is_not_a_success() -> None:
 
 @pytest.mark.parametrize("lower_s", [0.0, 20.0])
 @pytest.mark.parametrize("readback", [1.0, 0.0])
-def test_a_pump_that_starts_by_itself_is_a_fault_in_standby(lower_s: float, readback: float) -> None:
+def test_a_pump_that_starts_by_itself_is_a_fault_in_standby(
+    lower_s: float, readback: float
+) -> None:
     """Whether its read-back shows it, or only the rising mirror."""
     outcome = played(
         {"time_s": lower_s, "command": "lower"},

@@ -53,14 +53,14 @@ def reasons(bench: Config, *asked: str, seconds: float = 5.0) -> tuple[list[str]
     tick = run.run_tick((Command("hold", "ann"),))
     while tick is not None and tick.row.state != State.HOLD:
         tick = run.run_tick()
-    said: list[str] = []
+    messages: list[str] = []
     commands = tuple(Command(kind, "ann") for kind in asked)  # type: ignore[arg-type]
     excess_pa[0] = 0.0 if asked else 400.0
     for number in range(round(seconds * 20)):
         tick = run.run_tick(commands if number == 0 else ())
         assert tick is not None
-        said += [event.why for event in tick.events if isinstance(event, Why)]
-    return said, SafeLevel(int(tick.row.safe_level))
+        messages += [event.why for event in tick.events if isinstance(event, Why)]
+    return messages, SafeLevel(int(tick.row.safe_level))
 
 
 def test_a_fault_of_the_level_vent_states_what_is_fitted() -> None:

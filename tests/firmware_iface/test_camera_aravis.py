@@ -271,11 +271,11 @@ def test_aravis_own_tool_gets_frames(emulator: GigeCameraEmulator) -> None:
         f"-n 127.0.0.1 -w {WIDTH_PX} -h {HEIGHT_PX} -i 8000 -e 2000 -o 20 -a --no-packet-socket "
         "--duration=2"
     )
-    said = subprocess.run(
+    output = subprocess.run(
         [tool, *options.split()], capture_output=True, text=True, timeout=120, check=True
     ).stdout
-    assert "EMU1" in said
-    completed = int(re.search(r"n_completed_buffers\s*=\s*(\d+)", said)[1])  # type: ignore[index]
+    assert "EMU1" in output
+    completed = int(re.search(r"n_completed_buffers\s*=\s*(\d+)", output)[1])  # type: ignore[index]
     assert 1 <= completed <= emulator.exposures
 
 

@@ -388,8 +388,8 @@ def test_no_control_byte_of_a_run_is_printed(folder: Path, capsys: Said) -> None
         ("report", str(folder), "--json"),
     ):
         run(list(words))
-        said = "".join(capsys.readouterr())
-        assert said.replace("\n", "").replace("\t", "").isprintable(), words
+        output = "".join(capsys.readouterr())
+        assert output.replace("\n", "").replace("\t", "").isprintable(), words
 
 
 def test_a_report_shows_words_and_runs_none(folder: Path) -> None:

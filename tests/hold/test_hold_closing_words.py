@@ -157,19 +157,19 @@ def test_exit_code_words_summary_and_catalogue_agree(
     )
     logs = tmp_path / "logs"
     assert cli.run(["twin", "play", str(scene), "--logs", str(logs)]) == code
-    said = capsys.readouterr().err.splitlines()
+    lines = capsys.readouterr().err.splitlines()
     (entry,) = catalogue.list_entries(logs)
     summary = json.loads((entry.folder / "summary.json").read_text())
     assert summary["exit"] == entry.exit == Exit(code).name.lower()
     assert summary["end"]["exit_code"] == code
     assert entry.ended_in == name
     assert (summary["ended_in"] or {"name": ""})["name"] == name
-    fault_line = said[2]
+    fault_line = lines[2]
     assert fault_line.startswith("FAULT ") == bool(name)
     assert name in fault_line
     if name:
-        assert said[3].strip().startswith("seen:")
-        assert said[4].strip().startswith("to do:")
+        assert lines[3].strip().startswith("seen:")
+        assert lines[4].strip().startswith("to do:")
     assert cli.run(["runs", "--logs", str(logs)]) == 0
     assert name in capsys.readouterr().out
 

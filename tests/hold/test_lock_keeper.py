@@ -101,9 +101,9 @@ def full(*_: Any) -> None:
 def test_on_a_full_disk_the_outcome_states_it_and_the_lock_is_stored_once_there_is_space(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[Event] = []
+    events: list[Event] = []
     monkeypatch.setattr(lock_keeper, "_RETRY_S", 0.0)
-    with keeper(tmp_path, told) as kept:
+    with keeper(tmp_path, events) as kept:
         with monkeypatch.context() as patch:
             patch.setattr(os, "fsync", full)
             kept.handle_tick(outputs(SET))
@@ -111,7 +111,7 @@ def test_on_a_full_disk_the_outcome_states_it_and_the_lock_is_stored_once_there_
             kept.handle_tick(outputs())
             assert words(tmp_path) == []
         until(lambda: kept.handle_tick(outputs()), lambda: words(tmp_path) == ["bofak"])
-    assert [type(event) for event in told] == [LockNotStored, LockStored]
+    assert [type(event) for event in events] == [LockNotStored, LockStored]
 
 
 def until(act: Callable[[], object], what: Callable[[], bool]) -> None:

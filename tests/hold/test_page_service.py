@@ -56,9 +56,9 @@ def test_without_the_library_of_the_page_one_line_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    said: list[str] = []
-    assert start_page_service(tmp_path, None, said.append, ends_with_us=False) is None
-    assert said == ["no page: it needs nicegui: pip install 'membrane-ctrl[web]'"]
+    messages: list[str] = []
+    assert start_page_service(tmp_path, None, messages.append, ends_with_us=False) is None
+    assert messages == ["no page: it needs nicegui: pip install 'membrane-ctrl[web]'"]
 
 
 def write_interpreter(path: Path, program: str) -> str:

@@ -47,10 +47,10 @@ def test_a_played_scenario_is_a_run_for_every_reader(
     Path("old-run").mkdir()
     Path("dropout.toml").write_text(DROPOUT)
     assert cli.run(["twin", "play", "dropout.toml"]) == Exit.DONE
-    told = capsys.readouterr().err.splitlines()
-    assert told[0] == "loading the simulated bench"
-    assert "A laser that is gone for a second" in told[1]
-    assert told[-1] == "open it:    membrane-ctrl review last"
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "loading the simulated bench"
+    assert "A laser that is gone for a second" in lines[1]
+    assert lines[-1] == "open it:    membrane-ctrl review last"
     (folder,) = (path for path in Path("logs").iterdir() if path.is_dir())
     assert folder.name.endswith("-dropout")
     run = open_run(folder)

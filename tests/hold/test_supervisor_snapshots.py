@@ -126,12 +126,12 @@ async def test_an_unreadable_shape_is_reported_once_and_the_hold_continues() -> 
             Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0
         )
         assert await supervisor.run(0.2) == Exit.DONE
-        told = [
+        reported = [
             event
             for event in map(json.loads, events.drain())
             if event["kind"] == "shape_unreadable"
         ]
     assert supervisor.ticks > 3
-    assert [event["message"] for event in told] == [
+    assert [event["message"] for event in reported] == [
         "shape estimate: missing or unknown fields in the first line"
     ]

@@ -33,7 +33,7 @@ def test_a_fault_states_its_cause_place_and_remedy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ({"kind": "end", "exit": "done"}, "Run ended: done"),
         ({"kind": "why", "why": "inside +-2 µm"}, "Inside ±2 µm"),
@@ -71,8 +71,8 @@ def test_a_fault_states_its_cause_place_and_remedy() -> None:
         ({}, "?"),
     ],
 )
-def test_an_event_is_a_sentence(line: EventLine, said: str) -> None:
-    assert from_dict(line).sentence == said
+def test_an_event_is_a_sentence(line: EventLine, message: str) -> None:
+    assert from_dict(line).sentence == message
 
 
 @pytest.mark.parametrize("cls", KINDS.values(), ids=KINDS)

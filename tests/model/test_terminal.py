@@ -122,10 +122,10 @@ def test_the_output_of_a_live_screen_is_filtered_too() -> None:
 def test_an_error_is_one_line_without_control_bytes(capsys: pytest.CaptureFixture[str]) -> None:
     name = "no\x1b[31msuch\nrun\u202e"
     assert run(["report", name]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert said.removesuffix("\n").isprintable()
-    assert "no\\u001b[31msuch run" in said
+    output = capsys.readouterr().err
+    assert output.count("\n") == 1
+    assert output.removesuffix("\n").isprintable()
+    assert "no\\u001b[31msuch run" in output
 
 
 def test_the_help_text_is_unchanged(capsys: pytest.CaptureFixture[str]) -> None:

@@ -84,13 +84,13 @@ def test_a_dead_child_is_replaced_at_once_and_reported() -> None:
 
 def test_replacements_are_delayed_increasingly_and_limited_to_ten_an_hour() -> None:
     managed, _ = make_managed()
-    said: list[str] = []
+    messages: list[str] = []
     restarted_s = []
     for half_second in range(2 * 3600):
         if managed.child.alive:
             managed.child.kill()
         events = kinds(managed.check_child(0.5 * half_second))
-        said += events
+        messages += events
         if "child_restarted" in events:
             restarted_s.append(0.5 * half_second)
     waits = [later - before for before, later in pairwise(restarted_s)]
@@ -98,8 +98,8 @@ def test_replacements_are_delayed_increasingly_and_limited_to_ten_an_hour() -> N
     assert waits == sorted(waits)
     assert waits[0] <= 2.0
     assert waits[-1] >= 60.0
-    assert said.count("child_given_up") == 1
-    assert said.count("child_ended") == 11
+    assert messages.count("child_given_up") == 1
+    assert messages.count("child_ended") == 11
 
 
 def test_after_an_hour_it_is_tried_again() -> None:
@@ -124,12 +124,12 @@ def test_a_child_that_stops_its_heartbeat_is_killed_and_replaced() -> None:
     assert managed.check_child(17.0) == []
 
 
-@pytest.mark.parametrize(("moment_s", "said"), [(59.0, []), (61.0, ["child_silent"])])
+@pytest.mark.parametrize(("moment_s", "messages"), [(59.0, []), (61.0, ["child_silent"])])
 def test_a_child_that_never_sends_a_heartbeat_is_not_waited_for(
-    moment_s: float, said: list[str]
+    moment_s: float, messages: list[str]
 ) -> None:
     managed, _ = make_managed()
-    assert kinds(managed.check_child(moment_s)) == said
+    assert kinds(managed.check_child(moment_s)) == messages
 
 
 def test_a_child_beyond_its_replacements_is_not_killed_and_may_recover() -> None:

@@ -162,10 +162,10 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
         "rejected",
         "ok",
     ]
-    said = [
+    events = [
         text.split()[1].rstrip(":") for _, text in strings(path, "/events", "TextLog:text")
     ]  # after the time
-    assert said == ["state", "fault", "Run"]
+    assert events == ["state", "fault", "Run"]
     found = summary_of(feed.spec.run_dir)
     assert (found["ticks"], found["cycles"], found["cycles_rejected"], found["exit"]) == (
         1000,

@@ -79,9 +79,9 @@ def test_other_last_bits_are_no_difference_and_are_reported(
     assert 100 < int(str(report["near"])) <= len(TICKS)
     assert report["state_differences"] is None
     assert run(["replay", str(record)]) == Exit.DONE
-    said = capsys.readouterr().out
-    assert "another processor, or with other libraries" in said
-    assert "have other last bits" in said
+    output = capsys.readouterr().out
+    assert "another processor, or with other libraries" in output
+    assert "have other last bits" in output
 
 
 @pytest.mark.usefixtures("elsewhere")

@@ -110,9 +110,9 @@ def test_a_difference_is_found_at_its_first_tick(
 ) -> None:
     monkeypatch.setattr(replay_module, "Controller", changed_from(700))
     assert run(["replay", str(record)]) == Exit.REJECTED
-    said = capsys.readouterr().out
-    assert f"different  {len(TICKS) - 699} ticks, the first is tick 700 at 14.000 s" in said
-    assert "pump_fraction: recorded" in said
+    output = capsys.readouterr().out
+    assert f"different  {len(TICKS) - 699} ticks, the first is tick 700 at 14.000 s" in output
+    assert "pump_fraction: recorded" in output
 
 
 def test_a_changed_gain_shows_as_another_pump_but_the_same_states(record: Path) -> None:
@@ -267,9 +267,9 @@ def test_what_is_no_run_is_one_line(
 ) -> None:
     (record / missing).rename(record.parent / "elsewhere")
     assert run(["replay", str(record)]) == Exit.BAD_INPUT
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert missing in said
+    output = capsys.readouterr().err
+    assert output.count("\n") == 1
+    assert missing in output
 
 
 def test_a_damaged_row_group_of_the_inputs_is_a_gap(
@@ -318,9 +318,9 @@ def test_a_difference_is_shown_with_what_was_recorded(
     assert report["first_different"] == {"tick": 720, "time_s": TICKS[719][0].now_s}
     assert report["fields"] == ({"pump_fraction": [then, now]} if shown else {})
     assert run(["replay", str(record)]) == Exit.REJECTED
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert (
-        f"pump_fraction: recorded {then!r}, today {now!r}" in said
+        f"pump_fraction: recorded {then!r}, today {now!r}" in output
         if shown
-        else "smaller difference" in said
+        else "smaller difference" in output
     )

@@ -23,7 +23,7 @@ def at(decision: Decision, time_s: float) -> Decision:
 
 
 @pytest.mark.parametrize(
-    ("recorded", "today", "said"),
+    ("recorded", "today", "messages"),
     [
         ([CHECK, HOLD], [CHECK, HOLD], []),
         ([CHECK, HOLD], [CHECK, at(HOLD, 6.0)], []),
@@ -42,9 +42,9 @@ def at(decision: Decision, time_s: float) -> Decision:
     ],
 )
 def test_decisions_are_the_same_ones_within_the_slack_until_one_is_another(
-    recorded: list[Decision], today: list[Decision], said: list[str]
+    recorded: list[Decision], today: list[Decision], messages: list[str]
 ) -> None:
-    assert find_unmatched(recorded, today, 1.0) == said
+    assert find_unmatched(recorded, today, 1.0) == messages
 
 
 def test_each_wrong_time_is_reported() -> None:

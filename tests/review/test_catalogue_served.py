@@ -123,7 +123,7 @@ def test_other_programs_read_the_catalogue_on_this_machine_until_it_is_ended(
 
 
 @pytest.mark.parametrize(
-    ("asked", "said"),
+    ("asked", "message"),
     [
         (["--all", "last"], "or give --all"),
         ([], "or give --all"),
@@ -137,8 +137,8 @@ def test_requests_that_contradict_each_other_are_refused(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     asked: list[str],
-    said: str,
+    message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert command(["review", *asked]) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err

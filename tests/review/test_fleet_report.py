@@ -207,5 +207,5 @@ def test_a_fleet_of_nothing_is_a_line_for_each(
     assert (
         command(["report", "--fleet", str(lab / "empty"), str(lab / "missing")]) == Exit.BAD_INPUT
     )
-    said = capsys.readouterr().err.splitlines()
-    assert [line.split(":")[1].strip().rsplit("/")[-1] for line in said] == ["empty", "missing"]
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[1].strip().rsplit("/")[-1] for line in lines] == ["empty", "missing"]

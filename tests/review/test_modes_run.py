@@ -64,9 +64,9 @@ def test_a_mode_that_moves_within_a_week_is_reported(
     assert (
         modes_run.modes_command(tuple(runs), tmp_path / "out", as_json=False, pictures=False) == 0
     )
-    said = capsys.readouterr().out
-    assert "it moved by -1.5%: the film's tension by -3.0%" in said
-    assert said.count("mode  ") == 1
+    output = capsys.readouterr().out
+    assert "it moved by -1.5%: the film's tension by -3.0%" in output
+    assert output.count("mode  ") == 1
 
 
 def test_a_run_without_vibrations_is_reported_as_such(

@@ -52,7 +52,7 @@ def test_faults_and_missed_ticks_of_a_part_are_its_own(folder: Path) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
-    ("part", "whole", "said"),
+    ("part", "whole", "message"),
     [
         (["--from", "+100s", "--to", "+180s"], False, ", same part: Held for 1 min 15 s"),
         (["--from", "18:02", "--to", "18:04"], True, ", all of it: Held for 5 min 55 s"),
@@ -64,7 +64,7 @@ def test_a_part_is_compared_with_the_same_part_or_marked_as_not_compared(
     tmp_path: Path,
     part: list[str],
     whole: bool,
-    said: str,
+    message: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     other = written(tmp_path, HOURS, seed=8, name="20261122T180000Z-other")
@@ -74,7 +74,7 @@ def test_a_part_is_compared_with_the_same_part_or_marked_as_not_compared(
         )
         == 0
     )
-    assert said in capsys.readouterr().out
+    assert message in capsys.readouterr().out
     table = json.loads((tmp_path / "o" / "report.json").read_text())["compared_with"]
     assert table["whole_run"] is whole
     page = (tmp_path / "o" / "report.html").read_text()

@@ -380,7 +380,7 @@ def test_a_window_limits_the_ticks_and_runs_lie_over_each_other(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("asked", "said"),
+    ("asked", "message"),
     [
         ("--at +9h", "not in the run"),
         ("--at 25:00", "write 03:12"),
@@ -397,13 +397,13 @@ def test_a_window_limits_the_ticks_and_runs_lie_over_each_other(tmp_path: Path) 
     ],
 )
 def test_what_is_missing_is_named(
-    logs: Path, tmp_path: Path, capsys: Capsys, asked: str, said: str
+    logs: Path, tmp_path: Path, capsys: Capsys, asked: str, message: str
 ) -> None:
     folder, target = logs / "20261121T180000Z-night", tmp_path / "r.rrd"
     assert (
         command(["review", str(folder), *asked.split(" ", maxsplit=3), "--save", str(target)]) == 2
     )
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not target.exists()
 
 
@@ -427,9 +427,9 @@ def test_nothing_to_show_is_explained_and_beside_another_run_only_noted(
     broken.mkdir()
     (broken / "events.jsonl").write_text('{"kind": "start", "mono_s": 0.0}\n{"kin')
     assert command(["review", str(broken), "--save", str(target)]) == 2
-    said = capsys.readouterr().err
-    assert "1 line unreadable" in said
-    assert said.splitlines()[-1].endswith("no readable telemetry")
+    output = capsys.readouterr().err
+    assert "1 line unreadable" in output
+    assert output.splitlines()[-1].endswith("no readable telemetry")
     assert command(["review", str(broken), str(whole), "--save", str(target)]) == 0
     assert "broken: not shown" in capsys.readouterr().err
     assert entities(target)["/overview/loop/error"] > 0

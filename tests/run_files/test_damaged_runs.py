@@ -105,8 +105,8 @@ def test_any_file_may_be_damaged(
     HARM[harm](folder / file)
     before = _content(folder)
     assert cli(["runs", "show", str(folder)]) == 0
-    said = capsys.readouterr().out
-    assert Path(file).name in said
+    output = capsys.readouterr().out
+    assert Path(file).name in output
     run = open_run(folder)
     assert run.ticks(["error_um"]).num_rows == 3600 * (not file.startswith("ticks/ticks"))
     assert run.level(60.0)["time_s"].size > 0

@@ -122,20 +122,20 @@ def make(folder: Path, told: list[Event]) -> FaultLatch:
 
 
 def test_a_trip_is_latched_and_an_acknowledgement_clears_it(tmp_path: Path) -> None:
-    told: list[Event] = []
-    with make(tmp_path, told) as fault_latch:
+    events: list[Event] = []
+    with make(tmp_path, events) as fault_latch:
         fault_latch.handle_tick(outputs(*TRIP))
     found = LatchedFile(tmp_path).read()
     assert found == LatchedFault(
         "late", "ticks start too late", "150 ms", "less work", "2026-01-01T00:00:00+00:00", "run-7"
     )
-    with make(tmp_path, told) as fault_latch:
+    with make(tmp_path, events) as fault_latch:
         fault_latch.handle_tick(outputs(replace(ACK, refused="not now")))
     assert LatchedFile(tmp_path).read() is not None
-    with make(tmp_path, told) as fault_latch:
+    with make(tmp_path, events) as fault_latch:
         fault_latch.handle_tick(outputs(ACK))
     assert LatchedFile(tmp_path).read() is None
-    assert not told
+    assert not events
 
 
 def test_a_lock_is_no_latched_fault(tmp_path: Path) -> None:
@@ -158,22 +158,22 @@ def test_a_forgiven_fault_is_not_latched(tmp_path: Path) -> None:
 
 
 def test_a_failing_disk_is_reported(tmp_path: Path) -> None:
-    told: list[Event] = []
-    with make(tmp_path / "nowhere", told) as fault_latch:
+    events: list[Event] = []
+    with make(tmp_path / "nowhere", events) as fault_latch:
         fault_latch.handle_tick(outputs(*TRIP))
-    assert [type(event) for event in told] == [LatchFailed]
+    assert [type(event) for event in events] == [LatchFailed]
 
 
 def test_a_disk_that_works_again_is_reported_once(tmp_path: Path) -> None:
-    told: list[Event] = []
-    with make(tmp_path / "later", told) as fault_latch:
+    events: list[Event] = []
+    with make(tmp_path / "later", events) as fault_latch:
         fault_latch.handle_tick(outputs(*TRIP))
-        while not told:
+        while not events:
             fault_latch.handle_tick(outputs())
         (tmp_path / "later").mkdir()
         fault_latch.handle_tick(outputs(*TRIP))
         fault_latch.handle_tick(outputs(*TRIP))
-    assert [type(event) for event in told] == [LatchFailed, LatchWritten]
+    assert [type(event) for event in events] == [LatchFailed, LatchWritten]
 
 
 def test_the_twin_latches_nothing(tmp_path: Path) -> None:
@@ -206,12 +206,12 @@ def test_a_link_in_place_of_the_reserve_takes_nothing_of_anybody(tmp_path: Path,
 def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[Event] = []
+    events: list[Event] = []
 
     def full(self: LatchedFile) -> None:
         raise OSError(28, "No space left on device")
 
-    with make(tmp_path, told) as fault_latch:
+    with make(tmp_path, events) as fault_latch:
         (reserve,) = tmp_path.iterdir()
         monkeypatch.setattr(
             LatchedFile, "reserve_space", full
@@ -219,7 +219,7 @@ def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
         fault_latch.handle_tick(outputs(*TRIP))
         fault_latch._disk.submit(lambda: None).result()
         assert not reserve.exists()
-    assert told == []
+    assert events == []
     latched = LatchedFile(tmp_path).read()
     assert latched is not None
     assert latched.name == "late"

@@ -96,8 +96,8 @@ def test_a_run_that_cannot_be_deleted_keeps_no_other(
 
     monkeypatch.setattr("membrane_ctrl.run_files.retention.os.rename", refused)
     assert command(["runs", "prune", "--logs", str(tmp_path), "--keep-gb", "0", "--delete"]) == 4
-    said = capsys.readouterr()
-    assert f"{first}: cannot be deleted" in said.err
-    assert f"deleted {second.name}" in said.out
+    output = capsys.readouterr()
+    assert f"{first}: cannot be deleted" in output.err
+    assert f"deleted {second.name}" in output.out
     assert first.exists()
     assert not second.exists()

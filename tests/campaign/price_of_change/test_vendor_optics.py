@@ -88,9 +88,9 @@ def started(site: Path, *words: object, **pipes: Any) -> subprocess.Popen[str]:
 
 def output(site: Path, *words: object, code: int = 0) -> str:
     process = started(site, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    told, wrong = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == code, told + wrong
-    return told
+    printed, wrong = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == code, printed + wrong
+    return printed
 
 
 def test_no_place_of_ours_knows_them() -> None:
@@ -160,8 +160,8 @@ class Hold:
     def end(self) -> dict[str, Any]:
         """Stop it; returns the summary."""
         self._process.send_signal(signal.SIGINT)
-        told, _ = self._process.communicate(timeout=PATIENCE_S)
-        summary: dict[str, Any] = json.loads(told)
+        printed, _ = self._process.communicate(timeout=PATIENCE_S)
+        summary: dict[str, Any] = json.loads(printed)
         return summary
 
     def kill(self) -> None:

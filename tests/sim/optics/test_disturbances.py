@@ -231,6 +231,6 @@ def test_an_impossible_disturbance_is_refused_in_one_line(
     config = tmp_path / "bench.toml"
     config.write_text(f"[twin.disturbances]\n{line}\n")
     assert run(["simulate", str(tmp_path / "set"), "--config", str(config)]) == Exit.BAD_INPUT
-    (told,) = capsys.readouterr().err.strip().splitlines()
-    assert f"twin.disturbances.{line.split()[0]}" in told
+    (lines,) = capsys.readouterr().err.strip().splitlines()
+    assert f"twin.disturbances.{line.split()[0]}" in lines
     assert not (tmp_path / "set").exists()
