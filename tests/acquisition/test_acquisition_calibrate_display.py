@@ -31,7 +31,7 @@ def power_law(gamma: float) -> np.ndarray:
     return 200.0 * (np.array(RAMP_LEVELS) / 255.0) ** gamma  # counts
 
 
-def test_a_panel_is_measured_and_its_worth_said() -> None:
+def test_a_panel_is_measured_and_its_effect_reported() -> None:
     bench = OpenedBench(PanelResponse(tau_s=0.012), gamma=2.2)
     settling, response = measure_display(
         OpticalBench(bench, bench), bench.clock, WIDTH_PX, HEIGHT_PX

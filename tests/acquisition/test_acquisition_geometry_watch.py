@@ -61,7 +61,7 @@ def test_a_residual_that_has_grown_is_reported_once_and_its_end_too() -> None:
     assert events[0].message.startswith("calibrate again: the fit leaves 4.50 µrad")
 
 
-def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
+def test_a_ring_that_seems_to_tilt_is_reported_and_a_deeper_bowl_is_not() -> None:
     drift = GeometryWatch(in_force(), 4)
     deeper = replace(CYCLE, coeffs_um=CYCLE.coeffs_um + 2000.0 * zernike_projection())
     assert not any(drift.check_estimate(deeper) for _ in range(CYCLES))

@@ -39,7 +39,7 @@ def test_a_condition_must_stand_for_its_time() -> None:
     assert book.step(11.0) == [], "told once"
 
 
-def test_what_goes_before_its_time_is_told_to_nobody() -> None:
+def test_an_alarm_that_clears_before_its_time_is_not_sent() -> None:
     book = AlarmBook(CONFIG)
     for start_s in range(0, 100, 10):
         book.take_sign(BAD, float(start_s))
@@ -62,7 +62,7 @@ def test_it_is_over_when_it_stays_away_and_not_before() -> None:
     assert kinds(book.step(410.0)) == ["raised"], "a new alarm"
 
 
-def test_nobody_acknowledges_more_people_are_told() -> None:
+def test_without_an_acknowledgement_more_people_receive_the_alarm() -> None:
     book = book_with_a_told_alarm()
     assert book.step(909.0) == []
     (notice,) = book.step(910.0)
@@ -162,7 +162,7 @@ def test_a_reminder_names_what_still_stands() -> None:
     assert disk.step(900.0) == [("escalated", NOT_RECORDED)]
 
 
-def test_another_recorder_begins_without_the_formers_trouble_and_tells_its_own() -> None:
+def test_another_recorder_begins_without_the_formers_trouble_and_reports_its_own() -> None:
     disk = Disk()
     disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(0.0)

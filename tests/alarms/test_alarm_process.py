@@ -57,7 +57,7 @@ def told(sender: FakeSender) -> list[tuple[str, str]]:
     return [(notice.name, notice.kind) for notice in sender.through]
 
 
-def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
+def test_a_fault_that_was_held_for_too_long_is_sent_as_latched() -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.process_news(
@@ -73,7 +73,7 @@ def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
     assert sender.through[1].text.startswith("Fault displacement_missing")
 
 
-def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement() -> None:
+def test_the_next_fault_is_sent_however_soon_it_comes_after_an_acknowledgement() -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.process_news([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
@@ -90,7 +90,7 @@ def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement()
     assert sender.through[-1].text.startswith("Fault over_pressure")
 
 
-def test_a_fault_is_told_at_once_and_its_end_too() -> None:
+def test_a_fault_is_sent_at_once_and_its_end_too() -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.process_news([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
@@ -115,7 +115,7 @@ def test_a_value_out_of_its_limits() -> None:
     assert told(sender)[1:] == [("out_of_band", "cleared")]
 
 
-def test_a_loop_that_falls_silent_is_told_and_a_slow_start_is_not() -> None:
+def test_a_loop_that_falls_silent_is_reported_and_a_slow_start_is_not() -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     watcher.process_news([], [], 30.0)
@@ -126,7 +126,7 @@ def test_a_loop_that_falls_silent_is_told_and_a_slow_start_is_not() -> None:
     assert told(sender) == [("silent", "raised")]
 
 
-def test_an_escalation_is_tried_until_it_is_through_and_keeps_nobody_else_waiting() -> None:
+def test_an_escalation_is_tried_until_it_is_sent_and_delays_no_other_message() -> None:
     sender, behind = FakeSender(), FakeSender()
     behind.down = True
     watcher = Watcher(CONFIG, [Outbox(sender), Outbox(behind)], 0.0)
@@ -176,7 +176,7 @@ def spec(telemetry: object, events: object, folder: Path) -> AlarmsSpec:
     return AlarmsSpec(RunClock.start(), telemetry, events, CONFIG, folder)  # type: ignore[arg-type]
 
 
-def test_the_process_ends_with_the_run_and_says_why_it_ended(tmp_path: Path) -> None:
+def test_the_process_ends_with_the_run_and_sends_why_it_ended(tmp_path: Path) -> None:
     sender, reports = FakeSender(), list[Event]()
     with open_ring(16, ROW_BYTES) as telemetry, open_ring(16, 4096) as events:
         writer = RingWriter(events)
@@ -235,7 +235,9 @@ def urls(folder: Path, *lines: str, name: str = "urls.txt") -> str:
     return str(path)
 
 
-def test_who_is_told(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -> None:
+def test_each_list_receives_its_alarms(
+    tmp_path: Path, apprise: list[tuple[str, str, str, str]]
+) -> None:
     first = urls(tmp_path, "# people", "", "mail://ann", "broken://x")
     more = urls(tmp_path, "chat://all", name="more.txt")
     send, escalate = apprise_senders(

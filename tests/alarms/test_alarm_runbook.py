@@ -55,5 +55,5 @@ def test_the_names_are_found() -> None:
         *CHILDREN,
     ],
 )
-def test_what_to_do_is_said(name: str) -> None:
+def test_the_remedy_is_stated(name: str) -> None:
     assert re.search(rf"^\|.*`{name}`.*\|.+\|.+\|$", RUNBOOK, re.MULTILINE)

@@ -93,7 +93,7 @@ def test_events_as_signs(event: EventLine, expected: list[tuple[str, bool, str]]
         ("unknown", "disagree (laser"),
     ],
 )
-def test_who_is_wrong_is_said_in_the_operators_words(faulty: str, message: str) -> None:
+def test_the_faulty_sensor_is_named_in_the_operators_words(faulty: str, message: str) -> None:
     line = {"kind": "plausibility", "faulty": faulty, "readings": "laser +20.0 µm, camera +0.1 µm"}
     (sign,) = signs_of(from_dict(line).notice_changes({}))
     assert message in sign.text

@@ -145,7 +145,7 @@ def test_a_service_that_dies_before_it_sends_is_replaced_by_the_hold(world: Worl
     assert world.phones.lab == [("hold", "fault", "raised")]
 
 
-def test_a_service_that_restarts_goes_on_where_it_was(world: World) -> None:
+def test_a_service_that_restarts_continues_where_it_was(world: World) -> None:
     past = fault("late", 5.0)
     world.start("hold", HOLD_PATIENCE_S)
     world.start("service")
@@ -177,7 +177,7 @@ def test_of_two_services_one_sends(world: World) -> None:
     assert world.phones.lab == [("first", "fault", "raised"), ("second", "run_ended", "raised")]
 
 
-def test_a_fault_that_came_while_nobody_sent_is_a_new_one(world: World) -> None:
+def test_a_fault_that_came_while_no_process_sent_is_a_new_one(world: World) -> None:
     world.start("hold", HOLD_PATIENCE_S)
     world.start("service")
     world.step(0.0)
@@ -189,7 +189,7 @@ def test_a_fault_that_came_while_nobody_sent_is_a_new_one(world: World) -> None:
     assert world.phones.lab == [("service", "fault", "raised"), ("hold", "fault", "raised")]
 
 
-def test_an_alarm_that_ended_while_nobody_sent_is_cleared(world: World) -> None:
+def test_an_alarm_that_ended_while_no_process_sent_is_cleared(world: World) -> None:
     world.start("hold", HOLD_PATIENCE_S)
     world.start("service")
     world.step(0.0)
@@ -201,7 +201,7 @@ def test_an_alarm_that_ended_while_nobody_sent_is_cleared(world: World) -> None:
     assert world.phones.lab == [("service", "fault", "raised"), ("hold", "fault", "cleared")]
 
 
-def test_an_acknowledgement_while_nobody_sent_keeps_the_boss_asleep(world: World) -> None:
+def test_an_acknowledgement_while_no_process_sent_prevents_the_escalation(world: World) -> None:
     world.start("hold", HOLD_PATIENCE_S)
     world.start("service")
     world.step(0.0)

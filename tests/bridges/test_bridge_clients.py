@@ -267,7 +267,7 @@ port = {port}
 """
 
 
-async def test_mqtt_tells_obeys_and_survives_restarts(tmp_path: Path) -> None:
+async def test_mqtt_publishes_obeys_and_survives_restarts(tmp_path: Path) -> None:
     port, base = free_port(), "membrane/bench"
     settings = MQTT.format(port=port)
     async with (

@@ -271,14 +271,14 @@ def test_home_assistant_finds_every_name_and_only_the_allowed_commands() -> None
 @pytest.mark.parametrize(
     "bridge", [{"opcua": OpcuaConfig(host="0.0.0.0")}, {"epics": EpicsConfig(host="::")}], ids=str
 )
-def test_nobody_unknown_acts_from_another_machine(bridge: dict[str, object]) -> None:
+def test_no_unknown_client_acts_from_another_machine(bridge: dict[str, object]) -> None:
     BridgesConfig(**bridge)  # type: ignore[arg-type]
     with pytest.raises(ValidationError, match="cannot tell who acts from another machine"):
         BridgesConfig(role="operate", **bridge)  # type: ignore[arg-type]
     BridgesConfig(role="operate", mqtt=MqttConfig(host="broker.lab"))  # the broker knows its users
 
 
-def test_no_bridge_is_said(tmp_path: Path) -> None:
+def test_no_bridge_is_reported(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["--logs", str(tmp_path)])
     assert isinstance(done.exception, InputError)
     assert "add [bridges.mqtt], [bridges.opcua] or [bridges.epics]" in str(done.exception)

@@ -254,7 +254,7 @@ async def test_a_text_that_is_no_number_is_refused(tmp_path: Path, text: str) ->
         assert run.asked == []
 
 
-async def test_garbage_on_every_topic_is_answered_and_the_bridge_goes_on(tmp_path: Path) -> None:
+async def test_garbage_on_every_topic_is_answered_and_the_bridge_continues(tmp_path: Path) -> None:
     rng = random.Random(5)
     payloads = [
         b"",
@@ -374,7 +374,9 @@ async def test_a_wrong_availability_is_corrected_but_not_by_a_storm(tmp_path: Pa
         assert listener.of("availability").count("online") <= 8
 
 
-async def test_a_second_bridge_of_the_name_is_refused_and_the_first_goes_on(tmp_path: Path) -> None:
+async def test_a_second_bridge_of_the_name_is_refused_and_the_first_continues(
+    tmp_path: Path,
+) -> None:
     async with bridge(tmp_path) as (_, listener, port):
         begin_s = time.monotonic()
         async with serving(port, bridge_to(tmp_path)) as second:
@@ -392,7 +394,7 @@ async def test_a_second_bridge_of_the_name_is_refused_and_the_first_goes_on(tmp_
         assert "offline" not in listener.of("availability")
 
 
-async def test_of_two_bridges_that_start_together_one_goes_on(tmp_path: Path) -> None:
+async def test_of_two_bridges_that_start_together_one_continues(tmp_path: Path) -> None:
     for _ in range(3):
         port = free_port()
         async with (

@@ -252,7 +252,7 @@ def test_sets_of_different_rigs_are_named(
         ),
     ],
 )
-def test_wrong_options_are_said(
+def test_wrong_options_are_named(
     folders: list[Path], capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     assert run(["calibrate", str(folders[0]), *arguments]) == 2

@@ -168,7 +168,7 @@ def test_an_identified_sensor_is_cleared_only_below_half_the_limit() -> None:
     assert said == FaultySensor.NONE
 
 
-def test_if_the_gauge_lies_between_laser_and_camera_the_verdict_is_unsure() -> None:
+def test_if_the_gauge_is_between_laser_and_camera_the_verdict_is_unsure() -> None:
     judge, time_s = settled(20.0, 0.0, 10.0)
     assert judge.faulty == FaultySensor.UNKNOWN
     for second in range(1, 121):  # it is not settled: a later verdict of the gauge counts

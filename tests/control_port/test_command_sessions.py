@@ -143,7 +143,9 @@ async def test_a_deliberate_takeover_reaches_the_first_session_with_its_reason(
 
 
 @pytest.mark.parametrize("do", ["lower", "vent", "stop", "latch"])
-async def test_whoever_lowers_the_mirror_need_not_have_command(do: str, tmp_path: Path) -> None:
+async def test_a_client_that_lowers_the_mirror_need_not_have_command(
+    do: str, tmp_path: Path
+) -> None:
     async with port_run(tmp_path) as run:
         first, second = await call(client_of, run), await call(client_of, run)
         await call(first.ask, do="claim", text="tune")

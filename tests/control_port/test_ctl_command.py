@@ -190,7 +190,7 @@ def test_what_stands_until_it_is_over_is_shown() -> None:
     assert "  geometry          g.toml, calibrated 2026-01-02 (hash 12ab)" in lines
 
 
-def test_nobody_there_is_one_line_and_exit_code_4(
+def test_a_port_without_a_hold_is_one_line_and_exit_code_4(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["ctl", "status", "--socket", str(tmp_path / "control.sock")]) == 4

@@ -75,7 +75,7 @@ async def test_the_page_speaks_for_its_viewer_and_the_lower_role_counts(tmp_path
 
 
 @pytest.mark.parametrize("stated", [{}, {"name": "link", "account": ""}])
-async def test_an_account_is_believed_from_the_holds_own_user_only(
+async def test_an_account_is_accepted_from_the_holds_own_user_only(
     tmp_path: Path, stated: dict[str, str]
 ) -> None:
     async with port_run(tmp_path) as run:

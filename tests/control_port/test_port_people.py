@@ -6,7 +6,7 @@ from membrane_ctrl.control_port.sender import Peer, explain_missing_role
 from membrane_ctrl.model.events import Event
 
 
-def test_the_first_to_command_has_it_and_the_second_is_told_who() -> None:
+def test_the_first_to_command_has_it_and_the_second_learns_who() -> None:
     commander = Commander(600.0)
     assert commander.holder(0.0) == ""
     assert commander.claim("unix:ann", False, 0.0) == ""

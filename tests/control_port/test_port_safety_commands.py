@@ -75,7 +75,7 @@ async def test_every_request_of_a_flood_is_answered(tmp_path: Path) -> None:
         assert len(done) >= 16
 
 
-async def test_a_flood_that_nobody_reads_loses_no_stop(tmp_path: Path) -> None:
+async def test_a_flood_without_a_reader_loses_no_stop(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         ann.writer.transport.pause_reading()  # type: ignore[attr-defined]
         begin_s = time.monotonic()

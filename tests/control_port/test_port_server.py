@@ -57,7 +57,7 @@ async def test_a_command_is_answered_by_the_tick_that_obeyed(tmp_path: Path) -> 
         assert await ann.answer() == {"number": 9, "ok": True, "state": "hold"}
 
 
-async def test_what_the_controller_refuses_is_said(tmp_path: Path) -> None:
+async def test_a_command_that_the_controller_refuses_has_its_reason(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         run.state = State.INFLATE
         answer = await ann.ask(do="pause")
@@ -67,7 +67,7 @@ async def test_what_the_controller_refuses_is_said(tmp_path: Path) -> None:
         assert run.of_kind("refused") == [], "the controller records these"
 
 
-async def test_a_loop_that_does_not_tick_is_said(
+async def test_a_loop_that_does_not_tick_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.control_port.server._ANSWER_S", 0.05)
@@ -354,7 +354,7 @@ def test_a_client_of_something_else(tmp_path: Path) -> None:
             accepted.close()
 
 
-def test_a_client_waits_its_turn_at_a_crowded_door(tmp_path: Path) -> None:
+def test_a_client_waits_its_turn_at_a_crowded_port(tmp_path: Path) -> None:
     path = tmp_path / "control.sock"
     with socket.socket(socket.AF_UNIX) as endpoint, socket.socket(socket.AF_UNIX) as first:
         endpoint.bind(str(path))
@@ -370,7 +370,7 @@ def test_a_client_waits_its_turn_at_a_crowded_door(tmp_path: Path) -> None:
                     assert client.greeting["run"] == "r"
 
 
-def test_an_endpoint_that_is_flooded_is_said(
+def test_an_endpoint_that_is_flooded_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(

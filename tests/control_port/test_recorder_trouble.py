@@ -39,7 +39,7 @@ def test_each_trouble_stands_until_its_own_end() -> None:
     assert trouble.words == f"Not recorded: {'x' * 286}", "it is in every line of the log"
 
 
-def test_without_a_recorder_nothing_is_recorded_and_the_next_one_tells_its_own_trouble() -> None:
+def test_without_a_recorder_nothing_is_recorded_and_the_next_one_reports_its_own_trouble() -> None:
     trouble = Trouble()
     trouble.take(RecorderError("state file", "state file: x"))
     trouble.take(ChildEnded("screen", 1))

@@ -119,7 +119,7 @@ def test_clearing_without_a_gauge_never_runs_the_pump_again(run: Run) -> None:
     assert run.pumped_s == pumped_s
 
 
-def test_a_pump_that_is_switched_on_and_off_runs_no_longer_without_a_gauge(run: Run) -> None:
+def test_a_pump_that_is_switched_on_and_off_does_not_run_longer_without_a_gauge(run: Run) -> None:
     for _ in range(100):
         run.wait(1.0, NO_GAUGE)
         run.wait(1.0, NO_GAUGE, pump=0.0)

@@ -147,7 +147,7 @@ def test_a_height_map_beside_the_file_is_kept_with_the_run(tmp_path: Path) -> No
     assert read_configured_geometry(config).origin.hash != begun.origin.hash
 
 
-def test_without_a_file_yet_the_hand_counts_and_it_is_said(tmp_path: Path) -> None:
+def test_without_a_file_the_measured_geometry_counts_and_this_is_stated(tmp_path: Path) -> None:
     config = Config(optics=OpticsConfig(geometry_file=tmp_path / "g.toml"))
     there = read_configured_geometry(config)
     assert there.optics == config.optics

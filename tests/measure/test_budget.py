@@ -321,7 +321,7 @@ def test_a_change_counts_noise_that_has_its_own_row_once() -> None:
     assert grown == pytest.approx(0.04 * square, rel=0.2)
 
 
-def test_a_benchmark_that_was_killed_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_benchmark_that_was_killed_continues_where_it_was(tmp_path: Path) -> None:
     asked: list[int] = []
 
     def bench(seed: int) -> dict[str, int]:

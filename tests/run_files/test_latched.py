@@ -144,7 +144,7 @@ def test_a_lock_is_no_latched_fault(tmp_path: Path) -> None:
     assert LatchedFile(tmp_path).read() is None
 
 
-def test_a_resumed_fault_is_no_longer_latched(tmp_path: Path) -> None:
+def test_a_resumed_fault_is_not_latched(tmp_path: Path) -> None:
     with make(tmp_path, []) as fault_latch:
         fault_latch.handle_tick(outputs(*TRIP))
         fault_latch.handle_tick(outputs(StateEntered("standby", "fault", "resumes")))

@@ -200,7 +200,7 @@ async def test_safety_commands_have_a_path_of_their_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.real_time
-async def test_the_stream_tells_states_and_events(tmp_path: Path) -> None:
+async def test_the_stream_has_states_and_events(tmp_path: Path) -> None:
     """Against the application itself: a test client would wait for the end of the stream."""
     async with running(tmp_path) as (run, programs):
         feed_api = programs.of["read"]._transport.app  # type: ignore[attr-defined]

@@ -177,7 +177,7 @@ def test_a_hold_that_ended_well_is_no_alarm(
     assert phone == []
 
 
-def test_a_trip_that_nobody_has_sent_is_sent_by_the_next_service(
+def test_a_trip_that_was_not_sent_is_sent_by_the_next_service(
     tmp_path: Path, stack: ExitStack, phone: list[str]
 ) -> None:
     run = Run(tmp_path, stack)
@@ -249,7 +249,7 @@ def test_files_of_another_user_are_left_to_the_hold(
     assert "not sent by the service" in capsys.readouterr().err
 
 
-def test_a_folder_that_nobody_looks_after_stops_the_heartbeat(tmp_path: Path) -> None:
+def test_a_folder_that_no_process_follows_stops_the_heartbeat(tmp_path: Path) -> None:
     folder = FolderAlarms(tmp_path / "none")
     folder.step()
     now_s = time.monotonic()

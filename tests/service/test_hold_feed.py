@@ -82,7 +82,7 @@ async def test_a_command_for_the_last_run_does_not_reach_the_next(tmp_path: Path
         assert said == Outcome.succeeded("stop"), "whatever runs there becomes safe"
 
 
-async def test_without_a_hold_the_answer_says_so(tmp_path: Path) -> None:
+async def test_without_a_hold_the_answer_states_it(tmp_path: Path) -> None:
     feed = HoldFeed(Where(socket=tmp_path / "none.sock"))
     outcome = await asyncio.to_thread(feed.ask, {"do": "hold"})
     assert "no hold is listening" in outcome.text

@@ -86,7 +86,7 @@ def test_a_program_has_its_own_session_and_not_the_services_priority(
         assert starter.failure == ""
 
 
-def test_a_hold_that_does_not_start_says_why(
+def test_a_hold_that_does_not_start_prints_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "executable", str(write_program(tmp_path / "python", code=4)))

@@ -187,7 +187,7 @@ def test_a_guess_that_was_not_evaluated_is_not_counted(clock: Clock) -> None:
     assert granted.count(True) == 5, "withdrawing gives no more than was taken"
 
 
-def test_the_wait_is_as_long_as_it_says(clock: Clock) -> None:
+def test_the_wait_is_as_long_as_stated(clock: Clock) -> None:
     throttle = LoginThrottle()
     guess = Guess("anna", "198.51.100.7")
     while throttle.admit(guess).granted:

@@ -139,7 +139,7 @@ def test_a_panel_keeps_what_it_has_shown_for_hours(film: FilmShape) -> None:
     assert gain(film, renderer, WHITE, 36_000.0) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_dust_lies_still_and_then_elsewhere(film: FilmShape) -> None:
+def test_dust_stays_at_one_place_and_then_at_another(film: FilmShape) -> None:
     renderer = bench(film, dust=60)
     first, same, later = (gain(film, renderer, WHITE, t) for t in (1.0, 24.0, 26.0))
     assert np.array_equal(first, same)
