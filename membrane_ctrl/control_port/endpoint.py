@@ -35,7 +35,7 @@ class Endpoint:
         Bound, listening, non-blocking; the endpoint closes it.
     welcome : callable
         Serves one connection to its end.
-    tell : callable
+    record_event : callable
         Records an event.
     refused : callable
         Called with the refused peer and the reason.
@@ -46,13 +46,13 @@ class Endpoint:
         name: str,
         listener: socket.socket,
         welcome: Welcome,
-        tell: Callable[[events.Event], None],
+        record_event: Callable[[events.Event], None],
         refused: Callable[[str, str], None],
     ) -> None:
         self._name = name
         self._listener = listener
         self._welcome = welcome
-        self._tell = tell
+        self._record_event = record_event
         self._refused = refused
         self._inside: set[asyncio.Task[None]] = set()
         self._task: asyncio.Task[None] | None = None
@@ -79,12 +79,12 @@ class Endpoint:
             except Exception as error:
                 failures += 1
                 again_s = durations.pause_s(failures, _AGAIN_S)
-                self._tell(port_events.PortFailed(self._name, str(error), again_s))
+                self._record_event(port_events.PortFailed(self._name, str(error), again_s))
                 await asyncio.sleep(again_s)
                 continue
             if failures:
                 failures = 0
-                self._tell(port_events.PortOpen(self._name))
+                self._record_event(port_events.PortOpen(self._name))
             await asyncio.sleep(_PAUSE_S)
 
     async def _accept(self) -> None:
@@ -102,6 +102,8 @@ class Endpoint:
         try:
             await self._welcome(connection)
         except Exception as error:  # one client's error must not affect the others
-            self._tell(port_events.PortFailed(self._name, f"{type(error).__name__}: {error}"))
+            self._record_event(
+                port_events.PortFailed(self._name, f"{type(error).__name__}: {error}")
+            )
         finally:
             connection.close()

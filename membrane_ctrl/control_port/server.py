@@ -46,11 +46,11 @@ _OVER = "the run is over"
 class RunHooks:
     """What the port needs from the run."""
 
-    ask: Callable[[commands.Command], None]  # hands a command to the next tick
-    tell: Callable[[events.Event], None]  # records an event
+    queue_command: Callable[[commands.Command], None]  # for the next tick
+    record_event: Callable[[events.Event], None]
     now: Callable[[], float]  # the run's clock
     loop: Callable[[], schema.LoopConfig]  # present loop settings
-    pump: Callable[[], schema.PumpConfig]  # likewise
+    pump: Callable[[], schema.PumpConfig]  # present settings of the pump
     # of a request that set or removed a lock: why it is not on the disk, empty if it is; None: it
     # changed no lock
     lock_outcome: Callable[[int], Future[str] | None] = lambda number: None
@@ -65,10 +65,10 @@ class Port:
         self._listeners = listeners
         self._run = run
         self._hooks = hooks
-        self._tell = hooks.tell
+        self._record_event = hooks.record_event
         self._now = hooks.now
         self._commander = Commander(config.commander_lapses_s)
-        self._refusals = Refusals(hooks.tell, hooks.now)
+        self._refusals = Refusals(hooks.record_event, hooks.now)
         self._status = RunStatus()
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
@@ -113,10 +113,14 @@ class Port:
         endpoint: Endpoint | None = None
         if listeners.unix is not None:
             endpoint = Endpoint(
-                "unix", listeners.unix.socket, self._welcome_unix, self._tell, self._turned_away
+                "unix",
+                listeners.unix.socket,
+                self._welcome_unix,
+                self._record_event,
+                self._turned_away,
             )
             endpoint.open()
-            self._tell(port_events.PortAddresses(str(listeners.path)))
+            self._record_event(port_events.PortAddresses(str(listeners.path)))
         try:
             yield
         finally:
@@ -166,7 +170,7 @@ class Port:
         finally:
             self._sessions.remove(session)
             if (ended := self._commander.end_session(session.id)) is not None:
-                self._tell(
+                self._record_event(
                     port_events.CommanderChanged(None, ended.describe(), "its connection is closed")
                 )
 
@@ -273,7 +277,7 @@ class Port:
             former_name = former
         else:
             former_name = former_session.describe()
-        self._tell(port_events.CommanderChanged(name, former_name or None, request.why))
+        self._record_event(port_events.CommanderChanged(name, former_name or None, request.why))
         reason = f": {request.why}" if request.why else ""
         for other in self._sessions:
             of_session = former_session is not None and other.id == former_session.id
@@ -291,7 +295,7 @@ class Port:
             case "release":
                 self._release_command(session, request.why)
             case "quiet":
-                self._tell(port_events.AlarmsAcknowledged(sender.who, request.why))
+                self._record_event(port_events.AlarmsAcknowledged(sender.who, request.why))
         return {
             "ok": True,
             "status": self.status(),
@@ -305,7 +309,7 @@ class Port:
             return  # another session's
         self._commander.release(who, session.id)
         former = who if in_command is None else in_command.describe()
-        self._tell(port_events.CommanderChanged(None, former, why))
+        self._record_event(port_events.CommanderChanged(None, former, why))
 
     def _command(self, sender: Sender, request: protocol.Request) -> commands.Command:
         """The command of a request. Raises InputError for invalid
@@ -367,7 +371,7 @@ class Port:
             return _OVER
         future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._waiting[command.number] = future
-        self._hooks.ask(command)
+        self._hooks.queue_command(command)
         try:
             async with asyncio.timeout(_ANSWER_S):
                 return await future

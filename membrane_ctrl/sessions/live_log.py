@@ -64,7 +64,7 @@ class LiveLog:
             self._append_entry({"every_s": self._every_s, **points})
 
     def log_entry(self, what: str, line: str, **more: float | Sequence[str]) -> None:
-        """Note what happens: `step` (name, `planned_s`, `after_s`), `said`, `asks` (`among`), or
+        """Note what happens: `step` (name, `planned_s`, `after_s`), `result`, `asks` (`among`), or
         `ended` (why).
         """
         self.write_means()
@@ -83,10 +83,10 @@ class LiveLog:
             path.unlink()
         try:
             given = plain_json.loads(text)
-            fits = given["to"] == question and given["said"] in ("", *among)
+            fits = given["to"] == question and given["answer"] in ("", *among)
             if not fits:
                 return None
-            return PageAnswer(given["said"], terminal.one_line(_parse_line(given["by"])))
+            return PageAnswer(given["answer"], terminal.one_line(_parse_line(given["by"])))
         except (ValueError, TypeError, KeyError):
             return None
 
@@ -108,13 +108,13 @@ class LiveLog:
 class PageAnswer:
     """What a viewer of the page answered; empty: none of those that were named."""
 
-    said: str
+    answer: str
     by: str
 
 
 def write_answer(session: Path, question: str, given: PageAnswer) -> None:
     """Leave the answer to a question where the session finds it. Raises OSError."""
-    text = json.dumps({"to": question, "said": given.said, "by": given.by})
+    text = json.dumps({"to": question, "answer": given.answer, "by": given.by})
     files.write_text_atomic(files.resolve_user_path(session / ANSWER), text + "\n")
 
 
@@ -135,7 +135,7 @@ class Progressed:
     done_s: float = 0.0  # recorded in the step
     asks: str = ""  # a question that waits for its answer
     ended: str = ""  # why the session ended; empty while it runs, or if it was killed
-    said: tuple[str, ...] = ()  # results, oldest first
+    results: tuple[str, ...] = ()  # lines, oldest first
     begun_s: tuple[tuple[float, str], ...] = ()  # where on the picture each step began
     among: tuple[str, ...] = ()  # answers to the question that the page may give
 
@@ -184,12 +184,11 @@ class LiveReader:
             planned_s, after_s = float(entry["planned_s"]), float(entry["after_s"])
             begun = (*now.begun_s, (self.time_s, _parse_line(entry["step"])))[-_LINES_MAX:]
             self.progress = Progressed(
-                begun[-1][1], planned_s, after_s, said=now.said, begun_s=begun
+                begun[-1][1], planned_s, after_s, results=now.results, begun_s=begun
             )
-        elif "said" in entry:
-            self.progress = replace(
-                now, said=(*now.said, _parse_line(entry["said"]))[-_LINES_MAX:], asks="", among=()
-            )
+        elif "result" in entry:
+            results = (*now.results, _parse_line(entry["result"]))[-_LINES_MAX:]
+            self.progress = replace(now, results=results, asks="", among=())
         elif "asks" in entry:
             among = tuple(_parse_line(name) for name in entry.get("among", ())[:_ANSWERS_MAX])
             self.progress = replace(now, asks=_parse_line(entry["asks"]), among=among)

@@ -63,7 +63,7 @@ class Progress:
     def print_line(self, line: str) -> None:
         """Print a permanent line, and note it in the log."""
         self._print_text(line)
-        self.log_entry("said", line)
+        self.log_entry("result", line)
 
     def log_entry(self, what: str, line: str, **more: float | Sequence[str]) -> None:
         """Note in the log, if there is one."""
@@ -90,8 +90,8 @@ class Progress:
         try:
             while among and self.log is not None and not _has_typed_line(_POLL_S):
                 if (given := self.log.pop_answer(question, among)) is not None:
-                    self.print_line(f"{given.by} answers on the page: {given.said or 'none'}")
-                    return given.said
+                    self.print_line(f"{given.by} answers on the page: {given.answer or 'none'}")
+                    return given.answer
             return sys.stdin.readline().strip()
         finally:
             self._asking = False

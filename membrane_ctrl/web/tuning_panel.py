@@ -97,7 +97,7 @@ def _table(markdown: str) -> tuple[tuple[str, ...], ...]:
 
 def answered(session: Path, question: str, given: PageAnswer) -> Outcome:
     """Give a session an answer; returns what became of it."""
-    what = given.said or "none of them"
+    what = given.answer or "none of them"
     try:
         write_answer(session, question, given)
     except OSError as error:
@@ -162,7 +162,7 @@ class TuningPanel:
             self._said.clear()
             before = SessionSeen(seen.path, frozenset(), Progressed())
             self._show_steps(seen)
-        for line in find_new_lines(before.progress.said, seen.progress.said):
+        for line in find_new_lines(before.progress.results, seen.progress.results):
             self._said.push(line)
         if (before.done, before.progress.step) != (seen.done, seen.progress.step):
             self._show_steps(seen)

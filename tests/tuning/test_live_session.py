@@ -70,7 +70,7 @@ def test_a_reader_beside_the_session_sees_what_it_does(tmp_path: Path) -> None:
         2.0,
     )
     held(log, 1.0, math.nan)
-    log.log_entry("said", "observe: laser noise 1.00 µm")
+    log.log_entry("result", "observe: laser noise 1.00 µm")
     log.log_entry("step", "design", planned_s=0.0, after_s=320.0)
     log.log_entry("asks", "apply which?")
     more = reader.read_new()
@@ -93,7 +93,7 @@ def test_a_line_torn_by_a_kill_costs_no_other_line(tmp_path: Path) -> None:
     log = logged(tmp_path)
     log.log_entry("step", "observe", planned_s=300.0, after_s=0.0)
     path = tmp_path / NAME
-    path.write_bytes(path.read_bytes() + b'{"said": "hal')
+    path.write_bytes(path.read_bytes() + b'{"result": "hal')
     again = logged(tmp_path)
     again.log_entry("step", "verify", planned_s=600.0, after_s=0.0)
     reader = LiveReader(tmp_path)
@@ -107,19 +107,19 @@ def test_a_foreign_log_does_no_harm(tmp_path: Path) -> None:
         b'[]\n5\n{"every_s": 1e400, "displacement_um": [], "setpoint_um": [], '
         b'"flow_um_per_s": []}\n\xff\xfe\n'
         b'{"every_s": 0.2, "displacement_um": [1], "setpoint_um": [1, 2], "flow_um_per_s": [1]}\n'
-        b'{"step": {}, "planned_s": "x", "after_s": 1}\n{"said": "' + b"a" * 9000 + b'"}\n'
+        b'{"step": {}, "planned_s": "x", "after_s": 1}\n{"result": "' + b"a" * 9000 + b'"}\n'
     )
     reader = LiveReader(tmp_path)
     assert reader.read_new()["time_s"] == []
-    assert [len(line) for line in reader.progress.said] == [500]
+    assert [len(line) for line in reader.progress.results] == [500]
 
 
 def test_a_full_disk_ends_the_log_and_is_reported_once(tmp_path: Path) -> None:
     said: list[str] = []
     (tmp_path / NAME).mkdir()
     log = LiveLog(tmp_path, RATE_HZ, said.append)
-    log.log_entry("said", "one")
-    log.log_entry("said", "two")
+    log.log_entry("result", "one")
+    log.log_entry("result", "two")
     assert len(said) == 1
     assert NAME in said[0]
 
@@ -280,7 +280,7 @@ def progress_of(log: LiveLog) -> Progress:
 
 
 def answer(said: str, to: str = "which?", by: str = "anna") -> str:
-    return json.dumps({"to": to, "said": said, "by": by})
+    return json.dumps({"to": to, "answer": said, "by": by})
 
 
 @pytest.mark.parametrize("said", ["calm", ""])
@@ -295,7 +295,7 @@ def test_a_question_is_answered_on_the_page(
     assert f"answers on the page: {said or 'none'}" in capsys.readouterr().err
     reader = LiveReader(tmp_path)
     reader.read_new()
-    (line,) = reader.progress.said
+    (line,) = reader.progress.results
     assert line.startswith("anna")
     assert "\x1b" not in line
     assert (reader.progress.asks, reader.progress.among) == ("", ())
@@ -309,7 +309,7 @@ def test_a_question_is_answered_on_the_page(
         answer("calm", to="another?"),
         "{",
         "[]",
-        '{"to": "which?", "said": ["calm"], "by": 1}',
+        '{"to": "which?", "answer": ["calm"], "by": 1}',
         "\0",
     ],
 )

@@ -116,11 +116,11 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
     log = LiveLog(path, 50.0, print)
     log.log_entry("step", "observe", planned_s=60.0, after_s=0.0)
     for number in range(300):
-        log.log_entry("said", f"line {number}")
+        log.log_entry("result", f"line {number}")
     seen = watch.look()
     assert seen is not None
     assert (seen.head, seen.done) == (f"{path.name}: observe", frozenset())
-    log.log_entry("said", "line 300")
+    log.log_entry("result", "line 300")
     log.log_entry("asks", "apply which?", among=("calm", "lively"))
     (path / "candidates.md").write_text(
         "| candidate | Ms |\n|---|---:|\n| calm | 1.3 |\n| torn\n| lively | 1.6 |\n"
@@ -128,7 +128,7 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
     (path / "identified.json").write_text("{}")
     later = watch.look()
     assert later is not None
-    assert log_lines.find_new_lines(seen.progress.said, later.progress.said) == ("line 300",)
+    assert log_lines.find_new_lines(seen.progress.results, later.progress.results) == ("line 300",)
     assert later.head == f"{path.name}: observe, asks: apply which?"
     assert later.done == {"identify"}
     assert later.candidates == (("candidate", "Ms"), ("calm", "1.3"), ("lively", "1.6"))

@@ -61,7 +61,7 @@ class PortRun:
         self.outcomes: dict[int, Future[str]] = {}  # of storing locks, by number of the command
         hooks = RunHooks(
             self._ask,
-            self._tell,
+            self._record_event,
             lambda: self.now_s,
             lambda: self.loop,
             PumpConfig,
@@ -75,7 +75,7 @@ class PortRun:
     def close(self) -> None:
         self._stack.close()
 
-    def _tell(self, event: Event) -> None:
+    def _record_event(self, event: Event) -> None:
         self.events.append(event.to_dict())
 
     def _ask(self, command: Command) -> None:

@@ -45,7 +45,8 @@ def report_command(
             "whole_run": not other.is_part,
             "report": report_table(other),
             "differences": [
-                asdict(difference) | {"said": difference.verdict_text} for difference in differences
+                asdict(difference) | {"verdict": difference.verdict_text}
+                for difference in differences
             ],
         }
     folder = out.resolve() if out else opened.folder / "report"  # follow a link that the user names
