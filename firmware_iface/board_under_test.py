@@ -25,7 +25,7 @@ class BoardUnderTest:
     ) -> None:
         self._link = link
         self._sleep = sleep
-        # of the board, once it has said its version
+        # of the board, once its version is known
         self._registers: register_map.RegisterMap = register_map.load_default_map()
         # its own protections, from map version 3 on
         self._gauge_fitted = False

@@ -125,7 +125,7 @@ class Conformance(board_under_test.BoardUnderTest):
                 self._check_shown_claim,
             ),
             ("another claim is refused", "Claim", self._check_second_program),
-            ("nobody else commands, clears or disarms", "Claim", self._check_stop_by_others),
+            ("no other program commands, clears or disarms", "Claim", self._check_stop_by_others),
             ("the same claim may be made again", "Claim", self._check_second_claim),
             ("the claim lapses with the watchdog", "Claim", self._check_lapsed_claim),
             ("without a claim nothing is commanded", "Claim", self._check_without_claim),

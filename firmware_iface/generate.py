@@ -38,7 +38,7 @@ def make_markdown(registers: RegisterMap) -> str:
         "exception 3 and changes nothing; one to a read-only or unknown address, or to half "
         "a value, with 2.",
         "From map version 2 on, a part of a block is refused with 2, and a write without the "
-        "claim in force with 6",
+        "active claim with 6",
         "while a program holds the board, with 3 otherwise ([firmware](firmware.md#claim)).",
     ]
     for block in registers.blocks:

@@ -85,7 +85,7 @@
 #define MEMBRANE_HEARTBEAT_ADDRESS 58u /* u16: a value other than the last one feeds the watchdog */
 #define MEMBRANE_HEARTBEAT_MIN_RAW 0
 #define MEMBRANE_HEARTBEAT_MAX_RAW 65535
-#define MEMBRANE_COMMAND_KEY_ADDRESS 59u /* u32: claim_key of the claim in force; reads as 0 */
+#define MEMBRANE_COMMAND_KEY_ADDRESS 59u /* u32: claim_key of the active claim; reads as 0 */
 #define MEMBRANE_COMMAND_KEY_MIN_RAW 1
 #define MEMBRANE_COMMAND_KEY_MAX_RAW 4294967295
 
@@ -95,7 +95,7 @@
 #define MEMBRANE_CLEAR_FAULTS_ADDRESS 64u /* u16: fault bits to clear; also sets the pump command to 0; reads as 0 */
 #define MEMBRANE_CLEAR_FAULTS_MIN_RAW 0
 #define MEMBRANE_CLEAR_FAULTS_MAX_RAW 65535
-#define MEMBRANE_CLEAR_KEY_ADDRESS 65u /* u32: claim_key of the claim in force; reads as 0 */
+#define MEMBRANE_CLEAR_KEY_ADDRESS 65u /* u32: claim_key of the active claim; reads as 0 */
 #define MEMBRANE_CLEAR_KEY_MIN_RAW 1
 #define MEMBRANE_CLEAR_KEY_MAX_RAW 4294967295
 

@@ -94,7 +94,7 @@ def _opened(config: EpicsConfig, bridge: Bridge) -> dict[str, Any]:
 
 
 def _require_free(config: EpicsConfig) -> None:
-    """EPICS would take another port instead, where nobody looks. Raises DeviceError."""
+    """EPICS would take another port instead, where no client looks. Raises DeviceError."""
     for port in (config.ca_port, config.pva_port):
         try:
             socket.create_server((config.host, port)).close()

@@ -11,7 +11,7 @@ silence. A bridge that starts
 
 Two claims are compared by the time since which they are owned; a bridge that is not an owner yet
 ranks behind every owner, and equal ones are ordered by their random identifiers. So of two bridges
-that start together, one goes on; an owner is not displaced by a newcomer; and an owner whose
+that start together, one continues; an owner is not displaced by a newcomer; and an owner whose
 connection was interrupted gets its name back.
 """
 

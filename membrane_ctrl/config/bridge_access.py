@@ -48,7 +48,7 @@ def describe_bridges(bridges: BridgesConfig) -> str:
     accesses = list_bridge_accesses(bridges)
     if not accesses:
         return "none"
-    may = "read, and nobody acts"
+    may = "read, but not act"
     if bridges.role != "read":
         may = f"read and act (role {bridges.role} at most)"
     return "; ".join(f"{each.where}: {each.who} may {may}" for each in accesses)

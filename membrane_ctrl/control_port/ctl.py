@@ -302,7 +302,7 @@ def connected(
 
 
 def socket_path(where: Where) -> Path:
-    """The socket file: as told, of the run's own configuration, beside the run's folder, or among
+    """The socket file: as given, of the run's own configuration, beside the run's folder, or among
     the runs.
     """
     if where.socket is not None:

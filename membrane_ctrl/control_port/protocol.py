@@ -84,7 +84,7 @@ class Request(Section):
     text: Annotated[str, _words(TEXT_BYTES)] = ""
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
     pump: dict[str, Any] | None = None  # `gains`: the table `[pump]`, if it changes
-    # `tune`: an `ExperimentSpec`, which says what it takes
+    # `tune`: an `ExperimentSpec`, which states its fields
     experiment: dict[str, Any] | None = None
     shape_time_constant_s: float | None = None  # `gains`: of the shape loop
     # `gains`: of the setpoint, on trial
@@ -128,7 +128,7 @@ class Request(Section):
 
 
 def parse(line: bytes) -> Request:
-    """Parse a request. Raises RequestError with one line that says what is wrong."""
+    """Parse a request. Raises RequestError with one line that names the mistake."""
     try:
         return Request.model_validate_json(line, strict=True)
     except ValidationError as error:

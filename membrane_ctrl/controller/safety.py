@@ -26,8 +26,8 @@ GAS_MOVES = CONNECTED | {State.LOWER}
 ALWAYS = frozenset(State)
 NOT_YET_FAULT = ALWAYS - {State.FAULT}
 _FOREIGN = {
-    FOREIGN_CLAIM: "another claim is in force",
-    FOREIGN_PERIOD: "another watchdog period is in force",
+    FOREIGN_CLAIM: "another claim is active",
+    FOREIGN_PERIOD: "another watchdog period is active",
 }
 # One bit error must not vent a mirror that takes two hours to fill; in two ticks the pump moves the
 # film by 0.2 µm

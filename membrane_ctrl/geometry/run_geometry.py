@@ -54,7 +54,7 @@ def read_configured_geometry(config: Config) -> RunGeometry:
     """Read the file named in the configuration.
 
     A missing file is not an error: the first calibration of a bench has to use the geometry
-    measured by hand. The note says so.
+    measured by hand. The note states it.
 
     Raises InputError if the file exists but cannot be used.
     """

@@ -91,5 +91,5 @@ def test_the_words_for_users_and_for_readers() -> None:
         "(role operate at most)"
     )
     assert describe_bridges(BridgesConfig(epics=EpicsConfig())).endswith(
-        "may read, and nobody acts"
+        "may read, but not act"
     )

@@ -171,11 +171,11 @@ def test_the_sentence_for_the_operator_contains_the_value() -> None:
 @pytest.mark.parametrize(
     ("foreign", "seen"),
     [
-        (FOREIGN_CLAIM, "another claim is in force"),
-        (FOREIGN_PERIOD, "another watchdog period is in force"),
+        (FOREIGN_CLAIM, "another claim is active"),
+        (FOREIGN_PERIOD, "another watchdog period is active"),
         (
             FOREIGN_CLAIM | FOREIGN_PERIOD,
-            "another claim is in force and another watchdog period is in force",
+            "another claim is active and another watchdog period is active",
         ),
     ],
 )

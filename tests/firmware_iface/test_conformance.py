@@ -336,10 +336,10 @@ BROKEN = [
 ]
 CLAIMS_BROKEN = [
     (Claimless, "another claim is refused", "accepts a second claim"),
-    (Claimless, "nobody else commands, clears or disarms", "accepts a command with another key"),
+    (Claimless, "no other program commands, clears or disarms", "accepts a command with another key"),
     (Claimless, "without a claim nothing is commanded", "a write to command without a claim"),
     (ClaimedForEver, "the claim lapses with the watchdog", "exception 6"),
-    (HalfKey, "nobody else commands, clears or disarms", "accepts a command with another key"),
+    (HalfKey, "no other program commands, clears or disarms", "accepts a command with another key"),
     (ShowsKey, "the claim and the period are shown, the key is not", "command_key can be read"),
     (ClaimFeeds, "the same claim may be made again", "claims that are made again"),
     (StopsForATick, "anybody may stop the pump", "runs the pump at 0.05 after stop"),

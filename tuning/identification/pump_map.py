@@ -151,7 +151,7 @@ class Surveyed:
         leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
         if is_stuck(self.fit, self.rising):
             raise ValueError(
-                f"the mirror moves alike at every command ({flows[last]:.2f} +- "
+                f"the mirror moves the same at every command ({flows[last]:.2f} +- "
                 f"{sigmas[last]:.2f} µm/s more at "
                 f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not "
                 "arrive: free it, then run "

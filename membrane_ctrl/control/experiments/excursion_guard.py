@@ -40,7 +40,7 @@ class ExcursionGuard:
     of three standard deviations of that figure's own noise, which grows with fewer readings per
     second. Raises ValueError, with a remedy, if the margin uses up the limit.
 
-    Back it goes on the holding flow with a weak pull: behind a curve other than the configured one,
+    It returns on the holding flow with a weak pull: behind a curve other than the configured one,
     an integrator would wind up on the way and carry the mirror further past the centre than the
     experiment may. A mirror that strays nevertheless, behind an open vent or a dead pump, is given
     to the loop at twice the limit. An experiment that sets raw commands (`raw`) ends where it is.

@@ -68,7 +68,7 @@ def _read_cycles(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
     good = np.isfinite(shapes.sag_um) & np.isin(shapes.verdict, ("ok", "degraded"))
     if not (known.any() and good.any()):
         raise errors.RejectedError(
-            f"{run.folder}: without figures and a gauge a run says nothing of its film"
+            f"{run.folder}: without figures and a gauge a run shows nothing of its film"
         )
     time_s = np.asarray(shapes.time_s[good], float)
     middle_s = level["time_s"][known] + _LEVEL_S / 2
