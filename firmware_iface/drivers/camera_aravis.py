@@ -124,7 +124,9 @@ class AravisCamera:
         """
         if self._pending is None or self._stream is None:
             raise roles.LinkError(f"{self._name}: no exposure to fetch")
-        (time_s, out), self._pending = self._pending, None
+        time_s, out = self._pending
+        self._pending = None
+        # A frame that does not come in time: the stream begins again, so that it cannot come later
         library = arv.load_aravis()
         timeout_us = round(1e6 * self.config.timeout_s)
         buffer = library.call("arv_stream_timeout_pop_buffer", self._stream, timeout_us)
@@ -134,6 +136,7 @@ class AravisCamera:
             raise optical_roles.FrameLostError(
                 f"{self._name}: no frame within {self.config.timeout_s:g} s of its trigger"
             )
+        # A frame that came: copied if it is whole, and its buffer goes back to the stream
         try:
             status = library.call("arv_buffer_get_status", buffer)
             if status != _SUCCESS:

@@ -163,6 +163,7 @@ class Optoncdt1420:
         ]
 
     async def _identify(self) -> roles.DeviceIdentity:
+        # Model and range must be those of the configuration
         text = await self._send_command("GETINFO")
         fields = dict(re.findall(r"^\s*([\w. -]+?):\s*(.*?)\s*$", text, re.MULTILINE))
         name = fields.get("Name", "")
@@ -178,6 +179,7 @@ class Optoncdt1420:
                 f"{self._port.name}: {name} measures {self._range_mm:g} mm, range_mm = "
                 f"{self._config.range_mm:g}"
             )
+        # The displacements at the ends of the range
         if self._config.zero_mm is None:
             self._zero_mm = self._range_mm / 2
         else:
@@ -264,6 +266,7 @@ class Optoncdt1420:
             ) from error
         self._silent = 0
         self._port.succeeded()
+        # At least half of the values must be measurements; else the most frequent error code counts
         values = self._take_batches()
         good = values[values <= _RAW_MAX]
         if 2 * len(good) <= len(values):
@@ -271,6 +274,7 @@ class Optoncdt1420:
             return roles.DisplacementSample(
                 math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s
             )
+        # A single jump is dropped: a wrong byte can pass the marks and the counter
         raw = mean_of_middle(good)
         displacement_um = self._displacement_um(raw)
         if not self._gate.passes(displacement_um):

@@ -149,6 +149,7 @@ class SerialExchange:
     ) -> bytes:
         try:
             self._require_open(question.what)
+            # Rule 2: silence; rule 3: after a loss, the fence
             await self._wait_for_silence(question.what, timeout_s)
             if key not in self._sure and fence is not None:
                 await self._ask_once(fence, timeout_s)
@@ -157,6 +158,7 @@ class SerialExchange:
         except LinkDownError:
             raise
         except LinkError as error:
+            # A loss: from here on the line counts as noisy, and after some the port is closed
             self._sure.discard(key)
             self._noisy = True
             self._last_byte_s = asyncio.get_running_loop().time()

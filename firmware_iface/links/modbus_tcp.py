@@ -100,6 +100,9 @@ class GuardedModbusTcp:
         self._back_off.attempted(self._clock())
         self._request_times_s.clear()
 
+        # The library neither repeats a request nor connects by itself: a repeated write could move
+        # gas twice
+
         def changed(connected: bool) -> None:
             if not connected:
                 _fail_in_flight(client, f"{self.name}: connection lost")
@@ -281,6 +284,8 @@ class GuardedModbusTcp:
         client = self._client
         if client is None or not client.connected:
             raise LinkDownError(f"{what}: not connected")
+        # The bytes received for this request are bounded, and its transaction number is noted, so
+        # that a late answer is recognised
         self._received_bytes = 0
         self._note_request(client.ctx.next_tid + 1)
         try:

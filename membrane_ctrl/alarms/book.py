@@ -213,10 +213,12 @@ class AlarmBook:
             kind = self._list_due(alarm, now_s)
             if kind is None:
                 continue
+            # The alarm remembers what its people know
             if kind == "cleared":
                 del self._alarms[name]
             elif kind == "raised":
-                alarm.reported_s = alarm.reminded_s = now_s
+                alarm.reported_s = now_s
+                alarm.reminded_s = now_s
                 alarm.occurrence = self._occurrences.get(name, 0) + 1
                 self._occurrences[name] = alarm.occurrence
             else:

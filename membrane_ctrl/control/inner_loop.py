@@ -310,12 +310,14 @@ class InnerLoop:
         `step` continues from there; the target is not used.
         """
         self._forget_output()
+        # 1. The filter runs on, and the setpoint stands at its output: a later `step` has no jump
         seen = math.isfinite(given.displacement_um)
         if seen:
             self._filter_reading(given.displacement_um, dt_s)
         if not math.isnan(self.memory.measured.value):
             self._hold_setpoint_at(self.memory.measured.value)
             self._ramp.place(self.memory.measured.value - given.trim_um)
+        # 2. The flow within the pump's range; the integrator holds what is not for the weather
         weather_um_per_s = self._feedforward.update(
             given.ambient_pressure_pa, given.air_temperature_c, dt_s
         )
@@ -323,6 +325,7 @@ class InnerLoop:
         self._pid.place(placed_um_per_s - weather_um_per_s)
         self._discard_learned()
         fraction = self._pump_command(placed_um_per_s, dt_s)
+        # 3. The leak is learned from the pump's flow and the motion
         if seen:
             pumped_um_per_s = self._pump_flow(fraction) - weather_um_per_s
             self.memory.leak.update(

@@ -219,6 +219,7 @@ class PlausibilityCheck:
         `blind`: the last one is old. A camera that saw nothing of what moved is not accused of it.
         """
         memory = self.memory
+        # 1. One smoothed mean for each sensor; a figure counts over the time since the last one
         self._average_laser(displacement_um, dt_s)
         if math.isfinite(gauge_pa):
             memory.gauge.update(gauge_pa, dt_s, SMOOTH_S)
@@ -232,6 +233,7 @@ class PlausibilityCheck:
                 since_s = estimate.time_s - memory.figure_s
             memory.optics.update(estimate.sag_um, max(since_s, 0.0), SMOOTH_S)
             memory.figure_s = estimate.time_s
+        # 2. Judged while all three are there
         means = (memory.laser.value, memory.optics.value, memory.gauge.value)
         laser_present = memory.laser_gap_s <= LASER_GAP_S
         if laser_present and not blind and all(map(math.isfinite, means)):

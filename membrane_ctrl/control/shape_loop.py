@@ -133,22 +133,26 @@ class ShapeLoop:
         The estimate is given only when new; `settled`: the inner loop holds its setpoint;
         `distrust`: why the camera must not be used, if so.
         """
+        # 1. Since when the inner loop has held its setpoint: older figures do not count
         if not settled:
             self.memory.settled_since_s = math.inf
         elif math.isinf(self.memory.settled_since_s):
             self.memory.settled_since_s = now_s
-        if self.memory.state != telemetry.ShapeState.OFF:
-            if estimate is not None:
-                self.memory.seen_s = estimate.time_s
-            refusal = distrust
-            if refusal == NO_REASON:
-                refusal = self._find_refusal(now_s, estimate, displacement_um, settled)
-            if refusal != NO_REASON:
-                self._refuse_estimate(refusal)
-            elif estimate is not None:
-                self._admit_estimate(estimate)
-            if self.memory.state == telemetry.ShapeState.TRACKING:
-                self._move_trim(now_s, dt_s)
+        if self.memory.state == telemetry.ShapeState.OFF:
+            return self.output(now_s)
+        # 2. A figure is refused or admitted; without one, the age of the last is judged
+        if estimate is not None:
+            self.memory.seen_s = estimate.time_s
+        refusal = distrust
+        if refusal == NO_REASON:
+            refusal = self._find_refusal(now_s, estimate, displacement_um, settled)
+        if refusal != NO_REASON:
+            self._refuse_estimate(refusal)
+        elif estimate is not None:
+            self._admit_estimate(estimate)
+        # 3. The trim follows the change of the sag
+        if self.memory.state == telemetry.ShapeState.TRACKING:
+            self._move_trim(now_s, dt_s)
         return self.output(now_s)
 
     def output(self, now_s: float) -> ShapeOutput:
@@ -171,12 +175,14 @@ class ShapeLoop:
     ) -> Reason:
         """Why this tick's estimate must not be used; `NO_REASON` if it may be."""
         config = self._config
+        # The loop, with or without a figure in this tick
         if not settled:
             return make_reason(ShapeCode.NOT_SETTLED, "the inner loop is not settled")
         if now_s - self.memory.seen_s > config.fresh_s:
             return make_reason(ShapeCode.NO_SHAPE, f"no shape younger than {config.fresh_s:g} s")
         if estimate is None:
             return NO_REASON
+        # The figure itself
         if estimate.verdict == "rejected":
             return make_reason(ShapeCode.REJECTED, f"shape rejected: {estimate.reason}")
         if estimate.time_s < self.memory.settled_since_s:
@@ -189,6 +195,7 @@ class ShapeLoop:
             or not np.isfinite(estimate.covariance_um2).all()
         ):
             return make_reason(ShapeCode.NOT_FINITE, "the shape is not finite")
+        # The laser: the mirror has stayed where it was during the exposures
         moved_um = abs(displacement_um - estimate.displacement_um)
         if math.isnan(moved_um):
             return make_reason(ShapeCode.NO_LASER, "no laser reading to compare the shape with")

@@ -179,6 +179,7 @@ class Port:
         session.drop(reason)
 
     def _make_room(self, peer: Peer) -> None:
+        """Drop the connection that has been silent longest if there are too many."""
         own = [session for session in self._sessions if session.peer.who == peer.who]
         if len(own) >= _SESSIONS_EACH:
             crowd = own
@@ -190,13 +191,12 @@ class Port:
         in_command = self._commander.session
         idle = [each for each in crowd if in_command is None or each.id != in_command.id]
         if idle:
-            self._turn_out(
-                min(idle, key=lambda session: session.heard_s),
-                "too many connections: silent longest",
-            )
+            silent_longest = min(idle, key=lambda session: session.heard_s)
+            self._turn_out(silent_longest, "too many connections: silent longest")
 
     async def _answer(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
         """Execute a request or answer why not; the controller records its own refusals."""
+        # 1. Role, age, and the right to command, in this order
         peer = session.peer
         sender = sender_of(peer, request.on_behalf)
         refusal = (
@@ -204,11 +204,13 @@ class Port:
             or self._expired(request)
             or self._claim_command(session, request)
         )
+        # 2. A safety command overtakes what waits on all connections
         if not refusal and is_safety_command(request.do):
             for other in self._sessions:
                 other.refuse_waiting(request.do)
         if not refusal and request.do not in commands.TABLE:
             return self._run_errand(session, sender, request)
+        # 3. The next tick executes the command, or refuses it
         try:
             command = self._command(sender, request) if not refusal else None
         except errors.InputError as error:
@@ -259,7 +261,9 @@ class Port:
         """Give command to a client that needs it; returns why not, or an empty text."""
         if request.do in FREE:
             return ""
-        who, now_s = session.peer.who, self._now()
+        # 1. A claim begins a session of command; any other request takes command while it is free
+        who = session.peer.who
+        now_s = self._now()
         former = self._commander.holder(now_s)
         former_session = self._commander.session
         take_over = request.take_over
@@ -272,6 +276,7 @@ class Port:
         present = self._commander.session
         if refusal or (former == who and former_session is present):
             return refusal
+        # 2. Command has changed: record it, and notify those who have lost it
         name = who if present is None else present.describe()
         if former_session is None:
             former_name = former

@@ -163,12 +163,16 @@ class RingReader:
         messages: list[bytes] = []
         for _ in range(self._slots.count):
             written = self._slots.written
-            if self._read >= written or (limit is not None and len(messages) >= limit):
+            is_full = limit is not None and len(messages) >= limit
+            if self._read >= written or is_full:
                 break
+            # The writer has overwritten what was not read in time
             oldest = max(0, written - self._slots.count)
             if self._read < oldest:
                 self.dropped += oldest - self._read
                 self._read = oldest
+            # A slot that is being written is read in the next call, or counted as lost if it stays
+            # unreadable
             message = self._read_slot(self._read)
             if message is None and self._not_there_yet():
                 break

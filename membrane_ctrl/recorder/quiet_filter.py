@@ -33,27 +33,31 @@ class QuietFilter:
         """The rows to send now, in order of time; rows held back follow when something happens."""
         if self._every == 1 or not len(rows):
             return rows
+        # Something happens: a code changes, or the mirror leaves the band
         codes = rows[:, [telemetry.COLUMN[name] for name in _CODES]]
-        before = np.vstack((self._codes, codes[:-1]))
-        lively = (codes != before).any(axis=1) | (
-            np.abs(telemetry.get_column(rows, "error_um")) > self._band_um
-        )
+        codes_before = np.vstack((self._codes, codes[:-1]))
+        code_changes = (codes != codes_before).any(axis=1)
+        is_outside = np.abs(telemetry.get_column(rows, "error_um")) > self._band_um
+        lively = code_changes | is_outside
         self._codes = codes[-1]
+        time_s = telemetry.get_column(rows, "mono_s")
         if lively.any():
-            self._lively_until_s = (
-                float(telemetry.get_column(rows, "mono_s")[lively][-1]) + _AFTER_S
-            )
-            held, self._held = self._held, []
+            # All rows, after those that were held back, and all rows for some seconds from now
+            self._lively_until_s = float(time_s[lively][-1]) + _AFTER_S
+            held = self._held
+            self._held = []
             return np.concatenate((*held, rows))
-        now_s = float(rows[-1, telemetry.COLUMN["mono_s"]])
+        now_s = float(time_s[-1])
         if now_s < self._lively_until_s:
             return rows
+        # Quiet: every n-th row is sent; the others are held back for some seconds
         kept = telemetry.get_column(rows, "tick") % self._every == 0
         self._held.append(rows[~kept])
+        since_s = now_s - _BEFORE_S
         self._held = [
             part
             for part in self._held
-            if len(part) and part[-1, telemetry.COLUMN["mono_s"]] > now_s - _BEFORE_S
+            if len(part) and part[-1, telemetry.COLUMN["mono_s"]] > since_s
         ]
         quiet: telemetry.Rows = rows[kept]
         return quiet

@@ -71,10 +71,10 @@ class RerunOutput:
             self._pause_output()
             return False
         self.shapes.pictures = detail == DetailLevel.ALL
+        # Twice: after a failure the second is sent again, into a new segment
         for _ in range(2):
-            if (not self._alive or now_s >= self._segment_until_s) and not self._begin_segment(
-                now_s
-            ):
+            needs_segment = not self._alive or now_s >= self._segment_until_s
+            if needs_segment and not self._begin_segment(now_s):
                 return False
             self._errors.run_guarded("telemetry streams", lambda: self._telemetry.send_rows(rows))
             self._errors.run_guarded(

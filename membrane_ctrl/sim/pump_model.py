@@ -94,27 +94,26 @@ def _make_branches(
     """Flow in mL/s at each level of the command, rising and falling; None for the straight line."""
     command = np.arange(_LEVELS + 1) / _LEVELS
     if shape != "configured":
+        # A shape of the share beyond the dead band; hysteresis shifts the two branches apart
         play = _PLAY_FRACTION if shape == "hysteretic" else 0.0
-        shares = [
-            (command + shift - config.dead_fraction) / (1 - config.dead_fraction)
-            for shift in (-play, play)
-        ]
-        rising, falling = (
-            full_ml_per_s * _SHAPES[shape](np.clip(share, 0.0, 1.0)) for share in shares
-        )
+        branches = []
+        for shift in (-play, play):
+            share = (command + shift - config.dead_fraction) / (1 - config.dead_fraction)
+            branches.append(full_ml_per_s * _SHAPES[shape](np.clip(share, 0.0, 1.0)))
+        rising, falling = branches
         falling[0] = 0.0
         return rising.tolist(), falling.tolist()
     if not config.curve_fraction:
         return None
+    # The measured points, joined by SciPy's monotone cubic; no flow below the first of them
     from scipy.interpolate import PchipInterpolator
 
     points = np.array(config.curve_fraction)
     scale = full_ml_per_s / config.flow_full_um_per_s
     within = np.clip(command, points[0], points[-1])
-    rising, falling = (
-        np.where(
-            command < points[0], 0.0, scale * PchipInterpolator(points, np.array(flows))(within)
-        )
-        for flows in (config.curve_um_per_s, config.curve_falling_um_per_s or config.curve_um_per_s)
-    )
+    branches = []
+    for flows in (config.curve_um_per_s, config.curve_falling_um_per_s or config.curve_um_per_s):
+        curve = PchipInterpolator(points, np.array(flows))
+        branches.append(np.where(command < points[0], 0.0, scale * curve(within)))
+    rising, falling = branches
     return rising.tolist(), falling.tolist()

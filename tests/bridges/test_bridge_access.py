@@ -90,6 +90,4 @@ def test_the_words_for_users_and_for_readers() -> None:
         "read and act "
         "(role operate at most)"
     )
-    assert describe_bridges(BridgesConfig(epics=EpicsConfig())).endswith(
-        "may read, but not act"
-    )
+    assert describe_bridges(BridgesConfig(epics=EpicsConfig())).endswith("may read, but not act")

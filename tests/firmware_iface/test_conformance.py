@@ -336,7 +336,11 @@ BROKEN = [
 ]
 CLAIMS_BROKEN = [
     (Claimless, "another claim is refused", "accepts a second claim"),
-    (Claimless, "no other program commands, clears or disarms", "accepts a command with another key"),
+    (
+        Claimless,
+        "no other program commands, clears or disarms",
+        "accepts a command with another key",
+    ),
     (Claimless, "without a claim nothing is commanded", "a write to command without a claim"),
     (ClaimedForEver, "the claim lapses with the watchdog", "exception 6"),
     (HalfKey, "no other program commands, clears or disarms", "accepts a command with another key"),

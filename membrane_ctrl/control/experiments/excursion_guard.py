@@ -82,15 +82,18 @@ class ExcursionGuard:
                 "camera), then repeat"
             )
             return self.memory.ended or Finished(ExperimentEnd.READING_LOST, lost)
+        # The experiment itself, until it ends or the guard ends it
         off_um = self._motion.position_um - self._centre_um
         if self.memory.ended is None:
             found = self._guard_step(off_um, measurement, dt_s)
             if self._raw or not isinstance(found, Finished):
                 return found
             self.memory.ended = found
+        # The way back, until the mirror is near the centre, strays, or takes too long
         self.memory.back_s += dt_s
-        back = abs(off_um) < _BACK_SHARE * self._limit_um
-        if back or self.memory.back_s > _BACK_MOST_S or abs(off_um) > _STRAYED * self._limit_um:
+        is_back = abs(off_um) < _BACK_SHARE * self._limit_um
+        strays = abs(off_um) > _STRAYED * self._limit_um
+        if is_back or strays or self.memory.back_s > _BACK_MOST_S:
             return self.memory.ended
         back_um_per_s = self._around.holding_flow_um_per_s - PULL_PER_S * off_um
         return min(max(back_um_per_s, 0.0), self._around.full_flow_um_per_s)

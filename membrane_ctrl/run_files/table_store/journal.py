@@ -208,11 +208,13 @@ def read_journal(
     waiting: list[pa.RecordBatch] = []
     first_row = count = place = 0
     for frame in frames:
+        # Bytes between intact frames are lost, and those of a frame whose rows cannot be read
         lost_bytes = frame.start - place
         place = frame.end
         batch = _batch_or_none(frame, schema)
         if batch is None and frame.rows:
             lost_bytes += frame.end - frame.start
+        # A block ends before lost bytes, at a gap in the numbers of rows, and when it is full
         follows = batch is None or frame.first_row == first_row + count
         if waiting and (lost_bytes or not follows or count >= group_rows):
             yield _join_batches(first_row, waiting)
@@ -220,7 +222,8 @@ def read_journal(
         if lost_bytes:
             yield LostBytes(lost_bytes, False)
         if batch is not None:
-            first_row = first_row if waiting else frame.first_row
+            if not waiting:
+                first_row = frame.first_row
             waiting.append(batch)
             count += batch.num_rows
     if waiting:

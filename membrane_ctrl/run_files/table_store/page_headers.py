@@ -72,11 +72,14 @@ def _read_struct(data: bytes, place: int, depth: int) -> tuple[Fields, int]:
     fields: Fields = {}
     number = 0
     while True:
+        # A field begins with a byte: its type, and by how much its number is larger than the last
+        # one; a difference of 0 means that the number follows. The byte 0 ends the structure
         head = _read_byte(data, place)
         place += 1
         if head == 0:
             return fields, place
-        kind, step = head & 0x0F, head >> 4
+        kind = head & 0x0F
+        step = head >> 4
         if step:
             number += step
         else:

@@ -183,6 +183,7 @@ def _make_entry(
 ) -> PartEntry:
     """The manifest's line for a file just written."""
     with path.open("rb") as written:
+        # A checksum of each column's bytes in each row group
         metadata = pq.read_metadata(written)
         groups = []
         for place, (first_s, last_s) in enumerate(times_s):
@@ -193,6 +194,8 @@ def _make_entry(
                 written.seek(start)
                 checksums.append(zlib.crc32(written.read(size)))
             groups.append(GroupEntry(first_s=first_s, last_s=last_s, crc32=tuple(checksums)))
+        # A copy of the footer, without which no reader finds the columns; its length stands at the
+        # end
         written.seek(file.size_bytes - TAIL_BYTES)
         footer_bytes = int.from_bytes(written.read(4), "little")
         written.seek(file.size_bytes - TAIL_BYTES - footer_bytes)

@@ -163,17 +163,16 @@ class TableWriter:
 
     def _continue_after_kill(self) -> None:
         """Seal what a dead recorder left, and find the number and the time of the last row."""
-        numbers = sorted(
-            number
-            for path in _list_part_files(self._folder)
-            if (number := spec.file_number(path)) is not None
-        )
+        found = [spec.file_number(path) for path in _list_part_files(self._folder)]
+        numbers = sorted(number for number in found if number is not None)
         if not numbers:
             return
         self._number = numbers[-1] + 1
+        # Journals without a part are sealed soon
         journals = [
             number for number in numbers if spec.journal_path(self._folder, number).exists()
         ]
+        # The last row, from the manifest and from journals that it does not list
         self._sealable.extend(dict.fromkeys(journals))
         listed = read_manifest(self._folder, [])
         for entry in listed.values():
