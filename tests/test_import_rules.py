@@ -153,7 +153,7 @@ def test_control_is_pure(file: Path) -> None:
 @pytest.mark.parametrize("file", files_of("membrane_ctrl/metrology"), ids=str)
 def test_metrology_is_pure(file: Path) -> None:
     found = imports_of(file)
-    may = {"membrane_ctrl.metrology", "firmware_iface.roles"} | PLAIN_DATA
+    may = {"membrane_ctrl.metrology", "firmware_iface.optical_roles"} | PLAIN_DATA
     assert not {m for m in ours(found) if not allowed(m, may)}
     assert not {m for m in found if allowed(m, IO | NOT_PLAIN)}
 

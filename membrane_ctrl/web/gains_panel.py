@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 from nicegui import ui
 
 from membrane_ctrl.control_port.outcome import Outcome
-from membrane_ctrl.control_port.protocol import role_includes
+from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.controller.commands import TABLE, Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.run_status import gains_words

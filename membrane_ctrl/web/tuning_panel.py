@@ -157,7 +157,7 @@ class TuningPanel:
             return
         self._seen = seen
         self._head.set_text(seen.head)
-        self._said.set_visibility(bool(seen.progress.said))
+        self._said.set_visibility(bool(seen.progress.results))
         if before is None or before.path != seen.path:
             self._said.clear()
             before = SessionSeen(seen.path, frozenset(), Progressed())
