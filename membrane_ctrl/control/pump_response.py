@@ -7,12 +7,14 @@ x is the path of a mirror of gain 1 behind a dead time d and a lag L. Only two c
 the pump's curve has no effect: the flow k between them is an unknown. The speed v with the pump off
 is known within its standard deviation, and k within 60 % of the configured curve. y_0 and k are
 eliminated, d and L are averaged over a grid by their probability. Their prior is wide, about a
-typical pump: where the readings show little, the error bars show it.
+typical pump: where the readings show little, the error bars show it. As both are positive, their
+probability narrows where the readings make them too small; the standard deviation of their sum is
+therefore at least that of a shift in time, which the readings show equally well everywhere.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +39,8 @@ _SHARE_STEP = _DELAY_SHARES[1] - _DELAY_SHARES[0]
 _FINE_SUMS = 13
 _FINE_SHARES = 9
 _READINGS_LEAST = 10
+# For the derivative of a path
+_SHIFT_S = 0.01
 # Beyond this reduced chi-square something else than the pump moved the readings.
 _CHI2_MOST = 9.0
 
@@ -125,6 +129,7 @@ def identify_pump_response(
     flow_weight = (_FLOW_SIGMA_SHARE * flow_um_per_s) ** -2
     sums_s, shares = _SUM_S, _DELAY_SHARES
     response = None
+    shift_sigma_s = 0.0
     for _ in range(2):
         sum_s, share = (grid.ravel() for grid in np.meshgrid(sums_s, shares, indexing="ij"))
         delay_s, lag_s = share * sum_s, (1.0 - share) * sum_s
@@ -145,10 +150,22 @@ def identify_pump_response(
         weight = np.exp(log_weight - log_weight.max()) * interval
         response = _average_grid(delay_s, lag_s, weight, float(np.diff(sums_s)[-1]))
         best = int(weight.argmax())
+        # A reading's change by a shift in time, less what another flow would change as well
+        later = project @ _simulate_paths(
+            time_s, switches, delay_s[best : best + 1] + _SHIFT_S, lag_s[best : best + 1]
+        )
+        shift = (later[:, 0] - paths[:, best]) / _SHIFT_S
+        shift -= paths[:, best] * (paths[:, best] @ shift) / curvature[best]
+        slope_per_s = abs(overlap[best] / curvature[best]) * float(np.linalg.norm(shift))
+        shift_sigma_s = float(_SUM_S[-1])  # readings that show nothing
+        if slope_per_s * shift_sigma_s > math.sqrt(reduced):
+            shift_sigma_s = math.sqrt(reduced) / slope_per_s
         sums_s = _refine(sum_s, weight, sum_s[best], _SUM_STEP * sum_s[best], _FINE_SUMS)
         sums_s = np.maximum(sums_s, 1e-3 * np.arange(1, _FINE_SUMS + 1))
         shares = np.clip(_refine(share, weight, share[best], _SHARE_STEP, _FINE_SHARES), 0.0, 0.999)
-    return response
+    if response is None:
+        return None
+    return replace(response, sum_sigma_s=max(response.sum_sigma_s, shift_sigma_s))
 
 
 def apply_response(estimator: EstimatorConfig, response: PumpResponse | None) -> EstimatorConfig:
