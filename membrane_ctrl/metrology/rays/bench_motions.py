@@ -76,7 +76,7 @@ GROUPS = (
     MotionGroup("the camera rolled about its axis", 1, "µrad"),
     MotionGroup("the screen shifted sideways", 2, "µm"),
     _hidden("the screen shifted along its normal", "µm"),
-    MotionGroup("the screen tilted", 2, "µrad"),
+    MotionGroup("the screen tilted", 2, "µrad", knock=LARGEST),
     MotionGroup("the screen rolled in its plane", 1, "µrad"),
     MotionGroup("the mirror shifted sideways", 2, "µm", allowance=0.0),
     _hidden("the mirror shifted along z", "µm", allowance=0.0),

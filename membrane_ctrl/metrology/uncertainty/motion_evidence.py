@@ -24,6 +24,10 @@ are therefore estimated from saddle and slopes alone. An error of the reference 
 too (film that moved between its x and y frames): only frames that share the reference's error are
 compared in their saddle.
 
+Noise has a gain, too: its share of frames beyond a gain g is exp(-g / 2) for two components. A
+figure is doubted for a tilt of the ring only if the gain of a group is so large that noise reaches
+it, with all groups tried, in one of 10,000 frames. Smaller gains only widen the error bars.
+
 Motions that are too small to be found are an error of the figure, too: each group adds
 S (A + 1 / tau^2)^-1 S^T to the covariance, where tau, its allowance, is how far a body may move
 without any sign. Where the saddle is compared, a hidden motion may be as large as the saddle
@@ -33,6 +37,7 @@ admits.
 import math
 from dataclasses import dataclass, replace
 from functools import cache
+from statistics import NormalDist
 
 import numpy as np
 
@@ -45,9 +50,13 @@ from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_DEGREE
 # the ring by a fourth of its turn, a screen that shifts by a fifth.
 _KNOCK_PER_TILT = 5.0
 # Decreases of chi-square.
-_CHANCE_GAIN = 4.0  # for each component of a group: a smaller one is no motion beyond the allowance
+# For each component of a group: a smaller one does not widen the error bars beyond the allowance.
+_CHANCE_GAIN = 4.0
 _SURE_GAIN = 25.0  # 5 sigma
 _PLAUSIBLE_GAIN = 9.0  # below the best: 3 sigma
+# Share of the frames of a bench at rest in which a motion seems proven. Ten times less than
+# 1 in 1000: noise that is not quite normal reaches large gains more often.
+_FALSE_ALARMS = 1e-4
 # Effects on the figure (RMS without tilt) beyond which it is degraded: by a proven motion, and by
 # one that camera, screen or mirror may have made.
 _PROVEN_UM = 0.03
@@ -70,6 +79,21 @@ def ring_tilt() -> FloatArray:
 def ring_saddle() -> FloatArray:
     """Matrix (2, parameters): cosine and sine of the rim's height around twice the azimuth."""
     return _ring_harmonic(2)
+
+
+@cache
+def _gain_by_chance(components: int) -> float:
+    """Gain of a group of one or two components that a bench at rest has in one of its groups in a
+    share `_FALSE_ALARMS` of the frames.
+
+    The gain is chi-square distributed. The groups' gains are not independent, so that the share is
+    at most that.
+    """
+    tried = sum(not group.is_hidden for group in GROUPS)
+    share = _FALSE_ALARMS / tried
+    if components == 1:
+        return NormalDist().inv_cdf(share / 2) ** 2
+    return -2 * math.log(share)
 
 
 @dataclass(frozen=True)
@@ -177,6 +201,11 @@ class MotionFinding:
         return self.tilted[0].gain - mirror > _SURE_GAIN
 
     @property
+    def is_beyond_chance(self) -> bool:
+        """Whether noise alone hardly ever gives so large a gain, by the ring's tilt."""
+        return any(fit.gain > _gain_by_chance(GROUPS[fit.group].components) for fit in self.tilted)
+
+    @property
     def is_hidden_sure(self) -> bool:
         """Whether the ring has bent, most likely by a hidden motion."""
         if not self.bent:
@@ -223,7 +252,7 @@ def find_motion_doubt(motion: MotionFinding, own_mm2: FloatArray, tilt_urad: flo
     if motion.is_sure:
         return f"knocked: {motion.describe()}; check camera and screen"
     own_um = 1e3 * math.sqrt(float(np.trace(own_mm2[_FIGURE, _FIGURE])))
-    if motion.figure_um > max(own_um, _POSSIBLE_UM):
+    if motion.is_beyond_chance and motion.figure_um > max(own_um, _POSSIBLE_UM):
         return (
             f"the ring seems tilted by {tilt_urad:.2g} µrad since the reference: camera, screen or "
             f"mirror moved, cause unknown; {motion.describe_tilt()}; the figure may be "
