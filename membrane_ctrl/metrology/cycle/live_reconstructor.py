@@ -47,7 +47,15 @@ from membrane_ctrl.metrology.reconstruction import (
 from membrane_ctrl.metrology.uncertainty import cycle_errors, geometry_spread
 from membrane_ctrl.metrology.uncertainty.geometry_statement import GeometryStatement
 from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding, find_motion_doubt
-from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
+from membrane_ctrl.model.arrays import (
+    AnyArray,
+    ArrayLike,
+    BoolArray,
+    FloatArray,
+    Image,
+    IntArray,
+    Singles,
+)
 from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge_quality
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
@@ -117,6 +125,10 @@ class LiveReconstructor:
             shifts_rad = phase_steps.equal_shifts(steps)
         self._shifts_rad = np.broadcast_to(np.asarray(shifts_rad, float), (2, steps))
         self._weights = [phase_steps.step_weights(shifts) for shifts in self._shifts_rad]
+        # Sigma of a phase whose fringes swing by as much as the noise.
+        self._sigma_per_noise_rad = np.array(
+            [phase_steps.phase_sigma_rad(shifts, 1.0, 1.0) for shifts in self._shifts_rad]
+        )
         self._slots = pattern_sequence.FullSlots(steps)
         fringes = pattern_sequence.fringe_sequence(optics.pattern)
         self._patterns = tuple(
@@ -180,7 +192,7 @@ class LiveReconstructor:
         self._take_bands(np.zeros(0))
 
         # Absolute phases of the bins near the mirror.
-        images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
+        images = self._take_means(self._near)
         phase_rad = full_decoder.decode_full(images, optics.pattern, self._shifts_rad)
         is_saturated = self._binner.saturated.ravel()[self._near] > 0
         phase_rad[:, is_saturated] = np.nan
@@ -392,11 +404,16 @@ class LiveReconstructor:
             for slot, shift in zip(range(slots.start, slots.stop), shifts, strict=True):
                 patterns[slot] = replace(patterns[slot], shift_rad=float(shift))
         stack = self._stack_without_frames(tuple(patterns))
-        binned = self._binned(self._binner.sums[: self._slots.count])
+        some = image_lag.choose_lag_bins(state.index)
+        means = self._take_means(state.index[some])
         # Saturated bins are known of the sinusoids; other frames do not need them.
-        phase_rad = state.accepted[:, 0]
-        self._lag, corrected = image_lag.find_image_lag(stack, binned, state.index, phase_rad)
+        is_saturated = self._binner.saturated.ravel()[state.index[some]] > 0
+        levels = ClipLevels(self._binner.white_adu)
+        sample = Binned(self._bin_px, means, np.broadcast_to(is_saturated, means.shape), levels)
+        self._lag = image_lag.find_image_lag(stack, sample, state.accepted[:, 0, some])
         if self._lag.corrected:
+            binned = self._binned(self._binner.sums[: self._slots.count])
+            corrected = image_lag.remove_image_lag(stack, binned, self._lag)
             slots = np.r_[self._slots.sinusoids]
             self._binner.sums[slots] = np.rint(corrected.means[slots] * self._bin_px**2)
         self._doubt = self._doubt or image_lag.describe_image_lag(self._lag)
@@ -418,10 +435,18 @@ class LiveReconstructor:
 
     def _binned(self, sums: AnyArray) -> Binned:
         """Sums of frames as means."""
-        # in single precision throughout, which holds every sum exactly: a third of the time
-        means = np.divide(sums, self._bin_px**2, dtype=np.float32, casting="unsafe")
+        # in single precision, which holds every sum exactly: a third of the time
+        means = sums.astype(np.float32)
+        means /= np.float32(self._bin_px**2)
         saturated = np.broadcast_to(self._binner.saturated > 0, means.shape)
         return Binned(self._bin_px, means, saturated, ClipLevels(self._binner.white_adu))
+
+    def _take_means(self, index: IntArray) -> Singles:
+        """Means (frames, n) of some bins in all frames of a full cycle."""
+        sums = self._binner.sums[: self._slots.count].reshape(self._slots.count, -1)
+        means = np.take(sums, index, axis=1).astype(np.float32)
+        means /= np.float32(self._bin_px**2)
+        return means
 
     def _sums(self) -> list[AnyArray]:
         """Bin sums (N, bins) of the sinusoids of x and of y."""
@@ -482,10 +507,7 @@ class LiveReconstructor:
         """
         # Variance (2,) of the phase of a bin from the noise of its pixels.
         modulation_adu = quality.modulation_share * self._full_scale_adu
-        sigmas_rad = [
-            phase_steps.phase_sigma_rad(shifts, self._pixel_sigma_adu, modulation_adu)
-            for shifts in self._shifts_rad
-        ]
+        sigmas_rad = self._sigma_per_noise_rad * (self._pixel_sigma_adu / modulation_adu)
         noise_rad2 = np.square(sigmas_rad) / self._bin_px**2
 
         # Phases that changed by more than noise since the reference: an independent error of each

@@ -280,7 +280,8 @@ def _add_frequency(rad_per_row: FloatArray, power: FloatArray, rows: IntArray) -
 def _with_fringes(binned: Binned, axes: list[list[int]]) -> IntArray:
     """Bins (n,), enough of those in which both axes swing and nothing is saturated."""
     swing = np.minimum(*(np.ptp(binned.means[frames], axis=0) for frames in axes))
-    least_swing = CONTRAST_SHARE * np.percentile(swing, _LEAST_SWING_PERCENTILE)
+    some = swing.ravel()[:: max(1, swing.size // _ENOUGH_BINS)]
+    least_swing = CONTRAST_SHARE * np.percentile(some, _LEAST_SWING_PERCENTILE)
     saturated = binned.saturated[[*axes[0], *axes[1]]].any(axis=0)
     usable = (swing > least_swing) & ~saturated
     every = max(1, np.count_nonzero(usable) // _ENOUGH_BINS)

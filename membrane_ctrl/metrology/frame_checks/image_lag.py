@@ -211,32 +211,29 @@ def lag_correction(seen: Singles, previous: Singles, lag: ImageLag) -> Singles:
     return np.asarray(np.where(more > 0, rise, fall) * more)
 
 
-def find_image_lag(
-    stack: FrameStack, binned: Binned, index: IntArray, phase_rad: FloatArray
-) -> tuple[ImageLag, Binned]:
-    """Find the shares of a live cycle, whose phases are known, and take them out.
+def choose_lag_bins(index: IntArray) -> IntArray:
+    """Enough of the bins `index` (n,) of a live cycle to find the shares."""
+    return np.arange(0, index.size, max(1, index.size // _LIVE_BINS))
+
+
+def find_image_lag(stack: FrameStack, binned: Binned, phase_rad: FloatArray) -> ImageLag:
+    """Find the shares of a live cycle, whose phases are known.
 
     Parameters
     ----------
-    index : (n,) int array
-        Bins.
+    stack, binned : FrameStack, Binned
+        The cycle, and its frames as means over n bins.
     phase_rad : (2, n) array
-        Their absolute phases, to some hundredths of a radian.
-
-    Returns
-    -------
-    ImageLag, Binned
-        The bins are the given ones if the frames show no share.
+        Absolute phases of the bins, to some hundredths of a radian.
     """
-    few = slice(None, None, max(1, index.size // _LIVE_BINS))
-    index, phase_rad = index[few], phase_rad[:, few]
     x_frames = stack.sinusoids(AXES[0])
     mean_of_steps = stack.weights(x_frames)[0]
+    index = np.arange(phase_rad.shape[1])
     lag = UNKNOWN
     corrected = binned
     for _ in range(ROUNDS):
         # The light is the mean of the x steps, in the frames as corrected so far.
-        x_means = corrected.means[x_frames].reshape(len(x_frames), -1)[:, index]
+        x_means = corrected.means[x_frames].reshape(len(x_frames), -1)
         light = np.tensordot(mean_of_steps, x_means, axes=1)
         scene = SampledBins(index, light, phase_rad, np.zeros_like(phase_rad))
         found = estimate_image_lag(stack, corrected, scene, ())
@@ -244,7 +241,7 @@ def find_image_lag(
         if not lag.corrected or not is_worth_another_round(found):
             break
         corrected = remove_image_lag(stack, binned, lag)
-    return lag, corrected
+    return lag
 
 
 def is_worth_another_round(found: ImageLag) -> bool:

@@ -7,18 +7,21 @@ from membrane_ctrl.metrology.phase.gray_code import absolute_phase, gray_orders
 from membrane_ctrl.metrology.phase.pattern_sequence import FullSlots
 from membrane_ctrl.metrology.phase.phase_steps import compute_phasors
 from membrane_ctrl.metrology.phase.screen_scale import inside_pattern
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import FloatArray, Singles
 
 # A pixel sees the screen in the mirror if white differs from black by this share of what the bright
 # pixels show; the rest of the room differs by stray light only.
 CONTRAST_SHARE = 0.2
 _BRIGHTEST_PERCENTILE = 95  # what counts as bright
+_ENOUGH_PIXELS = 20_000  # for that percentile
 # The fringes must swing by this share of white less black, too: less is a blurred edge, dust or a
 # mixture of two places.
 FRINGE_SHARE = 0.1
 
 
-def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArray) -> FloatArray:
+def decode_full(
+    images: FloatArray | Singles, pattern: PatternConfig, shifts_rad: FloatArray
+) -> FloatArray:
     """Absolute phases of x and y from the images of a full cycle (eq. 1 and 2).
 
     Parameters
@@ -46,7 +49,8 @@ def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArr
     white = images[slots.white]
     black = images[slots.black]
     contrast = white - black
-    valid = contrast > CONTRAST_SHARE * np.percentile(contrast, _BRIGHTEST_PERCENTILE)
+    some = contrast.ravel()[:: max(1, contrast.size // _ENOUGH_PIXELS)]
+    valid = contrast > CONTRAST_SHARE * np.percentile(some, _BRIGHTEST_PERCENTILE)
     phases = []
     for sinusoids, gray, shifts in zip(slots.sinusoids, slots.gray, shifts_rad, strict=True):
         phasor = compute_phasors(images[sinusoids], shifts)

@@ -29,8 +29,10 @@ def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[In
         floor(s / T) from all bits but the last, and floor((V2 + 1) / 2) from all, V2 = floor(2 s /
         T).
     """
-    threshold = (np.asarray(white, float) + np.asarray(black, float)) / 2
-    return code_orders(np.asarray(gray, float) > threshold)
+    # Integers are averaged as numbers with fractions; single precision holds every camera's levels.
+    kind = np.result_type(np.asarray(white), np.float32)
+    threshold = (np.asarray(white, kind) + np.asarray(black, kind)) / 2
+    return code_orders(np.asarray(gray) > threshold)
 
 
 def code_orders(bits: BoolArray) -> tuple[IntArray, IntArray]:
@@ -47,9 +49,13 @@ def code_orders(bits: BoolArray) -> tuple[IntArray, IntArray]:
         As `gray_orders`.
     """
     # Each binary digit is the exclusive or of all Gray bits down to it.
-    binary = np.bitwise_xor.accumulate(bits.astype(np.int64), axis=0)
-    half_periods = np.tensordot(1 << np.arange(len(binary))[::-1], binary, axes=1)
-    return half_periods // 2, (half_periods + 1) // 2
+    digit = np.zeros(bits.shape[1:], bool)
+    half_periods = np.zeros(bits.shape[1:], np.int32)
+    for bit in bits:
+        digit ^= bit
+        half_periods *= 2
+        half_periods += digit
+    return half_periods >> 1, (half_periods + 1) >> 1
 
 
 def absolute_phase(wrapped_rad: FloatArray, k1: IntArray, k2: IntArray) -> FloatArray:

@@ -88,17 +88,21 @@ def compute_phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray)
     Returns
     -------
     (...) complex array
+        In single precision if the frames are.
 
     Raises
     ------
     ValueError
         As `step_weights`.
     """
-    stack = np.asarray(frames, float)
-    _, cosine, sine = step_weights(shifts_rad)
-    out = np.empty(stack.shape[1:], np.complex128)
-    out.real = np.einsum("k,k...->...", cosine, stack)
-    out.imag = np.einsum("k,k...->...", sine, stack)
+    stack = np.asarray(frames)
+    if stack.dtype != np.float32:
+        stack = stack.astype(float)
+    weights = step_weights(shifts_rad)[1:].astype(stack.dtype)
+    parts = weights @ stack.reshape(len(stack), -1)
+    out = np.empty(stack.shape[1:], np.result_type(stack, np.complex64))
+    out.real = parts[0].reshape(out.shape)
+    out.imag = parts[1].reshape(out.shape)
     return out
 
 

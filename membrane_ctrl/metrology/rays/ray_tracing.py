@@ -83,7 +83,7 @@ class Tracer:
         self._plane = np.vstack([geometry.screen_origin_mm, geometry.screen_axes])
         self._face = geometry.face
 
-    def start(self, points: Points, height: HeightFunction) -> None:
+    def start(self, points: Points, height: HeightFunction, steps: int = _START_STEPS) -> None:
         """Put the points on a starting shape, by t <- (vertex_z + h - F_z) / d_z.
 
         Each step contracts by slope times inclination of the ray (below 0.1), also at the kink of a
@@ -92,7 +92,7 @@ class Tracer:
         f = self._pinhole
         d = points.rays
         points.t_mm[:] = (self.vertex_z_mm - f[2]) / d[2]
-        for _ in range(_START_STEPS):
+        for _ in range(steps):
             h = height(f[0] + points.t_mm * d[0], f[1] + points.t_mm * d[1])
             points.t_mm[:] = (self.vertex_z_mm + h - f[2]) / d[2]
 

@@ -16,6 +16,8 @@ class BinGrid:
 
     Attributes
     ----------
+    columns : int
+        Number of bins in a row.
     column_px, row_px : (bins,) arrays
         Centres of the bins in pixels.
     rays : (3, bins) array
@@ -28,6 +30,7 @@ class BinGrid:
         middle = (bin_px - 1) / 2
         columns = np.arange(camera.width_px // bin_px) * bin_px + middle
         rows = np.arange(camera.height_px // bin_px) * bin_px + middle
+        self.columns = columns.size
         grid_columns, grid_rows = np.meshgrid(columns, rows)
         self.column_px = grid_columns.ravel()
         self.row_px = grid_rows.ravel()

@@ -56,7 +56,7 @@ def fit_surface(
     ----------
     start : height function or Surface
         A height function places the points once. A Surface is the last solution: the points must
-        then be on it, and one or two steps are enough.
+        then be on it, one or two steps are enough, and the matrix of the first one is kept.
     normal : NormalMatrix, optional
         A matrix to keep instead of recomputing it each step (the solution is the same).
     tolerance_mm : float
@@ -81,6 +81,8 @@ def fit_surface(
     while len(changes) < max_iterations:
         step = _gauss_newton_step(tracer, points, surface, normal, newton=0 if placed else 1)
         placed = False
+        if isinstance(start, Surface):
+            normal = step.normal
         surface = Surface.from_parameters(surface.parameters + step.delta, tracer.radius_mm)
         changes.append(float(np.max(np.abs(height_probe() @ step.delta))))
         if not changes[-1] * CONTRACTION > tolerance_mm:  # also ends on NaN

@@ -10,11 +10,18 @@ from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.metrology.phase import bin_sums, screen_scale
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.surface import Surface
-from membrane_ctrl.metrology.reconstruction import bin_grid, normal_matrix, surface_fit
+from membrane_ctrl.metrology.reconstruction import (
+    bin_grid,
+    normal_matrix,
+    smooth_fields,
+    surface_fit,
+)
 from membrane_ctrl.metrology.reconstruction.film_motion import sensitivity_mm_per_um
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _START_SAG_MM = 40.0  # the paper's starting parabola; any other leads to the same result
+_FIRST_POINTS = 8000  # of the first surface, which only finds outliers and starts the fit of all
+_PLACING_STEPS = 3  # towards a parabola near it; Newton steps do the rest
 _OUTLIER_SIGMAS = 8.0  # of the slopes' robust scatter: dust and glints, never noise
 _RAYLEIGH_MEDIAN = 1.177  # median of a Rayleigh distribution, in sigmas
 _LEAST_SLOPE = 1e-9  # floor of that scatter: the rounding of a noise-free set
@@ -98,38 +105,41 @@ def select_points(
     ValueError
         Too few bins see the pattern in the mirror to fit a surface.
     """
-    # All usable bins, and their surface.
+    # All usable bins, on a surface through some of them.
     finite = np.isfinite(phase_rad).all(axis=0)
     index, phase_rad = candidates[finite], phase_rad[:, finite]
     if index.size < _MIN_POINTS:
         raise ValueError(f"only {index.size} bins see the pattern in the mirror")
     points = ray_tracing.Points.of(grid.rays[:, index], screen_scale.screen_mm(phase_rad, pattern))
-    fit = surface_fit.fit_surface(
-        tracer, points, ray_tracing.make_parabola(_START_SAG_MM, tracer.radius_mm)
-    )
+    first = _fit_some(tracer, points, analysis_radius_mm)
+    near = ray_tracing.make_parabola(first.sag_mm, tracer.radius_mm)
+    tracer.start(points, near, steps=_PLACING_STEPS)
+    tracer.intersect(points, first, newton=3)
 
-    # Without bins outside the analysed radius, then without outliers.
-    for select in (_inside_radius, _without_outliers):
-        keep = select(tracer, points, fit.surface, analysis_radius_mm)
-        points = points.subset(keep)
-        index = index[keep]
-        phase_rad = phase_rad[:, keep]
-        if index.size < _MIN_POINTS:
-            raise ValueError(f"only {index.size} bins see the pattern inside the analysis radius")
-        fit = surface_fit.fit_surface(tracer, points, fit.surface)
+    # Without bins outside the analysed radius, and without outliers: the surface of all others.
+    inside = _inside_radius(tracer, points, analysis_radius_mm)
+    keep = np.flatnonzero(inside & _without_outliers(tracer, points, first, inside))
+    _check_count(keep.size)
+    points, index, phase_rad = points.subset(keep), index[keep], phase_rad[:, keep]
+    fit = surface_fit.fit_surface(tracer, points, first)
     tracer.intersect(points, fit.surface)
 
-    # Area of the mirror, seen from above, in a bundle of rays: solid angle t^2 / |d (-h_x, -h_y,
-    # 1)|.
-    field = tracer.slope_field(points, fit.surface)
-    facing = np.abs(points.rays[2] - field[4] * points.rays[0] - field[5] * points.rays[1])
-    area_mm2 = grid.solid_angle(index) * points.t_mm**2 / facing
-
-    # From phase to place on the screen, and the effect of the film's displacement.
+    # From phase to place on the screen; the effect of the film's displacement; the bins' areas.
     mm_per_rad = screen_scale.mm_per_rad(pattern)
-    bias_mm = grid.averaging_bias_mm(tracer, points, fit.surface, index)
-    offset_mm = bias_mm + screen_scale.centre_phase_rad(pattern) * mm_per_rad
-    sensitivity_rad_per_um = sensitivity_mm_per_um(tracer, points, fit.surface) / mm_per_rad
+
+    def trace_some(some: IntArray) -> FloatArray:
+        """Fields (5, m) at some of the points."""
+        there = points.subset(some)
+        return np.vstack(
+            [
+                grid.averaging_bias_mm(tracer, there, fit.surface, index[some]),
+                sensitivity_mm_per_um(tracer, there, fit.surface) / mm_per_rad,
+                _seen_area_mm2(grid, tracer, there, fit.surface, index[some])[None],
+            ]
+        )
+
+    fields = smooth_fields.interpolate_fields(trace_some, index, grid.columns)
+    offset_mm = fields[:2] + screen_scale.centre_phase_rad(pattern) * mm_per_rad
 
     accepted = np.zeros((2, bin_sums.FOLLOWED_ROWS, index.size))
     accepted[:, 0] = phase_rad
@@ -139,8 +149,8 @@ def select_points(
         index=index,
         points=points,
         offset_mm=offset_mm,
-        sensitivity_rad_per_um=sensitivity_rad_per_um,
-        area_mm2=area_mm2,
+        sensitivity_rad_per_um=fields[2:4],
+        area_mm2=fields[4],
         surface=fit.surface,
         normal=fit.normal,
         accepted=accepted,
@@ -148,8 +158,29 @@ def select_points(
     )
 
 
+def _fit_some(tracer: ray_tracing.Tracer, points: ray_tracing.Points, radius_mm: float) -> Surface:
+    """Surface through some of the points, inside a radius and without outliers."""
+    count = min(_FIRST_POINTS, points.t_mm.size)
+    some = points.subset(np.linspace(0, points.t_mm.size - 1, count).astype(int))
+    start = ray_tracing.make_parabola(_START_SAG_MM, tracer.radius_mm)
+    surface = surface_fit.fit_surface(tracer, some, start).surface
+    some = some.subset(_inside_radius(tracer, some, radius_mm))
+    _check_count(some.t_mm.size)
+    surface = surface_fit.fit_surface(tracer, some, surface).surface
+    everywhere = np.ones(some.t_mm.size, bool)
+    some = some.subset(_without_outliers(tracer, some, surface, everywhere))
+    _check_count(some.t_mm.size)
+    return surface_fit.fit_surface(tracer, some, surface).surface
+
+
+def _check_count(count: int) -> None:
+    """Raise ValueError if there are too few bins for a surface."""
+    if count < _MIN_POINTS:
+        raise ValueError(f"only {count} bins see the pattern inside the analysis radius")
+
+
 def _inside_radius(
-    tracer: ray_tracing.Tracer, points: ray_tracing.Points, _surface: Surface, radius_mm: float
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, radius_mm: float
 ) -> BoolArray:
     """Points within a radius."""
     x, y = tracer.position_mm(points)
@@ -157,10 +188,30 @@ def _inside_radius(
 
 
 def _without_outliers(
-    tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface, _radius_mm: float
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface, inside: BoolArray
 ) -> BoolArray:
-    """Slopes within some robust sigmas of the fit, in both directions."""
+    """Points whose slopes are within some robust sigmas of the fit, in both directions.
+
+    The sigma is that of the points `inside` (n,).
+    """
     field = tracer.slope_field(points, surface)
     residual = np.hypot(field[2] - field[4], field[3] - field[5])
-    sigma = max(float(np.median(residual)) / _RAYLEIGH_MEDIAN, _LEAST_SLOPE)
+    median = float(np.median(residual[inside]))
+    sigma = max(median / _RAYLEIGH_MEDIAN, _LEAST_SLOPE)
     return np.asarray(residual <= _OUTLIER_SIGMAS * sigma)
+
+
+def _seen_area_mm2(
+    grid: bin_grid.BinGrid,
+    tracer: ray_tracing.Tracer,
+    points: ray_tracing.Points,
+    surface: Surface,
+    index: IntArray,
+) -> FloatArray:
+    """Area of the mirror, seen from above, in the bundle of rays of each bin (n,).
+
+    Solid angle t^2 / |d (-h_x, -h_y, 1)|.
+    """
+    field = tracer.slope_field(points, surface)
+    facing = np.abs(points.rays[2] - field[4] * points.rays[0] - field[5] * points.rays[1])
+    return np.asarray(grid.solid_angle(index) * points.t_mm**2 / facing)

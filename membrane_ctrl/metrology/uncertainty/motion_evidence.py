@@ -63,6 +63,10 @@ _PROVEN_UM = 0.03
 _POSSIBLE_UM = 0.1
 _TINY = 1e-12  # instead of a division by zero
 _FIGURE = slice(FIRST_FIGURE_INDEX - 2, None)  # of the parameters: without tilt
+_KNOCKS = np.array([group.knock for group in GROUPS])
+# Components (groups, 2) of each group, and whether it has that one.
+_GROUP_COMPONENTS = np.array([[each.start, each.stop - 1] for each in group_columns()])
+_IS_COMPONENT = np.array([[True, group.components == 2] for group in GROUPS])
 
 
 @cache
@@ -290,9 +294,21 @@ class _GroupTest:
         return np.asarray(self.by_ring @ ring_mm + self.by_left @ left[self.columns])
 
 
-def _spread(information: FloatArray, size: float) -> FloatArray:
-    """(A + 1 / size^2)^-1 (k, k): covariance of a group, its components with a prior of `size`."""
-    return np.asarray(np.linalg.inv(information + np.eye(len(information)) / size**2))
+def _spread(information: FloatArray, size: float | FloatArray) -> FloatArray:
+    """(A + 1 / size^2)^-1 (..., k, k): covariance of groups, whose components have a prior of
+    `size` (...).
+    """
+    prior = np.eye(information.shape[-1]) / np.square(size)[..., None, None]
+    return np.asarray(np.linalg.inv(information + prior))
+
+
+def _blocks_of_groups(matrix: FloatArray) -> FloatArray:
+    """Part (groups, 2, 2) of a matrix (components, components) that belongs to each group; zeros
+    beside a single component. One call of the library for all groups is ten times faster than one
+    for each.
+    """
+    blocks = matrix[_GROUP_COMPONENTS[:, :, None], _GROUP_COMPONENTS[:, None, :]]
+    return np.where(_IS_COMPONENT[:, :, None] & _IS_COMPONENT[:, None, :], blocks, 0.0)
 
 
 @dataclass(frozen=True)
@@ -360,20 +376,26 @@ class MotionTest:
         `harmonic` (2, parameters) is `ring_tilt` or `ring_saddle`, `ring_mm2` (2, 2) its
         covariance.
         """
+        change = harmonic @ self._effects.figure_mm
+        by_ring = change.T @ np.linalg.inv(ring_mm2)
+        information = _blocks_of_groups(by_ring @ change)
+        by_left = np.zeros_like(information)
+        if self._slopes is not None:
+            own = _blocks_of_groups(self._slopes.gram)
+            scatter = _blocks_of_groups(self._slopes.covariance)
+            by_left = own @ np.linalg.pinv(scatter, rcond=1e-9, hermitian=True)
+            information = information + by_left @ own
+        spread = _spread(information, _KNOCKS)
         tests = {}
-        ring_weight = np.linalg.inv(ring_mm2)
         for number, (group, columns) in enumerate(zip(GROUPS, group_columns(), strict=True)):
-            change = harmonic @ self._effects.figure_mm[:, columns]
-            by_ring = change.T @ ring_weight
-            information = by_ring @ change
-            by_left = np.zeros((group.components,) * 2)
-            if self._slopes is not None:
-                own = self._slopes.gram[columns, columns]
-                scatter = self._slopes.covariance[columns, columns]
-                by_left = own @ np.linalg.pinv(scatter, rcond=1e-9, hermitian=True)
-                information = information + by_left @ own
-            spread = _spread(information, group.knock)
-            tests[number] = _GroupTest(columns, by_ring, by_left, information, spread)
+            block = slice(group.components)
+            tests[number] = _GroupTest(
+                columns,
+                by_ring[columns],
+                by_left[number, block, block],
+                information[number, block, block],
+                spread[number, block, block],
+            )
         return tests
 
     def find(self, tilt_mm: FloatArray, saddle_mm: FloatArray, left: FloatArray) -> MotionFinding:
