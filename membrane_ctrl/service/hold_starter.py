@@ -13,6 +13,7 @@ import re
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -253,6 +254,11 @@ class HoldStarter:
 def options_file(logs: Path, name: str) -> Path:
     """Return the file from which a unit takes its options at one start."""
     return logs / f".start-{name}.env"
+
+
+def find_name_of_run(run: str, names: Sequence[str]) -> str | None:
+    """Return the configuration of a run that the service has started, which has its name."""
+    return next((name for name in names if run.endswith(f"-{name}")), None)
 
 
 def is_configuration_name(name: str) -> bool:

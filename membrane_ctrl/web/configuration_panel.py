@@ -23,8 +23,9 @@ from membrane_ctrl.service.configuration_editor import (
 )
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_restart import begin_restart
-from membrane_ctrl.service.hold_starter import HoldStarter
+from membrane_ctrl.service.hold_starter import HoldStarter, find_name_of_run
 from membrane_ctrl.service.work_pools import CONFIGURATIONS, RUN_LISTS, PoolFullError
+from membrane_ctrl.web.confirmation import confirm
 from membrane_ctrl.web.messages import show_message
 
 EDITS: Role = "tune"
@@ -79,8 +80,7 @@ class ConfigurationPanel:
             show_message(str(error), good=False)
             return
         names = [each.name for each in listed if each.file is not None]
-        of_run = [name for name in names if self._feed.seen.name.endswith(f"-{name}")]
-        chosen = next(iter(of_run or names), None)
+        chosen = find_name_of_run(self._feed.seen.name, names) or next(iter(names), None)
         if self._choice.value in names:
             chosen = self._choice.value
         self._choice.set_options(names, value=chosen)
@@ -163,22 +163,12 @@ class ConfigurationPanel:
 
     async def _confirm_restart(self) -> None:
         """Ask, save, stop the hold, and start it again."""
-        with ui.dialog() as dialog, ui.card():
-            ui.label(f"Save {self._name} and restart?").classes("text-h6")
-            ui.label(
-                "The running hold ends and the pump stops; then the next one checks its devices, "
-                "inflates the mirror and holds it."
-            )
-            with ui.row():
-                ui.button("Save and restart", on_click=lambda: dialog.submit("yes")).props(
-                    "color=deep-orange-9"
-                )
-                ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None).props(
-                    "flat autofocus"
-                )
-        is_sure = await dialog
-        if not dialog.is_deleted:  # with the viewer
-            dialog.delete()
+        does = (
+            "The running hold ends and the pump stops; then the next one checks its devices, "
+            "inflates the mirror and holds it."
+        )
+        title = f"Save {self._name} and restart?"
+        is_sure = await confirm(title, (does,), "Save and restart", "deep-orange-9")
         if not is_sure or not await self._save():
             return
         assert self._loaded is not None

@@ -1,7 +1,7 @@
 // The figure map: colours, axes, colour bar, PV and RMS in the corner, a profile along a line that
 // the viewer drags.
 (() => {
-  const LEFT = 58, TOP = 42, RIGHT = 74, BOTTOM = 34, PROFILE = 120, MIN_DRAG = 8;
+  const LEFT = 70, TOP = 42, RIGHT = 84, BOTTOM = 34, PROFILE = 120, MIN_DRAG = 8;
 
   class FigureMap {
     constructor(canvas) {

@@ -120,6 +120,9 @@ def _list_colours() -> list[str]:
     return [to_hex(colormaps[DIVERGING_MAP](share)) for share in np.linspace(0.0, 1.0, _COLOURS)]
 
 
+_BESIDE = {"nameLocation": "middle", "nameGap": 40}  # of the name of an axis
+
+
 def make_terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[str, Any]:
     """Options of the bar chart of the terms from Z4: height, or change since the reference, with
     an error bar of one standard deviation.
@@ -138,7 +141,7 @@ def make_terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> 
         | {"textStyle": names},
         "tooltip": {"trigger": "axis", "confine": True},
         "xAxis": {**axis, "type": "category", "data": labels},
-        "yAxis": {**axis, "type": "value", "name": "µm", "nameGap": 8},
+        "yAxis": {**axis, "type": "value", "name": "µm", **_BESIDE},
         "series": [
             {
                 "type": "bar",

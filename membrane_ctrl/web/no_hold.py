@@ -8,8 +8,14 @@ from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.model import errors
 from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.service.hold_starter import Configuration, HoldStarter, StartOptions
+from membrane_ctrl.service.hold_starter import (
+    Configuration,
+    HoldStarter,
+    StartOptions,
+    find_name_of_run,
+)
 from membrane_ctrl.service.work_pools import RUN_LISTS
+from membrane_ctrl.web.confirmation import confirm
 from membrane_ctrl.web.messages import show_message
 from membrane_ctrl.web.runs_panel import open_report
 
@@ -62,7 +68,9 @@ class NoHoldPanel:
         self._listed = await RUN_LISTS.run(self._starter.list_configurations)
         labels = {each.name: _label(each) for each in self._listed}
         usable = [each.name for each in self._listed if not each.problem]
-        self._choice.set_options(labels, value=usable[0] if usable else None)
+        ended = self._feed.seen.ended
+        of_run = None if ended is None else find_name_of_run(ended.name, usable)
+        self._choice.set_options(labels, value=of_run or next(iter(usable), None))
 
     def _look(self) -> None:
         """Show the panel without a hold, and what is new."""
@@ -90,21 +98,10 @@ class NoHoldPanel:
         """Ask, start, and show what became of it."""
         assert self._starter is not None
         name = str(self._choice.value or "")
-        with ui.dialog() as dialog, ui.card():
-            ui.label(f"Start a hold with {name}?").classes("text-h6")
-            ui.label(
-                "The hold checks its devices and waits in standby."
-                if self._standby.value
-                else "The hold checks its devices, inflates the mirror and holds it."
-            )
-            with ui.row():
-                ui.button("Start", on_click=lambda: dialog.submit("yes")).props("color=primary")
-                ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None).props(
-                    "flat autofocus"
-                )
-        is_sure = await dialog
-        if not dialog.is_deleted:  # with the viewer
-            dialog.delete()
+        does = "The hold checks its devices, inflates the mirror and holds it."
+        if self._standby.value:
+            does = "The hold checks its devices and waits in standby."
+        is_sure = await confirm(f"Start a hold with {name}?", (does,), "Start")
         if not is_sure or not role_includes(self._user.role, "operate"):
             return
         options = StartOptions(bool(self._standby.value), bool(self._clear.value))

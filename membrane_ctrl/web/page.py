@@ -13,7 +13,7 @@ from nicegui import ui
 
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.sender import role_includes
-from membrane_ctrl.control_port.status import alarm_lines
+from membrane_ctrl.control_port.status import alarm_lines, lock_lines
 from membrane_ctrl.model.columns import MISSING, PUBLISHED, TelemetryColumn
 from membrane_ctrl.service.access import (
     ACTIONS,
@@ -50,10 +50,20 @@ _SESSION_DIGITS = 8
 _FETCH_S = 30.0  # for a browser to fetch a chart
 _FIRST_SIGNALS = ["error_um"]  # of the chart
 _PANEL_REM = {1: 22, 2: 30, 3: 38, 4: 46}  # height of the chart by its panels
-# a phone is narrow
+# One column on a phone: numbers and chart, commands and figure, events. On a wide screen commands
+# and figure are beside the others.
 _CSS = (
+    ".membrane-now { display: grid; gap: 1rem; grid-template-columns: minmax(0, 1fr) }"
+    ".membrane-events { height: 12rem }"
+    "@media (min-width: 1024px) {"
+    ".membrane-now { grid-template: auto minmax(12rem, 1fr) / minmax(0, 1fr) 26rem }"
+    ".membrane-side { grid-column: 2; grid-row: 1 / span 2 }"
+    ".membrane-events { height: 100% } }"
     ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"
-    ".membrane-map canvas { touch-action: pan-y; display: block }" + MESSAGE_CSS
+    ".membrane-map canvas { touch-action: pan-y; display: block }"
+    # legible on either ground
+    ".body--dark .text-negative { color: #ff7b72 !important }"
+    ".body--light .text-warning { color: #8a5a00 !important }" + MESSAGE_CSS
 )
 _PRIMARY = "#3276bb"  # white on it is legible (4.7 : 1); on NiceGUI's own blue it is not
 _COLOURS = {
@@ -243,14 +253,15 @@ class WebPage:
         self._alarm = ui.label().classes("text-negative text-bold").props('role="alert"')
         if self._logs is not None:
             NoHoldPanel(self._feed, self._hold, self._user, self._starter)
-        with ui.row().classes("w-full items-stretch no-wrap max-lg:flex-wrap"):
-            with ui.column().classes("col-grow min-w-0"):
+        with ui.element("div").classes("membrane-now w-full"):
+            with ui.column().classes("min-w-0"):
                 self._numbers = self._build_numbers()
                 self._build_chart()
-            with ui.column().style("width: 26rem; max-width: 100%"):
+            with ui.column().classes("membrane-side min-w-0"):
                 self._build_actions()
                 self._build_figure()
-        self._events = ui.log(max_lines=200).classes("w-full h-48").props('aria-label="events"')
+            self._events = ui.log(max_lines=200).classes("w-full membrane-events")
+            self._events.props('aria-label="events"')
         self._shown_events: tuple[str, ...] = ()
 
     def _build_numbers(self) -> dict[str, tuple[ui.card, ui.label]]:
@@ -259,10 +270,10 @@ class WebPage:
         with (
             ui.grid()
             .classes("w-full gap-2")
-            .style("grid-template-columns: repeat(auto-fill, minmax(min(8.5rem, 28vw), 1fr))")
-        ):
+            .style("grid-template-columns: repeat(auto-fill, minmax(min(8.5rem, 24vw), 1fr))")
+        ) as self._numbers_place:
             for column in PUBLISHED:
-                with ui.card().classes("q-pa-sm gap-0") as card:
+                with ui.card().classes("q-pa-sm max-sm:!p-1 gap-0") as card:
                     ui.label(column.title).classes("text-caption leading-tight")
                     label = ui.label(MISSING).classes("text-h6 leading-tight")
                     label.props(f'data-field="{column.name}"')
@@ -319,7 +330,7 @@ class WebPage:
             ui.button(
                 "Use this figure", icon="push_pin", on_click=self._keep_reference, color=None
             ).props("dense outline no-caps").tooltip("Keep the newest figure as a reference")
-        ui.label("without").classes("text-caption")
+        ui.label("terms removed from the figure").classes("text-caption")
         with ui.row().classes("items-center gap-x-2 gap-y-0"):
             boxes = {
                 name: ui.checkbox(name).props("dense size=sm") for name in figure_map.REMOVABLE
@@ -462,7 +473,11 @@ class WebPage:
             )
         self._why.set_text(silent or str(status.get("why") or "as it should be"))
         self._holder.set_text("" if silent else describe_holder(status))
-        self._alarm.set_text("; ".join(alarm_lines(status)))
+        # after the end, the fault is in the panel about it
+        has_ended = bool(seen.problem) and seen.ended is not None
+        lines = lock_lines(status) if has_ended else alarm_lines(status)
+        self._alarm.set_text("; ".join(lines))
+        self._numbers_place.set_visibility(not has_ended)
         for column in PUBLISHED:
             card, label = self._numbers[column.name]
             value = row.get(column.name)
@@ -572,4 +587,8 @@ def changes_something(action: ActionButton, status: Mapping[str, Any]) -> bool:
             return status.get("paused") is not False
         case "unlock":
             return bool(status.get("locks"))
+        case "keep":
+            return status.get("trial_left_s") is not None
+        case "quiet":
+            return bool(alarm_lines(status))
     return True

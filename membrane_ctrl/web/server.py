@@ -252,10 +252,12 @@ class HangUp:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         left = scope["type"] != "websocket"
+        has_gone = False
 
         async def hear() -> Message:
-            nonlocal left
+            nonlocal left, has_gone
             message = await receive()
+            has_gone = has_gone or message["type"] == "http.disconnect"
             left = left or message["type"] == "websocket.disconnect"
             return message
 
@@ -263,7 +265,12 @@ class HangUp:
             async with asyncio.timeout(_STUCK_S):  # TimeoutError is an OSError: the connection ends
                 await send(message)
 
-        await self._app(scope, hear, tell)
+        try:
+            await self._app(scope, hear, tell)
+        except RuntimeError:
+            # Starlette's middleware raises it if the browser has gone before its answer
+            if not has_gone:
+                raise
         if not left:
             user: WebUser = scope["membrane_user"]
             print(

@@ -84,3 +84,8 @@ def test_a_button_that_changes_nothing_is_off() -> None:
     assert not changes_something(action("resume"), tracking)
     assert not changes_something(action("unlock"), tracking)
     assert changes_something(action("unlock"), {"locks": [{}]})
+    assert not changes_something(action("keep"), tracking | {"trial_left_s": None})
+    assert changes_something(action("keep"), tracking | {"trial_left_s": 12.5})
+    assert not changes_something(action("quiet"), tracking)
+    locked = {"locks": [{"word": "bofa1", "text": "hands inside"}]}
+    assert changes_something(action("quiet"), tracking | locked)
