@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # A test starts hundreds of processes: without bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: hold test board board-fuzz board-hold rest lint types kernels fast real_time unit shake docs notebooks pictures bench campaign fuzz mutants generate clean
+.PHONY: hold test paper board board-fuzz board-hold rest lint types kernels fast real_time unit shake docs notebooks pictures bench campaign fuzz mutants generate clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml requirements.lock
@@ -56,6 +56,9 @@ unit: fast real_time
 
 shake: $(STAMP)  ## the same tests on a machine that pauses for a second, again and again; SEED=2 for other moments
 	$(BIN)/python tests/shake.py --seed $(or $(SEED),1) $(MAKE) unit
+
+paper: $(STAMP)  ## each figure and table of the paper, computed again: build/paper/paper.html and .pdf
+	$(BIN)/membrane-ctrl paper --out build/paper
 
 pictures: $(STAMP)  ## takes the pictures of README and documentation; ONLY='run-*' for some of them
 	$(BIN)/python -m tests.support.pictures $(ONLY)

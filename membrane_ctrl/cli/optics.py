@@ -46,7 +46,7 @@ TurnedOption = Annotated[
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `measure`, `track`, `modes`, `export-figure`, `film`, `uncertainty`, `stability`,
+    """Add `measure`, `track`, `modes`, `export-figure`, `film`, `uncertainty`, `paper`, `stability`,
     `simulate`.
     """
     app.command()(measure)
@@ -55,6 +55,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(export_figure)
     app.command()(film)
     app.command()(uncertainty)
+    app.command()(paper)
     app.command()(stability)
     app.command()(simulate)
 
@@ -237,6 +238,50 @@ def uncertainty(
         as_json=json,
     )
     return uncertainty_command(options)
+
+
+def paper(
+    out: Annotated[Path, typer.Option(help="Folder of the document.")] = Path("paper"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer pixels, sets and trials: for a first look.")
+    ] = False,
+    full_size: Annotated[
+        bool, typer.Option("--full-size", help="All pixels of the paper's camera, not a quarter.")
+    ] = False,
+    sets: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN_OF_SETS", help="Recorded sets, the first a full one, instead of simulated."
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="PART", help="Compute this part only; repeatable.")
+    ] = None,
+    seed: SeedOption = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Run trials on this Dask scheduler."),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Compute each figure and table of the paper again, and write them beside the paper's.
+
+    What is finished is kept in OUT/parts: the same command goes on where an earlier one ended.
+    """
+    from dataclasses import replace
+
+    from membrane_ctrl.model.errors import InputError
+    from membrane_ctrl.paper.bench import PaperOptions
+    from membrane_ctrl.paper.paper_command import QUICK, PaperCommand, paper_command
+
+    if quick and full_size:
+        raise InputError("--quick, --full-size: give one of them")
+    options = QUICK if quick else PaperOptions(shrink=1 if full_size else 2)
+    options = replace(options, seed=seed, scheduler=scheduler)
+    arguments = " --quick" * quick + " --full-size" * full_size
+    if sets is not None:
+        arguments += f" --sets {sets}"
+    return paper_command(PaperCommand(out, options, sets, tuple(only or ()), json, arguments))
 
 
 def stability(

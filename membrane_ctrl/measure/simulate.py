@@ -11,7 +11,7 @@ import numpy as np
 
 from membrane_ctrl.config import sight
 from membrane_ctrl.config.optics import ScreenPoseConfig
-from membrane_ctrl.config.schema import Config, OpticsConfig
+from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig
 from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.geometry.set_tables import move_screen
 from membrane_ctrl.model import errors, terminal
@@ -242,18 +242,8 @@ def _adjust_optics(options: SimulateOptions) -> OpticsConfig:
     """The configuration's optics with the depth, noise, steps and size from the options."""
     optics = options.config.optics
     camera, pattern = optics.camera, optics.pattern
+    camera = shrink_camera(camera, options.shrink)
     changes: dict[str, object] = {}
-    if options.shrink > 1:
-        column, row = camera.principal
-        changes = {
-            "width_px": camera.width_px // options.shrink,
-            "height_px": camera.height_px // options.shrink,
-            "pixel_um": camera.pixel_um * options.shrink,
-            # pixel centres are integers: the middle of the first large pixel is (shrink - 1) / 2
-            "principal_px": tuple(
-                (p - (options.shrink - 1) / 2) / options.shrink for p in (column, row)
-            ),
-        }
     if options.bits is not None:
         changes["bits"] = options.bits
     if options.noise_adu is not None:
@@ -272,3 +262,18 @@ def _make_progress_counter(total: int) -> Callable[[int], None] | None:
     if not sys.stderr.isatty():
         return None
     return lambda done: terminal.live_line(f"{done} of {total}", "" if done < total else "\n")
+
+
+def shrink_camera(camera: CameraConfig, shrink: int) -> CameraConfig:
+    """The same camera with pixels `shrink` times as large, and as many times fewer along a side."""
+    column, row = camera.principal
+    # pixel centres are integers: the middle of the first large pixel is (shrink - 1) / 2
+    first = (shrink - 1) / 2
+    return camera.model_copy(
+        update={
+            "width_px": camera.width_px // shrink,
+            "height_px": camera.height_px // shrink,
+            "pixel_um": camera.pixel_um * shrink,
+            "principal_px": ((column - first) / shrink, (row - first) / shrink),
+        }
+    )

@@ -1,0 +1,1 @@
+"""The published measurement, computed again: each figure and table of the paper beside ours."""

@@ -1,0 +1,284 @@
+"""Part: the paper's Monte Carlo of the height, in each reading of its text.
+
+A trial draws a, b and alpha, and noise of the pixels, and reconstructs the surface. The paper does
+not say what else follows a wrong angle, and that decides the result:
+
+- a pixel keeps its ray (the camera's pose follows a and alpha), as `measure` does, or keeps the
+  x_0 and y_0 of the nominal geometry;
+- the error of the protractor is one of the x equations only, or acts in the y equations as it does
+  in those of x;
+- the error acts as power in all directions: an estimate, which gives the curvature of the x
+  direction to y as well.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
+
+import numpy as np
+
+from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, phase_sigma_rad
+from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
+from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.terminal import track_progress
+from membrane_ctrl.paper import pictures
+from membrane_ctrl.paper.bench import PIXEL_NOISE_ADU, MeasuredBench, PaperOptions
+from membrane_ctrl.paper.comparison import Agreement, Comparison, PartResult, judge_within
+from membrane_ctrl.paper.convergence_parts import make_seen_points, solve_by_paper
+from membrane_ctrl.paper.reference_iteration import (
+    POWERS,
+    PolynomialSurface,
+    SeenPoints,
+    make_height_matrix,
+    make_parabola,
+    reconstruct,
+)
+from membrane_ctrl.paper.reference_pmd import PaperGeometry, compute_slope, predict_screen
+from membrane_ctrl.processes.worker_pool import run_jobs
+
+PAPER_MEAN_UM = 24.8
+PAPER_MAX_UM = 50.0
+_SIDE = 101  # points along the map
+_POINTS = 1500  # determine the 36 terms
+_START_ITERATIONS = 8
+_BATCH = 10  # trials per job: the bar moves, and no worker waits for long
+# From the nominal solution: each contracts fifty-fold, so that 50 µm become 1e-5 µm.
+_TRIAL_ITERATIONS = 4
+_X_SQUARED = POWERS.index((2, 0))
+_Y_SQUARED = POWERS.index((0, 2))
+# Scatter of a standard deviation over 100 trials is 7 %; three of these.
+_WITHIN = 0.21
+
+
+class AngleReading(StrEnum):
+    """What follows a wrong angle."""
+
+    PIXEL_RAYS = "pixels keep their rays"
+    FIXED_POINTS = "points keep x and y"
+    ANGLE_IN_Y = "points keep x and y, alpha also in the y equations"
+    POWER = "the error acts as power in all directions (estimate)"
+
+
+@dataclass(frozen=True, slots=True)
+class TrialInputs:
+    """What all trials share.
+
+    Attributes
+    ----------
+    seen : SeenPoints
+        The measurement.
+    nominal : PolynomialSurface
+        Its solution with the nominal geometry.
+    geometry : PaperGeometry
+        Nominal a, b and alpha.
+    sigmas : (float, float, float)
+        Standard uncertainties of a and b, mm, and of alpha, rad.
+    screen_sigma_mm : float
+        Noise of a point's place on the screen.
+    analysis_radius_mm : float
+    seed : int
+    """
+
+    seen: SeenPoints
+    nominal: PolynomialSurface
+    geometry: PaperGeometry
+    sigmas: tuple[float, float, float]
+    screen_sigma_mm: float
+    analysis_radius_mm: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """Errors that a trial draws; without noise by default."""
+
+    a_mm: float = 0.0
+    b_mm: float = 0.0
+    alpha_rad: float = 0.0
+    screen_mm: FloatArray | float = 0.0
+
+
+def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
+    """RMSE maps of the height, in each reading."""
+    mirror = bench.optics.mirror
+    seen = make_seen_points(bench, _POINTS)
+    start = make_parabola(40.0, mirror.radius_mm)
+    inputs = TrialInputs(
+        seen,
+        solve_by_paper(bench, start, _START_ITERATIONS, _POINTS).surface,
+        bench.geometry,
+        bench.geometry_sigmas,
+        _screen_sigma_mm(bench, seen),
+        mirror.analysis_radius_mm,
+        bench.options.seed,
+    )
+    axis_mm = np.linspace(-mirror.analysis_radius_mm, mirror.analysis_radius_mm, _SIDE)
+    x_mm, y_mm = np.meshgrid(axis_mm, axis_mm)
+    inside = np.hypot(x_mm, y_mm) <= mirror.analysis_radius_mm
+    to_height = make_height_matrix(x_mm[inside], y_mm[inside], mirror.radius_mm)
+
+    coeffs_mm = _run_everywhere(inputs, bench.options)
+    heights_um = 1e3 * coeffs_mm @ to_height.T
+    rmse_um = dict(zip(AngleReading, np.std(heights_um, axis=0, ddof=1), strict=True))
+    budget_um = {
+        name: _single_effect_um(inputs, to_height, trial)
+        for name, trial in (
+            ("a", _Trial(a_mm=inputs.sigmas[0])),
+            ("b", _Trial(b_mm=inputs.sigmas[1])),
+            ("alpha", _Trial(alpha_rad=inputs.sigmas[2])),
+        )
+    }
+
+    comparisons = [
+        _compare(reading, rmse_um[reading], bench.options.trials) for reading in AngleReading
+    ]
+    comparisons += [
+        Comparison(
+            f"part of {name}, mean over the mirror, µm (pixels keep their rays)",
+            "",
+            f"{value:.3g}",
+            Agreement.UNSTATED,
+            "by a change of one standard uncertainty",
+        )
+        for name, value in budget_um.items()
+    ]
+    maps = {}
+    for reading in AngleReading:
+        picture = np.full(inside.shape, np.nan)
+        picture[inside] = rmse_um[reading]
+        maps[str(reading)] = picture
+    numbers = {
+        "trials": bench.options.trials,
+        "mean_um": {reading.name: float(np.mean(rmse_um[reading])) for reading in AngleReading},
+        "max_um": {reading.name: float(np.max(rmse_um[reading])) for reading in AngleReading},
+        "budget_mean_um": budget_um,
+    }
+    return PartResult(
+        comparisons, numbers, {"RMSE of the height": pictures.draw_maps(maps, axis_mm, "µm")}
+    )
+
+
+def run_trials(inputs: TrialInputs, numbers: Sequence[int]) -> FloatArray:
+    """Coefficients (trials, readings, terms) of the trials with these numbers, mm."""
+    trials = [_draw(inputs, number) for number in numbers]
+    return np.array(
+        [[_solve_trial(inputs, trial, reading) for reading in AngleReading] for trial in trials]
+    )
+
+
+def _run_everywhere(inputs: TrialInputs, options: PaperOptions) -> FloatArray:
+    """All trials, in this process or on a Dask cluster: the same numbers."""
+    batches = [
+        range(first, min(first + _BATCH, options.trials))
+        for first in range(0, options.trials, _BATCH)
+    ]
+    job = partial(run_trials, inputs)
+    with run_jobs(job, batches, 1, options.scheduler) as results:
+        return np.concatenate(
+            list(track_progress(results, "trials of the Monte Carlo", len(batches)))
+        )
+
+
+def _compare(reading: AngleReading, rmse_um: FloatArray, trials: int) -> Comparison:
+    """One reading against the paper's mean and maximum."""
+    mean_um, max_um = float(np.mean(rmse_um)), float(np.max(rmse_um))
+    tolerance = _WITHIN * math.sqrt(100 / trials)
+    low, high = PAPER_MEAN_UM * (1 - tolerance), PAPER_MEAN_UM * (1 + tolerance)
+    return Comparison(
+        f"RMSE of the height, mean and largest, µm: {reading}",
+        "24.8 and about 50",
+        f"{mean_um:.1f} and {max_um:.0f}",
+        judge_within(mean_um, low, high),
+        f"{trials} trials; the scatter of 100 trials is 7 %",
+    )
+
+
+def _single_effect_um(inputs: TrialInputs, to_height: FloatArray, trial: _Trial) -> float:
+    """Mean change of the height by one input alone."""
+    coeffs_mm = _solve_trial(inputs, trial, AngleReading.PIXEL_RAYS)
+    return float(1e3 * np.mean(np.abs(to_height @ (coeffs_mm - inputs.nominal.coeffs_mm))))
+
+
+def _screen_sigma_mm(bench: MeasuredBench, seen: SeenPoints) -> float:
+    """Noise of a point's place on the screen.
+
+    A point stands for several pixels: its noise is that of their mean.
+    """
+    swing_adu = bench.full.quality.modulation_share * (2**bench.optics.camera.bits - 1)
+    shifts_rad = equal_shifts(bench.optics.pattern.steps)
+    of_pixel_rad = phase_sigma_rad(shifts_rad, PIXEL_NOISE_ADU, swing_adu)
+    pixels_of_paper = bench.pixels.index.size * bench.options.shrink**2
+    share = seen.screen_mm.shape[1] / pixels_of_paper
+    return float(of_pixel_rad * mm_per_rad(bench.optics.pattern) * math.sqrt(share))
+
+
+def _draw(inputs: TrialInputs, number: int) -> _Trial:
+    """The errors of a trial, which depend on its number and the seed alone."""
+    random = np.random.default_rng((inputs.seed, number))
+    a_mm, b_mm, alpha_rad = random.standard_normal(3) * inputs.sigmas
+    noise_mm = inputs.screen_sigma_mm * random.standard_normal(inputs.seen.screen_mm.shape)
+    return _Trial(float(a_mm), float(b_mm), float(alpha_rad), noise_mm)
+
+
+def _solve_trial(inputs: TrialInputs, trial: _Trial, reading: AngleReading) -> FloatArray:
+    """Coefficients (terms,) of the surface of one trial, mm."""
+    nominal = inputs.nominal
+    wrong = PaperGeometry(
+        inputs.geometry.a_mm + trial.a_mm,
+        inputs.geometry.b_mm + trial.b_mm,
+        inputs.geometry.alpha_rad + trial.alpha_rad,
+    )
+    rays = inputs.seen.rays
+    fixed_mm: FloatArray | None = None
+    if reading is AngleReading.PIXEL_RAYS:
+        rays = _turn_about_y(rays, trial.alpha_rad)
+    else:
+        fixed_mm = _meet(inputs.geometry, rays, nominal)
+    y_change = None
+    if reading is AngleReading.ANGLE_IN_Y:
+        y_change = partial(_change_y, inputs.geometry, wrong)
+    found = reconstruct(
+        wrong,
+        SeenPoints(rays, inputs.seen.screen_mm + trial.screen_mm),
+        nominal,
+        nominal.radius_mm,
+        inputs.analysis_radius_mm,
+        _TRIAL_ITERATIONS,
+        fixed_mm=fixed_mm,
+        y_change=y_change,
+    )
+    coeffs_mm = found.surface.coeffs_mm
+    if reading is AngleReading.POWER:
+        change_mm = coeffs_mm - nominal.coeffs_mm
+        coeffs_mm = coeffs_mm.copy()
+        coeffs_mm[_Y_SQUARED] += change_mm[_X_SQUARED] - change_mm[_Y_SQUARED]
+    return coeffs_mm
+
+
+def _change_y(
+    nominal: PaperGeometry, wrong: PaperGeometry, points_mm: FloatArray, slope_y: FloatArray
+) -> FloatArray:
+    """Change (n,) of y slopes by an angle that enters the y equations as it enters those of x."""
+    turned = PaperGeometry(nominal.a_mm, nominal.b_mm, wrong.alpha_rad)
+    _, y_mm, height_mm = points_mm
+    screen_mm = predict_screen(nominal, y_mm, height_mm, slope_y)
+    return compute_slope(turned, y_mm, height_mm, screen_mm) - slope_y
+
+
+def _turn_about_y(rays: FloatArray, angle_rad: float) -> FloatArray:
+    """Rays (3, n) of a camera that stands higher by an angle, and still looks at the vertex."""
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    turn = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+    return turn @ rays
+
+
+def _meet(geometry: PaperGeometry, rays: FloatArray, surface: PolynomialSurface) -> FloatArray:
+    """Places (2, n) where rays meet a surface."""
+    pinhole_mm = geometry.pinhole_mm[:, None]
+    height_mm: FloatArray | float = 0.0
+    for _ in range(6):
+        place_mm = pinhole_mm + (height_mm - pinhole_mm[2]) / rays[2] * rays
+        height_mm = surface.height_mm(place_mm[0], place_mm[1])
+    return np.asarray(place_mm[:2])

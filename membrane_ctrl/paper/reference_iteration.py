@@ -1,0 +1,243 @@
+"""The paper's iteration (its section 2.4): slopes on the last surface, then a new surface.
+
+Its 36 Zernike terms span all polynomials of x and y up to degree 7. The fit here uses the
+monomials, which span the same surfaces and share no code with the terms of `measure`.
+
+A point keeps its ray from the pinhole: where the ray meets the last surface is x_0, y_0 and h. The
+paper does not say so; with `fixed_mm` a point keeps x_0 and y_0 instead.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.paper.reference_pmd import (
+    PaperGeometry,
+    Reflection,
+    YReading,
+    compute_slopes,
+)
+
+DEGREE = 7  # of the paper's 36 terms
+_RAY_STEPS = 3  # towards the last surface; each contracts by slope times inclination, below 0.05
+# Powers of x and of y of all terms but the constant: h = 0 at the vertex.
+POWERS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j > 0)
+
+HeightFunction = Callable[[FloatArray, FloatArray], FloatArray]
+SlopeFunction = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+SlopeChange = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class PolynomialSurface:
+    """Height sum of c_k (x / R)^i (y / R)^j, with the powers of `POWERS`.
+
+    Attributes
+    ----------
+    coeffs_mm : (terms,) array
+    radius_mm : float
+        R.
+    """
+
+    coeffs_mm: FloatArray
+    radius_mm: float
+
+    def height_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Height (n,) at points."""
+        return np.asarray(make_height_matrix(x_mm, y_mm, self.radius_mm) @ self.coeffs_mm)
+
+    def slopes(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """dh/dx and dh/dy (n,) at points."""
+        along_x, along_y = make_slope_matrices(x_mm, y_mm, self.radius_mm)
+        return np.asarray(along_x @ self.coeffs_mm), np.asarray(along_y @ self.coeffs_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class StartShape:
+    """A starting shape: its height and its slopes, functions of x and y in mm."""
+
+    height_mm: HeightFunction
+    slopes: SlopeFunction
+
+
+@dataclass(frozen=True, slots=True)
+class SeenPoints:
+    """What the camera measured.
+
+    Attributes
+    ----------
+    rays : (3, n) array
+        Directions from the pinhole, in world.
+    screen_mm : (2, n) array
+        Point of the screen that is seen, from O'.
+    """
+
+    rays: FloatArray
+    screen_mm: FloatArray
+
+
+@dataclass(slots=True)
+class ReferenceSolution:
+    """A solution and how it was reached.
+
+    Attributes
+    ----------
+    surface : PolynomialSurface
+    changes_mm : list of float
+        Largest change of the height in each iteration, over the analysed disc.
+    """
+
+    surface: PolynomialSurface
+    changes_mm: list[float] = field(default_factory=list)
+
+
+def make_height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
+    """Matrix (n, terms) from coefficients to heights."""
+    x, y = x_mm / radius_mm, y_mm / radius_mm
+    return np.stack([x**i * y**j for i, j in POWERS], axis=1)
+
+
+def make_slope_matrices(
+    x_mm: FloatArray, y_mm: FloatArray, radius_mm: float
+) -> tuple[FloatArray, FloatArray]:
+    """Matrices (n, terms) from coefficients to slopes in x and in y."""
+    x, y = x_mm / radius_mm, y_mm / radius_mm
+    along_x = np.stack([i * x ** max(i - 1, 0) * y**j for i, j in POWERS], axis=1)
+    along_y = np.stack([j * x**i * y ** max(j - 1, 0) for i, j in POWERS], axis=1)
+    return along_x / radius_mm, along_y / radius_mm
+
+
+def make_parabola(depth_mm: float, radius_mm: float) -> StartShape:
+    """The paper's starting shape: a paraboloid with this depth at the radius."""
+    bend = depth_mm / radius_mm**2
+    return StartShape(
+        lambda x, y: bend * (x**2 + y**2), lambda x, y: (2.0 * bend * x, 2.0 * bend * y)
+    )
+
+
+def make_cone(depth_mm: float, radius_mm: float) -> StartShape:
+    """A cone with its tip at the vertex."""
+    slope = depth_mm / radius_mm
+
+    def slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        distance = np.maximum(np.hypot(x, y), 1e-12)
+        return slope * x / distance, slope * y / distance
+
+    return StartShape(lambda x, y: slope * np.hypot(x, y), slopes)
+
+
+def make_v_fold(depth_mm: float, radius_mm: float) -> StartShape:
+    """Two planes that meet in the y axis."""
+    slope = depth_mm / radius_mm
+    return StartShape(lambda x, _: slope * np.abs(x), lambda x, y: (slope * np.sign(x), 0.0 * y))
+
+
+def reconstruct(
+    geometry: PaperGeometry,
+    seen: SeenPoints,
+    start: StartShape | PolynomialSurface,
+    radius_mm: float,
+    analysis_radius_mm: float,
+    iterations: int,
+    *,
+    reading: YReading = YReading.HEIGHT_OF_POINT,
+    fixed_mm: FloatArray | None = None,
+    y_change: SlopeChange | None = None,
+) -> ReferenceSolution:
+    """Reconstruct the surface by the paper's equations.
+
+    Parameters
+    ----------
+    geometry : PaperGeometry
+        a, b and alpha.
+    seen : SeenPoints
+        The measurement.
+    start : StartShape
+        h^(0).
+    radius_mm, analysis_radius_mm : float
+        Of the mirror, and of the disc whose change of height is stated.
+    iterations : int
+    reading : YReading
+        What the y equations mean.
+    fixed_mm : (2, n) array, optional
+        x_0 and y_0 that the points keep; without, each keeps its ray.
+    y_change : callable, optional
+        Changes the y slopes (n,) of points (3, n): an error of the y equations.
+
+    Returns
+    -------
+    ReferenceSolution
+    """
+    if iterations < 1:
+        raise ValueError("iterations must be at least 1")
+    probe = _probe_matrix(radius_mm, analysis_radius_mm)
+    probe_x_mm, probe_y_mm = _probe_points(analysis_radius_mm)
+    last_mm = start.height_mm(probe_x_mm, probe_y_mm)
+    shape: StartShape | PolynomialSurface = start
+    changes_mm: list[float] = []
+    for _ in range(iterations):
+        points_mm = _place_points(geometry, seen, shape, fixed_mm)
+        rays = _reflect(geometry, points_mm, shape)
+        slopes = compute_slopes(geometry, points_mm, seen.screen_mm, rays, reading)
+        if y_change is not None:
+            slopes[1] += y_change(points_mm, slopes[1])
+        shape = _fit_slopes(points_mm, slopes, radius_mm)
+        height_mm = probe @ shape.coeffs_mm
+        changes_mm.append(float(np.max(np.abs(height_mm - last_mm))))
+        last_mm = height_mm
+    assert isinstance(shape, PolynomialSurface)
+    return ReferenceSolution(shape, changes_mm)
+
+
+def _place_points(
+    geometry: PaperGeometry,
+    seen: SeenPoints,
+    shape: StartShape | PolynomialSurface,
+    fixed_mm: FloatArray | None,
+) -> FloatArray:
+    """Points (3, n) on the last surface."""
+    if fixed_mm is not None:
+        return np.stack([*fixed_mm, shape.height_mm(*fixed_mm)])
+    pinhole_mm = geometry.pinhole_mm[:, None]
+    height_mm: FloatArray | float = 0.0
+    points_mm = pinhole_mm
+    for _ in range(_RAY_STEPS):
+        reach = (height_mm - pinhole_mm[2]) / seen.rays[2]
+        points_mm = pinhole_mm + reach * seen.rays
+        height_mm = shape.height_mm(points_mm[0], points_mm[1])
+    return np.stack([points_mm[0], points_mm[1], np.asarray(height_mm)])
+
+
+def _reflect(
+    geometry: PaperGeometry, points_mm: FloatArray, shape: StartShape | PolynomialSurface
+) -> Reflection:
+    """Normal, incident and reflected ray at points (3, n) of the last surface."""
+    slope_x, slope_y = shape.slopes(points_mm[0], points_mm[1])
+    normal = np.stack([-slope_x, -slope_y, np.ones_like(slope_x)], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    incident = points_mm.T - geometry.pinhole_mm
+    incident /= np.linalg.norm(incident, axis=1, keepdims=True)
+    towards = np.sum(incident * normal, axis=1, keepdims=True)
+    return Reflection(normal, incident, incident - 2.0 * towards * normal)
+
+
+def _fit_slopes(points_mm: FloatArray, slopes: FloatArray, radius_mm: float) -> PolynomialSurface:
+    """The paper's equation 19: least squares of both slopes."""
+    along_x, along_y = make_slope_matrices(points_mm[0], points_mm[1], radius_mm)
+    design = np.concatenate([along_x, along_y])
+    coeffs_mm, *_ = np.linalg.lstsq(design, np.concatenate(slopes), rcond=None)
+    return PolynomialSurface(coeffs_mm, radius_mm)
+
+
+def _probe_points(analysis_radius_mm: float) -> tuple[FloatArray, FloatArray]:
+    """Points over the analysed disc at which changes of the height are compared."""
+    axis_mm = np.linspace(-analysis_radius_mm, analysis_radius_mm, 41)
+    x_mm, y_mm = np.meshgrid(axis_mm, axis_mm)
+    inside = np.hypot(x_mm, y_mm) <= analysis_radius_mm
+    return x_mm[inside], y_mm[inside]
+
+
+def _probe_matrix(radius_mm: float, analysis_radius_mm: float) -> FloatArray:
+    return make_height_matrix(*_probe_points(analysis_radius_mm), radius_mm)

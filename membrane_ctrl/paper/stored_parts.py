@@ -1,0 +1,85 @@
+"""Finished parts on disk, so that a computation that was ended goes on where it was."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from membrane_ctrl.measure.result_files import write_json
+from membrane_ctrl.model import files, program
+from membrane_ctrl.paper.bench import PaperOptions
+from membrane_ctrl.paper.comparison import Comparison, PartResult
+from membrane_ctrl.paper.parts import Part
+
+_FORMAT = "membrane-paper-part/1"
+_BYTES_MAX = 10_000_000  # of one picture or table
+
+
+@dataclass(frozen=True, slots=True)
+class _StoredPart:
+    """The content of a part's table; its pictures are files beside it."""
+
+    origin: dict[str, Any]
+    made_from: dict[str, Any]
+    comparisons: list[Comparison]
+    numbers: dict[str, Any]
+    timing_s: dict[str, float]
+    pictures: list[str]
+
+
+_STORED = TypeAdapter(_StoredPart)
+
+
+class PartFolder:
+    """Parts of one document.
+
+    Parameters
+    ----------
+    folder : Path
+        Existing folder.
+    options : PaperOptions
+        A part that was computed with others is computed again.
+    sets : Path, optional
+        The recorded sets; None: simulated.
+    """
+
+    def __init__(self, folder: Path, options: PaperOptions, sets: Path | None) -> None:
+        self._folder = folder
+        self._made_from = {**asdict(options), "sets": None if sets is None else str(sets)}
+        del self._made_from["scheduler"]  # the numbers are the same everywhere
+
+    def read_part(self, part: Part) -> PartResult | None:
+        """A finished part; None if there is none of this program and these options."""
+        try:
+            content = files.read_bytes(self._table(part), _BYTES_MAX)
+            stored = _STORED.validate_json(content)
+            if stored.origin != program.file_origin(_FORMAT) or stored.made_from != self._made_from:
+                return None
+            pictures = {
+                title: files.read_bytes(self._picture(part, number), _BYTES_MAX)
+                for number, title in enumerate(stored.pictures)
+            }
+        except (OSError, ValueError, ValidationError):
+            return None
+        return PartResult(stored.comparisons, stored.numbers, pictures, stored.timing_s)
+
+    def write_part(self, part: Part, result: PartResult) -> None:
+        """Store a finished part, its table last. Raises OSError."""
+        for number, png in enumerate(result.pictures.values()):
+            files.write_bytes_atomic(self._picture(part, number), png)
+        table = {
+            "origin": program.file_origin(_FORMAT),
+            "made_from": self._made_from,
+            "comparisons": [asdict(comparison) for comparison in result.comparisons],
+            "numbers": dict(result.numbers),
+            "timing_s": dict(result.timing_s),
+            "pictures": list(result.pictures),
+        }
+        write_json(self._table(part), table)
+
+    def _table(self, part: Part) -> Path:
+        return self._folder / f"{part.name}.json"
+
+    def _picture(self, part: Part, number: int) -> Path:
+        return self._folder / f"{part.name}-{number + 1}.png"
