@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+# Linear algebra rounds its sums by where arrays lie in memory: more digits differ from run to run.
+DIGITS = 9
+
 
 class Agreement(StrEnum):
     """How a number here compares with the paper's."""
@@ -62,3 +65,14 @@ class PartResult:
 def judge_within(value: float, low: float, high: float) -> Agreement:
     """REPRODUCED if a value lies between two bounds, else DIFFERS."""
     return Agreement.REPRODUCED if low <= value <= high else Agreement.DIFFERS
+
+
+def round_numbers(value: Any) -> Any:
+    """A number, or the numbers in lists and mappings, to `DIGITS` significant digits."""
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS - 1}e}")
+    if isinstance(value, Mapping):
+        return {name: round_numbers(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [round_numbers(each) for each in value]
+    return value

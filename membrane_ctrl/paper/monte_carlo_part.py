@@ -184,8 +184,7 @@ def _run_everywhere(inputs: TrialInputs, options: PaperOptions) -> FloatArray:
 def _compare(reading: AngleReading, rmse_um: FloatArray, trials: int) -> Comparison:
     """One reading against the paper's mean and maximum."""
     mean_um, max_um = float(np.mean(rmse_um)), float(np.max(rmse_um))
-    tolerance = _WITHIN * math.sqrt(100 / trials)
-    low, high = PAPER_MEAN_UM * (1 - tolerance), PAPER_MEAN_UM * (1 + tolerance)
+    low, high = PAPER_MEAN_UM * (1 - _WITHIN), PAPER_MEAN_UM * (1 + _WITHIN)
     return Comparison(
         f"RMSE of the height, mean and largest, µm: {reading}",
         "24.8 and about 50",

@@ -3,19 +3,19 @@
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.measure.result_files import write_json
 from membrane_ctrl.model import errors, files, program
 from membrane_ctrl.paper.bench import MeasuredBench, PaperBench, PaperOptions, RecordedBench
-from membrane_ctrl.paper.comparison import PartResult
+from membrane_ctrl.paper.comparison import PartResult, round_numbers
 from membrane_ctrl.paper.document import count_agreements, render_document
 from membrane_ctrl.paper.parts import PARTS, Part
 from membrane_ctrl.paper.stored_parts import PartFolder
 
-# `--quick`: an eighth of the pixels along a side, and as many sets as pairs 10 minutes apart need.
+# `--quick`: a sixth of the pixels along a side, and as many sets as pairs 10 minutes apart need.
 QUICK = PaperOptions(shrink=6, sets=160, trials=40)
 
 
@@ -66,6 +66,7 @@ def paper_command(asked: PaperCommand) -> int:
             if result is None and (not asked.only or part.name in asked.only):
                 print(f"{part.title} ...", file=sys.stderr)
                 result = part.compute(bench)
+                result = replace(result, numbers=round_numbers(result.numbers))
                 stored.write_part(part, result)
             if result is not None:
                 results[part] = result

@@ -21,7 +21,8 @@ from membrane_ctrl.paper.reference_pmd import (
 )
 
 DEGREE = 7  # of the paper's 36 terms
-_RAY_STEPS = 3  # towards the last surface; each contracts by slope times inclination, below 0.05
+# Towards the last surface; each contracts by slope times inclination, below 0.05.
+_RAY_STEPS = 8
 # Powers of x and of y of all terms but the constant: h = 0 at the vertex.
 POWERS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j > 0)
 

@@ -34,6 +34,7 @@ PAPER_MEAN_SD_UM = 4.3
 _CENTRE_UM = 1.0  # standard deviation of the centre: +-2 µm are two of them
 _CORRELATED_S = 20.0  # the loop lets the centre wander no longer
 _LASER_NOISE_UM = 0.3
+_BIN_PX = 4  # side of a bin of the paper's camera
 _SIDE = 101  # points along a map
 _EDGE_SHARE = 0.95  # of the analysed radius: beyond it is the edge
 _LAGS_S = (60.0, 600.0)  # the paper's two intervals
@@ -72,7 +73,8 @@ def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> Series:
         disturbances=DisturbancesConfig(seeing_um=air_um),
     )
     random = np.random.default_rng((bench.options.seed, 451))
-    live = LiveReconstructor(bench.optics, laser_noise_um=_LASER_NOISE_UM)
+    bin_px = max(1, _BIN_PX // bench.options.shrink)
+    live = LiveReconstructor(bench.optics, bin_px, laser_noise_um=_LASER_NOISE_UM)
     full = pattern_sequence.full_sequence(bench.optics.pattern)
     fringes = pattern_sequence.fringe_sequence(bench.optics.pattern)
     film_um = _wander(random, len(full) + (sets - 1) * len(fringes))
