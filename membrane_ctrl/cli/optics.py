@@ -46,8 +46,8 @@ TurnedOption = Annotated[
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `measure`, `track`, `modes`, `export-figure`, `film`, `uncertainty`, `paper`, `stability`,
-    `simulate`.
+    """Add `measure`, `track`, `modes`, `export-figure`, `film`, `uncertainty`, `paper`,
+    `stability`, `simulate`.
     """
     app.command()(measure)
     app.command()(track)

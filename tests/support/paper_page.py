@@ -31,7 +31,7 @@ frames of the paper's bench; `--quick` in two minutes, `--sets RUN_OF_SETS` from
   90 degrees and a becomes a sin(alpha). The screen is inclined to that view, so that b is the
   height of each point of it; with that the equations are exact.
 - **Equation 14** takes both angles from arccosines, which have no sign. In y the angles need signs.
-- **x_0 and y_0** of a pixel are not defined where the height is unknown: here a pixel keeps its ray.
+- **x_0 and y_0** of a pixel depend on the height, which is unknown: here a pixel keeps its ray.
 - **The Monte Carlo** does not say whether a pixel keeps its ray or its x and y when alpha is wrong.
 - **Pitch of the screen**: eight periods of 49.82 mm do not fit on 768 pixels of 0.51 mm.
 - **1e-16 mm** between solutions is less than double precision resolves of a height of 34 mm.
