@@ -67,6 +67,7 @@ LAYERS = {
     6: {
         "membrane_ctrl/acquisition",
         "membrane_ctrl/console",
+        "membrane_ctrl/paper",
         "membrane_ctrl/recorder",
         "membrane_ctrl/replay",
         "membrane_ctrl/sessions",

@@ -154,5 +154,6 @@ _.sent  # of an event, written as a whole
 _.writable  # of a file that Arrow writes to
 Barometer, Thermometer  # contracts of drivers, which packages of others fill
 _.reason_code  # compared with the rest of its dataclass
+_.FIXED_POINTS  # a reading of the paper: all members are computed
 _.beside_heading  # read by the template of a report page
 (_.status_code, _.in_contact, _.has_report)  # of HTTP answers, written as a whole

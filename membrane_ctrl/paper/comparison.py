@@ -14,11 +14,12 @@ class Agreement(StrEnum):
 
     REPRODUCED = "reproduced"
     DIFFERS = "differs"
+    ASSUMED = "assumed here"
     UNSTATED = "not stated in the paper"
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class PaperStatement:
     """One statement of the paper, beside ours.
 
     Attributes
@@ -47,7 +48,7 @@ class PartResult:
 
     Attributes
     ----------
-    comparisons : sequence of Comparison
+    comparisons : sequence of PaperStatement
     numbers : mapping of str to numbers, lists or mappings
         Everything computed, with units in the names. Deterministic for a seed.
     pictures : mapping of str to bytes
@@ -56,7 +57,7 @@ class PartResult:
         What differs from run to run.
     """
 
-    comparisons: Sequence[Comparison]
+    comparisons: Sequence[PaperStatement]
     numbers: Mapping[str, Any]
     pictures: Mapping[str, bytes]
     timing_s: Mapping[str, float] = field(default_factory=dict)

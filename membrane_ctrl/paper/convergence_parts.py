@@ -8,7 +8,7 @@ from membrane_ctrl.metrology.reconstruction.surface_fit import fit_surface
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.paper import pictures
 from membrane_ctrl.paper.bench import MeasuredBench
-from membrane_ctrl.paper.comparison import Agreement, Comparison, PartResult, judge_within
+from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult, judge_within
 from membrane_ctrl.paper.reference_iteration import (
     ReferenceSolution,
     SeenPoints,
@@ -61,14 +61,14 @@ def compare_convergence(bench: MeasuredBench) -> PartResult:
     # `changes_mm` of `measure`: its bins from the start, and then its pixels from the bins' surface
     ours_mm = list(bench.full.fit.changes_mm)
     comparisons = [
-        Comparison(
+        PaperStatement(
             "iterations until the largest change is below 1e-6 mm, paper's iteration",
             "5",
             str(needed),
             judge_within(needed, 1, 5),
             "the paper's equations, here with h = 0 at the vertex",
         ),
-        Comparison(
+        PaperStatement(
             "the same, of `measure`",
             "",
             str(_count_iterations(ours_mm)),
@@ -118,7 +118,7 @@ def compare_starts(bench: MeasuredBench) -> PartResult:
     spread_mm = max(_largest(on_map(each - reference)) for each in heights_mm.values())
     own_spread_mm = max(_largest(on_map(each - own)) for each in ours_mm.values())
     comparisons = [
-        Comparison(
+        PaperStatement(
             "largest difference between the solutions after nine iterations, mm",
             "<= 1e-16",
             f"{spread_mm:.1e}",
@@ -126,7 +126,7 @@ def compare_starts(bench: MeasuredBench) -> PartResult:
             "the same to the rounding; of heights of 34 mm double precision resolves 7e-15 mm, so "
             "that 1e-16 mm is not a difference of two heights",
         ),
-        Comparison(
+        PaperStatement(
             "the same, of `measure`, mm",
             "",
             f"{own_spread_mm:.1e}",

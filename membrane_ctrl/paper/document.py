@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 
 from membrane_ctrl.measure.report_pdf import pdf_pages
-from membrane_ctrl.paper.comparison import Agreement, Comparison, PartResult
-from membrane_ctrl.paper.parts import Part
+from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult
+from membrane_ctrl.paper.parts import PaperPart
 from membrane_ctrl.report_pages.blocks import (
     PageBlock,
     PageLines,
@@ -26,13 +26,13 @@ _SOURCE = (
 
 
 def render_document(
-    results: Mapping[Part, PartResult], described: str, command: str
+    results: Mapping[PaperPart, PartResult], described: str, command: str
 ) -> tuple[str, bytes]:
     """The document as HTML and as PDF.
 
     Parameters
     ----------
-    results : mapping of Part to PartResult
+    results : mapping of PaperPart to PartResult
         In the order of the document.
     described : str
         What was computed: bench, size, seed.
@@ -49,7 +49,7 @@ def render_document(
     return render_page(page), _render_pdf(results, described, command)
 
 
-def count_agreements(results: Mapping[Part, PartResult]) -> dict[Agreement, int]:
+def count_agreements(results: Mapping[PaperPart, PartResult]) -> dict[Agreement, int]:
     """How many comparisons have which agreement."""
     found = [
         comparison.agreement for result in results.values() for comparison in result.comparisons
@@ -57,7 +57,7 @@ def count_agreements(results: Mapping[Part, PartResult]) -> dict[Agreement, int]
     return {agreement: found.count(agreement) for agreement in Agreement}
 
 
-def _summarise(results: Mapping[Part, PartResult]) -> PageTable:
+def _summarise(results: Mapping[PaperPart, PartResult]) -> PageTable:
     """One row a part: how many of its comparisons agree."""
     rows = []
     for part, result in results.items():
@@ -66,7 +66,7 @@ def _summarise(results: Mapping[Part, PartResult]) -> PageTable:
     return PageTable(("part", *map(str, Agreement)), rows)
 
 
-def _tabulate(comparisons: Sequence[Comparison]) -> PageTable:
+def _tabulate(comparisons: Sequence[PaperStatement]) -> PageTable:
     rows = [
         (each.quantity, each.paper, each.ours, str(each.agreement), each.note)
         for each in comparisons
@@ -74,7 +74,7 @@ def _tabulate(comparisons: Sequence[Comparison]) -> PageTable:
     return PageTable(_HEAD, rows)
 
 
-def _render_pdf(results: Mapping[Part, PartResult], described: str, command: str) -> bytes:
+def _render_pdf(results: Mapping[PaperPart, PartResult], described: str, command: str) -> bytes:
     """The same content in pages of A4."""
     lines = [_SOURCE, "", described]
     pictures = []

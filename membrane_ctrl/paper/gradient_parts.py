@@ -8,7 +8,7 @@ import numpy as np
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.paper import pictures
 from membrane_ctrl.paper.bench import PaperBench
-from membrane_ctrl.paper.comparison import Agreement, Comparison, PartResult
+from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult
 from membrane_ctrl.paper.reference_pmd import Reflection, YReading, compute_slopes
 
 _SIDE = 121  # points along a map of the aperture
@@ -49,35 +49,35 @@ def compare_gradients(bench: PaperBench) -> PartResult:
 
     exact = rows[YReading.HEIGHT_OF_POINT.name]
     comparisons = [
-        Comparison(
+        PaperStatement(
             "x slope by equations 3 to 14 less that of the film, µrad",
             "rigorous",
             _state(exact[0]),
             Agreement.REPRODUCED if np.max(np.abs(exact[0])) < _EXACT_URAD else Agreement.DIFFERS,
             "height and normal of the film known; tan(theta) of equation 12 is -dh/dx",
         ),
-        Comparison(
+        PaperStatement(
             "y slope, with b the height of each point of the screen, µrad",
             "follows the same principle",
             _state(exact[1]),
             Agreement.REPRODUCED if np.max(np.abs(exact[1])) < _EXACT_URAD else Agreement.DIFFERS,
             "the paper does not give the y equations; equation 14 needs angles with signs here",
         ),
-        Comparison(
+        PaperStatement(
             "y slope, with b sin(alpha), µrad",
             "",
             _state(rows[YReading.HEIGHT_OF_CENTRE.name][1]),
             Agreement.UNSTATED,
             "another reading of the y equations: the screen as level in y",
         ),
-        Comparison(
+        PaperStatement(
             "y slope, with a and b along the chief ray, µrad",
             "",
             _state(rows[YReading.CHIEF_RAY.name][1]),
             Agreement.UNSTATED,
             "the plainest reading of the y equations",
         ),
-        Comparison(
+        PaperStatement(
             "slopes without the correction delta theta of equation 14, µrad",
             "",
             f"x {_state(rows['NO_CORRECTION'][0])}; y {_state(rows['NO_CORRECTION'][1])}",

@@ -25,7 +25,7 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.terminal import track_progress
 from membrane_ctrl.paper import pictures
 from membrane_ctrl.paper.bench import PIXEL_NOISE_ADU, MeasuredBench, PaperOptions
-from membrane_ctrl.paper.comparison import Agreement, Comparison, PartResult, judge_within
+from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult, judge_within
 from membrane_ctrl.paper.convergence_parts import make_seen_points, solve_by_paper
 from membrane_ctrl.paper.reference_iteration import (
     POWERS,
@@ -39,7 +39,6 @@ from membrane_ctrl.paper.reference_pmd import PaperGeometry, compute_slope, pred
 from membrane_ctrl.processes.worker_pool import run_jobs
 
 PAPER_MEAN_UM = 24.8
-PAPER_MAX_UM = 50.0
 _SIDE = 101  # points along the map
 _POINTS = 1500  # determine the 36 terms
 _START_ITERATIONS = 8
@@ -135,7 +134,7 @@ def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
         _compare(reading, rmse_um[reading], bench.options.trials) for reading in AngleReading
     ]
     comparisons += [
-        Comparison(
+        PaperStatement(
             f"part of {name}, mean over the mirror, µm (pixels keep their rays)",
             "",
             f"{value:.3g}",
@@ -181,11 +180,11 @@ def _run_everywhere(inputs: TrialInputs, options: PaperOptions) -> FloatArray:
         )
 
 
-def _compare(reading: AngleReading, rmse_um: FloatArray, trials: int) -> Comparison:
+def _compare(reading: AngleReading, rmse_um: FloatArray, trials: int) -> PaperStatement:
     """One reading against the paper's mean and maximum."""
     mean_um, max_um = float(np.mean(rmse_um)), float(np.max(rmse_um))
     low, high = PAPER_MEAN_UM * (1 - _WITHIN), PAPER_MEAN_UM * (1 + _WITHIN)
-    return Comparison(
+    return PaperStatement(
         f"RMSE of the height, mean and largest, µm: {reading}",
         "24.8 and about 50",
         f"{mean_um:.1f} and {max_um:.0f}",

@@ -12,7 +12,7 @@ from membrane_ctrl.model import errors, files, program
 from membrane_ctrl.paper.bench import MeasuredBench, PaperBench, PaperOptions, RecordedBench
 from membrane_ctrl.paper.comparison import PartResult, round_numbers
 from membrane_ctrl.paper.document import count_agreements, render_document
-from membrane_ctrl.paper.parts import PARTS, Part
+from membrane_ctrl.paper.parts import PARTS, PaperPart
 from membrane_ctrl.paper.stored_parts import PartFolder
 
 # `--quick`: a sixth of the pixels along a side, and as many sets as pairs 10 minutes apart need.
@@ -60,7 +60,7 @@ def paper_command(asked: PaperCommand) -> int:
 
     with errors.convert_write_errors(asked.out):
         stored = PartFolder(files.make_folder(asked.out / "parts"), asked.options, asked.sets)
-        results: dict[Part, PartResult] = {}
+        results: dict[PaperPart, PartResult] = {}
         for part in parts:
             result = stored.read_part(part)
             if result is None and (not asked.only or part.name in asked.only):
@@ -77,7 +77,7 @@ def paper_command(asked: PaperCommand) -> int:
 
 
 def _write_document(
-    asked: PaperCommand, bench: MeasuredBench, results: dict[Part, PartResult]
+    asked: PaperCommand, bench: MeasuredBench, results: dict[PaperPart, PartResult]
 ) -> None:
     """Write the page, the PDF and the table."""
     camera = bench.optics.camera
@@ -96,7 +96,7 @@ def _write_document(
     write_json(asked.out / "paper.json", _make_table(asked, results))
 
 
-def _make_table(asked: PaperCommand, results: dict[Part, PartResult]) -> dict[str, Any]:
+def _make_table(asked: PaperCommand, results: dict[PaperPart, PartResult]) -> dict[str, Any]:
     """The content of `paper.json`."""
     options = asked.options
     return {
@@ -119,7 +119,7 @@ def _make_table(asked: PaperCommand, results: dict[Part, PartResult]) -> dict[st
     }
 
 
-def _summarise(results: dict[Part, PartResult]) -> str:
+def _summarise(results: dict[PaperPart, PartResult]) -> str:
     """One line a part, and the sum."""
     lines = []
     for part, result in results.items():

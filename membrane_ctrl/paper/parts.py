@@ -17,7 +17,7 @@ from membrane_ctrl.paper.comparison import PartResult
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class PaperPart:
     """A figure, table or statement of the paper.
 
     Attributes
@@ -32,8 +32,6 @@ class Part:
         Gets the bench and returns a PartResult.
     needs_truth : bool
         Whether only a simulated bench will do.
-    repeatable : bool
-        Whether its numbers are the same for a seed; timings are not.
     """
 
     name: str
@@ -41,47 +39,47 @@ class Part:
     source: str
     compute: Callable[[Any], PartResult]
     needs_truth: bool = False
-    repeatable: bool = True
 
 
 PARTS = (
-    Part("patterns", "Patterns and captured frames", "section 2.2", pattern_parts.compare_patterns),
-    Part(
+    PaperPart(
+        "patterns", "Patterns and captured frames", "section 2.2", pattern_parts.compare_patterns
+    ),
+    PaperPart(
         "phases",
         "Wrapped phase, K1, K2 and absolute phase",
         "section 2.2, equations 1 and 2",
         pattern_parts.compare_phases,
         needs_truth=True,
     ),
-    Part("gray", "Gray-code table", "section 2.2", pattern_parts.compare_gray_table),
-    Part(
+    PaperPart("gray", "Gray-code table", "section 2.2", pattern_parts.compare_gray_table),
+    PaperPart(
         "gradients",
         "From phase to slope",
         "section 2.3, equations 3 to 14",
         gradient_parts.compare_gradients,
         needs_truth=True,
     ),
-    Part(
+    PaperPart(
         "convergence",
         "Convergence of the iteration",
         "section 2.4, equation 22",
         convergence_parts.compare_convergence,
     ),
-    Part("starts", "Starting shapes", "section 2.4", convergence_parts.compare_starts),
-    Part("profile", "Surface and radial profile", "section 3.1", profile_part.compare_profile),
-    Part(
+    PaperPart("starts", "Starting shapes", "section 2.4", convergence_parts.compare_starts),
+    PaperPart("profile", "Surface and radial profile", "section 3.1", profile_part.compare_profile),
+    PaperPart(
         "monte_carlo",
         "Monte Carlo of the height",
         "section 3.1",
         monte_carlo_part.compare_monte_carlo,
     ),
-    Part("stability", "Stability and pairs", "section 3.2", stability_parts.compare_stability),
-    Part(
+    PaperPart("stability", "Stability and pairs", "section 3.2", stability_parts.compare_stability),
+    PaperPart(
         "timings",
         "Timings",
         "sections 2.1, 2.4 and 4",
         timing_parts.compare_timings,
-        repeatable=False,
     ),
-    Part("limitations", "Limitations", "section 4", timing_parts.compare_limitations),
+    PaperPart("limitations", "Limitations", "section 4", timing_parts.compare_limitations),
 )

@@ -13,7 +13,7 @@ from membrane_ctrl.metrology.phase.phase_steps import compute_phasors, equal_shi
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 from membrane_ctrl.paper import pictures
 from membrane_ctrl.paper.bench import MeasuredBench, PaperBench
-from membrane_ctrl.paper.comparison import Agreement, Comparison, PartResult
+from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult
 
 # The paper's screen (section 2.1).
 _SCREEN_COLUMNS = 1366
@@ -45,7 +45,7 @@ def compare_patterns(bench: MeasuredBench) -> PartResult:
     count = len(bench.patterns)
     steps = bench.optics.pattern.steps
     comparisons = [
-        Comparison(
+        PaperStatement(
             "patterns of a full set",
             "18: 4 sinusoids and 4 Gray codes an axis, white and black",
             f"{count}: {steps} sinusoids and {GRAY_BITS} Gray codes an axis, white and black",
@@ -55,7 +55,7 @@ def compare_patterns(bench: MeasuredBench) -> PartResult:
     side_mm = bench.optics.pattern.periods * bench.optics.pattern.period_mm
     pitch_mm = _DIAGONAL_MM / math.hypot(16, 9) * 9 / _SCREEN_ROWS
     comparisons.append(
-        Comparison(
+        PaperStatement(
             "height of the screen and side of eight periods, mm",
             f"768 pixels of 0.51 mm: {_SCREEN_ROWS * _STATED_PITCH_MM:.1f}; 8 x 49.82: 398.6",
             f"{side_mm:.1f} at a pitch of {raster.pixel_mm:.4f} mm, 96 pixels a period",
@@ -102,7 +102,7 @@ def compare_phases(bench: PaperBench) -> PartResult:
         if name == "x":
             drawn = _draw_phases(wrapped_rad, k1, k2, phase_rad, seen)
     comparisons = [
-        Comparison(
+        PaperStatement(
             f"wrong fringe orders of {name}, share of the pixels",
             "no discontinuity, also at the edge",
             f"{wrong[name]:.1e} of {int(seen.sum())}",
@@ -131,20 +131,20 @@ def compare_gray_table(bench: MeasuredBench) -> PartResult:
     displayed = _displayed_bits(make_screen(bench), bench.patterns[gray])
     same = bool(np.array_equal(displayed, bits))
     comparisons = [
-        Comparison(
+        PaperStatement(
             "bits that change between neighbouring half periods",
             "single-bit transitions",
             f"{changed.min()} to {changed.max()}",
             Agreement.REPRODUCED if np.all(changed == 1) else Agreement.DIFFERS,
         ),
-        Comparison(
+        PaperStatement(
             "displayed patterns against the table",
             "",
             "the same" if same else "not the same",
             Agreement.UNSTATED,
             "bits read from the middle of each displayed half period",
         ),
-        Comparison(
+        PaperStatement(
             "K1 (GC1 to GC3), K2 (GC1 to GC4)",
             "K1 jumps where the phase does, K2 half a period away",
             f"K1 {_join(k1)}; K2 {_join(k2)}",

@@ -25,7 +25,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.terminal import track_progress
 from membrane_ctrl.paper import pictures
 from membrane_ctrl.paper.bench import MeasuredBench, PaperBench, RecordedBench
-from membrane_ctrl.paper.comparison import Agreement, Comparison, PartResult, judge_within
+from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult, judge_within
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 
 PERIOD_S = 4.0  # of the paper's fringes sets
@@ -43,7 +43,7 @@ _AIR_UM = 100.0  # a first amplitude: the SD is proportional to it
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class SetSeries:
     """Heights of a series.
 
     Attributes
@@ -64,7 +64,7 @@ class Series:
     rejected: int
 
 
-def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> Series:
+def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> SetSeries:
     """One full set, and fringes sets after it, each computed from its frames."""
     renderer = OpticsRenderer(
         bench.optics,
@@ -100,10 +100,10 @@ def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> Series:
         parameters_mm.append(_read_parameters(estimate))
         middle_s.append(float(np.mean(time_s)))
         moved_um.append(float(np.mean(film_um[part])))
-    return Series(np.array(parameters_mm), np.array(middle_s), np.array(moved_um), rejected)
+    return SetSeries(np.array(parameters_mm), np.array(middle_s), np.array(moved_um), rejected)
 
 
-def read_series(bench: RecordedBench) -> Series:
+def read_series(bench: RecordedBench) -> SetSeries:
     """The recorded sets of a bench, each computed from its frames."""
     figures = Figures()
     parameters_mm, middle_s, moved_um = [], [], []
@@ -117,7 +117,7 @@ def read_series(bench: RecordedBench) -> Series:
         parameters_mm.append(measured.figure.fit.surface.parameters)
         middle_s.append(measured.time_s)
         moved_um.append(measured.displacement_um)
-    return Series(np.array(parameters_mm), np.array(middle_s), np.array(moved_um), rejected)
+    return SetSeries(np.array(parameters_mm), np.array(middle_s), np.array(moved_um), rejected)
 
 
 def compare_stability(bench: MeasuredBench) -> PartResult:
@@ -142,20 +142,20 @@ def compare_stability(bench: MeasuredBench) -> PartResult:
 
     sets = len(series.parameters_mm) + series.rejected
     comparisons = [
-        Comparison(
+        PaperStatement(
             "sets in 30 minutes",
             "451, of 4 s",
             f"{sets}, each computed from its own frames; {series.rejected} rejected",
             Agreement.REPRODUCED if sets == 451 and series.rejected == 0 else Agreement.DIFFERS,
         ),
-        Comparison(
+        PaperStatement(
             "SD of the height, mean over the mirror, µm",
             f"{PAPER_MEAN_SD_UM:g}",
             f"{np.mean(sd_um):.2f}",
             judge_within(float(np.mean(sd_um)), 3.9, 4.7),
             "with what the paper states of its bench: 0.4 ADU of noise, the centre held to 2 µm",
         ),
-        Comparison(
+        PaperStatement(
             "of it, not the motion of the centre, µm",
             "",
             f"{np.mean(rest_um):.3f}",
@@ -163,7 +163,7 @@ def compare_stability(bench: MeasuredBench) -> PartResult:
             "by regression on the centre's displacement; geometry cancels, it is the same in all "
             "sets",
         ),
-        Comparison(
+        PaperStatement(
             "SD at the edge, µm",
             ">= 6",
             f"{np.mean(sd_um[edge]):.2f}",
@@ -183,7 +183,7 @@ def compare_stability(bench: MeasuredBench) -> PartResult:
         edge_um = float(np.mean(air_sd_um[edge])) * needed_um / _AIR_UM
         numbers |= {"air_needed_um": needed_um, "sd_edge_in_air_um": edge_um}
         comparisons.append(
-            Comparison(
+            PaperStatement(
                 "warm air that would give 4.3 µm: RMS of the rays on the screen, µm",
                 "",
                 f"{needed_um:.0f}",
@@ -216,8 +216,8 @@ def _sd_in_warm_air_um(bench: PaperBench, to_height: FloatArray) -> FloatArray:
 
 
 def _compare_pairs(
-    series: Series, height_um: FloatArray, lag_s: float
-) -> tuple[Comparison, dict[str, float]] | None:
+    series: SetSeries, height_um: FloatArray, lag_s: float
+) -> tuple[PaperStatement, dict[str, float]] | None:
     """All pairs of sets an interval apart, beside the paper's one pair; None without any."""
     period_s = float(np.median(np.diff(series.time_s)))
     lag = max(1, round(lag_s / period_s)) if period_s > 0 else 0
@@ -230,7 +230,7 @@ def _compare_pairs(
         "mean_um": float(np.mean(rms_um)),
         "max_um": float(np.max(rms_um)),
     }
-    comparison = Comparison(
+    comparison = PaperStatement(
         f"RMS of the change over the mirror, {lag_s / 60:g} min apart, µm",
         "4 to 5 of one pair",
         f"{np.mean(rms_um):.2f} (largest {np.max(rms_um):.2f}) of all {rms_um.size} pairs",
@@ -245,7 +245,7 @@ def _read_parameters(estimate: ShapeEstimate) -> FloatArray:
     return surface.parameters
 
 
-def _film_share_um(series: Series, height_um: FloatArray) -> FloatArray:
+def _film_share_um(series: SetSeries, height_um: FloatArray) -> FloatArray:
     """Heights (sets, points) that follow the displacement of the centre, by regression; zeros
     without a laser.
     """
@@ -274,7 +274,7 @@ def _first_order(
 
 
 def _draw(
-    series: Series,
+    series: SetSeries,
     bench: MeasuredBench,
     axis_mm: FloatArray,
     inside: BoolArray,

@@ -9,8 +9,8 @@ from pydantic import TypeAdapter, ValidationError
 from membrane_ctrl.measure.result_files import write_json
 from membrane_ctrl.model import files, program
 from membrane_ctrl.paper.bench import PaperOptions
-from membrane_ctrl.paper.comparison import Comparison, PartResult
-from membrane_ctrl.paper.parts import Part
+from membrane_ctrl.paper.comparison import PaperStatement, PartResult
+from membrane_ctrl.paper.parts import PaperPart
 
 _FORMAT = "membrane-paper-part/1"
 _BYTES_MAX = 10_000_000  # of one picture or table
@@ -22,7 +22,7 @@ class _StoredPart:
 
     origin: dict[str, Any]
     made_from: dict[str, Any]
-    comparisons: list[Comparison]
+    comparisons: list[PaperStatement]
     numbers: dict[str, Any]
     timing_s: dict[str, float]
     pictures: list[str]
@@ -49,7 +49,7 @@ class PartFolder:
         self._made_from = {**asdict(options), "sets": None if sets is None else str(sets)}
         del self._made_from["scheduler"]  # the numbers are the same everywhere
 
-    def read_part(self, part: Part) -> PartResult | None:
+    def read_part(self, part: PaperPart) -> PartResult | None:
         """A finished part; None if there is none of this program and these options."""
         try:
             content = files.read_bytes(self._table(part), _BYTES_MAX)
@@ -64,7 +64,7 @@ class PartFolder:
             return None
         return PartResult(stored.comparisons, stored.numbers, pictures, stored.timing_s)
 
-    def write_part(self, part: Part, result: PartResult) -> None:
+    def write_part(self, part: PaperPart, result: PartResult) -> None:
         """Store a finished part, its table last. Raises OSError."""
         for number, png in enumerate(result.pictures.values()):
             files.write_bytes_atomic(self._picture(part, number), png)
@@ -78,8 +78,8 @@ class PartFolder:
         }
         write_json(self._table(part), table)
 
-    def _table(self, part: Part) -> Path:
+    def _table(self, part: PaperPart) -> Path:
         return self._folder / f"{part.name}.json"
 
-    def _picture(self, part: Part, number: int) -> Path:
+    def _picture(self, part: PaperPart, number: int) -> Path:
         return self._folder / f"{part.name}-{number + 1}.png"

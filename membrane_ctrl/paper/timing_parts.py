@@ -10,7 +10,7 @@ from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstr
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase import pattern_sequence
 from membrane_ctrl.paper.bench import MeasuredBench
-from membrane_ctrl.paper.comparison import Agreement, Comparison, PartResult
+from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult
 
 _FULL_CYCLE_S = 8.0
 _SEQUENTIAL_CYCLE_S = 20.0
@@ -44,7 +44,7 @@ def compare_timings(bench: MeasuredBench) -> PartResult:
         "fringes-only live cycle, 8 frames to the figure": ("some minutes", live_fringes_s),
     }
     comparisons = [
-        Comparison(
+        PaperStatement(
             f"{step}, s",
             paper,
             f"{seconds:.2f} ({seconds / copy_s:.0f} copies of the frames)",
@@ -54,13 +54,13 @@ def compare_timings(bench: MeasuredBench) -> PartResult:
         for step, (paper, seconds) in rows.items()
     ]
     comparisons.append(
-        Comparison(
+        PaperStatement(
             "acquisition of a full set and of a fringes set, s",
             f"{_FULL_CYCLE_S:g} ({_SEQUENTIAL_CYCLE_S:g} in sequence) and {_FRINGES_CYCLE_S:g}",
             "set by the screen's settling time: the next cycle's frames are taken while one is "
             "computed",
             Agreement.UNSTATED,
-            "`membrane-ctrl acquire` states the time of each frame",
+            "a hold states its rate of figures",
         )
     )
     timing_s = {step: seconds for step, (_, seconds) in rows.items()}
@@ -96,7 +96,7 @@ def compare_limitations(_: MeasuredBench) -> PartResult:
         ),
     )
     comparisons = [
-        Comparison(name, paper, ours, Agreement.UNSTATED, where)
+        PaperStatement(name, paper, ours, Agreement.UNSTATED, where)
         for name, paper, ours, where in rows
     ]
     return PartResult(comparisons, {}, {})

@@ -12,6 +12,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from membrane_ctrl.paper.comparison import Agreement
 from membrane_ctrl.paper.parts import PARTS
 
 DOCS = Path(__file__).parents[2] / "docs" / "paper"
@@ -41,8 +42,7 @@ frames of the paper's bench; `--quick` in two minutes, `--sets RUN_OF_SETS` from
 def make_page(table: dict[str, Any], pictures: dict[str, list[tuple[str, str]]]) -> str:
     """The page; `pictures` are title and file of each part's."""
     agreements = [row[3] for rows in table["comparisons"].values() for row in rows]
-    names = ("reproduced", "differs", "not stated in the paper")
-    summary = ", ".join(f"{agreements.count(name)} {name}" for name in names)
+    summary = ", ".join(f"{agreements.count(name)} {name}" for name in Agreement)
     summary = f"Of {len(agreements)} comparisons: {summary}."
     share = {1: "all", 2: "half", 6: "a sixth"}.get(table["shrink"], f"1/{table['shrink']}")
     sizes = {name: table[name] for name in ("sets", "trials", "seed")}
