@@ -154,6 +154,7 @@ _.sent  # of an event, written as a whole
 _.writable  # of a file that Arrow writes to
 Barometer, Thermometer  # contracts of drivers, which packages of others fill
 _.reason_code  # compared with the rest of its dataclass
+stated_kp_per_s, stated_ti_s  # of an event, written as a whole
 _.FIXED_POINTS  # a reading of the paper: all members are computed
 _.beside_heading  # read by the template of a report page
 (_.status_code, _.in_contact, _.has_report)  # of HTTP answers, written as a whole
