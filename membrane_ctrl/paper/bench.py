@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.optics import GeometryConfig
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.capture_set import read_set

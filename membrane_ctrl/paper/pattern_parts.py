@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from firmware_iface.display_patterns import ScreenRaster, compute_pattern_light
-from firmware_iface.roles import Pattern
+from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.metrology.phase.gray_code import absolute_phase, code_orders, gray_orders
 from membrane_ctrl.metrology.phase.pattern_sequence import GRAY_BITS, FullSlots
 from membrane_ctrl.metrology.phase.phase_steps import compute_phasors, equal_shifts
