@@ -104,7 +104,6 @@ _.to_xarray, open_result, open_stability  # for scripts: docs/how-to/data.md
 )
 _.requests, _.released, consumer  # of the stand-in for the package gpiod, whose request has these
 _.enters  # a rule's level for people, in the generated page
-_.by_password  # a login in one call, for tests and programs
 PageLoop  # named as text to uvicorn
 _.faulty_sensor  # in the template of a sentence
 # fields of a hold's messages: declared to be checked, and read by their keys

@@ -134,18 +134,6 @@ class Accounts:
         fits = not self.users and hmac.compare_digest(secret.encode(), self.secret.encode())
         return WebUser(_LINK_NAME, self.link_role) if fits else None
 
-    def by_password(
-        self, name: str, password: str, source: str = "", device: str = ""
-    ) -> WebUser | None:
-        """Who logs in with this password from a network address; None if nobody, or after too many
-        wrong ones.
-
-        `device` is the value of a device's cookie.
-        """
-        guess = self.guess_of(name, source, device)
-        admission = self.throttle.admit(guess)
-        return self.evaluate(guess, password, admission) if admission.granted else None
-
     def guess_of(self, name: str, source: str, device: str) -> Guess:
         """Return who guesses; a device counts only if its cookie is of this account."""
         known = self.users.get(name)

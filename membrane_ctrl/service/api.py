@@ -47,6 +47,7 @@ from membrane_ctrl.review import catalogue
 from membrane_ctrl.service.access import WebUser, on_behalf
 from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.ended_run import REPORT_NAME, EndedRun
+from membrane_ctrl.service.event_lines import find_new_lines
 from membrane_ctrl.service.feed import SIGNALS, HoldFeed, history
 from membrane_ctrl.service.hold_command import SendLimits
 from membrane_ctrl.service.hold_restart import begin_restart
@@ -403,7 +404,7 @@ async def _follow(hold: str, feed: HoldFeed) -> AsyncIterator[str]:
         seen = feed.seen
         parts = []
         if seen.events != events:
-            new = seen.events[_count_common(events, seen.events) :]
+            new = find_new_lines(events, seen.events)
             parts += [_event_message("event", line) for line in new]
             events = seen.events
         if shown is None or seen.status is not shown.status or seen.problem != shown.problem:
@@ -416,15 +417,6 @@ async def _follow(hold: str, feed: HoldFeed) -> AsyncIterator[str]:
         for part in parts:
             yield part
         await asyncio.sleep(_STREAM_S)
-
-
-def _count_common(old: tuple[str, ...], new: tuple[str, ...]) -> int:
-    """Return how many of the new lines were there before; the oldest may have been dropped."""
-    for dropped in range(len(old) + 1):
-        kept = old[dropped:]
-        if kept == new[: len(kept)]:
-            return len(kept)
-    return 0
 
 
 def _event_message(kind: str, value: object) -> str:

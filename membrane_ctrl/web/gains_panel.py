@@ -10,18 +10,18 @@ from urllib.parse import urlencode
 
 from nicegui import ui
 
-from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.controller.commands import TABLE, Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.run_status import gains_words
 from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.service.work_pools import PoolFullError, pool_of_command
+from membrane_ctrl.service.work_pools import PoolFullError
 from membrane_ctrl.web.confirmation import confirm
 from membrane_ctrl.web.gains_charts import CHARTS
 from membrane_ctrl.web.gains_views import ExploredGains, GainsSource, GainsViews, Setting
 from membrane_ctrl.web.messages import show_message
+from membrane_ctrl.web.sending import send_and_show
 
 TRIES: Role = "tune"  # as for `ctl gains`
 _LOOK_S = 1.0
@@ -323,11 +323,7 @@ class GainsPanel:
             show_message(f"{asked['do']}: needs the role {TRIES}", good=False)
             return
         asked |= {"why": f"web: {self._user.name} {does}", "on_behalf": self._on_behalf()}
-        try:
-            outcome = await pool_of_command(asked["do"]).run(self._feed.ask, asked)
-        except PoolFullError as error:
-            outcome = Outcome.failed(asked["do"], f"not sent: {error}")
-        show_message(outcome.text, outcome.done)
+        await send_and_show(self._feed, asked)
 
 
 class _Slider:

@@ -26,9 +26,10 @@ from membrane_ctrl.service.access import (
     request,
 )
 from membrane_ctrl.service.configuration_editor import ConfigurationEditor
+from membrane_ctrl.service.event_lines import find_new_lines
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
-from membrane_ctrl.service.work_pools import COMMANDS, PoolFullError, pool_of_command
+from membrane_ctrl.service.work_pools import COMMANDS, PoolFullError
 from membrane_ctrl.web import figure_map, history_chart
 from membrane_ctrl.web.action_dialog import ask_for_confirmation
 from membrane_ctrl.web.alarms_panel import alarms_panel
@@ -39,10 +40,10 @@ from membrane_ctrl.web.fetched_charts import SCRIPT as FETCHED_CHARTS
 from membrane_ctrl.web.fleet_panel import fleet_panel
 from membrane_ctrl.web.gains_panel import GainsPanel
 from membrane_ctrl.web.held_by import describe_holder
-from membrane_ctrl.web.log_lines import find_new_lines
 from membrane_ctrl.web.messages import MESSAGE_CSS, show_message
 from membrane_ctrl.web.no_hold import NoHoldPanel
 from membrane_ctrl.web.runs_panel import runs_panel
+from membrane_ctrl.web.sending import send_and_show
 from membrane_ctrl.web.shared_views import CHART_EVERY_S, FIRST_FIGURE, LOOK_S, SharedViews
 from membrane_ctrl.web.tuning_panel import CHOOSES, TuningPanel
 
@@ -560,11 +561,7 @@ class WebPage:
             show_message(str(error), good=False)
             return
         asked["on_behalf"] = on_behalf(self._user, self._session)
-        try:
-            outcome = await pool_of_command(action.do).run(self._feed.ask, asked)
-        except PoolFullError as error:
-            outcome = Outcome.failed(action.label, f"not sent: {error}")
-        show_message(outcome.text, outcome.done)
+        await send_and_show(self._feed, asked)
 
 
 def format_number(column: TelemetryColumn, value: float | None) -> str:

@@ -16,11 +16,11 @@ from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.service.access import WebUser
+from membrane_ctrl.service.event_lines import find_new_lines
 from membrane_ctrl.service.work_pools import ANSWERS
 from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, write_answer
 from membrane_ctrl.web.confirmation import confirm
-from membrane_ctrl.web.log_lines import find_new_lines
 from membrane_ctrl.web.messages import show_message
 from membrane_ctrl.web.session_chart import SessionChart
 from membrane_ctrl.web.session_status import describe_session, find_silent_s

@@ -12,6 +12,7 @@ from membrane_ctrl.service import accounts as account_store
 from membrane_ctrl.service import login_throttle
 from membrane_ctrl.service.accounts import Accounts, KnownUser
 from membrane_ctrl.service.login_throttle import Guess, LoginThrottle
+from tests.worlds.password_guesses import guess_password
 
 RIGHT, WRONG = "correct horse", "wrong wrong"
 
@@ -53,7 +54,7 @@ def accounts() -> Accounts:
 
 def device_of(found: Accounts, name: str) -> str:
     """The cookie of a device that has logged in."""
-    user = found.by_password(name, RIGHT, source=f"home of {name}")
+    user = guess_password(found, name, RIGHT, source=f"home of {name}")
     assert user is not None
     device = found.device_cookie(user, "")
     assert device is not None
@@ -63,18 +64,18 @@ def device_of(found: Accounts, name: str) -> str:
 def test_one_wrong_password_a_minute_keeps_nobody_out(clock: Clock, evaluated: list[str]) -> None:
     found = accounts()
     for _ in range(5):
-        found.by_password("anna", WRONG)
+        guess_password(found, "anna", WRONG)
     for _ in range(60):
         clock.now_s += 61.0
-        assert found.by_password("anna", WRONG) is None
+        assert guess_password(found, "anna", WRONG) is None
         clock.now_s += 1.0
-        assert found.by_password("anna", RIGHT) is not None
+        assert guess_password(found, "anna", RIGHT) is not None
 
 
 def test_guesses_from_one_address_are_limited_over_time(clock: Clock, evaluated: list[str]) -> None:
     found = accounts()
     for _ in range(3600):
-        found.by_password("anna", WRONG, "198.51.100.7")
+        guess_password(found, "anna", WRONG, "198.51.100.7")
         clock.now_s += 1.0
     assert 290 <= len(evaluated) <= 310, "5 at once, then one every 12 s"
 
@@ -84,10 +85,10 @@ def test_an_attack_from_one_address_leaves_other_addresses_alone(
 ) -> None:
     found = accounts()
     for number in range(2000):
-        found.by_password("anna", f"guess {number}", "198.51.100.7")
+        guess_password(found, "anna", f"guess {number}", "198.51.100.7")
         clock.now_s += 0.1
         if number % 100 == 0:
-            assert found.by_password("anna", RIGHT, f"10.0.0.{number // 100}") is not None
+            assert guess_password(found, "anna", RIGHT, f"10.0.0.{number // 100}") is not None
 
 
 def test_an_attack_from_many_addresses_is_limited_and_leaves_a_new_address_its_first_tries(
@@ -95,27 +96,27 @@ def test_an_attack_from_many_addresses_is_limited_and_leaves_a_new_address_its_f
 ) -> None:
     found = accounts()
     for number in range(20_000):
-        found.by_password("anna", WRONG, f"198.51.100.{number % 200}")
+        guess_password(found, "anna", WRONG, f"198.51.100.{number % 200}")
         clock.now_s += 0.01
     assert len(evaluated) <= 2 * 200 + 60 + 200, (
         "first tries of each address, then the budget of the account"
     )
-    assert found.by_password("anna", RIGHT, "10.0.0.1") is not None
-    assert found.by_password("anna", WRONG, "10.0.0.2") is None
-    assert found.by_password("anna", RIGHT, "10.0.0.2") is not None, "the owner may mistype once"
+    assert guess_password(found, "anna", RIGHT, "10.0.0.1") is not None
+    assert guess_password(found, "anna", WRONG, "10.0.0.2") is None
+    assert guess_password(found, "anna", RIGHT, "10.0.0.2") is not None, "one may mistype once"
 
 
 def test_a_device_that_has_logged_in_has_its_own_budget(clock: Clock, evaluated: list[str]) -> None:
     found = accounts()
     device = device_of(found, "anna")
     for number in range(1000):
-        found.by_password("anna", WRONG, "127.0.0.1")
+        guess_password(found, "anna", WRONG, "127.0.0.1")
         clock.now_s += 0.01
         if number % 100 == 0:
-            assert found.by_password("anna", RIGHT, "127.0.0.1", device) is not None
+            assert guess_password(found, "anna", RIGHT, "127.0.0.1", device) is not None
     evaluated.clear()
     for _ in range(100):
-        assert found.by_password("anna", WRONG, "127.0.0.1", device) is None
+        assert guess_password(found, "anna", WRONG, "127.0.0.1", device) is None
     assert len(evaluated) == 5, "a stolen device is limited, too"
 
 
@@ -133,7 +134,7 @@ def test_a_device_counts_for_its_own_account_only(
     }
     evaluated.clear()
     for _ in range(50):
-        found.by_password("anna", WRONG, "198.51.100.7", devices[made])
+        guess_password(found, "anna", WRONG, "198.51.100.7", devices[made])
     assert len(evaluated) == 5
 
 
@@ -152,7 +153,7 @@ def test_parallel_guesses_are_all_counted(evaluated: list[str]) -> None:
 
     def guess() -> None:
         begin.wait()
-        found.by_password("anna", WRONG)
+        guess_password(found, "anna", WRONG)
 
     threads = [threading.Thread(target=guess) for _ in range(40)]
     for thread in threads:
@@ -165,14 +166,14 @@ def test_parallel_guesses_are_all_counted(evaluated: list[str]) -> None:
 def test_an_unknown_name_costs_and_waits_as_a_known_one(clock: Clock, evaluated: list[str]) -> None:
     found = accounts()
     for _ in range(50):
-        assert found.by_password("nobody", RIGHT, "198.51.100.7") is None
+        assert guess_password(found, "nobody", RIGHT, "198.51.100.7") is None
     assert len(evaluated) == 5
 
 
 def test_many_names_from_one_address_share_its_budget(clock: Clock, evaluated: list[str]) -> None:
     found = accounts()
     for number in range(1000):
-        found.by_password(f"name {number}", WRONG, "198.51.100.7")
+        guess_password(found, f"name {number}", WRONG, "198.51.100.7")
     assert len(evaluated) == 20
 
 

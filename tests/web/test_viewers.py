@@ -10,11 +10,12 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.service import event_lines
 from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.work_pools import WorkPool
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_log import ANSWER, LiveLog, PageAnswer
-from membrane_ctrl.web import log_lines, server, tuning_panel
+from membrane_ctrl.web import server, tuning_panel
 from membrane_ctrl.web.made_once import MadeOnce
 
 
@@ -80,7 +81,7 @@ async def test_what_cannot_be_made_is_tried_again() -> None:
 def test_only_new_lines_are_shown(
     old: tuple[str, ...], new: tuple[str, ...], expected: tuple[str, ...]
 ) -> None:
-    assert log_lines.find_new_lines(old, new) == expected
+    assert event_lines.find_new_lines(old, new) == expected
 
 
 @pytest.mark.parametrize("leaves", [True, False])
@@ -119,7 +120,8 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
         log.log_entry("result", f"line {number}")
     seen = watch.look()
     assert seen is not None
-    assert (seen.head, seen.done) == (f"{path.name}: observe", frozenset())
+    head = f"{path.name}: Now: observe, 0:00 of about 1:00; 1:00 of holding left in the session"
+    assert (seen.head, seen.done) == (head, frozenset())
     log.log_entry("result", "line 300")
     log.log_entry("asks", "apply which?", among=("calm", "lively"))
     (path / "candidates.md").write_text(
@@ -128,17 +130,17 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
     (path / "identified.json").write_text("{}")
     later = watch.look()
     assert later is not None
-    assert log_lines.find_new_lines(seen.progress.results, later.progress.results) == ("line 300",)
-    assert later.head == f"{path.name}: observe, asks: apply which?"
+    found = event_lines.find_new_lines(seen.progress.results, later.progress.results)
+    assert found == ("line 300",)
+    assert later.head == f"{path.name}: Waiting for an answer: apply which?"
     assert later.done == {"identify"}
     assert later.candidates == (("candidate", "Ms"), ("calm", "1.3"), ("lively", "1.6"))
     log.log_entry("ended", "stopped")
     second = create_session(tmp_path, "second", "eve", "twin", Config(), LoopConfig()).path
     newest = watch.look()
     assert newest is not None
-    assert newest.head == f"{max(path, second).name}: " + (
-        "begun" if second > path else "observe, ended: stopped"
-    )
+    doing = "Nothing recorded yet; resume" if second > path else "Ended after observe (stopped)"
+    assert newest.head.startswith(f"{max(path, second).name}: {doing}")
 
 
 def test_an_answer_that_no_session_takes_is_withdrawn(
