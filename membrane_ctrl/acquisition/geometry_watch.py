@@ -52,7 +52,8 @@ class GeometryWatch:
 
     def __init__(self, geometry: RunGeometry, bin_px: int) -> None:
         optics = geometry.optics
-        self._geometry, self._radius_mm = Geometry.from_config(optics), optics.mirror.radius_mm
+        self._geometry = Geometry.from_config(optics)
+        self._radius_mm = optics.mirror.radius_mm
         shifts = phase_steps.equal_shifts(optics.pattern.steps)
         sigma_rad = phase_steps.phase_sigma_rad(
             shifts, slope_noise.pixel_sigma_adu(optics.camera.noise_adu), 1.0

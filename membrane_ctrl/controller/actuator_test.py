@@ -432,7 +432,8 @@ class ActuatorTest:
 
     def _begin_part(self, number: int) -> None:
         memory = self.memory
-        memory.part, memory.part_s = number, 0.0
+        memory.part = number
+        memory.part_s = 0.0
         memory.readings = np.empty((0, 2))
 
     def _fail_late(self, part: Part, found: str) -> None:

@@ -552,7 +552,9 @@ class Controller:
             self.memory.tick_error = f"{type(error).__name__}: {error}"
             # an error must not close an open vent
             vents = context.venting or context.levels.safe_level == SafeLevel.VENT
-            context.output, context.pump_fraction, context.vent_fraction = None, 0.0, float(vents)
+            context.output = None
+            context.pump_fraction = 0.0
+            context.vent_fraction = float(vents)
             if self.state == State.FAULT:  # no safer state is left
                 context.finished = errors.Exit.SAFETY_TRIP
             return

@@ -169,13 +169,17 @@ class ProcessValueChoice:
         self.memory = memory or ProcessValueState()
         self._comparison = LoopComparison(self.memory.comparison)
         self._innovations = InnovationTest(self.memory.innovations)
-        self._loop, self._pump, self._estimator = loop, pump, estimator
+        self._loop = loop
+        self._pump = pump
+        self._estimator = estimator
         self._prediction = PredictedPi(loop, pump, estimator, self.memory.prediction)
         self._correlation = ErrorCorrelation(loop, estimator, self.memory.correlation)
 
     def set_loop(self, loop: LoopConfig, pump: PumpConfig, estimator: EstimatorConfig) -> None:
         """Predict and compare with other settings, from the beginning."""
-        self._loop, self._pump, self._estimator = loop, pump, estimator
+        self._loop = loop
+        self._pump = pump
+        self._estimator = estimator
         # The gas in transit is of the former dead time
         self.memory.prediction.start_afresh()
         self._prediction = PredictedPi(loop, pump, estimator, self.memory.prediction)

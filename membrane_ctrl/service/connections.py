@@ -107,7 +107,8 @@ class GuardedHttp(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         """Start the deadline of a request."""
         super().on_message_begin()
-        self._in_head, self._head_bytes = True, 0
+        self._in_head = True
+        self._head_bytes = 0
         self._start_deadline()
 
     def on_headers_complete(self) -> None:
@@ -117,7 +118,8 @@ class GuardedHttp(HttpToolsProtocol):
 
     def on_message_complete(self) -> None:
         """Stop the deadline: the request is complete."""
-        self._in_head, self._head_bytes = True, 0
+        self._in_head = True
+        self._head_bytes = 0
         self._stop_deadline()
         if self.client is not None:
             self._guard.note_activity(self.client)

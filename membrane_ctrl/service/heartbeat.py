@@ -164,7 +164,8 @@ class MqttHeartbeat:
         self._client.on_connect = self._note_connection
         self._client.on_connect_fail = self._note_failure
         self._client.on_disconnect = self._note_end
-        self._host, self._port = config.host, config.port
+        self._host = config.host
+        self._port = config.port
         self._where = f"{config.host}:{config.port}"
         self._has_begun = False
 

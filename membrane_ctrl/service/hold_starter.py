@@ -85,7 +85,9 @@ class HoldStarter:
     """
 
     def __init__(self, logs: Path, configurations: Path, units: bool) -> None:
-        self.logs, self._configurations, self._units = logs, configurations, units
+        self.logs = logs
+        self._configurations = configurations
+        self._units = units
         # On Linux each thread has a niceness, and a program inherits that of the thread that
         # starts it. This thread begins before the service lowers its own priority.
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="hold starter")

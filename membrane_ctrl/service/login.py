@@ -104,7 +104,10 @@ class LoginMiddleware:
         tokens: TokenBook | None = None,
         guard: ConnectionGuard | None = None,
     ) -> None:
-        self._app, self._accounts, self._address, self._tokens = app, accounts, address, tokens
+        self._app = app
+        self._accounts = accounts
+        self._address = address
+        self._tokens = tokens
         self._guard = guard or ConnectionGuard()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

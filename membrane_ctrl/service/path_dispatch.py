@@ -23,7 +23,8 @@ class PathDispatch:
     """
 
     def __init__(self, api: ASGIApp, page: ASGIApp) -> None:
-        self._api, self._page = api, page
+        self._api = api
+        self._page = page
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         path = scope.get("path", "")

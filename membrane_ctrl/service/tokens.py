@@ -123,7 +123,8 @@ class TokenBook:
                 self._tokens = read_tokens(self._path)
                 self._stamp = stamp
         except (OSError, errors.CommandError):
-            self._tokens, self._stamp = [], None
+            self._tokens = []
+            self._stamp = None
 
 
 def _digest(token: str) -> str:

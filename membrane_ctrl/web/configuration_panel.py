@@ -53,8 +53,11 @@ class ConfigurationPanel:
         starter: HoldStarter,
         on_behalf: Callable[[], dict[str, str]],
     ) -> None:
-        self._feed, self._user, self._editor = feed, user, editor
-        self._starter, self._on_behalf = starter, on_behalf
+        self._feed = feed
+        self._user = user
+        self._editor = editor
+        self._starter = starter
+        self._on_behalf = on_behalf
         self._loaded: ConfigurationText | None = None
         with ui.row().classes("items-end w-full"):
             self._choice = ui.select([], label="configuration", on_change=self._load)

@@ -67,8 +67,12 @@ class GainsPanel:
         on_behalf: Callable[[], dict[str, str]],
         wanted: str = "",
     ) -> None:
-        self._views, self._feed, self._hold = views, feed, hold
-        self._user, self._on_behalf, self._wanted = user, on_behalf, wanted
+        self._views = views
+        self._feed = feed
+        self._hold = hold
+        self._user = user
+        self._on_behalf = on_behalf
+        self._wanted = wanted
         self._source: GainsSource | None = None
         self._explored: ExploredGains | None = None
         self._setting: Setting | None = None  # None: the gains of `start` themselves

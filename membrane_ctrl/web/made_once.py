@@ -14,7 +14,9 @@ class MadeOnce(Generic[T]):
     """Makes a thing on a thread of a pool, once for all who ask for it within its life."""
 
     def __init__(self, make: Callable[..., T], pool: WorkPool, life_s: float) -> None:
-        self._make, self._pool, self._life_s = make, pool, life_s
+        self._make = make
+        self._pool = pool
+        self._life_s = life_s
         self._made: dict[tuple[Hashable, ...], tuple[asyncio.Task[T], float]] = {}
 
     async def get(self, *key: Hashable) -> T:

@@ -38,7 +38,10 @@ class NoHoldPanel:
     def __init__(
         self, feed: HoldFeed, hold: str, user: WebUser, starter: HoldStarter | None
     ) -> None:
-        self._feed, self._hold, self._user, self._starter = feed, hold, user, starter
+        self._feed = feed
+        self._hold = hold
+        self._user = user
+        self._starter = starter
         self._lines: tuple[str, ...] = ()
         self._listed: list[Configuration] = []
         with ui.card().classes("w-full").props('aria-label="no hold runs"') as self._card:

@@ -104,7 +104,10 @@ class WebPage:
         editor: ConfigurationEditor | None = None,
     ) -> None:
         self._editor = editor
-        self._feeds, self._hold, self._user, self._views = feeds, hold, user, views
+        self._feeds = feeds
+        self._hold = hold
+        self._user = user
+        self._views = views
         self._starter = starter
         self._feed = feeds[hold]
         self._logs = self._feed.logs
@@ -132,7 +135,8 @@ class WebPage:
         gains : str
             Session or run whose gains are explored; empty for the newest.
         """
-        self._first_tab, self._wanted_gains = tab, gains
+        self._first_tab = tab
+        self._wanted_gains = gains
         self._dark = ui.dark_mode(None)
         ui.add_css(_CSS)
         scripts = (history_chart.SCRIPT, figure_map.SCRIPT, FETCHED_CHARTS)
@@ -356,7 +360,8 @@ class WebPage:
 
     def _set(self, name: str, value: object) -> None:
         setattr(self, name, value)
-        self._charted_s, self._drawn = -1e9, ()
+        self._charted_s = -1e9
+        self._drawn = ()
 
     def _choose_signals(self, signals: list[str]) -> None:
         self._set("_signals", list(signals) or list(_FIRST_SIGNALS))

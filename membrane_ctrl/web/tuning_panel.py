@@ -67,7 +67,8 @@ class SessionWatch:
         except (errors.CommandError, OSError):
             return None
         if self._reader is None or self._reader.session != newest.path:
-            self._reader, self._chart = LiveReader(newest.path), SessionChart()
+            self._reader = LiveReader(newest.path)
+            self._chart = SessionChart()
         self._chart.add_points(self._reader.read_new())
         seen = SessionSeen(
             newest.path,
@@ -124,8 +125,10 @@ class TuningPanel:
         user: WebUser,
         is_action_allowed: Callable[[], bool],
     ) -> None:
-        self._look, self._hold = look, hold
-        self._user, self._may = user, is_action_allowed
+        self._look = look
+        self._hold = hold
+        self._user = user
+        self._may = is_action_allowed
         self._head = (
             ui.label("No tuning session in this folder.")
             .classes("text-subtitle1")
@@ -140,7 +143,8 @@ class TuningPanel:
             self._chart_place.props('role="img" aria-label="centre and flow of the session"')
             self._chart = ui.echart({"series": []}).classes("w-full").style("height: 20rem")
         self._chart_place.set_visibility(False)
-        self._drawn_points, self._drawn_s = 0, -math.inf
+        self._drawn_points = 0
+        self._drawn_s = -math.inf
         self._buttons: list[ui.button] = []
         self._seen: SessionSeen | None = None
         ui.timer(_LOOK_S, self._show)
@@ -177,7 +181,8 @@ class TuningPanel:
         is_due = time.monotonic() - self._drawn_s > _DRAW_S
         if not seen.points or seen.points == self._drawn_points or not is_due:
             return
-        self._drawn_points, self._drawn_s = seen.points, time.monotonic()
+        self._drawn_points = seen.points
+        self._drawn_s = time.monotonic()
         self._chart_place.set_visibility(True)
         ids = json.dumps({"session": self._chart.id})
         url = f"/session-chart?{urlencode({'hold': self._hold})}"

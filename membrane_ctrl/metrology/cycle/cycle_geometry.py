@@ -56,9 +56,11 @@ class CycleGeometry:
         known_by: KnownBy,
         source: str,
     ) -> None:
-        self._optics, self._spread = optics, spread
+        self._optics = optics
+        self._spread = spread
         self._places_px = np.stack([grid.column_px, grid.row_px])
-        self._known_by, self._source = known_by, source
+        self._known_by = known_by
+        self._source = source
         self._explained_urad: float | None = None
         stated = Geometry.from_config(optics)
         # of a camera whose pixels are the bins: pixel centres are integers
