@@ -221,13 +221,13 @@ class BoardState:
         if whole is not None:
             return whole.encode(values)
         end = address + count
-        words: dict[int, int] = {}
+        by_address: dict[int, int] = {}
         for block in self.registers.blocks:
             if block.address < end and address < block.address + block.count:
-                words.update(enumerate(block.encode(values), block.address))
-        if len(words) < count or not all(at in words for at in range(address, end)):
+                by_address.update(enumerate(block.encode(values), block.address))
+        if not all(each in by_address for each in range(address, end)):
             raise RegisterRefusal(ILLEGAL_ADDRESS)
-        return [words[at] for at in range(address, end)]
+        return [by_address[each] for each in range(address, end)]
 
     def write(self, address: int, words: Sequence[int]) -> None:
         """Write whole registers, all or none.

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.alarms.book import AlarmMessage
+from membrane_ctrl.alarms.memory_limit import limited_memory
 from membrane_ctrl.alarms.outbox import Send
-from membrane_ctrl.alarms.sending import Service, limited_memory, send_to_all
+from membrane_ctrl.alarms.sending import Service, send_to_all
 from membrane_ctrl.config import schema
 from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model import errors, files

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.alarms.addresses import apprise_senders
+from membrane_ctrl.alarms.memory_limit import limited_memory
 from membrane_ctrl.alarms.outbox import Send
 from membrane_ctrl.alarms.run_alarms import RunAlarms
-from membrane_ctrl.alarms.sending import limited_memory
 from membrane_ctrl.alarms.sent_log import SentLog
 from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model import child_events, port_events

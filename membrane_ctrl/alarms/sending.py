@@ -7,17 +7,13 @@ process has a limit of memory.
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import resource
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 SERVICE_S = 60.0  # for one message; a mail server may take most of it
-_MEMORY_BYTES = 400_000_000  # beyond what the process has; an honest answer has some kilobytes
 
 
 class Service:
@@ -69,24 +65,3 @@ def send_to_all(services: Sequence[Service], title: str, body: str, kind: str) -
         service.has_accepted(until_s) for service in services
     ]  # wait for all: each gets every message
     return any(accepted)
-
-
-@contextlib.contextmanager
-def limited_memory() -> Iterator[None]:
-    """Within this context, the process may take `_MEMORY_BYTES` more than it has."""
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    most_bytes = _data_bytes() + _MEMORY_BYTES
-    if before[0] != resource.RLIM_INFINITY:
-        most_bytes = min(most_bytes, before[0])
-    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
-
-
-def _data_bytes() -> int:
-    """Memory of the process that counts against the limit."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    kilobytes = next(line.split()[1] for line in lines if line.startswith("VmData:"))
-    return 1024 * int(kilobytes)

@@ -64,7 +64,7 @@ class SentLog:
             raise
         self._read_bytes = 0
         self._rest = b""
-        self._lines: list[Line] = []
+        self._entries: list[Line] = []
         self._shown = 0
         self._is_torn = False  # the file's last line
         self._is_sender = False
@@ -95,9 +95,9 @@ class SentLog:
         if not self._is_sender:
             return False
         self._read_new_lines()
-        for line in reversed(self._lines):
-            if "sender" in line:
-                self._is_sender = line["sender"] == self._token
+        for entry in reversed(self._entries):
+            if "sender" in entry:
+                self._is_sender = entry["sender"] == self._token
                 break
         if self._is_sender:
             self._try_lock()  # one that hung when this process took its place may have ended
@@ -120,7 +120,7 @@ class SentLog:
     def read_sent(self) -> list[SentMessage]:
         """Return the messages that were accepted, oldest first."""
         self._read_new_lines()
-        found = [_parse_sent(line) for line in self._lines if line.get("sent") is True]
+        found = [_parse_sent(line) for line in self._entries if line.get("sent") is True]
         return [each for each in found if each is not None]
 
     def was_sent(self, message: AlarmMessage, to: str) -> bool:
@@ -138,8 +138,8 @@ class SentLog:
     def take_attempts(self) -> list[Line]:
         """Return the recorded attempts of all senders since the last call."""
         self._read_new_lines()
-        new = [line for line in self._lines[self._shown :] if "sent" in line]
-        self._shown = len(self._lines)
+        new = [entry for entry in self._entries[self._shown :] if "sent" in entry]
+        self._shown = len(self._entries)
         return new
 
     def _try_lock(self) -> bool:
@@ -168,7 +168,7 @@ class SentLog:
             written = 0
         self._is_torn = 0 < written < len(data) or (self._is_torn and not written)
         if written < len(data):
-            self._lines.append(line)
+            self._entries.append(line)
 
     def _read_new_lines(self) -> None:
         with contextlib.suppress(OSError):
@@ -178,7 +178,7 @@ class SentLog:
                     return
                 self._read_bytes += len(data)
                 *complete, self._rest = (self._rest + data).split(b"\n")
-                self._lines += [line for line in map(_parse_line, complete) if line is not None]
+                self._entries += [line for line in map(_parse_line, complete) if line is not None]
 
 
 def _parse_line(data: bytes) -> Line | None:

@@ -155,11 +155,12 @@ class NoticePart(_Part):
 
 def kind_of(message: Message) -> Kind:
     """Return the kind of a message, which its keys show."""
-    if "number" in message:
+    keys = message.keys()
+    if "number" in keys:
         return "answer"
-    if "notice" in message:
+    if "notice" in keys:
         return "notice"
-    if "status" in message or "event" in message:
+    if "status" in keys or "event" in keys:
         return "streamed"
     return "unknown"
 
@@ -179,7 +180,8 @@ def check_message(message: Message) -> Message:
 
 def check_greeting(message: Message) -> Message:
     """Return a greeting, checked. Raises AnswerError."""
-    if "membrane_ctrl" not in message:
+    keys = message.keys()
+    if "membrane_ctrl" not in keys:
         raise AnswerError("not a control port of membrane-ctrl")
     return check(message, GreetingPart)
 

@@ -16,7 +16,7 @@ from membrane_ctrl.config.toml_file import load_toml, read_toml
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.commander import CommandSession
 from membrane_ctrl.control_port.service_client import ServiceAddress, ServiceClient, read_token
-from membrane_ctrl.control_port.status import alarm_lines
+from membrane_ctrl.control_port.status_lines import alarm_lines
 from membrane_ctrl.model import errors, files, plain_json, run_status, terminal
 from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from membrane_ctrl.alarms.sending import limited_memory
+from membrane_ctrl.alarms.memory_limit import limited_memory
 from membrane_ctrl.config.service import HeartbeatConfig
 from membrane_ctrl.model import child_events, errors
 from membrane_ctrl.processes import child, event_pipe

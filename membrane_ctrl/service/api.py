@@ -38,7 +38,7 @@ from membrane_ctrl.control_port.api_models import (
 )
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.sender import Peer, explain_missing_role, role_includes
-from membrane_ctrl.control_port.status import alarm_lines, lock_lines
+from membrane_ctrl.control_port.status_lines import alarm_lines, lock_lines
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.columns import COLUMNS

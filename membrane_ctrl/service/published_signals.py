@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from membrane_ctrl.control_port.status import fault_line, lock_lines, notice_lines
+from membrane_ctrl.control_port.status_lines import fault_line, lock_lines, notice_lines
 from membrane_ctrl.model.columns import COLUMNS, PUBLISHED, unit_of
 from membrane_ctrl.model.notices import Topic
 from membrane_ctrl.service.hold_seen import HoldSeen

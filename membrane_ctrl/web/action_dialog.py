@@ -9,7 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control_port.status import lock_lines
+from membrane_ctrl.control_port.status_lines import lock_lines
 from membrane_ctrl.model.numbers import parse_number
 from membrane_ctrl.service.access import STOP, UNLOCK, ActionButton
 from membrane_ctrl.web.consequences import (

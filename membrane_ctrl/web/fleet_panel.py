@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from nicegui import ui
 
-from membrane_ctrl.control_port.status import alarm_lines
+from membrane_ctrl.control_port.status_lines import alarm_lines
 from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.service.feed import HoldFeed
 

@@ -12,7 +12,8 @@ import time
 import pytest
 
 from membrane_ctrl.alarms import sending
-from membrane_ctrl.alarms.sending import Service, limited_memory, send_to_all
+from membrane_ctrl.alarms.memory_limit import limited_memory
+from membrane_ctrl.alarms.sending import Service, send_to_all
 
 
 class Plugin:

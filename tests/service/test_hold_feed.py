@@ -14,7 +14,7 @@ import pytest
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.protocol import encode, parse
-from membrane_ctrl.control_port.status import alarm_lines
+from membrane_ctrl.control_port.status_lines import alarm_lines
 from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.service.access import (

@@ -1,0 +1,62 @@
+"""The lines that every display makes of a status: locks, fault, notices, alarms."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from membrane_ctrl.model.lock import Lock, describe_lock
+
+_LOCK_FIELDS = tuple(field.name for field in fields(Lock))
+
+
+def lock_lines(status: Mapping[str, Any]) -> list[str]:
+    """Return a line for each lock of a status: text, author, time, word, and whether it is not
+    stored.
+
+    Parameters
+    ----------
+    status : mapping
+        As the port answers it.
+
+    Returns
+    -------
+    list of str
+    """
+    lines = []
+    stated = status.get("locks")
+    for each in stated if isinstance(stated, list) else ():
+        if not isinstance(each, dict):
+            continue
+        lock = Lock(**{name: str(each.get(name, "")) for name in _LOCK_FIELDS})
+        problem = each.get("problem")
+        lines.append(describe_lock(lock) + (f"; NOT STORED: {problem}" if problem else ""))
+    return lines
+
+
+def fault_line(status: Mapping[str, Any]) -> str:
+    """Return the fault of a status with its cause and remedy; empty without one."""
+    fault = status.get("fault")
+    if not fault:
+        return ""
+    return "{code} {name}: {cause}; {remedy}".format_map(fault)
+
+
+def notice_lines(status: Mapping[str, Any], topic: str | None = None) -> list[str]:
+    """Return the sentences of a status's notices on neither faults nor locks, of one topic or of
+    all.
+    """
+    return [
+        str(each["text"]) for each in status.get("notices", ()) if topic in (None, each["topic"])
+    ]
+
+
+def alarm_lines(status: Mapping[str, Any]) -> list[str]:
+    """Return everything in a status that needs attention, a line each: locks, the fault, other
+    notices.
+    """
+    fault = fault_line(status)
+    return [
+        *(f"LOCKED {line}" for line in lock_lines(status)),
+        *([f"FAULT {fault}"] if fault else []),
+        *notice_lines(status),
+    ]
