@@ -45,13 +45,24 @@ def tracked(reference: Path, folder: Path, part: str) -> TrackedErrors:
 def row(part: str, found: TrackedErrors) -> str:
     """A row of the table in docs/measurements/tracking.md."""
     scale = 0.01 if part.startswith("sensor") else 1.0
-    unit = "µrad" if part in TURNS else "ppm" if part == "focal" else "µm"
+    unit = "µm"
+    if part in TURNS:
+        unit = "µrad"
+    elif part == "focal":
+        unit = "ppm"
+    # The last frame before the first that is not `ok`, and the motion in it
     ok = np.array(found.verdicts) == "ok"
     refused = np.flatnonzero(~ok[STEPS:])
-    last = STEPS + (int(refused[0]) if refused.size else GROWING) - 1
+    last = STEPS + GROWING - 1
+    if refused.size:
+        last = STEPS + int(refused[0]) - 1
     amount = scale * GROWTH ** (last - STEPS)
-    named = f"{amount * GROWTH:.3g} {unit}" if refused.size else f"none up to {amount:.4g} {unit}"
-    reason = found.reasons[last + 1].split(";")[0] if refused.size else ""
+    named = f"none up to {amount:.4g} {unit}"
+    reason = ""
+    if refused.size:
+        named = f"{amount * GROWTH:.3g} {unit}"
+        reason = found.reasons[last + 1].split(";")[0]
+    # Errors of the usable frames, and of that last one with its error bars
     given = np.flatnonzero(found.given)
     usable = ok[given]
     figures = np.abs(found.moved_terms[usable, 2:]).max()
@@ -59,7 +70,8 @@ def row(part: str, found: TrackedErrors) -> str:
     place = int(np.flatnonzero(given == last)[0])
     figure_nm = 1e3 * np.abs(found.terms_um[place, 2:]).max()
     bar_nm = 1e3 * found.terms_sigma_um[place, 2:].max()
-    sag_nm, sag_bar_nm = 1e3 * abs(found.sag_um[place]), 1e3 * found.sag_sigma_um[place]
+    sag_nm = 1e3 * abs(found.sag_um[place])
+    sag_bar_nm = 1e3 * found.sag_sigma_um[place]
     return (
         f"| {part} | {named} | {figure_nm:.0f} ({bar_nm:.0f}) | {sag_nm:.0f} ({sag_bar_nm:.0f}) "
         f"| {figures:.1f}, {sags:.1f} | {reason} |"

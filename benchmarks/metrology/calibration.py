@@ -153,16 +153,21 @@ def _plain(problem: Problem) -> Problem:
 
 def errors_um(surface: Surface, film: FilmShape, moved_um: float) -> tuple[float, float]:
     """Of the sag at 475 mm, and RMS of the figure inside it without the best plane."""
+    # Figure: the error on a grid, without the best plane
     y, x = np.mgrid[-475:476:25, -475:476:25].astype(float)
     inside = np.hypot(x, y) <= 475
-    x, y = x[inside], y[inside]
-    error = surface.height(x, y) - film.height_mm(x, y, moved_um)
+    x = x[inside]
+    y = y[inside]
+    error_mm = surface.height(x, y) - film.height_mm(x, y, moved_um)
     plane = np.stack([np.ones_like(x), x, y], axis=1)
-    figure = error - plane @ np.linalg.lstsq(plane, error, rcond=None)[0]
+    coeffs, *_ = np.linalg.lstsq(plane, error_mm, rcond=None)
+    figure_mm = error_mm - plane @ coeffs
+    # Sag: the mean error on a circle
     theta = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    rim = 475 * np.cos(theta), 475 * np.sin(theta)
-    sag = np.mean(surface.height(*rim) - film.height_mm(*rim, moved_um))
-    return 1e3 * float(sag), 1e3 * float(figure.std())
+    rim_x = 475 * np.cos(theta)
+    rim_y = 475 * np.sin(theta)
+    sag_mm = np.mean(surface.height(rim_x, rim_y) - film.height_mm(rim_x, rim_y, moved_um))
+    return 1e3 * float(sag_mm), 1e3 * float(figure_mm.std())
 
 
 def _measured(solution: Solution, film: FilmShape) -> tuple[float, float]:

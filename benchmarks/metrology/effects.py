@@ -19,19 +19,18 @@ FILMS = 4
 def row(effect: Effect) -> str:
     """One line of the table: RMS over the films."""
     found = [answer(effect, seed) for seed in range(FILMS)]
-    good = [each for each in found if not isinstance(each, str)]
-    said = {each if isinstance(each, str) else "; ".join((each[2], *each[3])) for each in found}
-    if not good:
-        return f"| {effect.description} | - | - | - | rejected: {' / '.join(sorted(said))} |"
-    errors, sigmas = (np.array([each[k] for each in good]) for k in (0, 1))
+    measured = [each for each in found if not isinstance(each, str)]
+    refusals = {each for each in found if isinstance(each, str)}
+    if not measured:
+        return f"| {effect.description} | - | - | - | rejected: {' / '.join(sorted(refusals))} |"
+    verdicts = refusals | {"; ".join((each[2], *each[3])) for each in measured}
+    errors = np.array([each[0] for each in measured])
+    sigmas = np.array([each[1] for each in measured])
     worst = float(np.max(np.abs(errors) / sigmas))
-    cells = [
-        f"{_rms(part[:, where]):.3g}"
-        for where in (slice(0, 1), slice(9, None))
-        for part in (errors, sigmas)
-    ]
-    figures = f"{cells[0]}, {cells[1]} | {cells[2]}, {cells[3]} | {worst:.1f}"
-    return f"| {effect.description} | {figures} | {' / '.join(sorted(said))} |"
+    sag = f"{_rms(errors[:, :1]):.3g}, {_rms(sigmas[:, :1]):.3g}"
+    figure = f"{_rms(errors[:, 9:]):.3g}, {_rms(sigmas[:, 9:]):.3g}"
+    texts = " / ".join(sorted(verdicts))
+    return f"| {effect.description} | {sag} | {figure} | {worst:.1f} | {texts} |"
 
 
 def _rms(values: FloatArray) -> float:

@@ -125,26 +125,35 @@ def _reference(live: LiveReconstructor, frames: list[np.ndarray]) -> tuple[float
 
 def _expected_screen(geometry: Geometry, rays: np.ndarray) -> np.ndarray:
     """Screen points (2, n) of the true film at displacement 0; NaN outside the analysis radius."""
-    f, t = geometry.pinhole_mm, -geometry.pinhole_mm[2] / rays[2]
-    x, y = f[0] + t * rays[0], f[1] + t * rays[1]
+    # Rays that meet the plane z = 0 within the analysis radius
+    pinhole = geometry.pinhole_mm
+    reach = -pinhole[2] / rays[2]
+    x = pinhole[0] + reach * rays[0]
+    y = pinhole[1] + reach * rays[1]
     inside = np.hypot(x, y) < OPTICS.mirror.analysis_radius_mm
-    out = np.full((2, rays.shape[1]), np.nan)
-    d, t = rays[:, inside], t[inside]
+    rays = rays[:, inside]
+    reach = reach[inside]
+    # Where they meet the film, by fixed-point iteration
     for _ in range(6):
-        x, y = f[0] + t * d[0], f[1] + t * d[1]
-        t = (FILM.height_mm(x, y, 0.0) - f[2]) / d[2]
-    p = f[:, None] + t * d
+        x = pinhole[0] + reach * rays[0]
+        y = pinhole[1] + reach * rays[1]
+        reach = (FILM.height_mm(x, y, 0.0) - pinhole[2]) / rays[2]
+    point = pinhole[:, None] + reach * rays
+    # The film's normal, by central differences, and the reflected rays
+    x, y, _ = point
     step = 0.1
-    hx = (FILM.height_mm(p[0] + step, p[1], 0.0) - FILM.height_mm(p[0] - step, p[1], 0.0)) / (
-        2 * step
+    rise_x = FILM.height_mm(x + step, y, 0.0) - FILM.height_mm(x - step, y, 0.0)
+    rise_y = FILM.height_mm(x, y + step, 0.0) - FILM.height_mm(x, y - step, 0.0)
+    normal = np.stack([-rise_x / (2 * step), -rise_y / (2 * step), np.ones_like(rise_x)])
+    projection = np.sum(rays * normal, axis=0) / np.sum(normal * normal, axis=0)
+    reflected = rays - 2 * projection * normal
+    # Where those meet the screen's plane
+    screen_normal = np.cross(geometry.screen_s_x, geometry.screen_s_y)
+    from_origin = point - geometry.screen_origin_mm[:, None]
+    from_origin = (
+        from_origin - (screen_normal @ from_origin) / (screen_normal @ reflected) * reflected
     )
-    hy = (FILM.height_mm(p[0], p[1] + step, 0.0) - FILM.height_mm(p[0], p[1] - step, 0.0)) / (
-        2 * step
-    )
-    n = np.stack([-hx, -hy, np.ones_like(hx)])
-    u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
-    face = np.cross(geometry.screen_s_x, geometry.screen_s_y)
-    q = p - geometry.screen_origin_mm[:, None]
-    q = q - (face @ q) / (face @ u) * u
-    out[:, inside] = geometry.screen_s_x @ q, geometry.screen_s_y @ q
-    return out
+    screen = np.full((2, inside.size), np.nan)
+    screen[0, inside] = geometry.screen_s_x @ from_origin
+    screen[1, inside] = geometry.screen_s_y @ from_origin
+    return screen

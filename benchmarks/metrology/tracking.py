@@ -82,14 +82,19 @@ def _bound_um(scene: CrossedScene, noise_adu: float) -> float:
     refitted.
     """
     once = scene.taper > 0  # the others repeat a bin
-    phases, jacobian = scene.phase_rad(scene.surface), scene.jacobian(scene.surface)
+    # The light of a bin is level + swing_x cos(phase_x) + swing_y cos(phase_y)
+    phases = scene.phase_rad(scene.surface)
+    jacobian = scene.jacobian(scene.surface)
     level, swing_x, swing_y = scene.light_adu
-    (cos_x, cos_y), (sin_x, sin_y) = np.cos(phases), np.sin(phases)
-    shape: FloatArray = -swing_x * sin_x * jacobian[0] - swing_y * sin_y * jacobian[1]
-    columns = np.concatenate(
-        [shape, *(scene.basis * wave for wave in (level, swing_x * cos_x, swing_y * cos_y))]
-    )
-    columns = columns[:, once]
+    cos_x, cos_y = np.cos(phases)
+    sin_x, sin_y = np.sin(phases)
+    # Its derivatives by the surface, and by the slowly varying light
+    by_shape: FloatArray = -swing_x * sin_x * jacobian[0] - swing_y * sin_y * jacobian[1]
+    waves = (level, swing_x * cos_x, swing_y * cos_y)
+    by_light = [scene.basis * wave for wave in waves]
+    columns = np.concatenate([by_shape, *by_light])[:, once]
+    # The Cramér-Rao bound
     sigma_adu = math.hypot(noise_adu, math.sqrt(1 / 12)) / scene.bin_px
     covariance = sigma_adu**2 * np.linalg.inv(columns @ columns.T)
-    return 1e3 * float(np.sqrt(np.trace(covariance[2 : PARAMETERS - 1, 2 : PARAMETERS - 1])))
+    of_terms = covariance[2 : PARAMETERS - 1, 2 : PARAMETERS - 1]
+    return 1e3 * float(np.sqrt(np.trace(of_terms)))

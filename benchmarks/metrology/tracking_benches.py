@@ -194,10 +194,11 @@ def _planted(world: Bench, times: Array, random: np.random.Generator) -> dict[in
             world.gains[float(times[k])] = GAINS[kind]
     if random.random() < 0.5:
         k = min(max(faults) + 2, times.size - 1)
-        deeper_um, tilt_um = random.uniform((-1e3, 0), (1e3, 10 * RADIUS_MM)) * random.random(
-            2
-        )  # often small
-        azimuth, faults[k], world.jump_s = random.uniform(0, 2 * math.pi), "jump", float(times[k])
+        most = random.uniform((-1e3, 0), (1e3, 10 * RADIUS_MM))
+        deeper_um, tilt_um = most * random.random(2)  # often small
+        azimuth = random.uniform(0, 2 * math.pi)
+        faults[k] = "jump"
+        world.jump_s = float(times[k])
         world.jump_um = (deeper_um, tilt_um * math.cos(azimuth), tilt_um * math.sin(azimuth))
     return faults
 

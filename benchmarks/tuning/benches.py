@@ -311,7 +311,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     """The tables of docs/measurements/tuning.md."""
     kept = [row for row in rows if "tuned_um" in row]
     ratio = np.array([row["tuned_um"] / row["least_um"] for row in kept])
-    said = np.array([row["predicted_um"] / row["tuned_um"] for row in kept])
+    predicted = np.array([row["predicted_um"] / row["tuned_um"] for row in kept])
     off = [(row["predicted_um"] - row["tuned_um"]) / row["predicted_sigma_um"] for row in kept]
     default = np.array([row["default_um"] / row["least_um"] for row in rows if "default_um" in row])
     lines = ["| of the drawn benches | |", "|---|---|", f"| examined | {len(rows)} |"]
@@ -323,21 +323,17 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             f"{default.max():.2f} |",
             f"| std after tuning / bound: median, worst | {np.median(ratio):.2f}, "
             f"{ratio.max():.2f} |",
-            f"| predicted over achieved | {said.min():.2f} to {said.max():.2f}, median "
-            f"{np.median(said):.2f} |",
-            f"| predicted within 20 % of achieved | {np.mean(abs(said - 1) <= 0.2):.0%} |",
+            f"| predicted over achieved | {predicted.min():.2f} to {predicted.max():.2f}, median "
+            f"{np.median(predicted):.2f} |",
+            f"| predicted within 20 % of achieved | {np.mean(abs(predicted - 1) <= 0.2):.0%} |",
             f"| achieved within 2 sigma of the prediction | {np.mean(np.abs(off) <= 2):.0%} |",
         ]
     lines.append(f"| excursion above the limit | {sum(_too_far(row) for row in rows)} |")
     lines += ["", "| bench | outcome | why |", "|---|---|---|"]
     for row in rows:
-        last = (
-            row.get("crashed")
-            or row.get("default_error")
-            or row.get("refused")
-            or row.get("reason", "")
-        )
-        why = "; then: ".join([*row.get("obeyed", ()), last or "kept"])
+        ends = [row.get(name) for name in ("crashed", "default_error", "refused", "reason")]
+        last = next(filter(None, ends), "kept")
+        why = "; then: ".join([*row.get("obeyed", ()), last])
         over = f"; excursion {row['excursion_um']:.1f} µm" if _too_far(row) else ""
         if outcome(row) != "kept" or over:
             lines.append(f"| {row['seed']}: {_short(row)} | {outcome(row)} | {why}{over} |")
