@@ -129,7 +129,7 @@ class Run:
                 self.process.join(PATIENCE_S)
             self.estimates += [unpack_estimate(message) for message in self._shapes.drain()]
 
-    def said(self, state: str, words: str) -> bool:
+    def has_reported(self, state: str, words: str) -> bool:
         """Whether a report says so."""
         reports = (report for report in self.reports if report["kind"] == "acquisition")
         return any(report["state"] == state and words in report["message"] for report in reports)
@@ -153,10 +153,10 @@ def test_cycles_through_display_and_camera(
     assert all(e.verdict != "ok" for e in before[before.index(full) + 1 :])
     assert full.verdict != "rejected"
     assert full.sag_um == pytest.approx(37_100, rel=0.01)
-    assert run.said("preparing", "camera: Aravis Fake EMU1")
+    assert run.has_reported("preparing", "camera: Aravis Fake EMU1")
 
     camera.unplug()
-    run.until(lambda: run.said("retrying", "plugged in"))
+    run.until(lambda: run.has_reported("retrying", "plugged in"))
     camera.plug_in()
     taken = len(run.estimates)
     run.until(lambda: any(e.verdict == "ok" for e in run.estimates[taken:]))
@@ -177,7 +177,7 @@ def test_a_camera_that_is_not_there_is_waited_for(
 ) -> None:
     camera.unplug()
     run = Run(stack, CONFIG, tmp_path)
-    run.until(lambda: run.said("retrying", "not found"))
+    run.until(lambda: run.has_reported("retrying", "not found"))
     camera.plug_in()
     run.until(lambda: bool(run.estimates))
     run.control.send("stop")

@@ -142,7 +142,7 @@ class Hold:
         assert set(self.troubles) <= {"recorder_done"}
 
     @property
-    def told(self) -> list[dict[str, Any]]:
+    def maintenance_events(self) -> list[dict[str, Any]]:
         """Maintenance notices and their ends in `events.jsonl`."""
         lines = map(json.loads, (self.folder / "events.jsonl").read_text().splitlines())
         return [line for line in lines if line["kind"].startswith("maintenance")]
@@ -213,7 +213,7 @@ def test_a_shift_over_a_restart_of_the_hold_is_reported_everywhere(
     kept = json.loads((first.folder / "vibrations.json").read_text())
     assert kept["schema"] == "membrane-vibrations/1"
     assert stated_program(kept) == program_identity()
-    assert [(line["kind"], line["name"]) for line in first.told] == [
+    assert [(line["kind"], line["name"]) for line in first.maintenance_events] == [
         ("maintenance", "pump_resonance")
     ]
     (driven,) = first.alarmed("pump_resonance")
@@ -223,7 +223,7 @@ def test_a_shift_over_a_restart_of_the_hold_is_reported_everywhere(
     second = Hold(tmp_path, 7.0, stack)
     minutes(second, 0.0, 3, 48.0 * 1.01)
     second.end()
-    (moved,) = second.told
+    (moved,) = second.maintenance_events
     assert (moved["kind"], moved["name"]) == ("maintenance", "film_tension")
     assert (
         "moved by +1.0% within 168 h: the film's tension by +2.0%; check clamping"
@@ -306,12 +306,12 @@ def test_a_shift_of_a_per_cent_within_a_week_of_pictures_is_reported_everywhere(
     assert moves == pytest.approx([change] * 4, abs=3e-4)
     assert last / first == pytest.approx(np.full(4, 1 + change), abs=5e-4)
     if abs(change) < 0.01:
-        assert hold.told == hold.alarmed("film_tension") == reported == []
+        assert hold.maintenance_events == hold.alarmed("film_tension") == reported == []
         assert "moved" not in message
         assert not any("Maintenance" in text for text in words)
         return
     assert message.count(f"it moved by {change:+.1%}: the film's tension by {2 * change:+.1%}") == 4
-    (told,) = hold.told
+    (told,) = hold.maintenance_events
     assert (told["kind"], told["name"]) == ("maintenance", "film_tension")
     # the first five searches end on day 1, and their median is of day 0
     assert (

@@ -53,7 +53,7 @@ def message(**event: object) -> bytes:
     return json.dumps(event).encode()
 
 
-def told(sender: FakeSender) -> list[tuple[str, str]]:
+def sent_notices(sender: FakeSender) -> list[tuple[str, str]]:
     return [(notice.name, notice.kind) for notice in sender.through]
 
 
@@ -86,7 +86,11 @@ def test_the_next_fault_is_sent_however_soon_it_comes_after_an_acknowledgement()
         [ROW.pack()], [message(kind="fault", name="over_pressure", latching=True)], 10.0
     )
     watcher.process_news([ROW.pack()], [], 10.0 + CONFIG.escalate_after_s)
-    assert told(sender) == [("fault", "raised"), ("fault", "raised"), ("fault", "escalated")]
+    assert sent_notices(sender) == [
+        ("fault", "raised"),
+        ("fault", "raised"),
+        ("fault", "escalated"),
+    ]
     assert sender.through[-1].text.startswith("Fault over_pressure")
 
 
@@ -98,7 +102,7 @@ def test_a_fault_is_sent_at_once_and_its_end_too() -> None:
         [ROW.pack()], [message(kind="state", state="standby", **{"from": "fault"})], 2.0
     )
     watcher.process_news([ROW.pack()], [], 33.0)
-    assert told(sender) == [("fault", "raised"), ("fault", "cleared")]
+    assert sent_notices(sender) == [("fault", "raised"), ("fault", "cleared")]
 
 
 def test_a_value_out_of_its_limits() -> None:
@@ -107,12 +111,12 @@ def test_a_value_out_of_its_limits() -> None:
     bad, good = replace(ROW, error_um=-20.0).pack(), ROW.pack()
     for now_s in range(30):
         watcher.process_news([bad], [], float(now_s))
-    assert told(sender) == []
+    assert sent_notices(sender) == []
     watcher.process_news([bad], [], 30.0)
-    assert told(sender) == [("out_of_band", "raised")]
+    assert sent_notices(sender) == [("out_of_band", "raised")]
     watcher.process_news([good], [], 31.0)
     watcher.process_news([good], [], 61.0)
-    assert told(sender)[1:] == [("out_of_band", "cleared")]
+    assert sent_notices(sender)[1:] == [("out_of_band", "cleared")]
 
 
 def test_a_loop_that_falls_silent_is_reported_and_a_slow_start_is_not() -> None:
@@ -121,9 +125,9 @@ def test_a_loop_that_falls_silent_is_reported_and_a_slow_start_is_not() -> None:
     watcher.process_news([], [], 30.0)
     watcher.process_news([ROW.pack()], [], 31.0)
     watcher.process_news([], [], 35.9)
-    assert told(sender) == []
+    assert sent_notices(sender) == []
     watcher.process_news([], [], 36.0)
-    assert told(sender) == [("silent", "raised")]
+    assert sent_notices(sender) == [("silent", "raised")]
 
 
 def test_an_escalation_is_tried_until_it_is_sent_and_delays_no_other_message() -> None:
@@ -135,11 +139,11 @@ def test_an_escalation_is_tried_until_it_is_sent_and_delays_no_other_message() -
     watcher.process_news([ROW.pack()], [], late_s)
     watcher.process_news([ROW.pack()], [message(kind="link", message="lost")], late_s + 1.0)
     watcher.process_news([ROW.pack()], [], late_s + 7.0)
-    assert told(sender) == [("fault", "raised"), ("fault", "escalated"), ("link", "raised")]
-    assert told(behind) == []
+    assert sent_notices(sender) == [("fault", "raised"), ("fault", "escalated"), ("link", "raised")]
+    assert sent_notices(behind) == []
     behind.down = False
     watcher.process_news([ROW.pack()], [], late_s + 11.0)
-    assert told(behind) == [("fault", "escalated")]
+    assert sent_notices(behind) == [("fault", "escalated")]
 
 
 @pytest.mark.parametrize(
@@ -151,7 +155,7 @@ def test_an_acknowledgement_keeps_the_others_asleep(event: EventLine) -> None:
     watcher.process_news([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
     watcher.process_news([ROW.pack()], [message(**event)], 1.0)
     watcher.process_news([ROW.pack()], [], 10_000.0)
-    assert told(sender) == [("fault", "raised")]
+    assert sent_notices(sender) == [("fault", "raised")]
 
 
 def test_a_network_that_is_down_is_tried_later_and_later_in_order() -> None:
@@ -183,7 +187,7 @@ def test_the_process_ends_with_the_run_and_sends_why_it_ended(tmp_path: Path) ->
         writer.put(message(kind="end", exit="safety_trip"))
         watch_run(spec(telemetry, events, tmp_path), [sender], reports.append, lambda: True)
         writer.close()
-    assert told(sender) == [("run_ended", "raised")]
+    assert sent_notices(sender) == [("run_ended", "raised")]
     assert [(r.alarm, r.sent) for r in reports if isinstance(r, AlarmSent)] == [("run_ended", True)]
 
 
@@ -196,7 +200,7 @@ def test_a_control_process_that_vanishes_is_reported(tmp_path: Path) -> None:
         watch_run(
             spec(telemetry, events, tmp_path), [sender], make_event_sender(ours), lambda: False
         )
-    assert told(sender) == [("control_gone", "raised")]
+    assert sent_notices(sender) == [("control_gone", "raised")]
 
 
 class Target:

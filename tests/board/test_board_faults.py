@@ -206,7 +206,7 @@ def test_damage_anywhere_in_the_firmware_s_memory_never_drives_the_pump_unfed(
         virtual_board.hear(rtu_frame(1, command(1)))  # the same heartbeat: does not feed
         virtual_board.pass_us(60_000)
         assert virtual_board.outputs[0] == 0
-        virtual_board.said()
+        virtual_board.read_sent()
 
 
 @pytest.mark.parametrize("damage", ["absent", "blank", "flipped", "short", "baud", "divisor"])
@@ -273,7 +273,7 @@ def test_a_request_cut_at_any_byte_does_nothing_and_the_next_one_is_answered(
     for kept in range(len(frame)):
         virtual_board.hear(frame[:kept])
         virtual_board.pass_us(4000)
-        assert virtual_board.said() == b""
+        assert virtual_board.read_sent() == b""
         assert virtual_board.outputs == (25_000, 12_500)
     assert virtual_board.ask_frame(frame)
     assert virtual_board.outputs == (37_500, 12_500)
@@ -310,9 +310,9 @@ def test_a_frame_is_one_only_between_silences(virtual_board: VirtualBoard) -> No
     assert virtual_board.ask_frame(ask) == answer
     virtual_board.hear(ask)
     virtual_board.pass_us(2000)  # heard after 1 ms, silent for 1 ms: too early to answer
-    assert virtual_board.said() == b""
+    assert virtual_board.read_sent() == b""
     virtual_board.pass_us(1000)
-    assert virtual_board.said() == answer
+    assert virtual_board.read_sent() == answer
 
 
 def test_a_line_that_splits_frames_may_have_a_longer_silence(firmware_library: Path) -> None:

@@ -69,7 +69,7 @@ class VirtualBoard:
         """Bytes arrive on the line, all at once."""
         self.chip.virtual_hear(data, len(data))
 
-    def said(self) -> bytes:
+    def read_sent(self) -> bytes:
         """What the board sent since the last call."""
         room = ctypes.create_string_buffer(1024)
         count = self.chip.virtual_said(room, len(room))
@@ -81,7 +81,7 @@ class VirtualBoard:
         self.pass_us(_ANSWERED_US)
         self.answered_us = self.now_us
         self.pass_us(_ASKED_US - _ANSWERED_US)
-        return self.said()
+        return self.read_sent()
 
     def ask(self, pdu: bytes, unit: int = 1) -> bytes:
         """The answer to a request over RTU; empty for none."""

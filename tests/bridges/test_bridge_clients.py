@@ -85,7 +85,7 @@ async def held(folder: Path) -> AsyncIterator[PortRun]:
             task.cancel()
 
 
-async def heard(port: int, topic: str, until: str = "") -> str:
+async def receive_text(port: int, topic: str, until: str = "") -> str:
     """The first message with that text, by mosquitto's own client."""
     async with (
         program("stdbuf", "-oL", "mosquitto_sub", "-p", str(port), "-t", topic) as client,
@@ -99,7 +99,7 @@ async def heard(port: int, topic: str, until: str = "") -> str:
                 return line.strip()
 
 
-async def told(port: int, topic: str, text: str, *more: str) -> None:
+async def publish_text(port: int, topic: str, text: str, *more: str) -> None:
     async with program("mosquitto_pub", "-p", str(port), "-t", topic, "-m", text, *more) as client:
         assert await client.wait() == 0
 
@@ -277,35 +277,35 @@ async def test_mqtt_publishes_obeys_and_survives_restarts(tmp_path: Path) -> Non
     ):
         run = await first_hold.enter_async_context(held(tmp_path))
         await first_broker.enter_async_context(broker(port))
-        await told(port, f"{base}/do/vent", "PRESS", "-r")  # stays at the broker
+        await publish_text(port, f"{base}/do/vent", "PRESS", "-r")  # stays at the broker
         async with hearing(port, f"{base}/answer") as answer:
             bridge = await bridge_stack.enter_async_context(bridges(tmp_path, settings))
             assert await answer() == "vent refused: a retained message is no command"
-            values = json.loads(await heard(port, f"{base}/values", '"hold"'))
+            values = json.loads(await receive_text(port, f"{base}/values", '"hold"'))
             assert (values["error_um"], values["run"]) == (0.25, "the-run")
-            await told(port, f"{base}/do/setpoint", "1.5")
+            await publish_text(port, f"{base}/do/setpoint", "1.5")
             assert (await answer()).endswith("mqtt: setpoint: done")
             for command, text, message in (
                 ("setpoint", "nan", f"mqtt: Setpoint: enter a number in µm: 'nan' {NO_NUMBER}"),
                 ("open_the_roof", "", "mqtt: no such command"),
                 ("mark", "x" * 100_000, "mqtt: mark refused: longer than 500 bytes"),
             ):
-                await told(port, f"{base}/do/{command}", text)
+                await publish_text(port, f"{base}/do/{command}", text)
                 assert (await answer()).endswith(message)
         assert [(each.kind, each.value) for each in run.asked] == [("setpoint", 1.5)]
-        found = json.loads(await heard(port, "homeassistant/device/membrane_bench/config"))
+        found = json.loads(await receive_text(port, "homeassistant/device/membrane_bench/config"))
         assert found["availability_topic"] == f"{base}/availability"
         await first_broker.aclose()
         async with broker(port):  # which knows nothing of the first one
-            await heard(port, f"{base}/availability", "online")
-            await heard(port, "homeassistant/device/membrane_bench/config")
+            await receive_text(port, f"{base}/availability", "online")
+            await receive_text(port, "homeassistant/device/membrane_bench/config")
             await first_hold.aclose()
-            await heard(port, f"{base}/availability", "offline")
-            assert json.loads(await heard(port, f"{base}/values"))["error_um"] is None
+            await receive_text(port, f"{base}/availability", "offline")
+            assert json.loads(await receive_text(port, f"{base}/values"))["error_um"] is None
             async with held(tmp_path):
-                await heard(port, f"{base}/availability", "online")
+                await receive_text(port, f"{base}/availability", "online")
                 bridge.kill()
-                await heard(port, f"{base}/availability", "offline")
+                await receive_text(port, f"{base}/availability", "offline")
 
 
 @pytest.mark.campaign

@@ -137,14 +137,14 @@ class Run:
         give_up_s = time.monotonic() + PATIENCE_S
         while not what():
             assert time.monotonic() < give_up_s, (
-                f"waited in vain; {self.events[-3:]}; {self.said()}"
+                f"waited in vain; {self.events[-3:]}; {self.read_stderr_end()}"
             )
             assert self.process.returncode is None or what(), (
-                f"ended with {self.process.returncode}; {self.said()}"
+                f"ended with {self.process.returncode}; {self.read_stderr_end()}"
             )
             await asyncio.sleep(0.02)
 
-    def said(self) -> str:
+    def read_stderr_end(self) -> str:
         """The last of what it wrote to standard error, where that is not a terminal."""
         path = self.folder / "stderr.txt"
         return path.read_text()[-2000:] if path.exists() else ""

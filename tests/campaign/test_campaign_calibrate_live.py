@@ -56,7 +56,7 @@ def wait_for(what: Callable[[], bool]) -> None:
         time.sleep(0.2)
 
 
-def told(logs: Path) -> list[dict[str, object]]:
+def read_events(logs: Path) -> list[dict[str, object]]:
     """Events of the one run."""
     found = list(logs.glob("*-hold/events.jsonl"))
     return (
@@ -82,7 +82,8 @@ def logs(tmp_path: Path) -> Iterator[Path]:
     try:
         wait_for(
             lambda: any(
-                e["kind"] == "shape" and e["state"] == "tracking" for e in told(tmp_path / "logs")
+                e["kind"] == "shape" and e["state"] == "tracking"
+                for e in read_events(tmp_path / "logs")
             )
         )
         yield tmp_path / "logs"
@@ -96,7 +97,7 @@ def test_aborted_gone_on_with_and_adopted(logs: Path) -> None:
     first = subprocess.Popen(
         [*live, "--range-um", "1200", "--sets", "3"], stderr=subprocess.PIPE, text=True
     )
-    wait_for(lambda: any(event["kind"] == "capture" for event in told(logs)))
+    wait_for(lambda: any(event["kind"] == "capture" for event in read_events(logs)))
     wait_for(lambda: any((logs / "calibration").glob("*/sets/set-1")))
     first.send_signal(signal.SIGINT)
     output = first.communicate(timeout=PATIENCE_S)[1]
@@ -119,7 +120,7 @@ def test_aborted_gone_on_with_and_adopted(logs: Path) -> None:
     new = read_geometry(logs.parent / "bench.toml")
     assert new.origin.hash == json.loads(done.stdout)["hash"]
     assert new.geometry.reference_displacement_um == 0.0  # the setpoint of the hold
-    events = told(logs)
+    events = read_events(logs)
     assert [event["verdict"] for event in events if event["kind"] == "capture"] == ["ok"] * 3
     assert not [event for event in events if event["kind"] in ("fault", "plausibility")]
     assert [event["state"] for event in events if event["kind"] == "shape"][-1] != "off"

@@ -58,7 +58,7 @@ def ctl(room: Room, who: str, words: str) -> str:
     return room.run(f"cd /; {PLACES} {as_who} {program} ctl {words} {SOCKET} 2>&1 || true")
 
 
-def told(room: Room) -> str:
+def read_sent(room: Room) -> str:
     return room.run("cat /run/told/told 2> /dev/null || true")
 
 
@@ -105,7 +105,7 @@ def test_a_killed_hold_is_recorded_reported_made_safe_and_started_again(room: Ro
     room.until(lambda: room.status_has("inflate"))
     room.kill(signal.SIGKILL)
     room.until(lambda: room.show("NRestarts")["NRestarts"] == "1")
-    assert "control_gone" in told(room)
+    assert "control_gone" in read_sent(room)
     assert "pump 0" in room.log()
     assert room.run(f"ls {runs(room)[0]}/summary.json")
     room.until(lambda: room.status_has("inflate"))
@@ -118,8 +118,8 @@ def test_a_hung_hold_is_killed_by_systemds_watchdog_and_started_again(room: Room
     room.kill(signal.SIGSTOP)
     room.until(lambda: room.show("NRestarts")["NRestarts"] == "1", 90.0)
     assert "Watchdog timeout" in room.log()
-    assert "silent" in told(room)
-    assert "control_gone" in told(room)
+    assert "silent" in read_sent(room)
+    assert "control_gone" in read_sent(room)
     assert room.run(f"ls {runs(room)[0]}/summary.json")
     room.until(lambda: room.status_has("inflate"))
 

@@ -32,7 +32,7 @@ def tense(share: float) -> float:
     return 0.7 * share**3 + 0.3 * share
 
 
-def told(
+def run_story(
     story: Story,
     duration_s: float,
     law: Law = hencky,
@@ -63,19 +63,19 @@ def test_a_laser_that_creeps_is_contradicted_by_the_gauge(rate_um_per_s: float) 
         way_um = rate_um_per_s * max(time_s - 100.0, 0.0)
         return -way_um, way_um, 0.0, 0.0
 
-    said, at_s = told(story, 300.0)
+    said, at_s = run_story(story, 300.0)
     assert "laser" in said
     assert "gauge" in said
     assert (at_s - 100.0) * abs(rate_um_per_s) < 45.0  # µm by which the film was led astray
 
 
 def test_film_motion_after_a_laser_jump_is_detected_within_30_s() -> None:
-    _, at_s = told(lambda t: (-30.0 * (t >= 100.0), 30.0 * (t >= 100.0), 0.0, 0.0), 300.0)
+    _, at_s = run_story(lambda t: (-30.0 * (t >= 100.0), 30.0 * (t >= 100.0), 0.0, 0.0), 300.0)
     assert 100.0 < at_s < 130.0
 
 
 def test_a_drifting_or_insensitive_gauge_is_detected() -> None:
-    said, at_s = told(lambda t: (0.0, 0.0, -0.1 * max(t - 100.0, 0.0), 0.0), 300.0)
+    said, at_s = run_story(lambda t: (0.0, 0.0, -0.1 * max(t - 100.0, 0.0), 0.0), 300.0)
     assert said
     assert at_s < 130.0
 
@@ -83,7 +83,7 @@ def test_a_drifting_or_insensitive_gauge_is_detected() -> None:
         way_um = 3.0 * time_s
         return way_um, 0.0, PRESSURE_PA - PRESSURE_PA * hencky(1 + way_um / SAG_UM), 0.0
 
-    said, at_s = told(blocked, 120.0)
+    said, at_s = run_story(blocked, 120.0)
     assert said
     assert at_s < 60.0
 
@@ -139,18 +139,20 @@ def test_a_week_of_weather_raises_a_notice_but_no_contradiction(phase: float) ->
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_drift_corrected_by_the_camera_raises_no_contradiction(sign: float) -> None:
     drifted: Story = lambda t: (0.0, sign * min(t / 15, 200.0), 0.0, sign * min(t / 15, 200.0))  # noqa: E731
-    assert told(drifted, 4000.0, rate_hz=2.0)[0] == ""
+    assert run_story(drifted, 4000.0, rate_hz=2.0)[0] == ""
 
 
 def test_a_drifting_camera_moves_film_and_laser_by_the_same_amount() -> None:
     assert (
-        told(lambda t: (min(t / 15, 200.0), 0.0, 0.0, min(t / 15, 200.0)), 4000.0, rate_hz=2.0)[0]
+        run_story(
+            lambda t: (min(t / 15, 200.0), 0.0, 0.0, min(t / 15, 200.0)), 4000.0, rate_hz=2.0
+        )[0]
         == ""
     )
 
 
 def test_a_laser_with_double_scale_is_detected_during_a_move() -> None:
-    said, at_s = told(lambda t: (1.75 * t, 1.75 * t, 0.0, 0.0), 300.0)
+    said, at_s = run_story(lambda t: (1.75 * t, 1.75 * t, 0.0, 0.0), 300.0)
     assert said
     assert 1.75 * at_s < 250.0
 
@@ -158,51 +160,55 @@ def test_a_laser_with_double_scale_is_detected_during_a_move() -> None:
 @pytest.mark.parametrize("law", [hencky, tense])
 @pytest.mark.parametrize("speed_um_per_s", [-1.2, 3.5])
 def test_a_long_move_raises_no_contradiction_for_any_film(law: Law, speed_um_per_s: float) -> None:
-    assert told(lambda t: (speed_um_per_s * t, 0.0, 0.0, 0.0), 1000.0, law)[0] == ""
+    assert run_story(lambda t: (speed_um_per_s * t, 0.0, 0.0, 0.0), 1000.0, law)[0] == ""
 
 
 @pytest.mark.parametrize("law", [hencky, tense])
 def test_a_move_and_its_return_raise_no_contradiction(law: Law) -> None:
     # the reference is a mean over the motion: with a curved law it is no point of the film's curve
     assert (
-        told(lambda t: (2000.0 - abs(20.0 * t % 4000.0 - 2000.0), 0.0, 0.0, 0.0), 1000.0, law)[0]
-        == ""
-    )
-
-
-def test_an_inflation_from_flat_raises_no_contradiction() -> None:
-    assert told(lambda t: (-SAG_UM + 20.0 * t, 0.0, 0.0, 0.0), SAG_UM / 20.0)[0] == ""
-
-
-def test_the_first_samples_of_a_noisy_gauge_are_not_used_as_reference() -> None:
-    assert {told(lambda t: (0.0, 0.0, 0.0, 0.0), 60.0, seed=seed)[0] for seed in range(40)} == {""}
-
-
-@pytest.mark.parametrize("by", [0.6, 1.7])
-def test_a_film_of_another_thickness_is_not_mistaken_for_a_wrong_unit(by: float) -> None:
-    assert told(lambda t: (0.0, 0.0, 0.0, 0.0), 60.0, lambda share: by * share**3)[0] == ""
-
-
-@pytest.mark.parametrize("rate_hz", [1.0, 10.0, 50.0])
-def test_noise_raises_no_contradiction_at_any_rate(rate_hz: float) -> None:
-    assert (
-        told(lambda t: (8 * math.sin(t / 30), 0.0, 0.0, 0.0), 20_000.0 / rate_hz, rate_hz=rate_hz)[
+        run_story(lambda t: (2000.0 - abs(20.0 * t % 4000.0 - 2000.0), 0.0, 0.0, 0.0), 1000.0, law)[
             0
         ]
         == ""
     )
 
 
+def test_an_inflation_from_flat_raises_no_contradiction() -> None:
+    assert run_story(lambda t: (-SAG_UM + 20.0 * t, 0.0, 0.0, 0.0), SAG_UM / 20.0)[0] == ""
+
+
+def test_the_first_samples_of_a_noisy_gauge_are_not_used_as_reference() -> None:
+    assert {
+        run_story(lambda t: (0.0, 0.0, 0.0, 0.0), 60.0, seed=seed)[0] for seed in range(40)
+    } == {""}
+
+
+@pytest.mark.parametrize("by", [0.6, 1.7])
+def test_a_film_of_another_thickness_is_not_mistaken_for_a_wrong_unit(by: float) -> None:
+    assert run_story(lambda t: (0.0, 0.0, 0.0, 0.0), 60.0, lambda share: by * share**3)[0] == ""
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 10.0, 50.0])
+def test_noise_raises_no_contradiction_at_any_rate(rate_hz: float) -> None:
+    assert (
+        run_story(
+            lambda t: (8 * math.sin(t / 30), 0.0, 0.0, 0.0), 20_000.0 / rate_hz, rate_hz=rate_hz
+        )[0]
+        == ""
+    )
+
+
 @pytest.mark.parametrize("by", [10.0, 0.1, 1000.0, 0.001, -1.0])
 def test_a_gauge_in_a_wrong_unit_is_detected_within_seconds(by: float) -> None:
-    said, at_s = told(lambda t: (0.0, 0.0, (by - 1) * PRESSURE_PA, 0.0), 60.0)
+    said, at_s = run_story(lambda t: (0.0, 0.0, (by - 1) * PRESSURE_PA, 0.0), 60.0)
     assert "600 Pa" in said
     assert at_s < 5.0
 
 
 def test_without_a_known_pressure_there_is_no_nominal_pressure() -> None:
     unknown = MirrorConfig(pressure_pa=0.0)
-    assert told(lambda t: (0.0, 0.0, -0.9 * PRESSURE_PA, 0.0), 60.0, mirror=unknown)[0] == ""
+    assert run_story(lambda t: (0.0, 0.0, -0.9 * PRESSURE_PA, 0.0), 60.0, mirror=unknown)[0] == ""
 
 
 def test_film_motion_during_a_laser_gap_raises_no_contradiction() -> None:
@@ -210,7 +216,7 @@ def test_film_motion_during_a_laser_gap_raises_no_contradiction() -> None:
         lost = 100.0 <= time_s < 130.0
         return -max(time_s - 100.0, 0.0), math.nan if lost else 0.0, 0.0, 0.0
 
-    assert told(story, 300.0)[0] == ""
+    assert run_story(story, 300.0)[0] == ""
 
 
 def grown(

@@ -39,12 +39,13 @@ def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate
     )
 
 
-def told(
+def judge_story(
     story: Story, duration_s: float = 400.0, seed: int = 1, gauge_drift_pa_per_s: float = 0.0
 ) -> list[FaultySensor]:
     """The verdict on every tick of a story; noise 1 µm, 1 µm and 0.5 Pa."""
     rng = np.random.default_rng(seed)
-    judge, said = PlausibilityCheck(10.0, 37_100.0), []
+    check = PlausibilityCheck(10.0, 37_100.0)
+    verdicts: list[FaultySensor] = []
     for tick in range(round(duration_s * RATE_HZ)):
         time_s = tick / RATE_HZ
         true_um, laser_um, camera_um = story(time_s)
@@ -57,8 +58,8 @@ def told(
         shape = (
             estimate(time_s, SAG_UM + true_um + camera_um + noise[1]) if tick % 20 == 0 else None
         )
-        said.append(judge.step(1 / RATE_HZ, true_um + laser_um + noise[2], gauge_pa, shape))
-    return said
+        verdicts.append(check.step(1 / RATE_HZ, true_um + laser_um + noise[2], gauge_pa, shape))
+    return verdicts
 
 
 def after(start_s: float, value: float) -> Callable[[float], float]:
@@ -68,14 +69,16 @@ def after(start_s: float, value: float) -> Callable[[float], float]:
 @pytest.mark.parametrize("seed", range(5))
 def test_consistent_sensors_raise_no_suspicion(seed: int) -> None:
     wander: Story = lambda t: (8 * math.sin(t / 30), 0.0, 0.0)  # noqa: E731
-    assert set(told(wander, 1200.0, seed)) == {FaultySensor.NONE}
+    assert set(judge_story(wander, 1200.0, seed)) == {FaultySensor.NONE}
 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("size_um", [-40.0, -20.0, 20.0, 40.0])
 def test_a_displaced_laser_is_identified_within_a_minute(size_um: float, seed: int) -> None:
     # the loop returns the reading to its setpoint, and moves the mirror off it
-    said = told(lambda t: (-after(200.0, size_um)(t), after(200.0, size_um)(t), 0.0), seed=seed)
+    said = judge_story(
+        lambda t: (-after(200.0, size_um)(t), after(200.0, size_um)(t), 0.0), seed=seed
+    )
     found = said.index(FaultySensor.LASER) / RATE_HZ
     assert 200.0 < found < 260.0
     assert FaultySensor.OPTICS not in said
@@ -84,30 +87,30 @@ def test_a_displaced_laser_is_identified_within_a_minute(size_um: float, seed: i
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("size_um", [-40.0, -20.0, 20.0, 40.0])
 def test_a_displaced_camera_is_identified_within_a_minute(size_um: float, seed: int) -> None:
-    said = told(lambda t: (0.0, 0.0, after(200.0, size_um)(t)), seed=seed)
+    said = judge_story(lambda t: (0.0, 0.0, after(200.0, size_um)(t)), seed=seed)
     found = said.index(FaultySensor.OPTICS) / RATE_HZ
     assert 200.0 < found < 260.0
     assert FaultySensor.LASER not in said
 
 
 def test_a_sensor_error_that_ends_is_cleared() -> None:
-    said = told(lambda t: (0.0, 0.0, 30.0 if 100 <= t < 200 else 0.0))
+    said = judge_story(lambda t: (0.0, 0.0, 30.0 if 100 <= t < 200 else 0.0))
     assert FaultySensor.OPTICS in said
     assert set(said[-500:]) == {FaultySensor.NONE}
 
 
 def test_slow_drifts_raise_no_suspicion() -> None:
-    assert set(told(lambda t: (0.0, 2.0 * t / 60, 0.0), 900.0)) == {
+    assert set(judge_story(lambda t: (0.0, 2.0 * t / 60, 0.0), 900.0)) == {
         FaultySensor.NONE
     }  # the laser's mount
-    assert set(told(lambda t: (0.0, 0.0, 0.0), 900.0, gauge_drift_pa_per_s=0.01)) == {
+    assert set(judge_story(lambda t: (0.0, 0.0, 0.0), 900.0, gauge_drift_pa_per_s=0.01)) == {
         FaultySensor.NONE
     }
 
 
 def test_a_drifting_gauge_does_not_blame_another_sensor() -> None:
     # 0.1 Pa a minute, far more than a gauge's zero moves
-    said = told(lambda t: (0.0, after(200.0, 30.0)(t), 0.0), gauge_drift_pa_per_s=0.1 / 60)
+    said = judge_story(lambda t: (0.0, after(200.0, 30.0)(t), 0.0), gauge_drift_pa_per_s=0.1 / 60)
     assert FaultySensor.LASER in said
     assert FaultySensor.OPTICS not in said
 

@@ -93,25 +93,25 @@ def test_a_loss_of_20_percent_in_a_night_is_followed_and_reported() -> None:
     assert [warning.bad for warning in PumpHealth(0.12).step(drift.known)[1]] == [True]
 
 
-def told(bench: Bench) -> bool:
+def is_reported(bench: Bench) -> bool:
     """Whether the notice came at any time of the night."""
     health, notices = PumpHealth(0.12), []
 
-    class Told(PumpDrift):
+    class WatchedDrift(PumpDrift):
         def step(self, displacement_um: float, flow_um_per_s: float, dt_s: float) -> bool:
             done = super().step(displacement_um, flow_um_per_s, dt_s)
             if done:
                 notices.extend(health.step(self.known)[1])
             return done
 
-    bench.run(Told(0.1, 0.15))
+    bench.run(WatchedDrift(0.1, 0.15))
     return any(notice.bad for notice in notices)
 
 
 @pytest.mark.campaign
 def test_exactly_the_nights_with_a_loss_of_20_percent_are_reported() -> None:
-    assert all(told(Bench(hours=8.0, ends_at=0.8, seed=seed)) for seed in range(200, 208))
-    assert not any(told(Bench(hours=8.0, seed=seed)) for seed in range(300, 308))
+    assert all(is_reported(Bench(hours=8.0, ends_at=0.8, seed=seed)) for seed in range(200, 208))
+    assert not any(is_reported(Bench(hours=8.0, seed=seed)) for seed in range(300, 308))
 
 
 @pytest.mark.campaign

@@ -54,7 +54,7 @@ def moved_um(ticks: list[VirtualTick]) -> float:
     return float(np.abs(centre_um[time_s >= FROM_S] - before).max())
 
 
-def told(ticks: list[VirtualTick]) -> list[str]:
+def list_used_sensors(ticks: list[VirtualTick]) -> list[str]:
     """Which sensors hold the mirror, as it was told."""
     return [
         ", ".join(event.sensors)
@@ -97,7 +97,7 @@ def test_a_lost_sensor_causes_neither_a_step_nor_a_fault(
     ticks = held(fail)
     assert moved_um(ticks) < 0.3
     assert not [event for tick in ticks for event in tick.events if isinstance(event, Fault)]
-    assert told(ticks) == used_sensors
+    assert list_used_sensors(ticks) == used_sensors
     alone = [
         event
         for tick in ticks
@@ -123,7 +123,7 @@ def test_without_laser_and_optics_the_flow_is_held_until_one_returns() -> None:
 
 def test_by_default_the_loop_controls_the_laser_reading() -> None:
     ticks = held(set_to("no_light", True), Config(twin=CONFIG.twin), until_s=19.0)
-    assert told(ticks) == []
+    assert list_used_sensors(ticks) == []
     assert ticks[-1].row.safe_level == SafeLevel.HOLD_FLOW
 
 

@@ -140,19 +140,19 @@ class Bench:
         """The last state."""
         return State(int(self.ticks[-1].row.state))
 
-    def told(self, kind: type) -> list[object]:
+    def events_of(self, kind: type) -> list[object]:
         """The events of a kind."""
         return [event for tick in self.ticks for event in tick.events if isinstance(event, kind)]
 
     @property
     def faults(self) -> list[str]:
         """Names of the faults, in order."""
-        return [event.name for event in self.told(Fault)]  # type: ignore[attr-defined]
+        return [event.name for event in self.events_of(Fault)]  # type: ignore[attr-defined]
 
     @property
     def notices(self) -> list[str]:
         """Names of the notices, in order."""
-        return [event.name for event in self.told(Maintenance)]  # type: ignore[attr-defined]
+        return [event.name for event in self.events_of(Maintenance)]  # type: ignore[attr-defined]
 
 
 _SETTLED = Originals[Bench]()
@@ -244,9 +244,9 @@ def test_the_loss_of_the_laser_is_reported_at_once_and_its_return_too() -> None:
     ]
     assert held.notices == ["laser_lost"]
     assert times_s[0] == pytest.approx(7.0, abs=0.3)
-    (notice,) = held.told(Maintenance)
+    (notice,) = held.events_of(Maintenance)
     assert notice.message.startswith("the laser is lost; optics and gauge are left")  # type: ignore[attr-defined]
-    assert [event.name for event in held.told(MaintenanceOver)] == ["laser_lost"]  # type: ignore[attr-defined]
+    assert [event.name for event in held.events_of(MaintenanceOver)] == ["laser_lost"]  # type: ignore[attr-defined]
     assert held.faults == []
 
 
@@ -327,7 +327,7 @@ def test_no_protection_is_lost_while_laser_and_estimate_exchange_the_loop(
 @pytest.mark.parametrize("um_per_s", [-0.05, 0.05])
 def test_slow_drift_of_the_optics_is_outvoted_by_laser_and_gauge(um_per_s: float) -> None:
     held = settled(config_of("estimate"), drifting(um_per_s)).fail(1200.0)
-    assert [event.faulty for event in held.told(Plausibility)] == ["optics"]  # type: ignore[attr-defined]
+    assert [event.faulty for event in held.events_of(Plausibility)] == ["optics"]  # type: ignore[attr-defined]
     assert held.moved_um < 40.0
     assert held.faults == []
     assert (
@@ -349,7 +349,7 @@ def test_an_experiment_ends_when_the_laser_that_it_measures_with_is_lost() -> No
     )
     held.command(Command("tune", "a test", experiment=spec))
     held.fail(20.0, lose_laser)
-    (ended,) = held.told(ExperimentEnded)
+    (ended,) = held.events_of(ExperimentEnded)
     assert not ended.completed  # type: ignore[attr-defined]
     assert held.moved_um < 10.0
     assert held.state == State.HOLD
@@ -403,7 +403,7 @@ def test_wrong_optics_are_outvoted_whatever_the_hold_does(undertaking: str, spoi
     held = settled(config_of("estimate"), spoil)
     held.command(UNDERTAKINGS[undertaking])
     held.fail(90.0)
-    assert "optics" in [event.faulty for event in held.told(Plausibility)]  # type: ignore[attr-defined]
+    assert "optics" in [event.faulty for event in held.events_of(Plausibility)]  # type: ignore[attr-defined]
     way_um = 40.0 if undertaking == "setpoint" else 0.0
     moved_um = np.array([tick.row.truth_displacement_um for tick in held.ticks]) - held.start_um
     assert moved_um.max() < way_um + 35.0
@@ -420,7 +420,7 @@ def test_a_wrong_laser_ends_an_experiment(process_value: str) -> None:
         wrong.laser_offset_um = 2.0 * since_s
 
     held.fail(40.0, drift)
-    assert held.told(ExperimentEnded)
+    assert held.events_of(ExperimentEnded)
     assert held.moved_um < 65.0
 
 
@@ -436,8 +436,8 @@ def test_an_experiment_ends_when_the_laser_that_it_measures_with_is_outvoted() -
         wrong.laser_offset_um = 0.3 * since_s
 
     held.fail(150.0, drift)
-    assert "laser" in [event.faulty for event in held.told(Plausibility)]  # type: ignore[attr-defined]
-    (ended,) = held.told(ExperimentEnded)
+    assert "laser" in [event.faulty for event in held.events_of(Plausibility)]  # type: ignore[attr-defined]
+    (ended,) = held.events_of(ExperimentEnded)
     assert ended.end == "reading_lost"  # type: ignore[attr-defined]
     assert held.faults == []
 
@@ -459,7 +459,7 @@ def test_sensors_without_faults_never_contradict_each_other(
     held = settled(config_of(process_value, shape=shape))
     held.command(UNDERTAKINGS[undertaking])
     held.fail(80.0)
-    assert held.told(Plausibility) == []
+    assert held.events_of(Plausibility) == []
     assert held.faults == []
     assert held.notices == []
 
@@ -499,7 +499,7 @@ def test_a_repeatedly_displaced_laser_does_not_move_the_film() -> None:
 
     held = settled(config_of("estimate")).fail(300.0, knock)
     assert held.moved_um < 20.0
-    assert "laser" in [event.faulty for event in held.told(Plausibility)]  # type: ignore[attr-defined]
+    assert "laser" in [event.faulty for event in held.events_of(Plausibility)]  # type: ignore[attr-defined]
 
 
 def leak_more(wrong: Wrong, since_s: float) -> None:
@@ -564,7 +564,7 @@ def test_optics_that_are_left_out_as_unsteady_count_as_missing_without_a_laser(
     held = settled(config_of(process_value), noisy_with_a_small_sigma()).fail(80.0, lose_laser)
     first = "film_unseen" if process_value == "optics" else "displacement_missing"
     assert held.faults[0] == first
-    messages = {event.name: event.message for event in held.told(Maintenance)}  # type: ignore[attr-defined]
+    messages = {event.name: event.message for event in held.events_of(Maintenance)}  # type: ignore[attr-defined]
     assert "no laser" in messages["optics_unsteady"]
     assert held.moved_um < 65.0
     assert held.state == State.FAULT
@@ -572,7 +572,7 @@ def test_optics_that_are_left_out_as_unsteady_count_as_missing_without_a_laser(
 
 def test_unsteady_optics_beside_a_laser_leave_the_mirror_to_the_laser() -> None:
     held = settled(config_of("estimate"), noisy_with_a_small_sigma()).fail(60.0)
-    messages = {event.name: event.message for event in held.told(Maintenance)}  # type: ignore[attr-defined]
+    messages = {event.name: event.message for event in held.events_of(Maintenance)}  # type: ignore[attr-defined]
     assert "the mirror follows the laser" in messages["optics_unsteady"]
     assert held.faults == []
     assert held.moved_um < 10.0
@@ -580,7 +580,7 @@ def test_unsteady_optics_beside_a_laser_leave_the_mirror_to_the_laser() -> None:
 
 def test_the_fault_of_unsteady_optics_without_a_laser_names_them() -> None:
     held = settled(config_of("optics"), noisy_with_a_small_sigma()).fail(60.0)
-    fault = held.told(Fault)[0]
+    fault = held.events_of(Fault)[0]
     assert "jumps again and again" in fault.sentence  # type: ignore[attr-defined]
     assert "laser reading" not in fault.sentence  # type: ignore[attr-defined]
 

@@ -300,7 +300,7 @@ def test_the_time_constant_of_the_shape_loop_is_on_trial_with_the_gains() -> Non
     controller = Controller(CONFIG, zernike_projection())
     now_s = 0.0
 
-    def told(*commands: Command) -> tuple[list[str], float]:
+    def obey_commands(*commands: Command) -> tuple[list[str], float]:
         nonlocal now_s
         now_s += 5.0
         out = controller.tick(TickInputs(now_s=now_s, dt_s=0.02, reading=None, commands=commands))
@@ -309,17 +309,17 @@ def test_the_time_constant_of_the_shape_loop_is_on_trial_with_the_gains() -> Non
     def tried(shape_s: float, trial_s: float = math.nan) -> Command:
         return replace(gains(CONFIG.loop.kp_per_s, trial_s), shape_time_constant_s=shape_s)
 
-    assert told(tried(90.0, 8.0))[1] == 90.0
-    kinds, memory_s = told()
+    assert obey_commands(tried(90.0, 8.0))[1] == 90.0
+    kinds, memory_s = obey_commands()
     assert ("gains_reverted" in kinds, memory_s) == (False, 90.0)
-    kinds, memory_s = told()
+    kinds, memory_s = obey_commands()
     assert ("gains_reverted" in kinds, memory_s) == (True, 40.0)
-    told(tried(90.0, 8.0))
-    told(Command("keep", "tester"))
-    assert [told()[1] for _ in range(3)] == [90.0] * 3
-    assert told(gains(0.3))[1] == 90.0  # gains alone leave it
-    assert told(tried(60.0, 1.0))[1] == 60.0
-    assert told()[1] == 90.0
+    obey_commands(tried(90.0, 8.0))
+    obey_commands(Command("keep", "tester"))
+    assert [obey_commands()[1] for _ in range(3)] == [90.0] * 3
+    assert obey_commands(gains(0.3))[1] == 90.0  # gains alone leave it
+    assert obey_commands(tried(60.0, 1.0))[1] == 60.0
+    assert obey_commands()[1] == 90.0
     assert "outside" in explain_refusal(tried(0.5), State.HOLD, CONFIG)
 
 
@@ -331,9 +331,9 @@ class Stepped:
     def __init__(self) -> None:
         self.controller = Controller(CONFIG, zernike_projection())
         self.now_s = 0.0
-        self.told(Command("setpoint", "tester", value=2.1), Command("shape_on", "tester"))
+        self.obey_commands(Command("setpoint", "tester", value=2.1), Command("shape_on", "tester"))
 
-    def told(self, *commands: Command, after_s: float = 1.0) -> tuple[float, bool]:
+    def obey_commands(self, *commands: Command, after_s: float = 1.0) -> tuple[float, bool]:
         self.now_s += after_s
         out = self.controller.tick(
             TickInputs(now_s=self.now_s, dt_s=0.02, reading=None, commands=commands)
@@ -348,29 +348,31 @@ def stepped(step_um: float, trial_s: float = 10.0) -> Command:
 
 def test_setpoint_step_and_shape_loop_revert_after_the_trial() -> None:
     run = Stepped()
-    assert run.told(stepped(0.0)) == (2.1, False)
-    assert run.told(stepped(5.0)) == (7.1, False)
-    assert run.told(after_s=9.0) == (7.1, False)  # the second trial counts
-    assert run.told(after_s=2.0) == (2.1, True)
+    assert run.obey_commands(stepped(0.0)) == (2.1, False)
+    assert run.obey_commands(stepped(5.0)) == (7.1, False)
+    assert run.obey_commands(after_s=9.0) == (7.1, False)  # the second trial counts
+    assert run.obey_commands(after_s=2.0) == (2.1, True)
     assert run.controller.loop_config == CONFIG.loop
 
 
 @pytest.mark.parametrize("ends", [gains(0.3), Command("keep", "tester")])
 def test_a_step_ends_with_its_trial_also_when_gains_stay(ends: Command) -> None:
     run = Stepped()
-    run.told(stepped(5.0))
-    assert run.told(ends) == (2.1, True)
+    run.obey_commands(stepped(5.0))
+    assert run.obey_commands(ends) == (2.1, True)
     assert run.controller.loop_config.kp_per_s == 0.3
 
 
 def test_a_setpoint_set_during_a_step_stays() -> None:
     run = Stepped()
-    run.told(stepped(5.0))
-    assert run.told(Command("setpoint", "tester", value=-1.0), Command("shape_off", "tester")) == (
+    run.obey_commands(stepped(5.0))
+    assert run.obey_commands(
+        Command("setpoint", "tester", value=-1.0), Command("shape_off", "tester")
+    ) == (
         -1.0,
         False,
     )
-    assert run.told(after_s=20.0) == (-1.0, False)
+    assert run.obey_commands(after_s=20.0) == (-1.0, False)
 
 
 def test_a_fault_ends_a_step() -> None:
@@ -383,9 +385,9 @@ def test_a_fault_ends_a_step() -> None:
 
 def test_a_setpoint_step_is_part_of_the_snapshot() -> None:
     run = Stepped()
-    run.told(stepped(5.0))
+    run.obey_commands(stepped(5.0))
     run.controller = continue_from(take_snapshot(run.controller), CONFIG, zernike_projection())
-    assert run.told(after_s=20.0) == (2.1, True)
+    assert run.obey_commands(after_s=20.0) == (2.1, True)
 
 
 def test_a_step_without_a_trial_or_beyond_the_limits_is_refused() -> None:

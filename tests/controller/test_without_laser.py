@@ -77,7 +77,7 @@ def held(
     return ticks
 
 
-def told(ticks: list[VirtualTick], kind: type[Any]) -> list[Any]:
+def events_of(ticks: list[VirtualTick], kind: type[Any]) -> list[Any]:
     return [event for tick in ticks for event in tick.events if isinstance(event, kind)]
 
 
@@ -99,8 +99,8 @@ def states(ticks: list[VirtualTick]) -> list[State]:
 def test_a_bench_without_a_laser_starts_settles_and_holds_its_sag() -> None:
     ticks = held(28.0)
     assert states(ticks) == [State.CHECK, State.INFLATE, State.SETTLE, State.HOLD]
-    assert not told(ticks, Fault)
-    assert [event.sensors for event in told(ticks, SensorsUsed)] == [
+    assert not events_of(ticks, Fault)
+    assert [event.sensors for event in events_of(ticks, SensorsUsed)] == [
         ("optics", "barometer", "thermometer")
     ]
     held_um = true_um(ticks, 18.0)
@@ -121,7 +121,7 @@ def test_an_existing_laser_is_not_used_when_the_optics_are_the_process_value() -
 
     config = BY_OPTICS.model_copy(update={"twin": TWIN.model_copy(update={"laser": True})})
     ticks = held(26.0, knock, config)
-    assert not told(ticks, Fault)
+    assert not events_of(ticks, Fault)
     assert np.ptp(true_um(ticks, 18.0)) < 0.3
 
 
@@ -133,7 +133,7 @@ def test_lost_and_returning_optics_cause_no_step(for_s: float, most_um: float) -
     ticks = held(22.0 + for_s, lose)
     moved_um = np.abs(true_um(ticks, 20.0) - true_um(ticks, 17.0, 20.0).mean())
     assert moved_um.max() < most_um
-    assert [fault.name for fault in told(ticks, Fault)] == ["film_unseen"] * (for_s > 1)
+    assert [fault.name for fault in events_of(ticks, Fault)] == ["film_unseen"] * (for_s > 1)
     assert ticks[-1].row.safe_level == SafeLevel.NONE
 
 
@@ -142,7 +142,7 @@ def test_a_lasting_loss_of_the_optics_ends_in_the_safe_state_with_one_event() ->
         wrong.camera_lost = now_s > 16.0
 
     ticks = held(60.0, lose)
-    (fault,) = told(ticks, Fault)
+    (fault,) = events_of(ticks, Fault)
     assert (fault.name, fault.seen) == ("film_unseen", "no figure of the mirror for 1.0 s")
     level = {tick.row.safe_level: tick.row.mono_s for tick in reversed(ticks)}
     assert level[SafeLevel.HOLD_FLOW] == pytest.approx(17.0, abs=0.1)
@@ -164,7 +164,7 @@ def test_a_start_waits_for_a_preparing_camera(
     ticks = held(48.0, prepares)
     assert (State.INFLATE in states(ticks)) == starts
     why = "sensors still not good after 15 s: no figure of the mirror yet"
-    assert [fault.seen for fault in told(ticks, Fault)] == ([] if starts else [why])
+    assert [fault.seen for fault in events_of(ticks, Fault)] == ([] if starts else [why])
 
 
 def test_intermittent_figures_end_the_check_with_a_reason() -> None:
@@ -173,7 +173,7 @@ def test_intermittent_figures_end_the_check_with_a_reason() -> None:
     def busy(wrong: Wrong, now_s: float) -> None:
         wrong.camera_lost = now_s % 3.0 > 1.2
 
-    (fault,) = told(held(17.0, busy), Fault)
+    (fault,) = events_of(held(17.0, busy), Fault)
     assert fault.name == "overdue"
     assert fault.seen.endswith("readings come and go, or the actuator test is not done")
 
@@ -278,7 +278,7 @@ def test_a_camera_that_returns_after_a_freeze_keeps_its_zero() -> None:
     ticks = [run.run_tick((Command("hold", "a test", "it runs"),))]
     ticks += [run.run_tick() for _ in range(1700)]
     assert all(ticks)
-    (fault,) = told(ticks, Fault)
+    (fault,) = events_of(ticks, Fault)
     assert fault.seen == "the camera repeats one figure to the last bit"
     assert true_um(ticks, 32.0).mean() == pytest.approx(true_um(ticks, 17.0, 20.0).mean(), abs=0.1)
 
@@ -308,7 +308,7 @@ def test_a_new_anchor_of_the_tracking_does_not_move_the_mirror(config: Config) -
 def test_the_optics_of_such_a_bench_cannot_be_switched_off() -> None:
     ticks = held(1.0, commands={20: Command("shape_off", "a test")})
     refusals = [
-        taken.refused for taken in told(ticks, CommandTaken) if taken.command == "shape_off"
+        taken.refused for taken in events_of(ticks, CommandTaken) if taken.command == "shape_off"
     ]
     assert refusals == ["the mirror is held by the optics alone (estimator.process_value)"]
 
@@ -345,16 +345,16 @@ def _judge_knock(um: float, until_s: float) -> None:
         wrong.laser_offset_um = um if now_s > 38.0 else 0.0
 
     ticks = held(until_s, knock, BY_ALL)
-    assert not told(ticks, Fault)
+    assert not events_of(ticks, Fault)
     moved_um = np.abs(true_um(ticks, 38.0) - true_um(ticks, 30.0, 38.0).mean())
     assert moved_um.max() < 0.3
-    jumps = [jump for event in told(ticks, SensorsUsed) for jump in event.jumped]
+    jumps = [jump for event in events_of(ticks, SensorsUsed) for jump in event.jumped]
     assert [jump.split()[0] for jump in jumps] == ["laser"]
     assert float(jumps[0].split()[1]) == pytest.approx(um, abs=4.5)
-    faulty_sensors = [event.faulty for event in told(ticks, Plausibility)]
+    faulty_sensors = [event.faulty for event in events_of(ticks, Plausibility)]
     assert faulty_sensors == ["laser", "none"]
     assert ticks[-1].row.laser_innovation == pytest.approx(0.0, abs=5.0)  # it is used again
-    assert told(ticks, ShapeLoopState)[-1].state == "tracking"
+    assert events_of(ticks, ShapeLoopState)[-1].state == "tracking"
     assert (
         min(tick.row.leak_um_per_s for tick in ticks if tick.row.mono_s > 38.0) > 1.0
     )  # no gas went anywhere
@@ -389,7 +389,7 @@ def test_a_drifting_laser_takes_over_at_the_present_position(shape_off: bool) ->
     )
     config = BY_ALL.model_copy(update=AT_10_HZ)
     ticks = held(360.0, lose, config, LaserDrift(60.0, 2.0, 600.0), switches, 0.2)
-    assert not told(ticks, Fault)
+    assert not events_of(ticks, Fault)
     before_um = true_um(ticks, 280.0, 300.0).mean()
     assert np.abs(true_um(ticks, 300.0, 330.0) - before_um).max() < 1.5
     after_um = true_um(ticks, 345.0).mean()  # a switch takes the figure of its time as the new one
@@ -420,8 +420,8 @@ def _judge_jump(um: float, seen: bool) -> None:
         BY_ALL,
         AmbientChange(JUMP_S, um / -0.358, 0.1),
     )
-    assert not told(ticks, Fault)
-    faulty_sensors = [event.faulty for event in told(ticks, Plausibility)]
+    assert not events_of(ticks, Fault)
+    faulty_sensors = [event.faulty for event in events_of(ticks, Plausibility)]
     assert faulty_sensors == ([] if seen else ["optics"])
     before_um = true_um(ticks, 30.0, JUMP_S).mean()
     assert np.abs(true_um(ticks, JUMP_S, JUMP_S + 1) - before_um).max() == pytest.approx(
@@ -458,8 +458,10 @@ def _early(
         None,
         0.2,
     )
-    faults = [fault.name for fault in told(ticks, Fault) if fault.name != "displacement_missing"]
-    faulty_sensors = [event.faulty for event in told(ticks, Plausibility)]
+    faults = [
+        fault.name for fault in events_of(ticks, Fault) if fault.name != "displacement_missing"
+    ]
+    faulty_sensors = [event.faulty for event in events_of(ticks, Plausibility)]
     off_um = (
         true_um(ticks, ticks[-1].row.mono_s - 3.0).mean()
         - true_um(ticks, jump_s - 1.0, jump_s).mean()
@@ -491,8 +493,8 @@ def test_a_jump_at_the_start_that_optics_alone_miss_ends_in_the_safe_state() -> 
 def test_a_smaller_jump_that_optics_alone_miss_is_reported(um: float) -> None:
     config = BY_OPTICS.model_copy(update=AT_10_HZ)
     ticks = held(60.0, _blind(um, 20.0), config, AmbientChange(20.0, um / -0.358, 0.1), None, 0.2)
-    assert [notice.name for notice in told(ticks, Maintenance)] == ["sag_doubted"]
-    assert not told(ticks, Fault)
+    assert [notice.name for notice in events_of(ticks, Maintenance)] == ["sag_doubted"]
+    assert not events_of(ticks, Fault)
 
 
 def test_pressure_steps_and_setpoint_changes_do_not_flag_the_optics() -> None:
@@ -501,7 +503,7 @@ def test_pressure_steps_and_setpoint_changes_do_not_flag_the_optics() -> None:
         1200: Command("setpoint", "a test", "", -20.0),
     }
     config = BY_OPTICS.model_copy(update=AT_10_HZ)
-    assert not told(
+    assert not events_of(
         held(150.0, NOTHING, config, AmbientChange(30.0, 20.0, 0.1), moves, 0.2), Maintenance
     )
 
@@ -518,8 +520,8 @@ def test_a_lost_camera_is_not_blamed_for_a_jump(config: Config) -> None:
 
     config = config.model_copy(update=AT_10_HZ)
     ticks = held(95.0, lose, config, AmbientChange(50.0, 40.0 / 0.358, 0.1), None, 0.2)
-    assert not told(ticks, Plausibility)
-    assert not told(ticks, Fault)
+    assert not events_of(ticks, Plausibility)
+    assert not events_of(ticks, Fault)
     assert true_um(ticks, 92.0).mean() == pytest.approx(true_um(ticks, 25.0, 30.0).mean(), abs=0.5)
 
 
@@ -577,8 +579,8 @@ def test_a_jump_that_the_camera_missed_is_not_counted_as_leak(config: Config) ->
     ticks = held(
         180.0, _blind(40.0), config, AmbientChange(JUMP_S, 40.0 / -0.358, 0.1), shape_s=0.2
     )
-    assert [event.faulty for event in told(ticks, Plausibility)] == ["optics"]
-    assert not told(ticks, Fault)
+    assert [event.faulty for event in events_of(ticks, Plausibility)] == ["optics"]
+    assert not events_of(ticks, Fault)
     leaks_um_per_s = [tick.row.leak_um_per_s for tick in ticks[600:]]
     assert 1.0 < min(leaks_um_per_s) < max(leaks_um_per_s) < 1.4
 
@@ -628,13 +630,13 @@ def test_a_camera_mount_warming_by_1_k_per_hour_is_reported_and_bounded(
 ) -> None:
     """It truly grows by 0.44 µm/K: what is known of it is 30 % wrong."""
     ticks, growing = _warmed(0.44, stated_um_per_k, 2.5)
-    assert not told(ticks, Fault)
+    assert not events_of(ticks, Fault)
     moved_um = (
         true_um(ticks, ticks[-1].row.mono_s - 60.0).mean() - true_um(ticks, 30.0, 60.0).mean()
     )
     assert abs(moved_um) < most_um
     assert abs(moved_um) < 2.0 * ticks[-1].row.estimate_sigma_um
-    (notice,) = told(ticks, Maintenance)
+    (notice,) = events_of(ticks, Maintenance)
     assert notice.name == "camera_mount_growth"
     assert notice.message.startswith(
         "the camera mount is +1.3 K from the reference: the figure may be off by 0.5 µm;"
@@ -657,8 +659,8 @@ def test_known_thermal_growth_of_the_camera_mount_does_not_move_the_mirror() -> 
     assert growing.um == pytest.approx(2.0, abs=0.1)
     before_um = true_um(ticks, 14.0, 18.0).mean()
     assert true_um(ticks, 26.0, 30.0).mean() == pytest.approx(before_um, abs=0.2)
-    assert [event.name for event in told(ticks, Maintenance)] == ["camera_mount_growth"]
-    assert [event.name for event in told(ticks, MaintenanceOver)] == ["camera_mount_growth"]
+    assert [event.name for event in events_of(ticks, Maintenance)] == ["camera_mount_growth"]
+    assert [event.name for event in events_of(ticks, MaintenanceOver)] == ["camera_mount_growth"]
     sigma_um = {round(tick.row.mono_s, 2): tick.row.estimate_sigma_um for tick in ticks}
     assert sigma_um[29.0] == pytest.approx(1.0, abs=0.1)
     assert sigma_um[33.0] < 0.2

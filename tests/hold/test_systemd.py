@@ -40,7 +40,7 @@ def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
         yield heard
 
 
-def said(heard: socket.socket) -> list[list[str]]:
+def read_messages(heard: socket.socket) -> list[list[str]]:
     found = []
     while True:
         try:
@@ -57,7 +57,7 @@ def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(
             notify.handle_tick(outputs(tick * 0.02, State.CHECK))
         notify.handle_tick(outputs(2.02, State.HOLD, -0.42))
         notify.handle_tick(outputs(2.04, State.FAULT, fault=20))
-    messages = said(systemd)
+    messages = read_messages(systemd)
     assert messages[0] == ["READY=1", "WATCHDOG=1", "STATUS=check"]
     assert messages[1:5] == [["WATCHDOG=1", "STATUS=check"]] * 4
     assert messages[5:] == [
@@ -85,7 +85,7 @@ def test_trouble_with_the_recording_is_in_the_status_until_it_is_over(
             from_dict({"kind": "recorder_recovered", "what": "disk", "message": "disk works again"})
         )
         notify.handle_tick(outputs(1.0, State.HOLD))
-    messages = said(systemd)
+    messages = read_messages(systemd)
     assert messages[0][1:] == [
         "WATCHDOG=1",
         "STATUS=hold, fault 20, recording: Disk almost full: /srv/?: less than 500 MB free",
@@ -107,7 +107,7 @@ def test_a_full_socket_is_not_waited_for(systemd: socket.socket) -> None:
     with SystemdNotify() as notify:
         for tick in range(5000):
             notify.handle_tick(outputs(float(tick), State.HOLD))
-    assert 0 < len(said(systemd)) < 5000
+    assert 0 < len(read_messages(systemd)) < 5000
 
 
 def test_the_unit_stops_what_it_must_and_never_restarts_into_a_fault() -> None:

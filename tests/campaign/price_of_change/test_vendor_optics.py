@@ -171,7 +171,7 @@ class Hold:
         self._process.wait()
 
 
-def said(events: list[dict[str, Any]], words: str) -> bool:
+def has_reported(events: list[dict[str, Any]], words: str) -> bool:
     """Whether the acquisition has reported this."""
     return any(
         words in str(event.get("message", "")) for event in events if event["kind"] == "acquisition"
@@ -186,11 +186,11 @@ def measured(events: list[dict[str, Any]]) -> int:
 def test_the_simulated_mirror_is_measured_through_them(site: Path, tmp_path: Path) -> None:
     hold = Hold(site, tmp_path)
     try:
-        hold.until(lambda events: said(events, "camera: Studio camera S1"))
+        hold.until(lambda events: has_reported(events, "camera: Studio camera S1"))
         hold.until(lambda events: measured(events) > 0)
         hold.until(lambda events: any(event.get("state") == "hold" for event in events))
         (identity,) = (
-            event["message"] for event in hold.events() if said([event], "Studio camera")
+            event["message"] for event in hold.events() if has_reported([event], "Studio camera")
         )
         assert str(os.getpid()) not in identity
         summary = hold.end()
@@ -208,7 +208,7 @@ def test_a_camera_that_fails_and_hangs_is_named_and_replaced_while_the_hold_cont
     hold = Hold(site, tmp_path, faults)
     try:
         for words in ("RuntimeError: bus error 5", "SystemExit: 3", "gave 306 x 255 uint8"):
-            hold.until(lambda events, words=words: said(events, words))  # type: ignore[misc]
+            hold.until(lambda events, words=words: has_reported(events, words))  # type: ignore[misc]
         hold.until(lambda events: any(event["kind"] == "child_silent" for event in events))
         restarted = "child_restarted"
         hold.until(lambda events: any(event["kind"] == restarted for event in events))
