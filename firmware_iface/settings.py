@@ -50,7 +50,9 @@ class Section(BaseModel):
         """Refuse `true` and "1" for a number, 1 for a switch: pydantic takes them all for what they
         are not.
         """
-        for name, value in table.items() if isinstance(table, dict) else ():
+        if not isinstance(table, dict):
+            return table
+        for name, value in table.items():
             field = cls.model_fields.get(name)
             kinds = set() if field is None else _list_kinds(field.annotation)
             if kinds == {bool} and not isinstance(value, bool):

@@ -199,7 +199,8 @@ class Instrument:
             value = round(struct.unpack(">f", raw)[0] / self._capacity * bronkhorst.FULL_SCALE)
         else:
             (value,) = struct.unpack(_FORMATS[parameter.kind], raw)
-        if not 0 <= value <= (bronkhorst.FULL_SCALE if parameter == bronkhorst.SETPOINT else 255):
+        most = bronkhorst.FULL_SCALE if parameter == bronkhorst.SETPOINT else 255
+        if not 0 <= value <= most:
             return False
         self._settings[parameter] = value
         self._drive()
@@ -233,9 +234,9 @@ class BronkhorstRegisters:
                 raw = struct.pack(f">{len(words)}H", *words)
                 if parameter.kind == "u8" and raw[0]:
                     raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_VALUE)
-                if not self._instrument.write(
-                    parameter, raw[1:] if parameter.kind == "u8" else raw
-                ):
+                if parameter.kind == "u8":
+                    raw = raw[1:]
+                if not self._instrument.write(parameter, raw):
                     raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_VALUE)
                 return
         raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_ADDRESS)

@@ -38,7 +38,10 @@ def compute_crc16(data: bytes) -> int:
 
 def _table_entry(index: int) -> int:
     for _ in range(8):
-        index = (index >> 1) ^ (0xA001 if index & 1 else 0)
+        lowest_bit = index & 1
+        index >>= 1
+        if lowest_bit:
+            index ^= 0xA001
     return index
 
 

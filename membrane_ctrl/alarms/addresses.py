@@ -102,7 +102,9 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
         )
     message = AlarmMessage("raised", "test", "warning", "this is only a test", escalated)
     senders = apprise_senders(alarms, "none, a test")
-    lists = [alarms.urls_file, alarms.escalation_urls_file][: 2 if escalated else 1]
+    lists: list[str | None] = [alarms.urls_file]
+    if escalated:
+        lists.append(alarms.escalation_urls_file)
     with limited_memory():
         deaf = [file for file, send in zip(lists, senders, strict=False) if not send(message)]
     if as_json:

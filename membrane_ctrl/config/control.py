@@ -141,11 +141,12 @@ class PumpConfig(Section):
             or len(commands) != len(flows)
             or (falling and len(falling) != len(flows))
         ):
-            raise ValueError(
+            counts = (
                 f"curve_fraction has {len(commands)} commands, curve_um_per_s {len(flows)} flows"
-                + (f", curve_falling_um_per_s {len(falling)}" if falling else "")
-                + ": give a flow for each of at least two commands"
             )
+            if falling:
+                counts += f", curve_falling_um_per_s {len(falling)}"
+            raise ValueError(f"{counts}: give a flow for each of at least two commands")
         if any(later <= earlier for earlier, later in pairwise(commands)):
             raise ValueError("curve_fraction must rise from each command to the next")
         for name, branch in (("curve_um_per_s", flows), ("curve_falling_um_per_s", falling)):

@@ -162,8 +162,9 @@ class _Feed:
         for message in messages:
             self.model.add_row(telemetry.TelemetryRow.unpack(message))
         self.model.add_rows(telemetry.unpack_rows(messages))
-        for message in self._shapes.drain() if self._shapes else ():
-            self.model.add_shape(shape_estimate.unpack_estimate(message))
+        if self._shapes:
+            for message in self._shapes.drain():
+                self.model.add_shape(shape_estimate.unpack_estimate(message))
         lines: list[EventLine] = [json.loads(message) for message in self._events.drain()]
         for line in lines:
             self.model.add_event(line)

@@ -22,14 +22,18 @@ def lock_lines(status: Mapping[str, Any]) -> list[str]:
     -------
     list of str
     """
-    lines = []
+    lines: list[str] = []
     stated = status.get("locks")
-    for each in stated if isinstance(stated, list) else ():
+    if not isinstance(stated, list):
+        return lines
+    for each in stated:
         if not isinstance(each, dict):
             continue
         lock = Lock(**{name: str(each.get(name, "")) for name in _LOCK_FIELDS})
-        problem = each.get("problem")
-        lines.append(describe_lock(lock) + (f"; NOT STORED: {problem}" if problem else ""))
+        line = describe_lock(lock)
+        if problem := each.get("problem"):
+            line += f"; NOT STORED: {problem}"
+        lines.append(line)
     return lines
 
 

@@ -121,8 +121,9 @@ def print_closing_report(
     run_dir: Path, as_json: bool, closing: RunEnd | None = None, page: PageAtEnd = NO_PAGE
 ) -> None:
     """Print how the run ended, a fault first, then its result, its folder and the page's link."""
-    for line in make_closing_lines(closing) if closing is not None else ():
-        print(line, file=sys.stderr)
+    if closing is not None:
+        for line in make_closing_lines(closing):
+            print(line, file=sys.stderr)
     summary_path = run_dir / "summary.json"
     if as_json:
         print(summary_path.read_text(encoding="utf-8") if summary_path.exists() else "{}")

@@ -98,8 +98,9 @@ class Recorder:
         self._events_lost = before.events_lost
         self._summary = before.summary
         self._status = RunStatus()
-        for logged in event_log.read_events(run_dir, []) if resumes else ():
-            self._status = self._status.after_event(logged.event, logged.mono_s)
+        if resumes:
+            for logged in event_log.read_events(run_dir, []):
+                self._status = self._status.after_event(logged.event, logged.mono_s)
         self._tables = RunTables(run_dir, clock.origin_utc, before.windows if resumes else None)
         self._input_ticks_lost = before.input_ticks_lost
         self._assembler = TickAssembler()

@@ -4,12 +4,14 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
 from membrane_ctrl.model import errors, program
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.files import make_folder, move_file, scratch_folder, write_text_atomic
 from membrane_ctrl.model.optional import import_optional
 from membrane_ctrl.model.telemetry import FIELDS
@@ -179,6 +181,18 @@ def _write_tables(
     return [path] if writer is not None else []
 
 
+def _append_values(file: Any, place: str, values: Column) -> None:
+    """Append values to a data set of an HDF5 file; the first ones make it."""
+    if place not in file:
+        file.create_dataset(
+            place, data=values, maxshape=(None,), chunks=True, compression="gzip", shuffle=True
+        )
+        return
+    data = file[place]
+    data.resize(data.shape[0] + values.size, axis=0)
+    data[-values.size :] = values
+
+
 def _write_hdf5(
     run: Run,
     to: str,
@@ -192,23 +206,10 @@ def _write_hdf5(
     h5py = import_optional("h5py", "h5", f"--format {to}")
     with h5py.File(path, "w") as file:
         file.attrs.update(_make_origin(run))
-        for block in run.tick_blocks(fields, start_s, end_s) if fields else ():
-            for name, values in block.items():
-                place = f"ticks/{name}"
-                if place not in file:
-                    file.create_dataset(
-                        place,
-                        data=values,
-                        maxshape=(None,),
-                        chunks=True,
-                        compression="gzip",
-                        shuffle=True,
-                    )
-                    continue
-                data = file[place]
-                data.resize(data.shape[0] + values.size, axis=0)
-                data[-values.size :] = values
         if fields:
+            for block in run.tick_blocks(fields, start_s, end_s):
+                for name, values in block.items():
+                    _append_values(file, f"ticks/{name}", values)
             _warn_if_missing(run, "ticks" in file)
         shapes = run.shapes()
         shapes = shapes.select_cycles((shapes.time_s >= start_s) & (shapes.time_s < end_s))

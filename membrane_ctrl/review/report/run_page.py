@@ -164,7 +164,9 @@ def _tabulate_windows(analysis: Analysis) -> PageTable:
     """Tabulate the hold's error by means over windows of increasing length."""
     rows = []
     for name, series in ((READING, analysis.reading), (TRUE, analysis.true)):
-        for window in () if series is None else series.windows:
+        if series is None:
+            continue
+        for window in series.windows:
             errors_um = (window.mean_um, window.std_um, window.p99_7_um, window.max_um)
             rows.append(
                 [

@@ -24,8 +24,10 @@ def block_s(a_s: Column, b_s: Column, window_s: float) -> float:
     """Common block length of two series at these times: unequal blocks would include different
     motion.
     """
-    spans_s = [float(np.ptp(time_s)) if time_s.size else 0.0 for time_s in (a_s, b_s)]
-    return max(min(_BLOCK_S, min(spans_s) / _LEAST_BLOCKS), _LEAST_VALUES * window_s)
+    shorter_s = 0.0
+    if a_s.size and b_s.size:
+        shorter_s = min(float(np.ptp(a_s)), float(np.ptp(b_s)))
+    return max(min(_BLOCK_S, shorter_s / _LEAST_BLOCKS), _LEAST_VALUES * window_s)
 
 
 def block_statistics(time_s: Column, values: Column, length_s: float) -> tuple[Column, Column]:
