@@ -186,41 +186,46 @@ class CrossedWorld:
         `t` is one time, or that of each row, (height, 1).
         """
         now = float(np.mean(t))
+        # The paper's bench: a camera that looks at the mirror's centre, a screen opposite to it
         alpha = math.radians(self.alpha_deg)
-        pinhole = (self.a_mm + 0.060 * self.kelvin_at(now)) * np.array(
-            [math.cos(alpha), 0.0, math.sin(alpha)]
-        )
-        forward = -np.array([math.cos(alpha), 0.0, math.sin(alpha)])
-        right, down = np.array([math.sin(alpha), 0.0, -math.cos(alpha)]), np.array([0.0, -1.0, 0.0])
+        cosine = math.cos(alpha)
+        sine = math.sin(alpha)
+        pinhole = (self.a_mm + 0.060 * self.kelvin_at(now)) * np.array([cosine, 0.0, sine])
+        forward = -np.array([cosine, 0.0, sine])
+        right = np.array([sine, 0.0, -cosine])
+        down = np.array([0.0, -1.0, 0.0])
+        # The rays of the pixels
         row, column = np.mgrid[: self.height, : self.width].astype(float)
         scale = self.pixel_um * 1e-3 / self.focal_mm
-        across, along = (
-            (column - (self.width - 1) / 2) * scale,
-            (row - (self.height - 1) / 2) * scale,
-        )
+        across = (column - (self.width - 1) / 2) * scale
+        along = (row - (self.height - 1) / 2) * scale
         ray = forward + across[..., None] * right + along[..., None] * down
+        # Where they meet the film, by fixed-point iteration: each round leaves a thirtieth of the
+        # height's error, and the heights of the last frame are a good start
         known = self._height.shape == row.shape
-        low, h = self.vertex_z_mm(t), self._height if known else np.zeros(row.shape)
-        for _ in range(3 if known else 8):  # the height's error shrinks to a thirtieth
+        low = self.vertex_z_mm(t)
+        h = self._height if known else np.zeros(row.shape)
+        for _ in range(3 if known else 8):
             reach = (low + h - pinhole[2]) / ray[..., 2]
-            x, y = pinhole[0] + reach * ray[..., 0], pinhole[1] + reach * ray[..., 1]
+            x = pinhole[0] + reach * ray[..., 0]
+            y = pinhole[1] + reach * ray[..., 1]
             h = np.where(np.hypot(x, y) < 1.05 * RADIUS_MM, self.film_mm(x, y, t), h)
         self._height = h
+        # Reflected at the film's normal, by central differences
         e = 0.25
         slope_x = (self.film_mm(x + e, y, t) - self.film_mm(x - e, y, t)) / (2 * e)
         slope_y = (self.film_mm(x, y + e, t) - self.film_mm(x, y - e, t)) / (2 * e)
         normal = np.stack([-slope_x, -slope_y, np.ones_like(x)], axis=-1)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         back = ray - 2 * np.sum(ray * normal, axis=-1, keepdims=True) * normal
-        away = np.array([math.cos(alpha), 0.0, -math.sin(alpha)])  # into the screen
-        origin = -self.b_mm * away
+        # Where the reflections meet the screen
+        into = np.array([cosine, 0.0, -sine])  # the screen
+        origin = -self.b_mm * into
         place = np.stack([x, y, low + h], axis=-1)
-        far = ((origin - place) @ away) / (back @ away)
+        far = ((origin - place) @ into) / (back @ into)
         hit = place + far[..., None] * back - origin
-        s_x, s_y = (
-            hit @ np.array([-math.sin(alpha), 0.0, -math.cos(alpha)]),
-            hit @ np.array([0.0, 1.0, 0.0]),
-        )
+        s_x = hit @ np.array([-sine, 0.0, -cosine])
+        s_y = hit @ np.array([0.0, 1.0, 0.0])
         if self.air_um:
             s_x = s_x + 1e-3 * self._air[0].at(now, x, y)
             s_y = s_y + 1e-3 * self._air[1].at(now, x, y)

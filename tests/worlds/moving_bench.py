@@ -66,21 +66,25 @@ class MovingBench(CrossedWorld):
     def trace(self, t: Any) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
         """As the world's, on the moved bench."""
         now = float(np.mean(t))
+        # The paper's bench: a camera that looks at the mirror's centre, a screen opposite to it
         alpha = math.radians(self.alpha_deg)
-        towards = np.array([math.cos(alpha), 0.0, math.sin(alpha)])
-        pinhole, forward = self.a_mm * towards, -towards
-        right, down = np.array([math.sin(alpha), 0.0, -math.cos(alpha)]), np.array([0.0, -1.0, 0.0])
-        into = np.array([math.cos(alpha), 0.0, -math.sin(alpha)])
+        cosine = math.cos(alpha)
+        sine = math.sin(alpha)
+        pinhole = self.a_mm * np.array([cosine, 0.0, sine])
+        forward = -np.array([cosine, 0.0, sine])
+        right = np.array([sine, 0.0, -cosine])
+        down = np.array([0.0, -1.0, 0.0])
+        into = np.array([cosine, 0.0, -sine])  # the screen
         origin = -self.b_mm * into
-        s_x, s_y = np.array([-math.sin(alpha), 0.0, -math.cos(alpha)]), np.array([0.0, 1.0, 0.0])
+        s_x = np.array([-sine, 0.0, -cosine])
+        s_y = np.array([0.0, 1.0, 0.0])
+        # The motions of this moment
+        bodies = ("camera", "screen", "mirror")
         shift = {
-            body: [1e-3 * self._now(f"{body}_{axis}", now) for axis in "xyz"]
-            for body in ("camera", "screen", "mirror")
+            body: [1e-3 * self._now(f"{body}_{axis}", now) for axis in "xyz"] for body in bodies
         }
-        turn = {
-            body: [self._now(f"{body}_r{axis}", now) for axis in "xyz"]
-            for body in ("camera", "screen", "mirror")
-        }
+        turn = {body: [self._now(f"{body}_r{axis}", now) for axis in "xyz"] for body in bodies}
+        # Camera and screen move along and about their own axes
         axes = [right, down, forward]
         pinhole = pinhole + sum(mm * axis for mm, axis in zip(shift["camera"], axes, strict=True))
         right, down, forward = _spin_all(axes, axes, turn["camera"])
@@ -95,24 +99,31 @@ class MovingBench(CrossedWorld):
         right, down, forward, s_x, s_y, normal = _spin_all(
             [right, down, forward, s_x, s_y, normal], world[::-1], back[::-1]
         )
+        # The rays of the pixels
         row, column = np.mgrid[: self.height, : self.width].astype(float)
-        scale = self.pixel_um * 1e-3 / (self.focal_mm * (1 + 1e-6 * self._now("focal", now)))
-        off = [self._now(f"sensor_{axis}", now) / self.pixel_um for axis in "xy"]
-        across = (column + off[0] - (self.width - 1) / 2) * scale
-        along = (row + off[1] - (self.height - 1) / 2) * scale
+        focal_mm = self.focal_mm * (1 + 1e-6 * self._now("focal", now))
+        scale = self.pixel_um * 1e-3 / focal_mm
+        off_x, off_y = (self._now(f"sensor_{axis}", now) / self.pixel_um for axis in "xy")
+        across = (column + off_x - (self.width - 1) / 2) * scale
+        along = (row + off_y - (self.height - 1) / 2) * scale
         ray = forward + across[..., None] * right + along[..., None] * down
-        low, height = self.vertex_z_mm(now), np.zeros(row.shape)
+        # Where they meet the film, by fixed-point iteration
+        low = self.vertex_z_mm(now)
+        height = np.zeros(row.shape)
         for _ in range(9):
             reach = (low + height - pinhole[2]) / ray[..., 2]
-            x, y = pinhole[0] + reach * ray[..., 0], pinhole[1] + reach * ray[..., 1]
+            x = pinhole[0] + reach * ray[..., 0]
+            y = pinhole[1] + reach * ray[..., 1]
             near = np.hypot(x, y) < 1.05 * RADIUS_MM
             height = np.where(near, self.film_mm(x, y, now), height)
+        # Reflected at the film's normal, by central differences
         e = 0.25
         by_x = (self.film_mm(x + e, y, now) - self.film_mm(x - e, y, now)) / (2 * e)
         by_y = (self.film_mm(x, y + e, now) - self.film_mm(x, y - e, now)) / (2 * e)
         up = np.stack([-by_x, -by_y, np.ones_like(x)], axis=-1)
         up /= np.linalg.norm(up, axis=-1, keepdims=True)
         away = ray - 2 * np.sum(ray * up, axis=-1, keepdims=True) * up
+        # Where the reflections meet the screen
         place = np.stack([x, y, low + height], axis=-1)
         far = ((origin - place) @ normal) / (away @ normal)
         hit = place + far[..., None] * away - origin
