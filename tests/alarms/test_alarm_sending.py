@@ -66,7 +66,8 @@ def test_a_service_that_hangs_delays_no_other_and_is_not_asked_again(
 
 _ENDLESS = """
 import http.server, threading, urllib.request
-from membrane_ctrl.alarms.sending import Service, limited_memory, send_to_all
+from membrane_ctrl.alarms.memory_limit import limited_memory
+from membrane_ctrl.alarms.sending import Service, send_to_all
 from tests.support.peak_memory import peak_mb
 
 class Endless(http.server.BaseHTTPRequestHandler):
