@@ -82,17 +82,17 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: not valid TOML: {_describe_cause(str(error), text)}") from None
 
 
-def _describe_cause(parser_message: str, text: str) -> str:
+def _describe_cause(message: str, text: str) -> str:
     """Return the parser's message, with the usual cause for two that do not name it: tomllib has no
     codes.
     """
-    found = re.search(r"at line (\d+)", parser_message)
+    found = re.search(r"at line (\d+)", message)
     line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
     if number := re.search(r"=\s*([-+]?\d+),(\d+)\s*(#|$)", line):
-        return f"{parser_message}: a number has a decimal point; write {number[1]}.{number[2]}"
-    if "overwrite" in parser_message or "twice" in parser_message:
-        return f"{parser_message}: {line} comes twice"
-    return parser_message
+        return f"{message}: a number has a decimal point; write {number[1]}.{number[2]}"
+    if "overwrite" in message or "twice" in message:
+        return f"{message}: {line} comes twice"
+    return message
 
 
 def _has_too_many_parts(line: str) -> bool:
