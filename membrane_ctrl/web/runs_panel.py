@@ -13,6 +13,7 @@ from urllib.parse import quote
 from nicegui import ui
 
 from membrane_ctrl.control_port.sender import role_includes
+from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.run_files.run import open_run
@@ -21,6 +22,7 @@ from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.service.work_pools import REPORTS, RUN_LISTS, PoolFullError
 from membrane_ctrl.web.messages import show_message
 
+WRITES: Role = "operate"  # reports
 _MOST = 200  # runs in the table, newest first
 _CARD = """<div class="q-pa-xs col-12"><q-card flat bordered class="q-pa-sm">
 <q-checkbox dense v-model="props.selected" :label="props.row.run" />
@@ -70,14 +72,14 @@ def report_problem(folder: Path, user: WebUser) -> str:
     """Write the run's report if there is none; returns why there is none, or an empty text."""
     if (folder / REPORT_NAME).exists():
         return ""
-    if not role_includes(user.role, "operate"):
-        return f"{folder.name}: no report yet; writing one needs the role operate"
+    if not role_includes(user.role, WRITES):
+        return f"{folder.name}: no report yet; writing one needs the role {WRITES}"
     return _command("report", str(folder))
 
 
 async def open_report(folder: Path, hold: str, user: WebUser) -> None:
     """Open a run's report in a new tab; write it before if there is none."""
-    if not (folder / REPORT_NAME).exists():
+    if not (folder / REPORT_NAME).exists() and role_includes(user.role, WRITES):
         show_message("Writing the report.")
     try:
         problem = await REPORTS.run(report_problem, folder, user)

@@ -279,6 +279,16 @@ def test_gains_on_trial_revert_after_their_time() -> None:
     assert kp_of(held) == pytest.approx(CONFIG.loop.kp_per_s, rel=0.02)
 
 
+def test_the_same_gains_for_a_second_end_a_trial() -> None:
+    """So the page goes back: it need not know the former gains."""
+    held = Held()
+    held.go(5.0, gains(0.3, 600.0))
+    assert not held.of("gains_reverted")
+    held.go(8.0, gains(0.3, 1.0))
+    assert len(held.of("gains_reverted")) == 1
+    assert kp_of(held) == pytest.approx(CONFIG.loop.kp_per_s, rel=0.02)
+
+
 def test_kept_gains_stay_and_the_next_trial_reverts_to_them() -> None:
     held = Held()
     held.go(5.0, gains(0.3, 6.0))

@@ -176,7 +176,7 @@ async def _page_pictures(folder: Path) -> dict[str, bytes]:
                         "document.querySelector('[role=tabpanel]').innerText.includes('night')"
                     )
                 if step == PRESS.format("NOW"):
-                    await tab.click("bookmarkMark")
+                    await tab.press("m")
                     await tab.until("document.body.innerText.includes('DO IT')")
                 await asyncio.sleep(5.0)
                 await tab.screenshot(target, whole=False)
