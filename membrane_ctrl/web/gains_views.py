@@ -34,8 +34,9 @@ if TYPE_CHECKING:
 
 _SESSIONS = "tuning"  # folder of the sessions in that of the runs
 _SOURCES_MOST = 20
-_NAME = re.compile(r"(?:tuning/)?[A-Za-z0-9][A-Za-z0-9._-]*")
-_LIFE_S = 60.0
+_NAME = re.compile(r"(?:tuning/)?[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+_LISTED_S = 15.0
+_LIFE_S = 10.0  # a browser fetches what was computed at once
 _WORKPIECES_MOST = 8
 _LOOP_KEYS = ("kp_per_s", "ti_s", "td_s", "measurement_filter_s")
 _GAIN_ROWS = ("K, 1/s", "Ti, s", "Td, s", "filter, s")
@@ -128,7 +129,7 @@ class GainsViews:
 
     def __init__(self, feeds: Mapping[str, HoldFeed]) -> None:
         self._feeds = feeds
-        self._sources = MadeOnce(self._list, GAINS, life_s=_LIFE_S / 4)
+        self._sources = MadeOnce(self._list, GAINS, life_s=_LISTED_S)
         self._explored = MadeOnce(self._explore, GAINS, life_s=_LIFE_S)
 
     async def list_sources(self, hold: str) -> list[str]:

@@ -115,6 +115,9 @@ def runs_panel(
     table.add_slot(
         "body-cell-error", '<q-td :props="props"><span v-html="props.value"></span></q-td>'
     )
+    table.add_slot(
+        "body-selection", '<q-checkbox v-model="props.selected" :aria-label="props.row.run" />'
+    )
     table.add_slot("item", _CARD)
     table.add_slot("no-data", '<span class="q-pa-sm">{{ props.message }}</span>')
 

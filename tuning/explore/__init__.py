@@ -1,1 +1,1 @@
-"""Tuning by hand: a page with sliders on the fitted plant and the recorded weather."""
+"""Tuning by hand: what gains would do, on the fitted plant and in the recorded weather."""
