@@ -151,7 +151,7 @@ def _make_reconstructor(
     interval between its figures.
     """
     shape = spec.config.shape
-    if shape.mode == "cycle":
+    if shape.mode != "track":
         return cycles, plan, lambda: shape.period_s
 
     # Tracking: one pattern stays on the screen, and each frame is a figure.

@@ -18,6 +18,7 @@ from rich.table import Table
 from firmware_iface import conformance, role_bench, roles
 from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
 from membrane_ctrl.acquisition import driver_check, optical_bench, waiting_clock
+from membrane_ctrl.acquisition.figure_mode import choose_figure_mode
 from membrane_ctrl.alarms.addresses import require_sendable
 from membrane_ctrl.commissioning import interlock_check
 from membrane_ctrl.config.alarms import AlarmsConfig
@@ -200,7 +201,10 @@ def _describe_hold(config: Config) -> dict[str, str]:
         if on
     ]
     shape_loop = "off"
-    if shape.enabled and shape.mode == "track":
+    decided, figure_mode = choose_figure_mode(config)
+    if shape.enabled and figure_mode is not None:
+        shape_loop = f"{decided.shape.mode}: {figure_mode.reason}"
+    elif shape.enabled and shape.mode == "track":
         shape_loop = f"{shape.track_rate_hz:g} figures/s, tracked"
     elif shape.enabled:
         shape_loop = f"a cycle every {shape.period_s:g} s"

@@ -40,7 +40,9 @@ def write_first_config(path: Path, twin: bool, ask: bool) -> int:
     if ask:
         tables = _ask_devices(found)
     else:
-        tables = {"devices": {"board": _TWIN.format(port=Config().twin.port)}}
+        board = _TWIN.format(port=Config().twin.port)
+        tables = {"devices": {"board": board}, "shape": {"mode": "auto"}}
+    tables |= {"estimator": {"process_value": "auto"}}
     parsed = toml_file.parse_tables(tables, Config, str(path))
     if parsed.devices is not None:
         bench.require_separate_ports(parsed.devices)
@@ -99,7 +101,7 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
                 ("dead_fraction", "start_fraction", "stall_fraction"), 0.0
             )
     if "camera" in section:
-        return tables
+        return tables | {"shape": {"mode": "auto"}}
     return tables | {"shape": {"enabled": False}}
 
 

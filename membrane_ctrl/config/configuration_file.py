@@ -17,7 +17,9 @@ def load_configuration(path: Path | None) -> schema.Config:
     not state, a hold finds at its start (`schema.leave_to_start`).
     """
     if path is None:
-        return schema.leave_to_start(schema.Config())
+        config = schema.leave_to_start(schema.Config())
+        shape = config.shape.model_copy(update={"mode": "auto"})
+        return config.model_copy(update={"shape": shape})
     return _resolve_files(toml_file.load_toml(path, schema.Config), path)
 
 

@@ -303,10 +303,12 @@ class ShapeConfig(Section):
 
     enabled: bool = True
     """Measure the shape and trim the setpoint. Set it to false on a bench without a camera."""
-    mode: Literal["cycle", "track"] = "cycle"
+    mode: Literal["auto", "cycle", "track"] = "cycle"
     """`cycle` takes the frames of a figure one pattern after the other; `track` shows crossed
-    fringes that do not change, so that every frame gives a figure. Set it to `track` for a figure
-    at the camera's rate (docs/how-to/tracking.md)."""
+    fringes that do not change, so that every frame gives a figure. `auto`: `track` if camera and
+    processor give five figures a second, decided at the start of the hold; it is the default of a
+    hold without a file, and `config init` writes it. Set it to `track` for a figure at the camera's
+    rate (docs/how-to/tracking.md)."""
     period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
     """Interval between cycles. Raise it for a camera or machine that needs longer."""
     frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1

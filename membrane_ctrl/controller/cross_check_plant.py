@@ -242,7 +242,7 @@ def judge_optics(config: Config, findings: ConfigFindings) -> None:
     if config.by_optics:
         shape, why = config.shape, "a bench held without a laser needs a figure from every frame"
         findings.error(not shape.enabled, "shape.enabled", why, "set it to true")
-        findings.error(shape.mode != "track", "shape.mode", why, 'set it to "track"')
+        findings.error(shape.mode == "cycle", "shape.mode", why, 'set it to "track"')
         slow, least = shape.track_rate_hz < _TRACK_LEAST_HZ, f"set at least {_TRACK_LEAST_HZ:g} Hz"
         findings.error(slow, "shape.track_rate_hz", "too few figures to hold the mirror by", least)
     camera = config.devices is not None and config.devices.camera is not None

@@ -170,6 +170,9 @@ def _list_headlines(summary: dict[str, Any]) -> Iterator[str]:
         value = summary.get(key)
         if isinstance(value, (int, float)) and math.isfinite(value):
             yield _format_headline(label, f"{value:.0f}")
+    rate_hz = summary.get("cycles_per_s")
+    if isinstance(rate_hz, (int, float)) and math.isfinite(rate_hz):
+        yield _format_headline("figures per second", f"{rate_hz:.3g}")
 
 
 def _format_headline(label: str, text: str) -> str:

@@ -9,10 +9,12 @@ import asyncio
 import contextlib
 import os
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from membrane_ctrl.acquisition import driver_check
+from membrane_ctrl.acquisition.figure_mode import choose_figure_mode
 from membrane_ctrl.alarms.addresses import require_sendable
 from membrane_ctrl.control_port import server, sockets
 from membrane_ctrl.controller import cross_check
@@ -57,6 +59,8 @@ def hold_mirror(options: HoldOptions) -> int:
         if options.config.shape.enabled:
             driver_check.require_optics(options.config.devices)
     require_sendable(options.config.alarms)
+    config, figure_mode = choose_figure_mode(options.config)
+    options = replace(options, config=config)
     geometry = read_configured_geometry(options.config)
     clock = RunClock.start()
     # SIGTERM before and after the ticks cleans up as well
@@ -111,6 +115,7 @@ def hold_mirror(options: HoldOptions) -> int:
             children=children,
             twin=twin,
             board=board,
+            figure_mode=figure_mode,
             make_port=partial(server.Port, config.port, listeners, run_dir.name),
             make_latch=partial(FaultLatch, latched, resumes, run_dir.name, clock.utc),
             make_keeper=partial(LockKeeper, lock_storage),

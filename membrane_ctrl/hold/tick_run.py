@@ -46,6 +46,7 @@ class HoldResources:
     children: child_processes.ChildProcesses
     twin: TwinProcess | None
     board: BoardAtStart
+    figure_mode: run_events.FigureModeChosen | None  # None: the mode was stated
     make_port: Callable[[server.RunHooks], server.Port]
     make_latch: Callable[[Callable[[events.Event], None]], FaultLatch]
     make_keeper: Callable[
@@ -97,6 +98,8 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
             program_identity(),
         )
         supervisor.record_event(run_events.Started(*started))
+        if parts.figure_mode is not None:
+            supervisor.record_event(parts.figure_mode)
         exit_code = errors.Exit.DEVICE_FAILED
         try:
             _send_first_commands(supervisor, options.standby, latch, parts.board, keeper.at_start)

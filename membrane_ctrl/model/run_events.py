@@ -25,6 +25,19 @@ class Started(
     program: str | None = None
 
 
+class FigureModeChosen(
+    Event,
+    kind="figure_mode",
+    sentence="Figures are measured by `{mode}`: {reason} ({processors} processors, {figure_ms:g} ms a figure)",  # noqa: E501
+):
+    """How figures are measured with `shape.mode = "auto"`, and what the machine offers."""
+
+    mode: str
+    reason: str
+    processors: int
+    figure_ms: float
+
+
 class Ended(
     Event,
     kind="end",

@@ -54,6 +54,8 @@ class Summary(StateNode):
     missed_ticks: Count = 0
     cycles: Count = 0
     rejected: Count = 0
+    first_cycle_s: float = math.nan
+    last_cycle_s: float = math.nan
     leak_um_per_s: float = math.nan
     state: float = math.nan
     time_s: float = 0.0
@@ -121,8 +123,16 @@ class Summary(StateNode):
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Add the result of a measurement cycle."""
         self.cycles += 1
+        if math.isnan(self.first_cycle_s):
+            self.first_cycle_s = estimate.time_s
+        self.last_cycle_s = estimate.time_s
         self.rejected += estimate.verdict == "rejected"
         self.latency_ms.add(np.array([estimate.latency_s * 1e3]))
+
+    def _find_cycle_rate(self) -> float:
+        """Figures per second between the first and the last; NaN without two."""
+        lasted_s = self.last_cycle_s - self.first_cycle_s
+        return (self.cycles - 1) / lasted_s if lasted_s > 0.0 else math.nan
 
     def as_dict(self, dropped: dict[str, int], recorder: dict[str, Any]) -> dict[str, Any]:
         """The content of `summary.json`; NaN for missing figures.
@@ -158,6 +168,7 @@ class Summary(StateNode):
             "missed_ticks": self.missed_ticks,
             "cycles": self.cycles,
             "cycles_rejected": self.rejected,
+            "cycles_per_s": self._find_cycle_rate(),
             "cycle_latency_ms": _histogram_quantiles(self.latency_ms),
             "geometry": self.geometry,
             "states": [asdict(each) for each in self.states],

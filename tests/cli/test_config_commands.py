@@ -44,7 +44,12 @@ async def test_the_first_configuration_passes_check_against_the_twin(
     text = path.read_text()
     assert ("FTDI" in text) == (not options)
     config = load_toml(path, Config)
-    assert config == Config.model_validate({"devices": {"board": "tcp://127.0.0.1:5020"}})
+    stated = {
+        "devices": {"board": "tcp://127.0.0.1:5020"},
+        "shape": {"mode": "auto"},
+        "estimator": {"process_value": "auto"},
+    }
+    assert config == Config.model_validate(stated)
     assert config.devices is not None
     lab = Lab(StillPlant(), config.devices)
     try:
