@@ -42,6 +42,7 @@ from membrane_ctrl.instruments import (
 from membrane_ctrl.model import errors, plain_json, run_status, terminal
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.optional import describe_missing, find_missing_page_library
+from membrane_ctrl.processes import machine_grants
 
 _READS = 100
 _LONGEST_S = 2.0  # slow devices get fewer reads
@@ -222,9 +223,21 @@ def _describe_hold(config: Config) -> dict[str, str]:
         "shape loop": shape_loop,
         "locks": _describe_locks(config),
         "control port": _describe_port(config.port),
+        **_describe_machine(),
         "alarms": _describe_alarms(config.alarms),
         "page": _describe_page(config),
         "bridges": describe_bridges(config.bridges),
+    }
+
+
+def _describe_machine() -> dict[str, str]:
+    """What this machine would grant the ticks of a hold."""
+    found = machine_grants.find_grants()
+    return {
+        "ticks run with": found.scheduling,
+        "memory": found.memory_words,
+        "processors": found.processor_words,
+        "clock": found.clock_source or "unknown",
     }
 
 

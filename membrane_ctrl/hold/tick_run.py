@@ -27,7 +27,7 @@ from membrane_ctrl.model import errors, events, run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.program import program_identity
-from membrane_ctrl.processes import priority, ring
+from membrane_ctrl.processes import machine_grants, priority, ring
 from membrane_ctrl.sim.twin_process import TwinProcess
 
 
@@ -105,6 +105,7 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
             _send_first_commands(supervisor, options.standby, latch, parts.board, keeper.at_start)
             gc.collect()
             gc.freeze()  # the collector need not visit objects that live for the whole run
+            supervisor.record_event(_lock_memory())
             async with port.open():
                 with _stop_on_signals(supervisor), latch, keeper, systemd:
                     # last: the board's watchdog runs from here on
@@ -125,6 +126,18 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
             supervisor.record_event(
                 run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks)
             )
+
+
+def _lock_memory() -> run_events.MachineUsed:
+    """Lock the memory of this process, if that is allowed without a limit."""
+    found, locked = machine_grants.find_grants(), machine_grants.lock_memory()
+    return run_events.MachineUsed(
+        scheduling=found.scheduling,
+        memory="locked" if locked else f"not locked ({found.memory_words})",
+        memory_locked=locked,
+        processors=found.processor_words,
+        clock_source=found.clock_source or "unknown",
+    )
 
 
 def _record_and_notify(event: events.Event, supervisor: Supervisor, wiring: Wiring) -> None:

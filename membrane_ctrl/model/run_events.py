@@ -25,6 +25,21 @@ class Started(
     program: str | None = None
 
 
+class MachineUsed(
+    Event,
+    kind="machine",
+    sentence="The ticks run with {scheduling}; memory: {memory}; processors: {processors}; clock: "
+    "{clock_source}",
+):
+    """What the machine grants the process of the ticks."""
+
+    scheduling: str
+    memory: str
+    memory_locked: bool
+    processors: str
+    clock_source: str
+
+
 class FigureModeChosen(
     Event,
     kind="figure_mode",
