@@ -157,4 +157,9 @@ stated_kp_per_s, stated_ti_s  # of an event, written as a whole
 _.FIXED_POINTS  # a reading of the paper: all members are computed
 _.beside_heading  # read by the template of a report page
 (_.status_code, _.in_contact, _.has_report)  # of HTTP answers, written as a whole
-(_.stated_kp_per_s, _.stated_ti_s, _.figure_ms, _.memory_locked)  # of events, which are written as a whole
+(
+    _.stated_kp_per_s,
+    _.stated_ti_s,
+    _.figure_ms,
+    _.memory_locked,
+)  # of events, which are written as a whole
