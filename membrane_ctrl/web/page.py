@@ -59,7 +59,7 @@ _CSS = (
     "@media (min-width: 1024px) {"
     ".membrane-now { grid-template: auto minmax(12rem, 1fr) / minmax(0, 1fr) 26rem }"
     ".membrane-side { grid-column: 2; grid-row: 1 / span 2 }"
-    ".membrane-events { height: 100% } }"
+    ".membrane-events { height: 100%; max-height: 24rem } }"
     ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"
     ".membrane-map canvas { touch-action: pan-y; display: block }"
     # legible on either ground
