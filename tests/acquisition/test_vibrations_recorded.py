@@ -39,7 +39,7 @@ from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.rerun_recording import Recording
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.drum_modes import DRUM_MODES
+from membrane_ctrl.sim.optics.drum_modes import drum_modes
 from tests.metrology.tracking.test_track_live import FILM, OPTICS, held_um
 from tests.support.rrd_reading import reader, scalars, strings
 from tests.worlds.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
@@ -251,7 +251,7 @@ class Film:
         """Minutes of a film whose vibrations have changed their frequencies."""
         modes = tuple(
             replace(mode, amplitude_nm=20.0, frequency_hz=mode.frequency_hz * (1 + change))
-            for mode in DRUM_MODES
+            for mode in drum_modes(1.0)
         )
         renderer = OpticsRenderer(self.optics, FILM, seed=3, modes=modes)
         hold.ticks(at_s)

@@ -73,15 +73,21 @@ class Board:
         """Inner corners in a photograph: place (n, 3) on the board in squares, and (n, 2) column
         and row in px.
         """
+        # The corners that are seen, and their numbers, counted row by row.
+        numbers = np.zeros(0, int)
         if self.kind == "chessboard":
             inner = (self.columns - 1, self.rows - 1)
             found, seen = cv2.findChessboardCornersSB(image, inner, flags=cv2.CALIB_CB_ACCURACY)
-            numbers = np.arange(inner[0] * inner[1]) if found else np.zeros(0, int)
+            if found:
+                numbers = np.arange(inner[0] * inner[1])
         else:
             seen, ids, _, _ = cv2.aruco.CharucoDetector(self._charuco()).detectBoard(image)
-            numbers = np.zeros(0, int) if ids is None else np.asarray(ids).ravel()
+            if ids is not None:
+                numbers = np.asarray(ids).ravel()
         if not numbers.size:
             return np.zeros((0, 3)), np.zeros((0, 2))
+
+        # Their places: the first corner is one square from both edges.
         row, column = np.divmod(numbers, self.columns - 1)
         place = np.stack([column + 1.0, row + 1.0, np.zeros(numbers.size)], axis=1)
         return place, np.asarray(seen, float).reshape(-1, 2)
@@ -101,6 +107,7 @@ def on_screen(board: Board, square_px: int, width_px: int, height_px: int) -> Le
         sizes = f"{width} x {height} pixels, the screen {width_px} x {height_px}"
         raise ValueError(f"{board} of {square_px} px has {sizes}")
     levels = np.full((height_px, width_px), 255, np.uint8)
-    top, left = (height_px - height) // 2, (width_px - width) // 2
+    top = (height_px - height) // 2
+    left = (width_px - width) // 2
     levels[top : top + height, left : left + width] = drawn
     return levels

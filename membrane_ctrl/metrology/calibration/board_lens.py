@@ -25,9 +25,9 @@ LEAST_CORNERS = 12  # of a view
 _WORSE = 3.0  # times the median view's error
 # Bow of a board over its longest side: paper on a plate, a screen
 FLATNESS = 2e-4
-# Corners that the picture of a plane leaves by this many squares are not those of the board, and a
-# lens that leaves this share of a square on average fits none
-_OF_ANOTHER_BOARD, _LEFT_OF_CORNERS = 0.5, 0.1
+# Corners that are off the picture of a plane by this many squares are not those of the board.
+_LARGEST_PLANE_MISFIT = 0.5
+_LARGEST_RESIDUAL = 0.1  # of a lens, in squares on average: with more it fits no photograph
 _SMALLEST_SQUARE_PX = 2.0
 _FOCAL_UNKNOWN = 0.2  # relative sigma of a focal length about which nothing was learned
 _SPLIT_VIEWS = 2 * LEAST_VIEWS  # fewer views are not tested for two cameras
@@ -41,7 +41,17 @@ _NAMES = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1"
 
 @dataclass(frozen=True)
 class BoardView:
-    """Corners of one photograph: place (n, 3) on the board in any unit, (n, 2) in px."""
+    """Corners of one photograph.
+
+    Attributes
+    ----------
+    name : str
+        Name of the photograph.
+    place : (n, 3) array
+        Places on the board, in any unit.
+    seen_px : (n, 2) array
+        Columns and rows in the photograph.
+    """
 
     name: str
     place: FloatArray
@@ -50,16 +60,70 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Lens:
-    """Result of the views."""
+    """The lens that fits the views.
+
+    Attributes
+    ----------
+    focal_px : float
+        Focal length over the pixels' pitch.
+    principal_px : (float, float)
+        Column and row of the principal point.
+    distortion : tuple of float
+        k1, k2, p1, p2.
+    sigmas : dict
+        Standard uncertainties by the calibration's names of the parameters.
+    rms_px : float
+        Residual of a corner (both components) with this lens.
+    stated_rms_px : float
+        The same with the stated lens.
+    used, left_out : tuples of str
+        Names of the views.
+    """
 
     focal_px: float
     principal_px: tuple[float, float]
-    distortion: tuple[float, ...]  # k1, k2, p1, p2
-    sigmas: dict[str, float]  # by the calibration's names of the parameters
-    rms_px: float  # residual of a corner (both components), with this lens and with the stated one
+    distortion: tuple[float, ...]
+    sigmas: dict[str, float]
+    rms_px: float
     stated_rms_px: float
-    used: tuple[str, ...]  # names of views
+    used: tuple[str, ...]
     left_out: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _CameraFit:
+    """OpenCV's fit of some views.
+
+    Attributes
+    ----------
+    rms_px : float
+        Residual of a corner.
+    matrix : (3, 3) array
+        Camera matrix.
+    lens : (5,) array
+        k1, k2, p1, p2, k3 = 0.
+    sigmas : (18,) array
+        OpenCV's sigmas of the intrinsics, of independent corners: fx, fy, cx, cy, k1, ...
+    view_rms_px : (views,) array
+        Residual of each view.
+    """
+
+    rms_px: float
+    matrix: FloatArray
+    lens: FloatArray
+    sigmas: FloatArray
+    view_rms_px: FloatArray
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length over the pixels' pitch."""
+        return float(self.matrix[0, 0])
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Logarithm of the focal length, principal point, k1, k2, p1, p2."""
+        principal = [self.matrix[0, 2], self.matrix[1, 2]]
+        return np.array([np.log(self.matrix[0, 0]), *principal, *self.lens[:4]])
 
 
 def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
@@ -78,44 +142,53 @@ def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
         With fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, if nothing fits, or if the
         views do not determine the lens.
     """
-    # Fit without the worst view, until no view is much worse than the others.
+    # Views with enough corners, all on a plane.
     seen = [view for view in views if len(view.place) >= LEAST_CORNERS]
-    bent = [view.name for view in seen if _plane_misfit(view) > _OF_ANOTHER_BOARD]
+    bent = [view.name for view in seen if _plane_misfit(view) > _LARGEST_PLANE_MISFIT]
     good = [view for view in seen if view.name not in bent]
+
+    # Fit without the worst view, until no view is much worse than the others.
     while True:
-        if len(good) < LEAST_VIEWS:
-            named = ", ".join(bent)
-            also = f"; the corners in {named} do not lie on a plane board" if bent else ""
-            raise ValueError(
-                f"the board is seen in {len(good)} photographs; at least {LEAST_VIEWS} are "
-                f"needed, tilted both ways{also}"
-            )
-        rms, matrix, lens, sigmas, errors = _fit_camera(good, stated)
-        worst = int(np.argmax(errors))
-        if errors[worst] <= _WORSE * float(np.median(errors)):
+        _require_views(good, bent)
+        fit = _fit_camera(good, stated)
+        worst = int(np.argmax(fit.view_rms_px))
+        if fit.view_rms_px[worst] <= _WORSE * float(np.median(fit.view_rms_px)):
             break
         good = good[:worst] + good[worst + 1 :]
-    focal_px = float(matrix[0, 0])
-    names = {view.name for view in good}
-    found = _parameters(matrix, lens)
 
     # Sigmas: those of independent corners (in OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2) or of
     # the scatter between the views, the larger one, and the effect of a board that is not flat.
-    independent = np.array([sigmas[1] / focal_px, *sigmas[2:8]])
+    independent = np.array([fit.sigmas[1] / fit.focal_px, *fit.sigmas[2:8]])
     scatter = _jackknife_sigmas(good, stated)
-    flatness = _parameters(*_fit_camera(_bowed_views(good), stated)[1:3]) - found
-    values = np.hypot(np.maximum(independent, scatter), flatness)
-    _require_determined(good, values, rms)
-    _refuse_two_cameras(good, stated, matrix, lens, rms)
+    flatness = _fit_camera(_bowed_views(good), stated).parameters - fit.parameters
+    sigmas = np.hypot(np.maximum(independent, scatter), flatness)
+    _require_determined(good, sigmas, fit.rms_px)
+    _refuse_two_cameras(good, stated, fit)
+
+    stated_lens = np.array(stated.distortion, float)
+    used = [view.name for view in good]
     return Lens(
-        focal_px=focal_px,
-        principal_px=(float(matrix[0, 2]), float(matrix[1, 2])),
-        distortion=tuple(float(k) for k in lens[:4]),
-        sigmas=dict(zip(_NAMES, map(float, values), strict=True)),
-        rms_px=rms,
-        stated_rms_px=_rms_px(good, _camera_matrix(stated), np.array(stated.distortion, float)),
-        used=tuple(view.name for view in good),
-        left_out=tuple(view.name for view in views if view.name not in names),
+        focal_px=fit.focal_px,
+        principal_px=(float(fit.matrix[0, 2]), float(fit.matrix[1, 2])),
+        distortion=tuple(float(k) for k in fit.lens[:4]),
+        sigmas=dict(zip(_NAMES, map(float, sigmas), strict=True)),
+        rms_px=fit.rms_px,
+        stated_rms_px=_rms_px(good, _camera_matrix(stated), stated_lens),
+        used=tuple(used),
+        left_out=tuple(view.name for view in views if view.name not in used),
+    )
+
+
+def _require_views(good: Sequence[BoardView], bent: Sequence[str]) -> None:
+    """Raise ValueError if fewer than `LEAST_VIEWS` views are left; `bent` are those off a plane."""
+    if len(good) >= LEAST_VIEWS:
+        return
+    also = ""
+    if bent:
+        also = f"; the corners in {', '.join(bent)} do not lie on a plane board"
+    raise ValueError(
+        f"the board is seen in {len(good)} photographs; at least {LEAST_VIEWS} are "
+        f"needed, tilted both ways{also}"
     )
 
 
@@ -138,14 +211,15 @@ def _plane_misfit(view: BoardView) -> float:
 
 def _square_px(view: BoardView) -> float:
     """About the side of a square in the picture, of a board whose squares have the side 1."""
-    spans = [float(np.linalg.norm(np.std(part, axis=0))) for part in (view.seen_px, view.place)]
-    return spans[0] / max(spans[1], 1e-9)
+    span_px = float(np.linalg.norm(np.std(view.seen_px, axis=0)))
+    span = float(np.linalg.norm(np.std(view.place, axis=0)))
+    return span_px / max(span, 1e-9)
 
 
 def _require_determined(views: Sequence[BoardView], sigmas: FloatArray, rms_px: float) -> None:
     """Raise ValueError if the fit leaves too much, or does not determine the lens."""
     square_px = float(np.median([_square_px(view) for view in views]))
-    if rms_px > _LEFT_OF_CORNERS * square_px:
+    if rms_px > _LARGEST_RESIDUAL * square_px:
         raise ValueError(
             f"the corners are {rms_px:.1f} px RMS off with the best lens, {rms_px / square_px:.0%} "
             "of a square: cause unknown; it looks like corners mistaken for their neighbours, a "
@@ -163,20 +237,11 @@ def _require_determined(views: Sequence[BoardView], sigmas: FloatArray, rms_px: 
         )
 
 
-def _parameters(matrix: FloatArray, lens: FloatArray) -> FloatArray:
-    """Logarithm of the focal length, principal point, k1, k2, p1, p2."""
-    return np.array([np.log(matrix[0, 0]), matrix[0, 2], matrix[1, 2], *lens[:4]])
-
-
 def _jackknife_sigmas(views: Sequence[BoardView], stated: CameraConfig) -> FloatArray:
     """Sigmas (7,) of the parameters from fits without each view in turn."""
     count = len(views)
-    without = np.array(
-        [
-            _parameters(*_fit_camera([*views[:k], *views[k + 1 :]], stated)[1:3])
-            for k in range(count)
-        ]
-    )
+    fits = [_fit_camera([*views[:k], *views[k + 1 :]], stated) for k in range(count)]
+    without = np.array([fit.parameters for fit in fits])
     squares = np.sum((without - without.mean(axis=0)) ** 2, axis=0)
     return np.asarray(np.sqrt((count - 1) / count * squares))
 
@@ -196,11 +261,7 @@ def _bowed_views(views: Sequence[BoardView]) -> list[BoardView]:
 
 
 def _refuse_two_cameras(
-    views: Sequence[BoardView],
-    stated: CameraConfig,
-    matrix: FloatArray,
-    lens: FloatArray,
-    rms: float,
+    views: Sequence[BoardView], stated: CameraConfig, common: _CameraFit
 ) -> None:
     """Raise ValueError if the views fall into two groups with focal lengths of their own.
 
@@ -210,43 +271,52 @@ def _refuse_two_cameras(
     """
     if len(views) < _SPLIT_VIEWS:
         return
-    best = [_best_focal(view, matrix, lens) for view in views]
-    ordered = [views[k] for k in np.argsort(best)]
-    gaps = np.diff(np.sort(best))[LEAST_VIEWS - 1 : len(views) - LEAST_VIEWS]
+
+    # The first split: at the widest gap between the views' own focal lengths that leaves enough
+    # views on both sides.
+    own_focal = [_best_focal(view, common.matrix, common.lens) for view in views]
+    ordered = [views[k] for k in np.argsort(own_focal)]
+    gaps = np.diff(np.sort(own_focal))[LEAST_VIEWS - 1 : len(views) - LEAST_VIEWS]
     split = LEAST_VIEWS + int(np.argmax(gaps))
     groups = [ordered[:split], ordered[split:]]
     fits = [_fit_camera(group, stated) for group in groups]
+
+    # Each view goes to the camera that fits it better, and both are fitted again.
     for _ in range(_SPLIT_STEPS):
-        left = np.array([[_rms_px([view], *fit[1:3]) for fit in fits] for view in views])
-        first = left[:, 0] < left[:, 1]
-        if min(np.count_nonzero(first), np.count_nonzero(~first)) < LEAST_VIEWS:
+        groups = [[], []]
+        for view in views:
+            rms_px = [_rms_px([view], fit.matrix, fit.lens) for fit in fits]
+            is_first = rms_px[0] < rms_px[1]
+            groups[0 if is_first else 1].append(view)
+        if min(len(group) for group in groups) < LEAST_VIEWS:
             return
-        groups = [
-            [view for view, its in zip(views, mine, strict=True) if its] for mine in (first, ~first)
-        ]
         fits = [_fit_camera(group, stated) for group in groups]
-    counts = [sum(len(view.place) for view in group) for group in groups]
-    squares = sum(fit[0] ** 2 * count for fit, count in zip(fits, counts, strict=True))
-    apart = abs(float(np.log(fits[0][1][0, 0] / fits[1][1][0, 0])))
+
+    # Two cameras only if the focal lengths differ by far more than their scatter, and if the
+    # residual falls.
+    difference = abs(float(np.log(fits[0].focal_px / fits[1].focal_px)))
     scatter = math.hypot(*(_jackknife_focal(group, stated) for group in groups))
-    if apart > _SPLIT_SIGMAS * scatter and np.sqrt(squares / sum(counts)) < _SPLIT_BETTER * rms:
-        names = [", ".join(view.name for view in group) for group in groups]
-        focal = [float(fit[1][0, 0]) for fit in fits]
-        raise ValueError(
-            f"the photographs are of two cameras, or the focus was changed: {names[0]} have a "
-            f"focal length of {focal[0]:.1f} px, {names[1]} of {focal[1]:.1f} px"
-        )
+    corners = [sum(len(view.place) for view in group) for group in groups]
+    squares = sum(fit.rms_px**2 * count for fit, count in zip(fits, corners, strict=True))
+    rms_px_of_two = math.sqrt(squares / sum(corners))
+    if difference <= _SPLIT_SIGMAS * scatter or rms_px_of_two >= _SPLIT_BETTER * common.rms_px:
+        return
+    first, second = (", ".join(view.name for view in group) for group in groups)
+    raise ValueError(
+        f"the photographs are of two cameras, or the focus was changed: {first} have a "
+        f"focal length of {fits[0].focal_px:.1f} px, {second} of {fits[1].focal_px:.1f} px"
+    )
 
 
 def _best_focal(view: BoardView, matrix: FloatArray, lens: FloatArray) -> float:
     """Relative change of the focal length with which one view fits best."""
-    left = []
+    rms_px = []
     for change in _FOCAL_SPREAD:
         tried = matrix.copy()
         tried[0, 0] *= 1 + change
         tried[1, 1] *= 1 + change
-        left.append(_rms_px([view], tried, lens))
-    return float(_FOCAL_SPREAD[int(np.argmin(left))])
+        rms_px.append(_rms_px([view], tried, lens))
+    return float(_FOCAL_SPREAD[int(np.argmin(rms_px))])
 
 
 def _jackknife_focal(views: Sequence[BoardView], stated: CameraConfig) -> float:
@@ -254,10 +324,8 @@ def _jackknife_focal(views: Sequence[BoardView], stated: CameraConfig) -> float:
     return float(_jackknife_sigmas(views, stated)[0])
 
 
-def _fit_camera(
-    views: Sequence[BoardView], stated: CameraConfig
-) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """RMS, camera matrix, distortion, sigmas of the intrinsics, RMS of each view."""
+def _fit_camera(views: Sequence[BoardView], stated: CameraConfig) -> _CameraFit:
+    """Fit one camera to views, each with a pose of its own. Raises ValueError if nothing fits."""
     places = [view.place.astype(np.float32)[:, None] for view in views]
     seen = [view.seen_px.astype(np.float32)[:, None] for view in views]
     size = (stated.width_px, stated.height_px)
@@ -269,12 +337,12 @@ def _fit_camera(
         raise ValueError(f"no lens fits the photographs: {str(error).splitlines()[0]}") from None
     if not np.isfinite(rms):
         raise ValueError("no lens fits the photographs")
-    return (
-        float(rms),
-        np.asarray(matrix, float),
-        _flatten_row(lens),
-        _flatten_row(sigmas),
-        _flatten_row(errors),
+    return _CameraFit(
+        rms_px=float(rms),
+        matrix=np.asarray(matrix, float),
+        lens=_flatten_row(lens),
+        sigmas=_flatten_row(sigmas),
+        view_rms_px=_flatten_row(errors),
     )
 
 
@@ -284,7 +352,8 @@ def _flatten_row(values: ArrayLike) -> FloatArray:
 
 def _rms_px(views: Sequence[BoardView], matrix: FloatArray, lens: FloatArray) -> float:
     """Residual of the corners with a given lens, each view with its own best pose."""
-    squares, count = 0.0, 0
+    squares = 0.0
+    count = 0
     for view in views:
         _, turn, shift = cv2.solvePnP(view.place, view.seen_px, matrix, lens)
         expected = cv2.projectPoints(view.place, turn, shift, matrix, lens)[0][:, 0]

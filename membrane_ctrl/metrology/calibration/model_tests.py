@@ -31,28 +31,52 @@ _CAMERA_SIGMA_DEG = 1.0  # of a bump: a hand on the mount
 _CREEP_SIGMA_MM = 1.0
 _LEAST_TO_CREEP = 3  # sets
 _LASER_SIGMA = 1.0  # of its scale when the optics alone determine it
+_DETERMINED = 1e-10  # eigenvalue, of scaled equations, from which on a combination is determined
+
+
+def _is_sure(fall: float, freedom: int) -> bool:
+    """Whether noise hardly ever causes as large a fall of the sum of squares."""
+    return bool(chi2.sf(fall, freedom) < SURE)
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A held parameter that the sets want to move."""
+    """A held parameter that the sets want to move.
+
+    Attributes
+    ----------
+    name : str
+        Of the parameter.
+    value, sigma : float
+        Its value and standard uncertainty if it were free.
+    fall : float
+        By how much the sum of squares then falls.
+    figure_um : float
+        Effect of freeing it on a surface, RMS without the best plane.
+    """
 
     name: str
-    value: float  # its value if it were free
+    value: float
     sigma: float
-    fall: float  # of the sum of squares
-    figure_um: float  # effect of freeing it on a surface, RMS without the best plane
+    fall: float
+    figure_um: float
 
     @property
     def sure(self) -> bool:
         """Whether noise hardly ever causes as large a fall."""
-        return bool(chi2.sf(self.fall, 1) < SURE)
+        return _is_sure(self.fall, 1)
 
 
 @dataclass(frozen=True)
 class LaserScale:
-    """Scale of the laser and its sigma by the optics alone (1: good); the fall is against the
-    prior.
+    """Scale of the laser by the optics alone.
+
+    Attributes
+    ----------
+    value, sigma : float
+        The scale (1: good) and its standard uncertainty.
+    fall : float
+        By how much the sum of squares falls without the prior.
     """
 
     value: float
@@ -62,15 +86,23 @@ class LaserScale:
     @property
     def sure(self) -> bool:
         """As for `Suspect`: whether it is off by more than its data sheet allows."""
-        return bool(
-            chi2.sf(((self.value - 1) / np.hypot(self.sigma, bench_parameters.LASER.sigma)) ** 2, 1)
-            < SURE
-        )
+        sigma = np.hypot(self.sigma, bench_parameters.LASER.sigma)
+        return _is_sure(((self.value - 1) / sigma) ** 2, 1)
 
 
 @dataclass(frozen=True)
 class CameraBump:
-    """The camera's pose differs for some of the sets."""
+    """The camera's pose differs for some of the sets.
+
+    Attributes
+    ----------
+    sets : tuple of int
+        Numbers of these sets.
+    turned_deg : three floats
+        Yaw, pitch and roll by which the camera turned.
+    fall : float
+        By how much the sum of squares falls if it is free.
+    """
 
     sets: tuple[int, ...]
     turned_deg: tuple[float, float, float]
@@ -79,36 +111,58 @@ class CameraBump:
     @property
     def sure(self) -> bool:
         """As for `Suspect`."""
-        return bool(chi2.sf(self.fall, len(_CAMERA)) < SURE)
+        return _is_sure(self.fall, len(_CAMERA))
 
 
 @dataclass(frozen=True)
 class MountCreep:
-    """Camera or screen moved evenly from the first set to the last."""
+    """Camera or screen moved evenly from the first set to the last.
 
-    name: str  # of the parameter that explains most of it alone
-    amount: float  # by which that one changed
+    Attributes
+    ----------
+    name : str
+        Of the parameter that explains most of it alone.
+    amount : float
+        By which that one changed.
+    fall : float
+        By how much the sum of squares falls if all poses creep.
+    freedom : int
+        Number of these poses.
+    """
+
+    name: str
+    amount: float
     fall: float
     freedom: int
 
     @property
     def sure(self) -> bool:
         """As for `Suspect`."""
-        return bool(chi2.sf(self.fall, self.freedom) < SURE)
+        return _is_sure(self.fall, self.freedom)
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """One set against the geometry of all others."""
+    """One set against the geometry of all others.
 
-    index: int  # of the set
-    fall: float  # of the sum of squares, when this set has a geometry and a ring of its own
-    freedom: int  # numbers that the set then determines by itself
+    Attributes
+    ----------
+    index : int
+        Of the set.
+    fall : float
+        By how much the sum of squares falls if this set has a geometry and a ring of its own.
+    freedom : int
+        Numbers that the set then determines by itself.
+    """
+
+    index: int
+    fall: float
+    freedom: int
 
     @property
     def disagrees(self) -> bool:
         """As for `Suspect.sure`."""
-        return bool(chi2.sf(self.fall, self.freedom) < SURE)
+        return _is_sure(self.fall, self.freedom)
 
 
 def find_suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
@@ -116,21 +170,33 @@ def find_suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
     first.
     """
     sums = np.sum(_reduce_equations(solution), axis=0)
+    held_squares = _sum_squares(sums, solution)
+
+    # From a change of the parameters to the change of a surface, without its plane.
     response = figure_uncertainty.surface_response(solution, solution.problem.middle)[:, :-1]
-    flat = disc_heights.remove_plane(*disc_heights.heights_over_disc(1.0))
-    out = []
+    flat_heights = disc_heights.remove_plane(*disc_heights.heights_over_disc(1.0))
+
+    suspects = []
     for name in bench_parameters.NAMES[len(bench_parameters.POSE) : bench_poses.OPTICAL]:
         if name in solution.free:
             continue
+        # The solution with this one free.
         k = bench_parameters.NAMES.index(name)
         freed = solution.problem.sigmas.copy()
         freed[k] = bench_parameters.usual_sigma(name)
         moved = solver.solve_step(sums + solution.known(freed), freed)
-        fall = _sum_squares(sums, solution) - moved.squares
-        sigma = float(np.sqrt(moved.covariance[k, k]))
-        figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[: bench_poses.OPTICAL])))
-        out.append(Suspect(name, float(moved.delta[k]), sigma, fall, figure_um))
-    return tuple(sorted((s for s in out if s.sure), key=lambda s: -s.fall))
+
+        change_mm = flat_heights @ (response @ moved.delta[: bench_poses.OPTICAL])
+        suspect = Suspect(
+            name=name,
+            value=float(moved.delta[k]),
+            sigma=float(np.sqrt(moved.covariance[k, k])),
+            fall=held_squares - moved.squares,
+            figure_um=1e3 * float(np.std(change_mm)),
+        )
+        if suspect.sure:
+            suspects.append(suspect)
+    return tuple(sorted(suspects, key=lambda suspect: -suspect.fall))
 
 
 def laser_scale(solution: solver.Solution) -> LaserScale:
@@ -140,109 +206,146 @@ def laser_scale(solution: solver.Solution) -> LaserScale:
     free[k] = _LASER_SIGMA
     sums = np.sum(_reduce_equations(solution), axis=0)
     moved = solver.solve_step(sums + solution.known(free), free)
-    fall = _sum_squares(sums, solution) - moved.squares
     return LaserScale(
-        1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall
+        value=1 + float(solution.common[k] + moved.delta[k]),
+        sigma=float(np.sqrt(moved.covariance[k, k])),
+        fall=_sum_squares(sums, solution) - moved.squares,
     )
 
 
 def compare_left_out_sets(solution: solver.Solution) -> tuple[LeftOut, ...]:
-    """Each set against the others."""
-    reduced, sigmas = _reduce_equations(solution), solution.problem.sigmas
-    own = solution.known(sigmas)
-    everything = solver.solve_step(np.sum(reduced, axis=0) + own, sigmas).squares
-    out = []
-    for k, this in enumerate(reduced):
-        others = np.sum([r for j, r in enumerate(reduced) if j != k], axis=0) + own
-        alone, freedom = _fit_alone(this, sigmas)
-        fall = everything - solver.solve_step(others, sigmas).squares - alone
-        out.append(LeftOut(k, float(fall), freedom))
-    return tuple(out)
+    """Each set against the others: the fall of the sum of squares if it is solved by itself."""
+    reduced = _reduce_equations(solution)
+    together = _sum_squares(np.sum(reduced, axis=0), solution)
+    compared = []
+    for k, of_set in enumerate(reduced):
+        others = np.sum([sums for j, sums in enumerate(reduced) if j != k], axis=0)
+        alone, freedom = _fit_alone(of_set, solution.problem.sigmas)
+        fall = together - _sum_squares(others, solution) - alone
+        compared.append(LeftOut(k, float(fall), freedom))
+    return tuple(compared)
 
 
 def find_moved_screens(solution: solver.Solution) -> list[tuple[int, float]]:
     """Sets beside which the screen was moved, but not as stated: each with the fall if that place
     is free.
     """
-    reduced, out = _reduce_equations(solution), []
-    everything, moved = (
-        _sum_squares(np.sum(reduced, axis=0), solution),
-        np.arange(bench_poses.SCREEN_MOVE),
-    )
-    for k, each in enumerate(solution.equations):
-        free = each.sums.copy()
-        phases, state = solution.problem.sets[k], solution.states[k]
-        for sums, known, move in zip(
-            each.elsewhere, phases.elsewhere, state.elsewhere, strict=True
-        ):
-            told, sigmas = known.known(solution.problem.references.laser_sigma_um)[:, moved]
-            hand = np.hstack([np.eye(moved.size), (told - move[moved])[:, None]]) / sigmas[:, None]
-            own, without_hand = np.append(moved, len(sums) - 1), sums.copy()
-            without_hand[np.ix_(own, own)] -= hand.T @ hand
-            free += normal_equations.eliminate_first(
-                without_hand, set_phases.MOVED
-            ) - normal_equations.eliminate_first(sums, set_phases.MOVED)
-        others = [*reduced[:k], replace(each, sums=free).reduced(), *reduced[k + 1 :]]
-        fall = everything - _sum_squares(np.sum(others, axis=0), solution)
-        if chi2.sf(fall, moved.size) < SURE:
-            out.append((k, float(fall)))
-    return out
+    reduced = _reduce_equations(solution)
+    held_squares = _sum_squares(np.sum(reduced, axis=0), solution)
+    found = []
+    for k, of_set in enumerate(solution.equations):
+        # The equations of this set with the screens' moves free.
+        free = replace(of_set, sums=_free_screen_moves(solution, k))
+        others = [*reduced[:k], free.reduced(), *reduced[k + 1 :]]
+        fall = held_squares - _sum_squares(np.sum(others, axis=0), solution)
+        if _is_sure(fall, bench_poses.SCREEN_MOVE):
+            found.append((k, float(fall)))
+    return found
+
+
+def _free_screen_moves(solution: solver.Solution, k: int) -> FloatArray:
+    """Sums of set k without what was stated of its screens' moves."""
+    phases = solution.problem.sets[k]
+    state = solution.states[k]
+    of_set = solution.equations[k]
+    laser_sigma_um = solution.problem.references.laser_sigma_um
+    places = np.arange(bench_poses.SCREEN_MOVE)
+    free = of_set.sums.copy()
+    for sums, known, move in zip(of_set.elsewhere, phases.elsewhere, state.elsewhere, strict=True):
+        # The rows of the stated move, which were added to the normal equations.
+        stated, sigmas = known.known(laser_sigma_um)[:, places]
+        stated_rows = np.hstack([np.eye(places.size), (stated - move[places])[:, None]])
+        stated_rows /= sigmas[:, None]
+        own = np.append(places, len(sums) - 1)
+        without_stated = sums.copy()
+        without_stated[np.ix_(own, own)] -= stated_rows.T @ stated_rows
+
+        # Their effect on the unknowns of the set.
+        free += normal_equations.eliminate_first(without_stated, set_phases.MOVED)
+        free -= normal_equations.eliminate_first(sums, set_phases.MOVED)
+    return np.asarray(free)
 
 
 def find_camera_bumps(solution: solver.Solution) -> tuple[CameraBump, ...]:
     """Turns of the camera for one set, or from one set on; only sure ones, the strongest first."""
     count = len(solution.states)
-    groups = {(k,) for k in range(count)} | {tuple(range(k, count)) for k in range(1, count)}
-    out = []
-    for group in sorted(groups):
+    single = {(k,) for k in range(count)}
+    from_one_on = {tuple(range(k, count)) for k in range(1, count)}
+    sigmas = np.full(len(_CAMERA), _CAMERA_SIGMA_DEG)
+    bumps = []
+    for group in sorted(single | from_one_on):
         share = np.isin(np.arange(count), group).astype(float)
-        amounts, fall = _moved_by(
-            solution, _CAMERA, share, np.full(len(_CAMERA), _CAMERA_SIGMA_DEG)
-        )
+        amounts, fall = _free_motion(solution, _CAMERA, share, sigmas)
         yaw, pitch, roll = amounts
-        out.append(CameraBump(group, (yaw, pitch, roll), fall))
-    return tuple(sorted((bump for bump in out if bump.sure), key=lambda bump: -bump.fall))
+        bump = CameraBump(group, (yaw, pitch, roll), fall)
+        if bump.sure:
+            bumps.append(bump)
+    return tuple(sorted(bumps, key=lambda bump: -bump.fall))
 
 
 def find_mount_creep(solution: solver.Solution) -> MountCreep | None:
     """Whether camera or screen crept from the first set to the last, and what changed most; None if
     not sure.
     """
-    count, poses = len(solution.states), tuple(range(len(bench_parameters.POSE)))
+    count = len(solution.states)
     if count < _LEAST_TO_CREEP:
         return None
     share = np.linspace(-0.5, 0.5, count)
-    sigmas = np.array(
-        [_CAMERA_SIGMA_DEG if p.unit == "deg" else _CREEP_SIGMA_MM for p in bench_parameters.POSE]
-    )
-    whole = _moved_by(solution, poses, share, sigmas)[1]
-    single = [_moved_by(solution, (k,), share, sigmas[[k]]) for k in poses]
-    most = max(poses, key=lambda k: single[k][1])
-    found = MountCreep(bench_parameters.NAMES[most], single[most][0][0], whole, len(poses))
-    return found if found.sure else None
+    units = [parameter.unit for parameter in bench_parameters.POSE]
+    sigmas = np.array([_CAMERA_SIGMA_DEG if unit == "deg" else _CREEP_SIGMA_MM for unit in units])
+
+    # All poses together, and each alone.
+    poses = tuple(range(len(bench_parameters.POSE)))
+    _, fall = _free_motion(solution, poses, share, sigmas)
+    alone = [_free_motion(solution, (k,), share, sigmas[[k]]) for k in poses]
+    most = max(poses, key=lambda k: alone[k][1])
+    amounts, _ = alone[most]
+    creep = MountCreep(bench_parameters.NAMES[most], amounts[0], fall, len(poses))
+    if not creep.sure:
+        return None
+    return creep
 
 
-def _moved_by(
+def _free_motion(
     solution: solver.Solution, columns: tuple[int, ...], share: FloatArray, sigmas: FloatArray
 ) -> tuple[tuple[float, ...], float]:
-    """Amounts by which parameters moved in the sets, each by its share, and the fall of the sum of
-    squares.
+    """Free the motion of some parameters between the sets.
+
+    Parameters
+    ----------
+    solution : Solution
+        The calibration.
+    columns : tuple of int
+        Numbers of the k parameters.
+    share : (sets,) array
+        Share of the motion by which each set moved.
+    sigmas : (k,) array
+        Standard deviations of the motion before the sets.
+
+    Returns
+    -------
+    amounts : tuple of k floats
+        The motion.
+    fall : float
+        By how much the sum of squares falls.
     """
-    reduced, hand = _reduce_equations(solution), solution.problem.sigmas
-    sums = np.sum(
-        [_with_more(each, columns, part) for each, part in zip(reduced, share, strict=True)], axis=0
-    )
-    known = _with_more(solution.known(hand), columns, 0.0)
+    # The equations with the motion as further unknowns, which act as the parameters do.
+    reduced = _reduce_equations(solution)
+    prior = solution.problem.sigmas
+    pairs = zip(reduced, share, strict=True)
+    sums = np.sum([_with_more(each, columns, part) for each, part in pairs], axis=0)
+
+    # What is known of all unknowns before the sets.
+    known = _with_more(solution.known(prior), columns, 0.0)
     extra = np.arange(set_state.COMMON, set_state.COMMON + len(columns))
     known[extra, extra] += 1 / sigmas**2
-    kept = np.append(
-        hand > 0,
-        np.ones(set_state.COMMON - len(bench_parameters.NAMES) + len(columns), bool),
-    )
-    delta, squares = _solve_free(sums + known, np.flatnonzero(kept))
-    return tuple(delta[-len(columns) :].tolist()), _sum_squares(
-        np.sum(reduced, axis=0), solution
-    ) - squares
+
+    # Held parameters stay; ring, form and motion are free.
+    others = set_state.COMMON - len(bench_parameters.NAMES) + len(columns)
+    free = np.flatnonzero(np.append(prior > 0, np.ones(others, bool)))
+    delta, squares = _solve_free(sums + known, free)
+    fall = _sum_squares(np.sum(reduced, axis=0), solution) - squares
+    return tuple(delta[-len(columns) :].tolist()), fall
 
 
 def leave_set_out(solution: solver.Solution, index: int) -> solver.Solution:
@@ -302,19 +405,28 @@ def film_rise(solution: solver.Solution, film: set_state.FilmModel) -> float:
 
 def bind_waves(solution: solver.Solution) -> solver.Solution:
     """The equations of a solution with waves, for a film without; its unknowns stay."""
-    return _change_film_rows(
-        solution, lambda phases, state: (1.0, reference_rows.wave_rows(phases, state, free=False))
-    )
+
+    def bind(phases: set_phases.SetPhases, state: set_state.SetState) -> tuple[float, FloatArray]:
+        """Rows that bind the waves, to be added."""
+        return 1.0, reference_rows.wave_rows(phases, state, free=False)
+
+    return _change_film_rows(solution, bind)
 
 
 def wave_fall(solution: solver.Solution) -> float:
     """By how much the sum of squares of a solution without waves falls if the film has them."""
-    without = _change_film_rows(
-        solution, lambda phases, state: (-1.0, reference_rows.wave_rows(phases, state, free=False))
-    )
-    free = _change_film_rows(
-        without, lambda phases, state: (1.0, reference_rows.wave_rows(phases, state, free=True))
-    )
+
+    def unbind(phases: set_phases.SetPhases, state: set_state.SetState) -> tuple[float, FloatArray]:
+        """Rows that bind the waves, to be subtracted."""
+        return -1.0, reference_rows.wave_rows(phases, state, free=False)
+
+    def free_waves(
+        phases: set_phases.SetPhases, state: set_state.SetState
+    ) -> tuple[float, FloatArray]:
+        """Rows of a film's usual waves, to be added."""
+        return 1.0, reference_rows.wave_rows(phases, state, free=True)
+
+    free = _change_film_rows(_change_film_rows(solution, unbind), free_waves)
     return sum_of_squares(solution) - sum_of_squares(free)
 
 
@@ -342,17 +454,19 @@ def _sum_squares(sums: FloatArray, solution: solver.Solution) -> float:
 
 def _fit_alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
     """Least sum of squares of one set by itself, and how many numbers it determines; no prior."""
-    free = np.flatnonzero(
-        np.append(sigmas > 0, np.ones(set_state.COMMON - len(bench_parameters.NAMES), bool))
-    )
-    matrix, right = reduced[np.ix_(free, free)], reduced[free, -1]
+    # The free unknowns, scaled to a unit diagonal.
+    others = set_state.COMMON - len(bench_parameters.NAMES)
+    free = np.flatnonzero(np.append(sigmas > 0, np.ones(others, bool)))
+    matrix = reduced[np.ix_(free, free)]
+    right = reduced[free, -1]
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
-    good = values > 1e-10
+
+    # Least squares over the combinations that the set determines.
+    is_determined = values > _DETERMINED
     along = vectors.T @ (right * scale)
-    return float(reduced[-1, -1] - np.sum(along[good] ** 2 / values[good])), int(
-        np.count_nonzero(good)
-    )
+    explained = np.sum(along[is_determined] ** 2 / values[is_determined])
+    return float(reduced[-1, -1] - explained), int(np.count_nonzero(is_determined))
 
 
 def _with_more(sums: FloatArray, columns: Sequence[int], share: float) -> FloatArray:
@@ -367,7 +481,11 @@ def _with_more(sums: FloatArray, columns: Sequence[int], share: float) -> FloatA
 
 
 def _solve_free(sums: FloatArray, free: IntArray) -> tuple[FloatArray, float]:
-    matrix, right = sums[np.ix_(free, free)], sums[free, -1]
+    """Solve for the free unknowns: the step of all unknowns, 0 for the others, and the least sum of
+    squares.
+    """
+    matrix = sums[np.ix_(free, free)]
+    right = sums[free, -1]
     scale = 1 / np.sqrt(np.diag(matrix))
     found = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)
     delta = np.zeros(len(sums) - 1)

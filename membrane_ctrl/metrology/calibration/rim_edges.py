@@ -121,12 +121,15 @@ def _fit_ellipse(points_px: FloatArray) -> FloatArray:
     terms = np.stack([x * x, x * y, y * y, x, y], axis=1)
     a, b, c, d, e = np.linalg.lstsq(terms, np.ones(x.size), rcond=None)[0]
 
-    # Centre and axes.
+    # About its centre it is p^T M p = 1: the axes are the eigenvectors of M, their lengths the
+    # inverse roots of its eigenvalues.
     form = np.array([[a, b / 2], [b / 2, c]])
     centre = np.linalg.solve(form, [-d / 2, -e / 2])
     values, axes = np.linalg.eigh(form / (1 + centre @ form @ centre))
     if values.min() <= 0:
         raise ValueError("the rim is not an ellipse")
+
+    # A circle, stretched along the axes.
     theta = 2 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
     circle = np.stack([np.cos(theta), np.sin(theta)])
     around = axes @ (circle / np.sqrt(values)[:, None])

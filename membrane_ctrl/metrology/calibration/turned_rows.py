@@ -43,26 +43,48 @@ def form_rows(
 ) -> FloatArray:
     """The figure of a set is the film's, turned and shifted: weighted rows [derivatives, miss].
 
-    None without a turned mirror among the sets, or where the figure does not turn.
+    The equation of each turning term is q = T(angle) form(sag) - (shift) grad q: the film's form in
+    the mirror's frame, turned by the mirror's angle, and seen from an axis that is shifted.
+
+    Parameters
+    ----------
+    turned : TurnedMirror or None
+        How the set's mirror was turned; None: it was not.
+    state : SetState
+        The set's own unknowns.
+    common : (COMMON,) array
+        Unknowns of all sets.
+    references : References
+        What is known of the form.
+
+    Returns
+    -------
+    (terms, LOCAL + COMMON + 1) array
+        No rows without a turned mirror among the sets, or where the figure does not turn.
     """
     if references.form_sag_mm is None or (turned is not None and not turned.figure_turns):
         return np.zeros((0, LOCAL + COMMON + 1))
+
+    # The film's form at this sag, in the mirror's frame.
     terms = np.array(film_form.TURNING)
     powers = film_form.depth_powers(state.surface.sag_mm - references.form_sag_mm)
-    form = common[FORM_PLACE].reshape(film_form.POWERS, terms.size)
-    x_mm, y_mm, more_rad = state.seat
-    angle_rad = more_rad + (0.0 if turned is None else np.radians(turned.angle_deg))
+    form = powers @ common[FORM_PLACE].reshape(film_form.POWERS, terms.size)
+
+    # The mirror's angle and the shift of its axis.
+    x_mm, y_mm, angle_rad = state.seat
+    if turned is not None:
+        angle_rad += np.radians(turned.angle_deg)
     turn = film_form.turn_matrix(angle_rad)
-    of_film = powers @ form
+    by_angle = film_form.turn_derivative(angle_rad) @ form
     by_shift = shift_derivatives(state.surface, terms)
 
+    # q - T form + (shift) grad q = 0, by the surface, the seat and the form.
     rows = np.zeros((terms.size, LOCAL + COMMON + 1))
     rows[np.arange(terms.size), terms] = 1.0
-    by_turn = film_form.turn_derivative(angle_rad) @ of_film
-    rows[:, SEAT] = np.column_stack([by_shift, -by_turn])
+    rows[:, SEAT] = np.column_stack([by_shift, -by_angle])
     rows[:, LOCAL:][:, FORM_PLACE] = -np.kron(powers, turn)
-    shifted = turn @ of_film - by_shift @ (x_mm, y_mm)
-    rows[:, -1] = shifted - state.surface.parameters[terms]
+    expected = turn @ form - by_shift @ (x_mm, y_mm)
+    rows[:, -1] = expected - state.surface.parameters[terms]
     return np.asarray(rows / form_sigmas_mm(references)[:, None])
 
 

@@ -114,9 +114,10 @@ def _describe_combination(
     `parts` are the parameters that are named; `amounts` (k,) are those of all free parameters,
     whose numbers are `free` (k,).
     """
-    # The effect of one sigma on the surface.
+    # The effect of one sigma on the surface; the laser's scale has none.
     is_optical = free < bench_poses.OPTICAL
-    change_mm = surface_response(solution, index)[:, free[is_optical]] @ amounts[is_optical]
+    response = surface_response(solution, index)[:, free[is_optical]]
+    change_mm = response @ amounts[is_optical]
     heights, plane = heights_over_disc(radius_mm / solution.problem.radius_mm)
     moved_um = 1e3 * heights @ change_mm
     figure_um = remove_plane(moved_um, plane)

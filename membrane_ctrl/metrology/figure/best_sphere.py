@@ -43,44 +43,64 @@ class Sphere:
         """Deviation (n,) in mm of points (3, n), and the unit normals (3,
         n) of the sphere there.
         """
+        # q, q n and q^2 of each point; then s, the share of the radius at which the point is.
         q = points_mm - np.array([[0.0], [0.0], [self.vertex_mm]])
-        c, along, square = self.curvature_per_mm, self.normal @ q, np.einsum("in,in->n", q, q)
+        along = self.normal @ q
+        square = np.einsum("in,in->n", q, q)
+        c = self.curvature_per_mm
         s = np.sqrt(1 - 2 * c * along + c * c * square)
-        return (2 * along - c * square) / (1 + s), (self.normal[:, None] - c * q) / s
+
+        deviation_mm = (2 * along - c * square) / (1 + s)
+        normals = (self.normal[:, None] - c * q) / s
+        return deviation_mm, normals
 
     def sag_mm(self, radius_mm: float) -> float:
         """Depth over a disc around the vertex; NaN for a disc larger than the sphere."""
         c = self.curvature_per_mm
-        left = 1 - (c * radius_mm) ** 2
-        return c * radius_mm**2 / (1 + math.sqrt(left)) if left >= 0 else math.nan
+        # Square of the cosine of the angle between the normals at rim and vertex.
+        cosine_square = 1 - (c * radius_mm) ** 2
+        if cosine_square < 0:
+            return math.nan
+        return c * radius_mm**2 / (1 + math.sqrt(cosine_square))
 
 
 def best_sphere(points_mm: FloatArray) -> Sphere:
     """Sphere with the least squares of the deviations along its normal, for points (3, n)."""
+    # The start: a paraboloid z = z0 + t_x x + t_y y + c (x^2 + y^2) / 2 through some of the points.
+    # Its four columns are scaled to one size.
     some = points_mm[:, :: max(1, points_mm.shape[1] // _SPHERE_POINTS)]
-    scale = float(np.sqrt(np.mean(some[0] ** 2 + some[1] ** 2)))
     x, y, z = some
-    bowl = np.stack([np.ones_like(x), x, y, (x * x + y * y) / 2], axis=1)
+    scale = float(np.sqrt(np.mean(x**2 + y**2)))
     columns = np.array([1.0, 1 / scale, 1 / scale, 2 / scale**2])
-    found = columns * np.linalg.lstsq(bowl * columns, z, rcond=None)[0]
+    paraboloid = np.stack([np.ones_like(x), x, y, (x * x + y * y) / 2], axis=1)
+    found = columns * np.linalg.lstsq(paraboloid * columns, z, rcond=None)[0]
+
+    # Gauss-Newton steps, the last one with all points.
     for cloud in (some, some, points_mm):
         found = found + _sphere_step(Sphere(*found), cloud, columns)
-    return Sphere(*(float(value) for value in found))
+    vertex_mm, tilt_x, tilt_y, curvature_per_mm = (float(value) for value in found)
+    return Sphere(vertex_mm, tilt_x, tilt_y, curvature_per_mm)
 
 
 def _sphere_step(sphere: Sphere, points_mm: FloatArray, columns: FloatArray) -> FloatArray:
-    """Gauss-Newton step (4,); from (1 - c d)^2 = s^2, the derivatives
-    of d need no division by c.
+    """Gauss-Newton step (4,) of vertex, tilts and curvature.
+
+    From (1 - c d)^2 = s^2, the derivatives of d need no division by c.
     """
     deviation, normals = sphere.deviation(points_mm)
     q = points_mm - np.array([[0.0], [0.0], [sphere.vertex_mm]])
-    s, n = 1 - sphere.curvature_per_mm * deviation, sphere.normal
-    length = 1 / n[2]
-    turn_x = (np.array([-1.0, 0, 0]) + n * n[0]) / length  # d normal / d tilt_x
-    turn_y = (np.array([0.0, -1, 0]) + n * n[1]) / length
     square = np.einsum("in,in->n", q, q)
-    rows = np.stack(
-        [-normals[2], turn_x @ q / s, turn_y @ q / s, (deviation**2 - square) / (2 * s)]
-    )
+    s = 1 - sphere.curvature_per_mm * deviation
+    n = sphere.normal
+
+    # Derivatives of the unit normal by the tilts.
+    length = 1 / n[2]
+    normal_by_x = (np.array([-1.0, 0, 0]) + n * n[0]) / length
+    normal_by_y = (np.array([0.0, -1, 0]) + n * n[1]) / length
+
+    # Derivatives of the deviation by vertex, tilts and curvature.
+    by_curvature = (deviation**2 - square) / (2 * s)
+    rows = np.stack([-normals[2], normal_by_x @ q / s, normal_by_y @ q / s, by_curvature])
     rows *= columns[:, None]
-    return np.asarray(columns * np.linalg.lstsq(rows @ rows.T, -rows @ deviation, rcond=1e-13)[0])
+    step = np.linalg.lstsq(rows @ rows.T, -rows @ deviation, rcond=1e-13)[0]
+    return np.asarray(columns * step)

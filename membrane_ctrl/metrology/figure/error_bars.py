@@ -30,10 +30,18 @@ _NEIGHBOURS = 0.03  # share of the rays, on either side, over which an encircled
 
 @dataclass(frozen=True)
 class FigureBars:
-    """1 sigma of a figure's numbers and Fringe terms."""
+    """1 sigma of a figure.
+
+    Attributes
+    ----------
+    numbers : Quantities
+        Of its numbers.
+    fringe_um : (37,) array
+        Of its Fringe terms.
+    """
 
     numbers: Quantities
-    fringe_um: FloatArray  # (37,)
+    fringe_um: FloatArray
 
 
 def figure_bars(
@@ -77,22 +85,23 @@ def figure_bars(
     rough = FigureOf(thin, evaluate.aperture_mm)
     nominal = rough(thin)
 
-    # Independent modes of the parameters' errors, each of 1 sigma, as surfaces on that grid.
+    # Independent modes of the parameters' errors, each of 1 sigma, as surfaces on that grid: the
+    # eigenvectors of the covariance, scaled by the roots of its eigenvalues.
     values, vectors = np.linalg.eigh(covariance_mm2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    modes = np.stack(
-        [
-            surface.Surface.from_parameters(parameters, disc_mm).on_grid(thin.axis_mm)
-            for parameters in root.T
-        ]
-    )
+    surfaces = [surface.Surface.from_parameters(parameters, disc_mm) for parameters in root.T]
+    modes = np.stack([mode.on_grid(thin.axis_mm) for mode in surfaces])
 
-    # Mean squares of the changes by random sums of them, then by the cells' own noise.
-    random = np.random.default_rng(1)  # the same set has the same error bars
+    # Mean squares of the changes by random sums of these modes. The seed is fixed: the same set has
+    # the same error bars.
+    random = np.random.default_rng(1)
     squares = np.zeros(len(fields(Quantities)))
     for _ in range(_TRIALS):
         change = np.tensordot(random.normal(size=len(root)), modes, axes=1)
-        squares += _compute_change(nominal, rough(thin.plus(change))) ** 2 / _TRIALS
+        disturbed = rough(thin.plus(change))
+        squares += _compute_change(nominal, disturbed) ** 2 / _TRIALS
+
+    # And by the cells' own noise, which is independent of them.
     if cell_slope > 0:
         for change in _propagate_white_noise(seen, evaluate.aperture_mm, cell_slope, random):
             moved = np.array(astuple(evaluate(seen.plus(change)).numbers))
@@ -126,17 +135,23 @@ def _propagate_white_noise(
     """
     step_mm = float(seen.axis_mm[1] - seen.axis_mm[0])
     slopes = random.normal(0, cell_slope, (2, _TILE, _TILE))
+    spectrum_x, spectrum_y = np.fft.fft2(slopes)
 
-    # Least squares for the height of waves k: -i k (slopes) / k^2; slower waves belong to the fit.
+    # Waves k of the tile. Slower ones than the fit's terms belong to the fit.
     k = 2 * np.pi * np.fft.fftfreq(_TILE, step_mm)
     k_x, k_y = np.meshgrid(k, k)
     square = k_x**2 + k_y**2
-    spectrum = np.fft.fft2(slopes)
     is_fast = square > (np.pi * zonal_map.FIT_CYCLES / aperture_mm) ** 2
-    integrated = -1j * (k_x * spectrum[0] + k_y * spectrum[1]) / np.where(is_fast, square, 1.0)
+
+    # Least squares for the height of each wave from both slopes: -i (k slopes) / k^2.
+    along_k = k_x * spectrum_x + k_y * spectrum_y
+    integrated = -1j * along_k / np.where(is_fast, square, 1.0)
     height = np.fft.ifft2(np.where(is_fast, integrated, 0)).real
 
+    # Parts of the periodic tile, as large as the map.
     tiles = np.stack([height, *slopes])
     for _ in range(_WHITE_TRIALS):
         down, right = np.arange(seen.axis_mm.size) + random.integers(_TILE, size=(2, 1))
-        yield tiles[:, (down % _TILE)[:, None], right % _TILE]
+        rows = (down % _TILE)[:, None]
+        columns = right % _TILE
+        yield tiles[:, rows, columns]

@@ -30,22 +30,48 @@ def power_spectrum(found: Figure, axis_mm: FloatArray, aperture_mm: float) -> Po
     """Spectrum of the deviation from the best sphere under a radial Hann window.
 
     Cells without a measurement are filled by the fit of the terms.
+
+    Parameters
+    ----------
+    found : Figure
+        The figure, with its maps (n, n).
+    axis_mm : (n,) array
+        Middle of the cells, along x as along y.
+    aperture_mm : float
+        Radius of the aperture, at which the window ends.
+
+    Returns
+    -------
+    PowerSpectrum
+        Rings of half a wave over the aperture's radius, up to half the sampling frequency.
     """
+    # The window, cos^2 of a quarter turn over the aperture.
     x, y = np.meshgrid(axis_mm, axis_mm)
-    r, step = np.hypot(x, y), float(axis_mm[1] - axis_mm[0])
-    window = np.where(r < aperture_mm, np.cos(np.pi / 2 * np.minimum(r / aperture_mm, 1)) ** 2, 0.0)
-    values = np.where(np.isfinite(found.deviation_um), found.deviation_um, found.smooth_um)
-    values = window * (values - np.sum(window * values) / np.sum(window))
-    density = np.abs(np.fft.rfft2(values)) ** 2 * step**2 / np.sum(window**2)
-    f = np.hypot(
-        *np.meshgrid(np.fft.rfftfreq(axis_mm.size, step), np.fft.fftfreq(axis_mm.size, step))
-    )
+    r = np.hypot(x, y)
+    share = np.minimum(r / aperture_mm, 1)
+    window = np.where(r < aperture_mm, np.cos(np.pi / 2 * share) ** 2, 0.0)
+
+    # The deviation under it, without its weighted mean, and the density of its waves.
+    step_mm = float(axis_mm[1] - axis_mm[0])
+    deviation = np.where(np.isfinite(found.deviation_um), found.deviation_um, found.smooth_um)
+    mean = np.sum(window * deviation) / np.sum(window)
+    transform = np.fft.rfft2(window * (deviation - mean))
+    density = np.abs(transform) ** 2 * step_mm**2 / np.sum(window**2)
+
+    # The ring of each wave, by its frequency in any direction.
+    along_x = np.fft.rfftfreq(axis_mm.size, step_mm)
+    along_y = np.fft.fftfreq(axis_mm.size, step_mm)
+    frequency_x, frequency_y = np.meshgrid(along_x, along_y)
     width = 1 / (2 * aperture_mm)
-    ring = np.round(f / width).astype(np.int64).ravel()
+    ring = np.round(np.hypot(frequency_x, frequency_y) / width).astype(np.int64).ravel()
+
+    # Means over the rings, without the first one, which is the mean height.
     count = np.bincount(ring)
-    known = np.flatnonzero((count > 0) & (np.arange(count.size) * width < 0.5 / step))[1:]
-    mean = (np.bincount(ring, density.ravel()) / np.maximum(count, 1))[known]
-    # neighbours in the plane share what the window smears: fewer are independent
+    is_sampled = np.arange(count.size) * width < 0.5 / step_mm
+    known = np.flatnonzero((count > 0) & is_sampled)[1:]
+    ring_mean = (np.bincount(ring, density.ravel()) / np.maximum(count, 1))[known]
+
+    # Neighbours in the plane share what the window smears: fewer are independent.
     independent = np.sum(window**2) ** 2 / (window.size * np.sum(window**4))
-    sigma = mean / np.sqrt(np.maximum(count[known] * independent, 1.0))
-    return PowerSpectrum(width * known.astype(np.float64), mean, sigma)
+    sigma = ring_mean / np.sqrt(np.maximum(count[known] * independent, 1.0))
+    return PowerSpectrum(width * known.astype(np.float64), ring_mean, sigma)

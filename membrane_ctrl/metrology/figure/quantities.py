@@ -218,4 +218,5 @@ def _compute_spot(
     rate -= rate.mean(axis=1, keepdims=True)
     start -= start.mean(axis=1, keepdims=True)
     focus_mm = -float(np.sum(start * rate) / max(np.sum(rate * rate), 1e-300))
-    return focus_mm, np.hypot(*(start + rate * focus_mm))
+    spot_x, spot_y = start + rate * focus_mm
+    return focus_mm, np.hypot(spot_x, spot_y)

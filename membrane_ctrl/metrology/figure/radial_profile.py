@@ -44,31 +44,58 @@ class RadialProfile:
 
 
 def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) -> RadialProfile:
-    """Profile of a height map (n, n) on `axis_mm`, NaN where not measured, of a film with its rim
-    at `rim_mm`.
+    """Profile of a height map along the radius.
+
+    Parameters
+    ----------
+    axis_mm : (n,) array
+        Middle of the cells, along x as along y.
+    height_mm : (n, n) array
+        Height; NaN where not measured.
+    rim_mm : float
+        Radius of the film's rim.
+
+    Returns
+    -------
+    RadialProfile
+        Without rings in which nothing was measured.
     """
     x, y = np.meshgrid(axis_mm, axis_mm)
     seen = np.isfinite(height_mm)
-    r, h = np.hypot(x[seen], y[seen]), height_mm[seen]
+    r = np.hypot(x[seen], y[seen])
+    height = height_mm[seen]
+
+    # The bowl's sag by least squares, with a free offset: a dimple at the vertex must not shift the
+    # whole comparison.
     shape = hencky_bowl.bowl_profile(r / rim_mm)
-    shape_mean, h_mean = shape.mean(), h.mean()
-    # least squares with a free offset: a dimple at the vertex must not shift the whole comparison
-    sag = float(np.sum((shape - shape_mean) * (h - h_mean)) / np.sum((shape - shape_mean) ** 2))
-    left = h - (sag * (shape - shape_mean) + h_mean)
+    shape_mean = shape.mean()
+    height_mean = height.mean()
+    shape_rest = shape - shape_mean
+    sag = float(np.sum(shape_rest * (height - height_mean)) / np.sum(shape_rest**2))
+
+    # Mean and 95 % band of each ring: of the difference from the bowl, because across a ring the
+    # bowl itself climbs by millimetres.
+    over_bowl = height - (sag * shape_rest + height_mean)
     edges = np.linspace(0.0, float(r.max()), _RINGS + 1)
     ring = np.clip(np.digitize(r, edges) - 1, 0, _RINGS - 1)
     rows = []
     for k in range(_RINGS):
         inside = ring == k
         if np.any(inside):
-            # of the difference to the bowl: across a ring the bowl itself climbs by millimetres
-            rows.append(
-                (r[inside].mean(), left[inside].mean(), *np.percentile(left[inside], [2.5, 97.5]))
-            )
+            low, high = np.percentile(over_bowl[inside], [2.5, 97.5])
+            rows.append((r[inside].mean(), over_bowl[inside].mean(), low, high))
     radius, mean, low, high = np.array(rows).T
-    bowl = sag * hencky_bowl.bowl_profile(radius / rim_mm) + h_mean - sag * shape_mean
+
+    # The bowl at these radii, and the band about it.
+    bowl = sag * hencky_bowl.bowl_profile(radius / rim_mm) + height_mean - sag * shape_mean
     return RadialProfile(
-        radius, bowl + mean, bowl + low, bowl + high, bowl, sag, pressure_pa(sag, rim_mm)
+        radius_mm=radius,
+        mean_mm=bowl + mean,
+        low_mm=bowl + low,
+        high_mm=bowl + high,
+        hencky_mm=bowl,
+        sag_mm=sag,
+        pressure_pa=pressure_pa(sag, rim_mm),
     )
 
 

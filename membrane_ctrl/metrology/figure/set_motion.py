@@ -60,10 +60,12 @@ class FilmMotion:
         x, y = checked.view.used
         frames = len(x) + len(y)
 
-        # Motion within the axes, and the share of it that is not noise. The means of both axes are
-        # removed: two degrees of freedom less.
-        seen_x, seen_y = (part - part.mean() for part in np.split(checked.film_um, [len(x)]))
-        within_um2 = float(np.var(np.concatenate([seen_x, seen_y])))
+        # Motion within the axes, and the share of its square that is not noise. The means of both
+        # axes are removed: two degrees of freedom less.
+        within_x_um, within_y_um = (
+            part - part.mean() for part in np.split(checked.film_um, [len(x)])
+        )
+        within_um2 = float(np.var(np.concatenate([within_x_um, within_y_um])))
         noise_um2 = checked.film_noise_um**2 * (1 - 2 / frames)
         moving = max(1 - noise_um2 / max(within_um2, 1e-12), 0.0)
 
@@ -74,6 +76,7 @@ class FilmMotion:
         laser_um = LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y))
         least = motion_share(math.sqrt(moving * within_um2), laser_um)
         most = motion_share(math.sqrt(within_um2), laser_um)
+
         # A film at rest within both axes may still step between them. Beyond 2 sigma of the laser
         # that step is measured, however little the film moves from frame to frame.
         beyond_noise = 1 - (SEEN_BY_LASER * laser_um) ** 2 / max(x_to_y_um**2, 1e-12)
@@ -81,11 +84,14 @@ class FilmMotion:
             most = 1.0
         share = max(least, beyond_noise)
 
-        # The figure belongs to the mean of all readings, also where a frame is left out.
+        # The displacement of each axis. The figure belongs to the mean of all readings, also where
+        # a frame is left out.
         about_um = readings_um[[*x, *y]].mean() - checked.stack.mean_reading_um
-        of_axes = np.array([len(y), -len(x)]) / frames
-        mean_x_um, mean_y_um = np.nan_to_num(about_um + share * x_to_y_um * of_axes)
-        motion_um = (moving * seen_x + mean_x_um, moving * seen_y + mean_y_um)
+        side_of_axis = np.array([len(y), -len(x)]) / frames
+        mean_x_um, mean_y_um = np.nan_to_num(about_um + share * x_to_y_um * side_of_axis)
+        motion_um = (moving * within_x_um + mean_x_um, moving * within_y_um + mean_y_um)
+
+        # Its uncertainty: the laser's noise in the largest share, and the difference of the shares.
         sigma_um = math.hypot(math.sqrt(most) * laser_um, (most - share) * x_to_y_um)
         return cls(motion_um, sigma_um, checked.film_noise_um)
 
@@ -103,7 +109,17 @@ class FilmMotion:
 def combine_axis_steps(
     checked: Checked, axis: int, motion_um: FloatArray | None
 ) -> phase_change.StepCombination:
-    """How the means of the usable frames of an axis combine, whose film moved so."""
+    """Combination of the phase steps of an axis, for means over pixels instead of sums.
+
+    Parameters
+    ----------
+    checked : Checked
+        The set, whose usable frames are combined.
+    axis : int
+        0 for x, 1 for y.
+    motion_um : (N,) array or None
+        Displacement of the film at these frames; None: it is not corrected.
+    """
     used = checked.view.used[axis]
     shifts = checked.stack.shifts_rad(used)
     return film_motion.combine_steps(checked.stack.weights(used), shifts, 1, motion_um)

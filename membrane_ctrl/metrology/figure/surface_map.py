@@ -1,6 +1,6 @@
 """A measured surface on a square grid: heights and slopes."""
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,12 +29,21 @@ class SurfaceMap:
     def part(self, stride: int) -> "SurfaceMap":
         """Every `stride`-th cell along both axes."""
         every = slice(None, None, stride)
-        return SurfaceMap(self.axis_mm[every], *(a[every, every] for a in astuple(self)[1:]))
+        return SurfaceMap(
+            axis_mm=self.axis_mm[every],
+            height_mm=self.height_mm[every, every],
+            slope_x=self.slope_x[every, every],
+            slope_y=self.slope_y[every, every],
+        )
 
     def plus(self, change: FloatArray) -> "SurfaceMap":
         """With another height and slopes (3, n, n) added."""
-        now = self.height_mm + change[0], self.slope_x + change[1], self.slope_y + change[2]
-        return SurfaceMap(self.axis_mm, *now)
+        return SurfaceMap(
+            axis_mm=self.axis_mm,
+            height_mm=self.height_mm + change[0],
+            slope_x=self.slope_x + change[1],
+            slope_y=self.slope_y + change[2],
+        )
 
     def points(self) -> FloatArray:
         """Rows (3, cells) x, y, z of the measured cells in mm."""

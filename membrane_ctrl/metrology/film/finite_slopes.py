@@ -106,15 +106,22 @@ def _finite_forces(
         Where Newton's method begins.
     """
     prestrain, poisson, load = film
+
+    # Strains of the hoop, and of the radius without the slope's part.
     u_r = outward + 2 * v[:, None] * outward_v
     hoop_strain = prestrain + outward + outward**2 / 2
     flat_strain = prestrain + u_r + u_r**2 / 2 + poisson * hoop_strain
+
+    # Hooke's law S (1 - nu^2) = flat_strain + h'^2 / 2 with h'^2 / 2 = climb / S^2.
     climb = load**2 * v[:, None] * (1 + outward) ** 4 / 8
+    stiffness = 1 - poisson**2
     force = start[:, None] + 0 * outward
     for _ in range(_FORCE_STEPS):
-        excess = (1 - poisson**2) * force - flat_strain - climb / force**2
-        force = force - excess / (1 - poisson**2 + 2 * climb / force**3)
-    return force, hoop_strain + poisson * force, 1 + u_r, 1 + outward
+        excess = stiffness * force - flat_strain - climb / force**2
+        slope = stiffness + 2 * climb / force**3
+        force = force - excess / slope
+    hoop_force = hoop_strain + poisson * force
+    return force, hoop_force, 1 + u_r, 1 + outward
 
 
 def _finite_basis(v: FloatArray) -> tuple[FloatArray, FloatArray]:

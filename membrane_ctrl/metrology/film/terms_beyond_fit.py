@@ -24,6 +24,9 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 # Legendre degrees of the round terms that a calibration does not take from Hencky, of unit RMS
 ROUND_DEGREES = (EXCESS_DEGREE + 1, EXCESS_DEGREE + 2, EXCESS_DEGREE + 3)
+# The excess' largest degree and these, and sqrt(2 k + 1): coefficient over RMS of degree k.
+_FAMILY_DEGREES = np.array([EXCESS_DEGREE, *ROUND_DEGREES])
+_FAMILY_RMS = np.sqrt(2 * _FAMILY_DEGREES + 1)
 # Azimuthal order of the waves, how many radial orders of each, and 1 sigma of the first of them
 _WAVE_ORDERS = (
     (1, 2, 5e-5),
@@ -42,11 +45,19 @@ _WAVE_FALL = 5.0  # from one radial order to the next; a film of the law has ten
 
 @dataclass(frozen=True)
 class Wave:
-    """A Zernike term beyond the fit's that is not round."""
+    """A Zernike term beyond the fit's that is not round.
+
+    Attributes
+    ----------
+    radial_order, azimuthal_order : int
+        n and m; m below 0: a sine.
+    sigma_mm : float
+        Standard deviation of its amplitude over films that were not measured.
+    """
 
     radial_order: int
-    azimuthal_order: int  # below 0: a sine
-    sigma_mm: float  # of its amplitude in a film that nobody has measured
+    azimuthal_order: int
+    sigma_mm: float
 
     @property
     def rms_factor(self) -> float:
@@ -75,11 +86,10 @@ WAVE_DEGREE = max(wave.radial_order for wave in WAVES)
 @cache
 def wave_polynomials() -> FloatArray:
     """Waves of unit RMS (waves, WAVE_DEGREE + 1, WAVE_DEGREE + 1) as polynomials in x and y."""
-    rows = [
-        wave.rms_factor
-        * zernike.radial_polynomial(wave.radial_order, wave.azimuthal_order, WAVE_DEGREE)
-        for wave in WAVES
-    ]
+    rows = []
+    for wave in WAVES:
+        polynomial = zernike.radial_polynomial(wave.radial_order, wave.azimuthal_order, WAVE_DEGREE)
+        rows.append(wave.rms_factor * polynomial)
     out = np.stack(rows)
     out.setflags(write=False)
     return out
@@ -92,11 +102,8 @@ def round_series() -> FloatArray:
     """
     out = np.zeros((len(ROUND_DEGREES), EXCESS_TERMS))
     for row, degree in zip(out, ROUND_DEGREES, strict=True):
-        power = (
-            np.sqrt(2 * degree + 1)
-            * Legendre.basis(degree, domain=[0, 1]).convert(kind=Polynomial).coef
-        )
-        row[1 : degree + 1] = power[1:]
+        powers = Legendre.basis(degree, domain=[0, 1]).convert(kind=Polynomial).coef
+        row[1 : degree + 1] = np.sqrt(2 * degree + 1) * powers[1:]
     out.setflags(write=False)
     return out
 
@@ -110,9 +117,7 @@ def _film_family() -> tuple[FloatArray, FloatArray]:
     for slackness in np.linspace(1e-3, film_law.SLACKEST, 240):
         bowl = film_law.Bowl(np.asarray(slackness), np.ones(()), hencky_bowl.POISSON_RATIO, 1.0)
         coef = hencky_bowl.legendre_series(bowl, 40).coef.astype(np.float64) / bowl.sag_mm
-        rows.append(
-            [coef[k] / np.sqrt(2 * k + 1) for k in (hencky_bowl.EXCESS_DEGREE, *ROUND_DEGREES)]
-        )
+        rows.append(coef[_FAMILY_DEGREES] / _FAMILY_RMS)
     table = np.array(rows)
     return table[:, 0], table[:, 1:]
 
@@ -124,11 +129,12 @@ def round_of(excess_mm: float, sag_mm: float) -> FloatArray:
     At a given sag every film is one number, the slackness, and so is its round figure, whatever
     makes it slack.
     """
-    own = (
-        hencky_bowl.profile_legendre().coef[[hencky_bowl.EXCESS_DEGREE, *ROUND_DEGREES]]
-        / np.sqrt(2 * np.array([hencky_bowl.EXCESS_DEGREE, *ROUND_DEGREES]) + 1)
-        / hencky_bowl.excess_rms()
-    )
+    # The same degrees of the excess of unit RMS.
+    coef = hencky_bowl.profile_legendre().coef[_FAMILY_DEGREES]
+    of_excess = coef / _FAMILY_RMS / hencky_bowl.excess_rms()
+
+    # The film of the family with this share of the first degree, less what the excess has itself.
     first, others = _film_family()
-    there = [np.interp(excess_mm * own[0] / sag_mm, first, other) for other in others.T]
-    return np.asarray(sag_mm * np.array(there) - excess_mm * own[1:])
+    share = excess_mm * of_excess[0] / sag_mm
+    of_film = [np.interp(share, first, other) for other in others.T]
+    return np.asarray(sag_mm * np.array(of_film) - excess_mm * of_excess[1:])

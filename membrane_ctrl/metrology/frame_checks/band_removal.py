@@ -127,7 +127,9 @@ class _Steps:
         off = np.eye(count) - self._design @ self._inverse  # the projector P
         self.rad_per_row = rad_per_row
         self.amplitudes = np.zeros((count, len(waves)))
-        turns = _TURNS if len(waves) else 1
+        turns = 1
+        if len(waves):
+            turns = _TURNS
         for _ in range(turns):
             self._fit()
             harmonics = self._free_harmonics(off)
@@ -172,25 +174,33 @@ class _Steps:
         count = len(self.frames)
         unknowns_of_frames = count * len(waves)
 
-        # Waves by waves, by harmonics and by the rest; harmonics by harmonics and by the rest.
+        # Normal equations of waves with waves.
         products = np.array(
             [off[k][:, None] * self._sums(self._lit[k] * self._lit) for k in range(count)]
         )
-        matrix = np.einsum("jkr,pr,qr->jpkq", products, waves, waves)
-        matrix = matrix.reshape(unknowns_of_frames, unknowns_of_frames)
-        by_waves = np.array(
-            [self._sums(self._lit * one) @ waves.T for one in (*harmonics, self._rest)]
-        ).reshape(len(harmonics) + 1, -1)
-        flat = harmonics.reshape(len(harmonics), -1)
-        matrix = np.block([[matrix, by_waves[:-1].T], [by_waves[:-1], flat @ flat.T]])
-        right = np.append(by_waves[-1], flat @ self._rest.ravel())
+        wave_matrix = np.einsum("jkr,pr,qr->jpkq", products, waves, waves)
+        wave_matrix = wave_matrix.reshape(unknowns_of_frames, unknowns_of_frames)
 
-        # Scaled to a unit diagonal; an unknown without any effect stays 0.
+        # Of waves with harmonics, and on the right-hand side of waves with the rest.
+        fields = (*harmonics, self._rest)
+        by_waves = np.array([self._sums(self._lit * field) @ waves.T for field in fields])
+        by_waves = by_waves.reshape(len(fields), -1)
+        mixed = by_waves[:-1]
+        wave_right = by_waves[-1]
+
+        # Of harmonics with harmonics, and with the rest.
+        flat = harmonics.reshape(len(harmonics), -1)
+        matrix = np.block([[wave_matrix, mixed.T], [mixed, flat @ flat.T]])
+        right = np.append(wave_right, flat @ self._rest.ravel())
+
+        # Solved with a unit diagonal; an unknown without any effect stays 0.
         diagonal = np.diag(matrix)
         scale = np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
         inverse = np.linalg.pinv(matrix / np.outer(scale, scale), _SINGULAR, hermitian=True)
         found = inverse @ (right / scale) / scale
-        return found[:unknowns_of_frames].reshape(count, -1), found[unknowns_of_frames:]
+        of_frames = found[:unknowns_of_frames].reshape(count, -1)
+        of_harmonics = found[unknowns_of_frames:]
+        return of_frames, of_harmonics
 
 
 def remove_bands(

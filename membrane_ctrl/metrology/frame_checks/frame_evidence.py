@@ -197,17 +197,22 @@ def estimate_light_and_film(
     scene = scene.thinned(_SAMPLED_PX // binned.bin_px**2)
     readings_um = np.nan_to_num(stack.displacement_um - stack.mean_reading_um)
 
-    # Smooth functions of the place on the mirror, which the phases stand for.
+    # Polynomials in the place on the mirror, to which the phases are about proportional.
     spread_rad = scene.phase_rad.std(axis=1)
     u, v = (scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]) / spread_rad[:, None]
-    order = _SMOOTH_ORDER if spread_rad.min() > _SEVERAL_RAD else _FLAT_ORDER
+    order = _FLAT_ORDER
+    if spread_rad.min() > _SEVERAL_RAD:
+        order = _SMOOTH_ORDER
     smooth = np.stack([u**p * v**q for p in range(order) for q in range(order - p)])
 
-    # The phases follow the measured ones smoothly.
-    deviation = (phase_rad[:, scene.index] - scene.phase_rad) @ np.linalg.pinv(smooth)
-    scene = replace(scene, phase_rad=scene.phase_rad + deviation @ smooth)
-    contrast = smooth[1:] - smooth[1:].mean(axis=1, keepdims=True)
+    # The predicted phases plus a smooth fit of what the measured ones deviate from them.
+    deviation_rad = phase_rad[:, scene.index] - scene.phase_rad
+    smooth_rad = deviation_rad @ np.linalg.pinv(smooth) @ smooth
+    scene = replace(scene, phase_rad=scene.phase_rad + smooth_rad)
 
+    # Each frame by its model, with a contrast that differs over the mirror, and with the light that
+    # the other axis saw.
+    contrast = smooth[1:] - smooth[1:].mean(axis=1, keepdims=True)
     means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
     light = np.ones((2, len(stack.patterns)))
     film_um = np.empty(0)
@@ -220,6 +225,8 @@ def estimate_light_and_film(
             columns = np.vstack([model.columns, model.columns[1] * contrast])
             model = replace(model, columns=columns)
             found.append(_make_evidence(means[k], model, light_of_others, 0.0, k))
+
+        # Light about the mean of the axis, and the film's place: the laser's reading corrected.
         level_and_swing = np.array([[each.level, each.swing] for each in found]).T
         light[:, own] = level_and_swing / level_and_swing.mean(axis=1, keepdims=True)
         film_um = np.append(film_um, readings_um[own] + [each.moved_um for each in found])
@@ -249,8 +256,11 @@ class _FrameModel:
         """The sure bins, and the pattern there, scaled so that its product with a picture of
         standard deviation 1 is their correlation.
         """
-        pattern = self.columns[:2][-1][self.sure]
-        return self.sure, (pattern - pattern.mean()) / (pattern.size * max(pattern.std(), 1e-6))
+        # The second column; white and black have the constant alone.
+        shape = self.columns[min(1, len(self.columns) - 1)]
+        pattern = shape[self.sure]
+        norm = pattern.size * max(pattern.std(), 1e-6)
+        return self.sure, (pattern - pattern.mean()) / norm
 
 
 def _make_model(
@@ -283,12 +293,16 @@ def _solve_coefficients(
     seen: FloatArray, model: _FrameModel, light: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
     """Coefficients, their noise if the rest is noise, and the RMS of the rest over the light."""
+    # Normal equations, scaled to a unit diagonal: the columns are of very different size.
     sure = model.sure
     columns = (model.columns * light)[:, sure]
     normal = columns @ columns.T
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))  # columns of very different size
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))
+    scales = np.outer(scale, scale)
+    inverse = np.linalg.pinv(normal / scales) / scales
     solved = inverse @ (columns @ seen[sure])
+
+    # The rest, which is the noise of each bin.
     rest = float(np.sqrt(np.mean((seen[sure] - solved @ columns) ** 2)))
     sigma = rest * np.sqrt(np.maximum(np.diag(inverse), 0.0))
     return solved, sigma, rest / float(np.mean(light[sure]))
@@ -335,7 +349,9 @@ def _find_best_pattern(
         if deviation < _FLAT_PICTURE * mean:
             continue
         likeness = float(picture[sure] @ wave) / deviation
-        margin = 0.0 if frame == own else _CLEARLY_MORE
+        margin = _CLEARLY_MORE
+        if frame == own:
+            margin = 0.0
         if likeness > best_likeness + margin:
             best_likeness = likeness
             best = frame

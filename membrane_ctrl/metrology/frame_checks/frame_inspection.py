@@ -75,20 +75,26 @@ def find_obvious_faults(stack: FrameStack, binned: Binned) -> list[Flag]:
     frames = [k for axis in AXES for k in stack.sinusoids(axis) if k not in stack.unusable]
     if not frames:
         return []
+
+    # Mean light, and share of clipped bins, of each frame.
     brightest = np.max(binned.means[frames], axis=0)
     is_bright = brightest >= np.median(brightest)
     light = {k: float(np.mean(binned.means[k][is_bright])) for k in frames}
     saturated = {k: float(np.mean(binned.saturated[k][is_bright])) for k in frames}
+
+    # Frames that are far from the medians.
     usual_light = float(np.median(list(light.values())))
     usual_saturated = float(np.median(list(saturated.values())))
     flags = []
     for k in frames:
         if light[k] < _DARK * usual_light:
             reason = f"dark: {light[k] / usual_light:.2f} of the light of the others"
-            flags.append(Flag(k, FrameDefect.DARK, reason, usual_light / max(light[k], _TINY)))
+            severity = usual_light / max(light[k], _TINY)
+            flags.append(Flag(k, FrameDefect.DARK, reason, severity))
         elif saturated[k] > usual_saturated + _BURNT_SHARE:
             reason = f"saturated: {saturated[k]:.0%} of the bins"
-            flags.append(Flag(k, FrameDefect.SATURATED, reason, saturated[k] / SATURATED_SHARE))
+            severity = saturated[k] / SATURATED_SHARE
+            flags.append(Flag(k, FrameDefect.SATURATED, reason, severity))
     return flags
 
 
@@ -155,6 +161,7 @@ def _judge_sinusoid(
 
     Each deviation is in units of its limit; the largest one is the frame's defect if it exceeds 1.
     """
+    # Limits of the other frames' scatter, and their usual values.
     step_limit_rad, usual_step_rad = _compute_limit([each.step_rad for each in same], STEP_RAD)
     moved_limit_um, usual_moved_um = _compute_limit([each.moved_um for each in same], MOVED_UM)
     level_limit, usual_level = _compute_limit([each.level for each in every], 0.0)
@@ -162,10 +169,13 @@ def _judge_sinusoid(
     usual_rest = float(np.median([each.rest for each in same]))
     usual_saturated = float(np.median([each.saturated for each in same]))
 
-    step_off_rad = (own.step_rad - usual_step_rad + np.pi) % (2 * np.pi) - np.pi
+    # Floors that are a share of the usual light.
     level_limit = max(LEVEL_SHARE * usual_level, level_limit)
     swing_limit = max(SWING_SHARE * usual_swing, swing_limit)
     rest_limit = max(REST_SHARE, _REST_RATIO * usual_rest)
+
+    # Deviations of this frame, the phase's within half a turn. Independent rests add in squares.
+    step_off_rad = (own.step_rad - usual_step_rad + np.pi) % (2 * np.pi) - np.pi
     more_rest = max(own.rest**2 - usual_rest**2, 0.0) ** 0.5
     deviations = {
         _Deviation.STEP: abs(step_off_rad) / step_limit_rad,
@@ -216,10 +226,14 @@ def _judge_gray(
     light_limit = max(GRAY_SHARE, bright_limit / max(bright, _TINY))
     flags = []
     for k in gray:
+        # A bit without an edge on the mirror is as good as white or black.
         own = evidence[k]
         if not _NO_EDGE < own.lit < 1 - _NO_EDGE:
             flags += _judge_flat(k, own, bright, is_white=own.lit > 0.5)
             continue
+
+        # The light of its bright bits; and its content: rest, contrast, and the pattern it is most
+        # like.
         light_severity = abs(own.level / max(bright, _TINY) - 1) / light_limit
         content_severity = max(
             own.rest / (GRAY_REST * bright),

@@ -86,7 +86,9 @@ class ImageLag:
     @property
     def left(self) -> float:
         """Standard uncertainty of the share that is left in the frames; NaN if unknown."""
-        return self.sigma if self.corrected else math.hypot(self.share, self.sigma)
+        if self.corrected:
+            return self.sigma
+        return math.hypot(self.share, self.sigma)
 
 
 UNKNOWN = ImageLag(0.0, 0.0, math.nan)

@@ -244,12 +244,14 @@ def _compare_places(
     """
     images = _Images(phase_rad, frames, bright, centre_rad)
 
-    # A coarse search, and a finer one around its best place.
+    # A coarse search over scales and shifts.
     coarse = _score_places(images, _coarse_places(centre_rad), frames)
     if not coarse.power.size:
         return None
     best = int(np.argmax(coarse.score))
     scale = coarse.scale[best]
+
+    # A finer one over the shifts around its best place.
     shifts_rad = coarse.shift_rad[best] + np.arange(-_STEP_RAD, _STEP_RAD, _CELL_RAD)
     fine = _score_places(images, [(scale, shifts_rad)], frames)
     best = int(np.argmax(fine.score))
@@ -270,6 +272,8 @@ def _compare_places(
     # Stray light around an edge has a mirror image of about the same share.
     mirrored = _score_places(images, [(2 - scale, np.array([-shift_rad]))], frames)
     is_stray = bool(mirrored.share.size) and float(mirrored.share[0]) > _STRAY_SHARE * float(share)
+
+    # Explained power over that of chance; 0 for stray light, and for a share that is no light.
     clear = 0.0
     if not is_stray and share >= 0:
         clear = float(share**2 * power) / max(chance, _TINY)
@@ -322,8 +326,10 @@ def _coarse_places(centre_rad: float, every: int = 1) -> list[tuple[float, Float
     of_other_images = shifts_rad[np.abs(shifts_rad) > HIDDEN_RAD]
     places = []
     for scale in _SCALES:
-        has_first_image = abs(scale - 1) <= _SAME_SCALE
-        places.append((scale, of_other_images if has_first_image else shifts_rad))
+        of_scale_rad = shifts_rad
+        if abs(scale - 1) <= _SAME_SCALE:  # the first image is among these
+            of_scale_rad = of_other_images
+        places.append((scale, of_scale_rad))
     return places
 
 

@@ -29,17 +29,22 @@ class GridFit:
         orders: Sequence[tuple[int, int]],
         y: FloatArray | None = None,
     ) -> None:
+        if y is None:
+            y = x
+        # The terms as sums of products of Legendre polynomials, which are well conditioned:
+        # coefficients (terms, degree + 1, degree + 1).
         degree = max(n for n, _ in orders)
-        to_legendre = np.stack(
-            [np.pad(p, (0, degree + 1 - p.size)) for p in map(poly2leg, np.eye(degree + 1))]
-        )
+        powers = [poly2leg(power) for power in np.eye(degree + 1)]
+        to_legendre = np.stack([np.pad(p, (0, degree + 1 - p.size)) for p in powers])
         self._terms = np.stack(
             [to_legendre.T @ radial_polynomial(n, m, degree) @ to_legendre for n, m in orders]
         )
+
         # Legendre polynomials (points, degree + 1) along the columns and the rows.
         self._x = legvander(x, degree)
-        self._y = legvander(x if y is None else y, degree)
+        self._y = legvander(y, degree)
         self._mask = mask
+
         # The Gram matrix of the terms over the mask, from moments of products of polynomials.
         pairs_x = np.einsum("ia,ib->iab", self._x, self._x)
         pairs_y = np.einsum("ia,ib->iab", self._y, self._y)

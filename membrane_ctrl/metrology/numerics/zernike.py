@@ -33,8 +33,10 @@ def osa_from_noll(per_term: FloatArray) -> FloatArray:
     """Values (terms, ...) in the order of OSA/ANSI's index from 0, of the same terms in Noll's
     order.
     """
+    # OSA's index grows with the radial order, then with the azimuthal one (sines before cosines).
     orders = [noll_orders(j) for j in NOLL_INDICES]
-    return np.asarray(per_term)[sorted(range(ZERNIKE_TERMS), key=orders.__getitem__)]
+    noll_places = sorted(range(ZERNIKE_TERMS), key=orders.__getitem__)
+    return np.asarray(per_term)[noll_places]
 
 
 def fringe_set_orders(j: int) -> tuple[int, int]:
@@ -64,23 +66,35 @@ def monomial_table() -> FloatArray:
 def _term_polynomial(j: int) -> FloatArray:
     """One of the terms, with unit RMS over the disc."""
     n, m = noll_orders(j)
-    return math.sqrt(n + 1 if m == 0 else 2 * (n + 1)) * radial_polynomial(n, m, ZERNIKE_DEGREE)
+    square = n + 1
+    if m != 0:
+        square = 2 * (n + 1)
+    return math.sqrt(square) * radial_polynomial(n, m, ZERNIKE_DEGREE)
 
 
 def radial_polynomial(n: int, m: int, degree: int) -> FloatArray:
     """Polynomial (degree + 1, degree + 1) in x and y of a term without normalisation, R(1) = 1;
     sine for m < 0.
+
+    R_n^m(r) is a sum over k of radial coefficients times r^(n - 2k) = r^|m| u^p, with u = x^2 +
+    y^2 and p = (n - |m|) / 2 - k. Both factors are expanded by the binomial theorem: u^p, and
+    (x + iy)^|m| = r^|m| (cos + i sin)(|m| theta).
     """
     order = abs(m)
+    half = (n - order) // 2
     out = np.zeros((degree + 1, degree + 1))
-    for k in range((n - order) // 2 + 1):
-        radial = (-1) ** k * math.comb(n - k, k) * math.comb(n - 2 * k, (n - order) // 2 - k)
-        power_u = (n - order) // 2 - k
-        for s in range(power_u + 1):  # u^power = sum of binomials x^2s y^2(power - s)
-            for t in range(order + 1):  # (x + iy)^m = sum of binomials x^(m-t) (iy)^t
-                angular = (1j**t).imag if m < 0 else (1j**t).real
-                weight = radial * math.comb(power_u, s) * math.comb(order, t) * angular
-                out[2 * s + order - t, 2 * (power_u - s) + t] += weight
+    for k in range(half + 1):
+        radial = (-1) ** k * math.comb(n - k, k) * math.comb(n - 2 * k, half - k)
+        p = half - k
+        for s in range(p + 1):  # u^p: binomial times x^2s y^2(p - s)
+            for t in range(order + 1):  # (x + iy)^|m|: binomial times x^(|m| - t) (iy)^t
+                angular = (1j**t).real
+                if m < 0:
+                    angular = (1j**t).imag
+                weight = radial * math.comb(p, s) * math.comb(order, t) * angular
+                power_x = 2 * s + order - t
+                power_y = 2 * (p - s) + t
+                out[power_x, power_y] += weight
     return out
 
 
@@ -93,27 +107,29 @@ def evaluate_terms(x: FloatArray, y: FloatArray, table: FloatArray | None = None
     """All terms, (terms, ...), at points of the unit disc; or the polynomials of a table like
     theirs.
     """
-    table = monomial_table() if table is None else table
-    p, q = np.array(
-        [(p, q) for p in range(ZERNIKE_DEGREE + 1) for q in range(ZERNIKE_DEGREE + 1 - p)]
-    ).T
-    powers_x = np.stack([x**k for k in range(ZERNIKE_DEGREE + 1)])
-    powers_y = np.stack([y**k for k in range(ZERNIKE_DEGREE + 1)])
+    if table is None:
+        table = monomial_table()
+    orders = range(ZERNIKE_DEGREE + 1)
+    p, q = np.array([(p, q) for p in orders for q in range(ZERNIKE_DEGREE + 1 - p)]).T
+    powers_x = np.stack([x**k for k in orders])
+    powers_y = np.stack([y**k for k in orders])
     return np.asarray(np.tensordot(table[:, p, q], powers_x[p] * powers_y[q], axes=1))
 
 
 def evaluate_gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """d/dx and d/dy of all terms, each (terms, ...), at points of the unit disc."""
-    return evaluate_terms(x, y, differentiate_table(monomial_table(), 1)), evaluate_terms(
-        x, y, differentiate_table(monomial_table(), 2)
-    )
+    by_x = evaluate_terms(x, y, differentiate_table(monomial_table(), 1))
+    by_y = evaluate_terms(x, y, differentiate_table(monomial_table(), 2))
+    return by_x, by_y
 
 
 def differentiate_table(table: FloatArray, axis: int) -> FloatArray:
     """Derivative of polynomials whose powers run along `axis` (1: x, 2: y), in the same shape."""
-    powers = np.arange(table.shape[axis]).reshape([-1 if k == axis else 1 for k in range(3)])
-    out = np.roll(table * powers, -1, axis=axis)
-    return np.asarray(out)
+    # Each coefficient times its power, one place lower; the constant, times 0, comes last.
+    along_axis = [1, 1, 1]
+    along_axis[axis] = -1
+    powers = np.arange(table.shape[axis]).reshape(along_axis)
+    return np.asarray(np.roll(table * powers, -1, axis=axis))
 
 
 def at_vertex() -> FloatArray:

@@ -163,19 +163,28 @@ class Binner:
                 )
             if frame.dtype not in (np.uint8, np.uint16):
                 raise ValueError(f"frame has {frame.dtype} pixels, not uint8 or uint16")
-        clipped = np.uint32(self.white_adu)
-        limits = [clipped if watched is None or slot in watched else _NEVER for slot in slots]
+        # From which value a pixel of each frame counts as saturated.
+        limits = []
+        for slot in slots:
+            is_watched = watched is None or slot in watched
+            limits.append(np.uint32(self.white_adu) if is_watched else _NEVER)
         width = self.sums.shape[2] * self.bin_px
 
         def run(start: int, stop: int) -> None:
+            """Sum a range of the rows of bins, of all frames."""
             for frame, slot, limit in zip(frames, slots, limits, strict=True):
-                fits_16_bits = frame.dtype == np.uint8 and self.bin_px <= _NARROW_BIN_PX
-                line = np.empty((2, width), np.uint16 if fits_16_bits else np.uint32)
+                # Memory for sums over a bin: 16 bits use more vector units, where they suffice.
+                sum_type = "uint32"
+                if frame.dtype == np.uint8 and self.bin_px <= _NARROW_BIN_PX:
+                    sum_type = "uint16"
+                line = np.empty((2, width), sum_type)
                 pixels = np.ascontiguousarray(frame)
                 _bin_rows(
                     pixels, self.bin_px, limit, line, self.sums[slot], self.saturated, start, stop
                 )
 
         # A single frame is not split: waking a thread costs more than half a frame.
-        least_rows = self._size[0] + 1 if len(frames) == 1 else 0
+        least_rows = 0
+        if len(frames) == 1:
+            least_rows = self._size[0] + 1
         split_over_threads(run, self.sums.shape[1], least_rows)

@@ -105,11 +105,15 @@ class FrameStack:
         return step_weights(self.shifts_rad(frames), self._light_of(frames))
 
     def _light_of(self, frames: list[int]) -> FloatArray | None:
-        return None if self.light is None else self.light[:, frames]
+        if self.light is None:
+            return None
+        return self.light[:, frames]
 
     def reordered(self, order: list[int]) -> "FrameStack":
         """Return the set with pictures exchanged: frame k shows what `order[k]` did."""
-        gain = None if self.gain is None else self.gain[order]
+        gain = self.gain
+        if gain is not None:
+            gain = gain[order]
         new_place = {taken: frame for frame, taken in enumerate(order)}
         new_place[-1] = -1  # no frame before
         before = tuple(new_place[self.before_of(taken)] for taken in order)
@@ -166,7 +170,9 @@ class Binned:
 
     def reordered(self, order: list[int]) -> "Binned":
         """As `FrameStack.reordered`."""
-        black = None if self.black is None else self.black[order]
+        black = self.black
+        if black is not None:
+            black = black[order]
         return replace(self, means=self.means[order], saturated=self.saturated[order], black=black)
 
 

@@ -80,11 +80,14 @@ def places_mm(
     second = np.full(first_mm.shape, np.inf)
     place_mm = np.full(first_mm.shape, np.nan)
     for order in range(math.ceil((high - low) / pitch_mm)):
-        # Least squares of all phases near the place of this order.
+        # The place of this order, and the residuals of all phases there, within half a turn.
         tried_mm = first_mm + order * pitch_mm
         residual = turns - tried_mm * turns_per_mm
         residual -= np.rint(residual)
-        tried_mm = tried_mm + np.sum(residual * turns_per_mm, axis=0) / np.sum(turns_per_mm**2)
+
+        # Least squares of all phases near it, and what it leaves.
+        correction_mm = np.sum(residual * turns_per_mm, axis=0) / np.sum(turns_per_mm**2)
+        tried_mm = tried_mm + correction_mm
         residual = turns - tried_mm * turns_per_mm
         residual -= np.rint(residual)
         in_range = (tried_mm >= low) & (tried_mm <= high)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import compile_kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel, compile_step
 from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.metrology.phase.clip_levels import ClipLevels
 from membrane_ctrl.metrology.phase.phase_change import StepCombination
@@ -33,6 +33,20 @@ class PixelPhases:
     swing_adu: Singles
     rest_adu: Singles
     saturated: BoolArray
+
+
+@compile_step
+def _correct_light(frames, previous, rise, fall, k, place, fade):  # type: ignore[no-untyped-def]
+    """Light of a pixel in frame k: without that of the previous picture, and without bands.
+
+    Where the pixel is brighter than before, `rise` of the change is missing, else `fall` of it.
+    """
+    value = float(frames[k, place])
+    more = value - float(previous[k, place])
+    share = fall
+    if more > 0:
+        share = rise
+    return (value + share * more) * fade
 
 
 @compile_kernel
@@ -65,8 +79,8 @@ def _compute_phases(  # type: ignore[no-untyped-def]
         place = index[p]
         row = place // (frames.shape[1] // height)
 
-        # Mean and phasor c + i s by least squares, of the light without that of the previous
-        # picture and without bands; and the extreme values, which may be clipped.
+        # Mean and phasor c + i s by least squares (section 1 of the derivation; eq. 1 of the paper
+        # for four steps); and the extreme values, which may be clipped.
         mean = 0.0
         c = 0.0
         s = 0.0
@@ -76,20 +90,16 @@ def _compute_phases(  # type: ignore[no-untyped-def]
             value = float(frames[k, place])
             top = max(top, value)
             bottom = min(bottom, value)
-            more = value - float(previous[k, place])
-            value += (rise if more > 0 else fall) * more
-            value *= fade[k, row]
-            mean += weights[0, k] * value
-            c += weights[1, k] * value
-            s += weights[2, k] * value
+            light = _correct_light(frames, previous, rise, fall, k, place, fade[k, row])
+            mean += weights[0, k] * light
+            c += weights[1, k] * light
+            s += weights[2, k] * light
 
         # What they leave: sum of squares over the steps.
         rest = 0.0
         for k in range(steps):
-            value = float(frames[k, place])
-            more = value - float(previous[k, place])
-            value += (rise if more > 0 else fall) * more
-            left = value * fade[k, row] - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
+            light = _correct_light(frames, previous, rise, fall, k, place, fade[k, row])
+            left = light - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
             rest += left * left
 
         # The phase without the film's motion, in the period nearest to the reference.
@@ -97,8 +107,12 @@ def _compute_phases(  # type: ignore[no-untyped-def]
         wrapped = branchless_arctan2(s, c)
         period = math.floor((reference[p] - wrapped) / (2 * math.pi) + 0.5)
         reference[p] = wrapped + 2 * math.pi * period
+
+        # The swing, with a negative sign where a frame is clipped, and the rest.
         swing = math.sqrt(c * c + s * s)
-        out[0, p] = -swing if top >= white or bottom <= black else swing
+        if top >= white or bottom <= black:
+            swing = -swing
+        out[0, p] = swing
         out[1, p] = math.sqrt(rest)
 
 
@@ -146,8 +160,14 @@ def pixel_phases(
     flat = frames.reshape(len(frames), -1)
     phase = reference_rad.copy()
     out = np.empty((2, index.size), np.float32)
-    fade = np.ones(frames.shape[:2]) if gain is None else 1 / gain
-    before = flat if previous is None else previous.reshape(flat.shape)
+
+    # Without bands the gain is 1; without image lag a frame is its own predecessor.
+    fade = np.ones(frames.shape[:2])
+    if gain is not None:
+        fade = 1 / gain
+    before = flat
+    if previous is not None:
+        before = previous.reshape(flat.shape)
     rise, fall = (share / (1 - share) for share in lag_shares)
     fixed = (fade, np.linalg.pinv(design), design, combined.turn, combined.mirror)
 

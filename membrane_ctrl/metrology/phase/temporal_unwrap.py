@@ -60,16 +60,23 @@ def unwrap_in_time(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArra
         raise ValueError(f"{len(wrapped_rad)} phases for periods {counts.tolist()}")
     if not (0 < counts[0] <= 1 and np.all(np.diff(counts) > 0)):
         raise ValueError(f"periods {counts.tolist()} must rise from at most one a screen")
+
+    # The coarsest fringe has at most one period on the screen: its phase is the position.
     position = np.mod(wrapped_rad[0], 2 * math.pi) / (2 * math.pi * counts[0])
     steps = np.empty((len(counts) - 1, *position.shape))
     for k in range(1, len(counts)):
-        # Among the positions that the finer phase allows, the one nearest to the coarser position.
-        fine = wrapped_rad[k] / (2 * math.pi * counts[k])
-        fine = fine + np.rint((position - fine) * counts[k]) / counts[k]
+        # Among the positions that the finer phase allows, one period apart, the one nearest to the
+        # coarser position.
+        first = wrapped_rad[k] / (2 * math.pi * counts[k])
+        periods_to_add = np.rint((position - first) * counts[k])
+        fine = first + periods_to_add / counts[k]
         steps[k - 1] = (fine - position) * counts[k]
         position = fine
-    agree = np.all(np.abs(steps) < CONSISTENT_PERIODS, axis=0) & (position >= 0) & (position <= 1)
-    return Unwrapped(position, steps, agree)
+
+    # A pixel is consistent if all steps agree and its position is on the screen.
+    agrees = np.all(np.abs(steps) < CONSISTENT_PERIODS, axis=0)
+    is_on_screen = (position >= 0) & (position <= 1)
+    return Unwrapped(position, steps, agrees & is_on_screen)
 
 
 def predict_phase(

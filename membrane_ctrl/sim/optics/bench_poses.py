@@ -141,12 +141,16 @@ def _undistort_points(
     for _ in range(_UNDISTORT_STEPS):
         # x <- (x_d - tangential(x, y)) / radial(r^2)
         r2 = x * x + y * y
-        radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        numerator = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        denominator = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = numerator / denominator
         x_next = (x_d - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)) / radial
         y_next = (y_d - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y) / radial
-        change = max(float(np.abs(x_next - x).max()), float(np.abs(y_next - y).max()))
-        x, y = x_next, y_next
-        if change < _UNDISTORT_TOLERANCE:
+        change_x = float(np.abs(x_next - x).max())
+        change_y = float(np.abs(y_next - y).max())
+        x = x_next
+        y = y_next
+        if max(change_x, change_y) < _UNDISTORT_TOLERANCE:
             return x, y
     raise ValueError(
         f"camera.distortion = {distortion} folds the picture: it cannot be undone at its edge"

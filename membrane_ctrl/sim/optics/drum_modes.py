@@ -1,7 +1,7 @@
 """Vibrations of the simulated film: drum modes."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -47,15 +47,22 @@ class DrumMode:
 
         m = self.lobes
         terms = film.terms_at(0.0)
+
+        # RMS of J_m(z r) cos(m theta) over the unit disc.
         zero = special.jn_zeros(m, self.circles)[-1]
-        # RMS of J_m(z r) cos(m theta) over the unit disc
-        rms = abs(special.jv(m + 1, zero)) * (math.sqrt(0.5) if m else 1.0)
-        poly_mm = np.zeros((2 * _SERIES + m + 1,) * 2)
+        rms = abs(special.jv(m + 1, zero))
+        if m:
+            rms *= math.sqrt(0.5)
+
+        # The film's own polynomial, with room for the mode's powers.
+        size = 2 * _SERIES + m + 1
+        poly_mm = np.zeros((size, size))
         poly_mm[: terms.poly_mm.shape[0], : terms.poly_mm.shape[1]] = terms.poly_mm
         for k in range(_SERIES + 1):
             factorials = math.factorial(k) * math.factorial(k + m)
             part_mm = 1e-3 / rms * (-1) ** k * (zero / 2) ** (2 * k + m) / factorials
-            for p, q in np.ndindex(k + 1, m // 2 + 1):  # binomials of both factors
+            # Binomial theorem for (x^2 + y^2)^k and Re (x + i y)^m.
+            for p, q in np.ndindex(k + 1, m // 2 + 1):
                 power_x = 2 * (k - p + m // 2 - q) + m % 2
                 power_y = 2 * (p + q)
                 binomials = math.comb(k, p) * math.comb(m, 2 * q) * (-1) ** q
@@ -63,15 +70,13 @@ class DrumMode:
         return terms._replace(poly_mm=poly_mm)
 
 
-# The modes of the twin's film, with amplitudes of 1 nm.
-DRUM_MODES = (
-    DrumMode(27.0, 0, 1),
-    DrumMode(48.0, 1, 1),
-    DrumMode(57.0, 2, 1),
-    DrumMode(61.0, 0, 2),
-)
-
-
 def drum_modes(amplitude_nm: float) -> tuple[DrumMode, ...]:
-    """The film's vibrations of this amplitude; none of 0."""
-    return tuple(replace(mode, amplitude_nm=amplitude_nm) for mode in DRUM_MODES if amplitude_nm)
+    """The vibrations of the simulated film, each with this amplitude; none if it is 0."""
+    if not amplitude_nm:
+        return ()
+    return (
+        DrumMode(27.0, 0, 1, amplitude_nm),
+        DrumMode(48.0, 1, 1, amplitude_nm),
+        DrumMode(57.0, 2, 1, amplitude_nm),
+        DrumMode(61.0, 0, 2, amplitude_nm),
+    )

@@ -17,8 +17,10 @@ from membrane_ctrl.sim import hencky, stretched_film
 from membrane_ctrl.sim.optics.film_terms import FilmTerms, film_heights, height_and_slopes
 from membrane_ctrl.sim.optics.zernike_polynomials import zernike_polynomial
 
-MAX_FILM_TERMS = 105  # Noll's, up to radial order 13: finer errors are ripples, wrinkles and bumps
-# of a mounted film, up to radial order 7; the film does not depend on how many are fitted
+# Noll's terms that a film may have, up to radial order 13: finer errors are ripples, wrinkles and
+# bumps.
+MAX_FILM_TERMS = 105
+# Noll's terms of a mounted film, up to radial order 7, however many the metrology fits.
 _TYPICAL_TERMS = 36
 _SPHERE_TERMS = 40  # those left out are below 1e-12 for radii up to half of the curvature's
 _Form = Literal["hencky", "paraboloid", "sphere"]
@@ -35,9 +37,9 @@ def bowl_series(bowl: _Form, sag_mm: float, radius_mm: float) -> FloatArray:
     if bowl == "paraboloid":
         return np.array([0.0, 1.0])
     x = (2 * sag_mm * radius_mm / (radius_mm**2 + sag_mm**2)) ** 2
-    terms = np.array(
-        [0.0] + [comb(2 * k, k) / (4**k * (2 * k - 1)) * x**k for k in range(1, _SPHERE_TERMS)]
-    )
+    terms = np.zeros(_SPHERE_TERMS)
+    for k in range(1, _SPHERE_TERMS):
+        terms[k] = comb(2 * k, k) / (4**k * (2 * k - 1)) * x**k
     return np.asarray(terms / terms.sum())
 
 

@@ -95,6 +95,8 @@ def shade_rows(
     for row in range(start, stop):
         # The random numbers do not depend on how rows are shared between threads.
         state = np.uint64(seed) * MIX_1 + np.uint64(row) * np.uint64((width + 3) // 4) * GOLDEN
+
+        # The quantities at the row, in the columns of the nodes.
         interpolate_row(nodes, 0, row // step, weights[row % step], line_x)
         interpolate_row(nodes, 1, row // step, weights[row % step], line_y)
         interpolate_row(nodes, 2, row // step, weights[row % step], line_r2)
@@ -106,20 +108,30 @@ def shade_rows(
                 column = cell * step + k
                 counts = dark
                 if interpolate_cubic(line_r2, cell, weights, k) <= radius2_mm2:  # on the film
+                    # Light of the screen where the ray meets it: the level of the pattern inside
+                    # its region, the panel's leak beside it.
                     s_x_mm = interpolate_cubic(line_x, cell, weights, k)
                     s_y_mm = interpolate_cubic(line_y, cell, weights, k)
                     light = leak
-                    if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:  # on the pattern
-                        s_mm = s_y_mm if axis == 1 else s_x_mm
+                    if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:
+                        s_mm = s_x_mm
+                        if axis == 1:
+                            s_mm = s_y_mm
                         light = _look_up_level(s_mm, values, cell_mm, smooth)
+
+                    # What the bench does to it, and the lens' vignetting.
                     if disturbed:
                         light *= interpolate_cubic(line_factor, cell, weights, k)
                         counts += interpolate_cubic(line_room, cell, weights, k)
                     counts += white * light * (1.0 - column_loss[column] - row_loss[row])
+
+                # Noise: four 16-bit numbers from each 64-bit one.
                 if sigma > 0.0:
-                    if column & 3 == 0:  # four 16-bit numbers from each 64-bit one
+                    if column & 3 == 0:
                         state += GOLDEN
                         bits = random_64_bits(state)
                     counts += sigma * quantiles[bits & LOW_16]
                     bits >>= np.uint64(16)
+
+                # The converter rounds, and clips at both ends.
                 out[row, column] = min(max(counts + 0.5, 0.0), full)

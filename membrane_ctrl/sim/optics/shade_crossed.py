@@ -42,9 +42,11 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
     `lines` (3 or 5, nodes) are the quantities of `shade` at the row's nodes, `weights` (4) those of
     the place. `levels` and `rooms` (cells,) are memory for the screen's level and the room's light.
     """
+    # Ternaries and `&` instead of branches: they keep the loops on vector units.
     rate, first_x, first_y, half_mm, radius2_mm2 = pattern
     dark, white, leak, gamma, sigma, full, row_loss = scale
-    one, none = _FLOAT(1.0), _FLOAT(0.0)
+    one = _FLOAT(1.0)
+    none = _FLOAT(0.0)
 
     # The screen's level where the ray meets it, 0 beside the pattern; white on the film, else 0.
     for c in range(counts.size):

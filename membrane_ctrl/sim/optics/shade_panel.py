@@ -80,20 +80,33 @@ def shade_panel_rows(
     low_column, low_row, pitch_mm = places
     lines = np.empty((nodes.shape[0], nodes.shape[2]))
     for row in range(start, stop):
+        # The random numbers do not depend on how rows are shared between threads.
         state = np.uint64(seed) * MIX_1 + np.uint64(row) * np.uint64(out.shape[1]) * GOLDEN
+
+        # The quantities at the row, in the columns of the nodes.
         for k in range(nodes.shape[0]):
             interpolate_row(nodes, k, row // step, weights[row % step], lines[k])
         for column in range(out.shape[1]):
-            cell, k = column // step, column % step
+            cell = column // step
+            k = column % step
             counts = dark
-            if interpolate_cubic(lines[2], cell, weights, k) <= radius_mm * radius_mm:
-                panel_column = low_column + interpolate_cubic(lines[0], cell, weights, k) / pitch_mm
-                panel_row = low_row - interpolate_cubic(lines[1], cell, weights, k) / pitch_mm
+            if (
+                interpolate_cubic(lines[2], cell, weights, k) <= radius_mm * radius_mm
+            ):  # on the film
+                # Light of the panel's pixels where the ray meets them.
+                s_x_mm = interpolate_cubic(lines[0], cell, weights, k)
+                s_y_mm = interpolate_cubic(lines[1], cell, weights, k)
+                panel_column = low_column + s_x_mm / pitch_mm
+                panel_row = low_row - s_y_mm / pitch_mm
                 light = _pixel_light(picture, panel_column, panel_row, leak)
+
+                # What a disturbed bench does to it, and the lens' vignetting.
                 if nodes.shape[0] > 3:
                     light *= interpolate_cubic(lines[3], cell, weights, k)
                     counts += interpolate_cubic(lines[4], cell, weights, k)
                 counts += white * light * (1.0 - column_loss[column] - row_loss[row])
+
+            # Noise; then the converter rounds, and clips at both ends.
             if sigma > 0.0:
                 state += GOLDEN
                 counts += sigma * quantiles[random_64_bits(state) & LOW_16]

@@ -15,8 +15,6 @@ from membrane_ctrl.sim.optics import bench_poses, film_shape, pattern_levels, ze
 from membrane_ctrl.sim.optics.turned_film import MirrorSeat
 
 # Faults of single frames on a real bench, for simulated sets.
-
-
 FaultKind = Literal[
     "stale",
     "swapped",
@@ -39,6 +37,7 @@ _DEFAULT_AMOUNT: dict[FaultKind, float] = {
 # Of a sphere that leans: its coma is of micrometres, its terms above radial order 7 far below a
 # nanometre.
 _LEANING_TERMS = 36
+_FITTED_RINGS = 40  # and as many spokes: points at which such a sphere is fitted
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +72,9 @@ class FrameFault:
     @property
     def strength(self) -> float:
         """The amount, or the typical one of this kind."""
-        return _DEFAULT_AMOUNT[self.kind] if self.amount is None else self.amount
+        if self.amount is None:
+            return _DEFAULT_AMOUNT[self.kind]
+        return self.amount
 
     @classmethod
     def parse(cls, text: str) -> "FrameFault":
@@ -97,7 +98,7 @@ class FrameFault:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Position of the film's centre: start + drift t + amplitude sin(2 pi frequency t + phase)."""
+    """Motion of the film's centre: start + drift t + amplitude sin(2 pi frequency t + phase)."""
 
     start_um: float = 0.0
     drift_um_per_s: float = 0.0
@@ -118,26 +119,51 @@ def make_artefact_shape(
     lean_y: float,
     form_um: FloatArray | None = None,
 ) -> film_shape.FilmShape:
-    """A concave sphere, or a flat (infinite radius of curvature), in the mirror's place.
+    """A concave sphere, or a flat, in the mirror's place.
 
-    Its slopes at the vertex are `lean_x`, `lean_y`: a sphere that leans by 1 mrad has micrometres
-    of coma. `form_um` (terms,) are Noll terms of its form error.
+    Parameters
+    ----------
+    curvature_mm : float
+        Radius of curvature; infinite for a flat.
+    radius_mm : float
+        Radius of the artefact's rim.
+    lean_x, lean_y : float
+        Slopes at the vertex: a sphere that leans by 1 mrad has micrometres of coma.
+    form_um : (terms,) array, optional
+        Noll terms of its form error.
+
+    Returns
+    -------
+    FilmShape
+        The upright sphere as its bowl, and what leaning and form error add as Zernike terms.
     """
-    coeffs_um = np.zeros(_LEANING_TERMS) if form_um is None else np.array(form_um)
+    coeffs_um = np.zeros(_LEANING_TERMS)
+    if form_um is not None:
+        coeffs_um = np.array(form_um)
     coeffs_um[1:3] += 1e3 * radius_mm / 2 * np.array([lean_x, lean_y])
     if isinf(curvature_mm):
         return film_shape.FilmShape(0.0, radius_mm, "paraboloid", tuple(coeffs_um.tolist()))
-    rho, theta = np.meshgrid(np.sqrt((np.arange(40) + 0.5) / 40), 2 * pi * np.arange(40) / 40)
-    x, y = (rho * np.cos(theta)).ravel(), (rho * np.sin(theta)).ravel()
+
+    # Points of the unit disc: rings of equal area, spokes.
+    ring_radii = np.sqrt((np.arange(_FITTED_RINGS) + 0.5) / _FITTED_RINGS)
+    angles = 2 * pi * np.arange(_FITTED_RINGS) / _FITTED_RINGS
+    rho, theta = np.meshgrid(ring_radii, angles)
+    x = (rho * np.cos(theta)).ravel()
+    y = (rho * np.sin(theta)).ravel()
+
+    # Heights of the leaning sphere, with its centre at R (-lean_x, -lean_y, 1) / length, and of the
+    # upright one.
+    length = sqrt(1 + lean_x**2 + lean_y**2)
+    centre = curvature_mm * np.array([-lean_x, -lean_y, 1.0]) / length
+    from_axis = (radius_mm * x - centre[0]) ** 2 + (radius_mm * y - centre[1]) ** 2
+    leaning = centre[2] - np.sqrt(curvature_mm**2 - from_axis)
+    upright = curvature_mm - np.sqrt(curvature_mm**2 - radius_mm**2 * (x * x + y * y))
+
+    # Their difference without the tilt, which is in the terms already, as Zernike terms.
+    tilt = radius_mm * (lean_x * x + lean_y * y)
     terms = [zernike_polynomials.zernike_polynomial(row) for row in np.eye(coeffs_um.size)]
     design = np.stack([np.polynomial.polynomial.polyval2d(x, y, term) for term in terms], axis=1)
-    # the centre is at R (-lean_x, -lean_y, 1) / length
-    centre = curvature_mm * np.array([-lean_x, -lean_y, 1.0]) / sqrt(1 + lean_x**2 + lean_y**2)
-    across = (radius_mm * x - centre[0]) ** 2 + (radius_mm * y - centre[1]) ** 2
-    height = centre[2] - np.sqrt(curvature_mm**2 - across)
-    upright = curvature_mm - np.sqrt(curvature_mm**2 - radius_mm**2 * (x * x + y * y))
-    ramp = radius_mm * (lean_x * x + lean_y * y)
-    coeffs_um += 1e3 * np.linalg.lstsq(design, height - upright - ramp, rcond=None)[0]
+    coeffs_um += 1e3 * np.linalg.lstsq(design, leaning - upright - tilt, rcond=None)[0]
     sag_mm = curvature_mm - sqrt(curvature_mm**2 - radius_mm**2)
     return film_shape.FilmShape(sag_mm, radius_mm, "sphere", tuple(coeffs_um.tolist()))
 
@@ -283,11 +309,9 @@ class SimulationSpec:
 
     def displacement_um(self, frame: int) -> float:
         """True position of the film during a frame (faults aside)."""
-        return (
-            self.displacements_um[frame]
-            if self.displacements_um
-            else self.motion.at_um(self.time_s(frame))
-        )
+        if self.displacements_um:
+            return self.displacements_um[frame]
+        return self.motion.at_um(self.time_s(frame))
 
     def pressure_pa(self, displacement_um: float) -> float:
         """Gauge pressure under a Hencky film there."""
@@ -297,5 +321,8 @@ class SimulationSpec:
     @property
     def reference_um(self) -> float:
         """Displacement for which the geometry holds: as stated, or that of the first frame."""
-        stated = (self.stated_geometry or self.optics.geometry).reference_displacement_um
-        return self.displacement_um(0) if stated is None else stated
+        geometry = self.stated_geometry or self.optics.geometry
+        stated_um = geometry.reference_displacement_um
+        if stated_um is None:
+            return self.displacement_um(0)
+        return stated_um

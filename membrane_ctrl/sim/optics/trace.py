@@ -118,10 +118,13 @@ def _plane_point(
     """
     q = axes @ (p - origin)
     r = axes @ direction
-    if q[2] * r[2] >= 0.0:
+    runs_away = q[2] * r[2] >= 0.0
+    if runs_away:
         return np.nan, np.nan, np.nan, np.nan
     t = -q[2] / r[2]
-    return q[0] + t * r[0], q[1] + t * r[1], r[0] / r[2], r[1] / r[2]
+    s_x = q[0] + t * r[0]
+    s_y = q[1] + t * r[1]
+    return s_x, s_y, r[0] / r[2], r[1] / r[2]
 
 
 @compile_loop()

@@ -10,14 +10,18 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.film_shape import MAX_FILM_TERMS, FilmShape
 from membrane_ctrl.sim.optics.zernike_polynomials import zernike_polynomial
 
-# What a hand leaves, 1 sigma: marks on the ring, stops for its edge, its three feet
-_ANGLE_SIGMA_DEG, _SHIFT_SIGMA_MM, _RAISED_SIGMA_MM, _TILT_SIGMA_RAD = 0.2, 0.3, 0.1, 3e-4
-_RINGS, _SPOKES = 40, 80  # points at which the shifted film is fitted
+# What a hand leaves, 1 sigma.
+_ANGLE_SIGMA_DEG = 0.2  # marks on the ring
+_SHIFT_SIGMA_MM = 0.3  # stops for its edge
+_RAISED_SIGMA_MM = 0.1  # its three feet
+_TILT_SIGMA_RAD = 3e-4
+_RINGS = 40  # rings of points at which the shifted film is fitted
+_SPOKES = 80  # points of each
 
 
 @dataclass(frozen=True, slots=True)
 class MirrorSeat:
-    """Where the mirror stands, against its usual place.
+    """Place of the mirror, relative to its usual one.
 
     Attributes
     ----------
@@ -66,14 +70,23 @@ def turn_film(film: FilmShape, seat: MirrorSeat, displacement_um: float) -> Film
     if film.ripples or film.wrinkles or film.bumps:
         raise ValueError("a turned mirror: only for a film without ripples, wrinkles and bumps")
     deeper = replace(film, sag_mm=film.sag_mm + seat.raised_mm)
-    rho, theta = np.meshgrid(
-        np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS), 2 * np.pi * np.arange(_SPOKES) / _SPOKES
-    )
-    x, y = (rho * np.cos(theta)).ravel(), (rho * np.sin(theta)).ravel()
-    x_mm, y_mm = film.radius_mm * x, film.radius_mm * y
-    turned_mm = deeper.height_mm(*_in_mirror(seat, x_mm, y_mm), displacement_um)
+
+    # Points of the unit disc: rings of equal area, spokes.
+    ring_radii = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
+    angles = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
+    rho, theta = np.meshgrid(ring_radii, angles)
+    x = (rho * np.cos(theta)).ravel()
+    y = (rho * np.sin(theta)).ravel()
+    x_mm = film.radius_mm * x
+    y_mm = film.radius_mm * y
+
+    # The film there, in the mirror's own frame and tilted, and the bowl in its usual place.
+    mirror_x_mm, mirror_y_mm = _in_mirror(seat, x_mm, y_mm)
+    turned_mm = deeper.height_mm(mirror_x_mm, mirror_y_mm, displacement_um)
     turned_mm += seat.tilt[0] * x_mm + seat.tilt[1] * y_mm
     bowl_mm = replace(deeper, zernike_um=()).height_mm(x_mm, y_mm, displacement_um)
+
+    # Their difference as Zernike terms.
     terms = [zernike_polynomial(row) for row in np.eye(MAX_FILM_TERMS)]
     design = np.stack([np.polynomial.polynomial.polyval2d(x, y, term) for term in terms], axis=1)
     coeffs_um = 1e3 * np.linalg.lstsq(design, turned_mm - bowl_mm, rcond=None)[0]
@@ -84,6 +97,8 @@ def _in_mirror(
     seat: MirrorSeat, x_mm: FloatArray, y_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Places of the bench in the axes of the turned mirror."""
-    x_mm, y_mm = x_mm - seat.shift_mm[0], y_mm - seat.shift_mm[1]
-    cosine, sine = cos(radians(seat.angle_deg)), sin(radians(seat.angle_deg))
-    return cosine * x_mm + sine * y_mm, cosine * y_mm - sine * x_mm
+    from_axis_x = x_mm - seat.shift_mm[0]
+    from_axis_y = y_mm - seat.shift_mm[1]
+    cosine = cos(radians(seat.angle_deg))
+    sine = sin(radians(seat.angle_deg))
+    return cosine * from_axis_x + sine * from_axis_y, cosine * from_axis_y - sine * from_axis_x

@@ -20,12 +20,18 @@ def noll_orders(j: int) -> tuple[int, int]:
     """
     if j < 1:
         raise ValueError(f"Noll's index starts at 1, not {j}")
-    n, place = 0, j - 1  # place of the term within its radial order
+    # The radial order, and the place of the term within it: order n has n + 1 terms.
+    n = 0
+    place = j - 1
     while place > n:
         n += 1
         place -= n
+
+    # Azimuthal orders have the parity of n and rise in pairs; an odd j is a sine.
     m = n % 2 + 2 * ((place + (n + 1) % 2) // 2)
-    return n, m if j % 2 == 0 else -m
+    if j % 2 == 1:
+        m = -m
+    return n, m
 
 
 @cache
@@ -38,19 +44,20 @@ def _zernike_monomials(j: int) -> dict[tuple[int, int], float]:
     """
     n, signed_m = noll_orders(j)
     m = abs(signed_m)
-    norm = sqrt(n + 1) if m == 0 else sqrt(2 * (n + 1))
-    # (x + i y)^m: y^k carries i^k, real (cosine) for even k, imaginary (sine) for odd k
+    norm = sqrt(n + 1)
+    if m != 0:
+        norm = sqrt(2 * (n + 1))
+
+    # (x + i y)^m: y^k carries i^k, which is real (cosine) for even k, imaginary (sine) for odd k.
     first = 1 if signed_m < 0 else 0
-    angular = (
-        {(m - k, k): comb(m, k) * (-1) ** (k // 2) for k in range(first, m + 1, 2)}
-        if m
-        else {(0, 0): 1}
-    )
+    angular = {(m - k, k): comb(m, k) * (-1) ** (k // 2) for k in range(first, m + 1, 2)}
+
+    # Times each radial coefficient and (x^2 + y^2)^power.
     terms: dict[tuple[int, int], float] = {}
     for s in range((n - m) // 2 + 1):
         radial = (-1) ** s * factorial(n - s)
         radial //= factorial(s) * factorial((n + m) // 2 - s) * factorial((n - m) // 2 - s)
-        power = (n - m) // 2 - s  # of x^2 + y^2
+        power = (n - m) // 2 - s
         for (i, k), factor in angular.items():
             for p in range(power + 1):
                 key = (i + 2 * (power - p), k + 2 * p)

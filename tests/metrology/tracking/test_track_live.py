@@ -29,7 +29,7 @@ from membrane_ctrl.model.acquisition_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.drum_modes import DRUM_MODES
+from membrane_ctrl.sim.optics.drum_modes import drum_modes
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.pattern_levels import Light
 from membrane_ctrl.sim.plant import Plant
@@ -239,7 +239,7 @@ def test_a_hold_finds_the_films_vibrations_and_no_others() -> None:
         update={"camera": OPTICS.camera.model_copy(update={"bits": 12, "noise_adu": 1.0})}
     )
     tracker = LiveTracker(optics, LiveReconstructor(optics, 1), 32, step_s=10.0)
-    modes = tuple(replace(mode, amplitude_nm=20.0) for mode in DRUM_MODES)
+    modes = drum_modes(20.0)
     renderer = OpticsRenderer(optics, FILM, seed=3, modes=modes)
     film_um, listener, told = held_um(126.0), VibrationFollower(), []
     still = [
