@@ -48,8 +48,8 @@ def calibration_report(
     middle = solution.problem.middle
     claim = figure_uncertainty.propagate_to_figure(solution, middle, analysis_radius_mm)
     scale = model_tests.laser_scale(solution)
-    number = advice.number_advice(solution, middle)
-    artefact = artefact_advice.artefact_advice(solution, middle)
+    number = advice.advise_number(solution, middle)
+    artefact = artefact_advice.advise_sphere(solution, middle)
     return table | {
         "iterations": len(solution.changes),
         "condition": weak_combinations.condition_number(solution),
@@ -71,7 +71,9 @@ def calibration_report(
         },
         "advice": None if number is None else asdict(number),
         "artefact_advice": None if artefact is None else asdict(artefact),
-        "screen_advice": [asdict(each) for each in screen_advice.screen_advice(solution, middle)],
+        "screen_advice": [
+            asdict(each) for each in screen_advice.advise_screen_sets(solution, middle)
+        ],
         "film": solution.problem.references.film,
         "rim": solution.problem.rim is not None,
         "laser": {"scale": scale.value, "sigma": scale.sigma},

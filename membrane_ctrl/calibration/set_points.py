@@ -108,7 +108,7 @@ def phases_of_screen(capture: CaptureSet) -> set_phases.SetPhases:
         sigma_mm=sigma_mm,
         displacement_um=math.nan,
         artefact=screen,
-        elsewhere=(set_phases.ANYWHERE,),
+        moved_screens=(set_phases.ANYWHERE,),
         period_mm=pattern.period_mm,
     )
 

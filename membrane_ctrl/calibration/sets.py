@@ -80,7 +80,7 @@ def read_sets(
     sets: list[set_phases.SetPhases] = []
     benches: list[OpticsConfig] = []
     used: list[Path] = []
-    elsewhere: list[tuple[Path, set_phases.SetPhases, set_tables.ScreenMovedTable]] = []
+    moved_screens: list[tuple[Path, set_phases.SetPhases, set_tables.ScreenMovedTable]] = []
     notes: list[str] = []
     edges: list[FloatArray] = []
     heads = {folder: read_head(folder, stated) for folder in folders}
@@ -111,7 +111,7 @@ def read_sets(
         if head.screen_moved is not None:
             if used:
                 _same_rig(used[0], benches[0], folder, bench, films=False)
-            elsewhere.append((folder, phases, head.screen_moved))
+            moved_screens.append((folder, phases, head.screen_moved))
             continue
         sets.append(phases)
         benches.append(bench)
@@ -119,7 +119,7 @@ def read_sets(
         first = next((k for k, phases in enumerate(sets) if phases.artefact is None), 0)
         same_kind = sets[first].artefact is head.artefact
         _same_rig(used[first], benches[first], folder, bench, same_kind)
-    for folder, phases, moved in elsewhere:
+    for folder, phases, moved in moved_screens:
         join_moved_screen(sets, folder, phases, moved)
     films = [k for k, phases in enumerate(sets) if phases.artefact is None]
     if not films:
@@ -192,7 +192,7 @@ def join_moved_screen(
         )
     nearest = films[int(np.nanargmin(differences_um))]
     base = sets[nearest]
-    known = set_phases.Elsewhere(
+    known = set_phases.MovedScreen(
         moved.shift_mm,
         moved.shift_sigma_mm,
         moved.turn_sigma_deg,

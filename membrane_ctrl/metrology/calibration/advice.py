@@ -21,7 +21,7 @@ class Advice:
     sag_um: float  # 1 sigma then
 
 
-def number_advice(solution: Solution, index: int) -> Advice | None:
+def advise_number(solution: Solution, index: int) -> Advice | None:
     """What to measure better, from the equations alone; None if no single number is worth it."""
     sums, own = (
         np.sum([each.reduced() for each in solution.equations], axis=0),

@@ -49,7 +49,7 @@ class ArtefactAdvice:
     sag_um: float
 
 
-def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
+def advise_sphere(solution: Solution, index: int) -> ArtefactAdvice | None:
     """The sphere that would reduce the sag's sigma most.
 
     Its set is foreseen from the calibrated bench: rays of the film's set that meet the sphere, with
@@ -70,7 +70,7 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
     if solution.problem.with_artefact:
         return None
     phases = solution.problem.sets[index]
-    phases = replace(phases.subset(phases.seen_with(0)), elsewhere=())
+    phases = replace(phases.subset(phases.seen_with(0)), moved_screens=())
     surface = solution.states[index].surface
 
     # As deep as the film, so that the fringes fall on the same places of the screen.

@@ -23,7 +23,7 @@ def foreseen_set(
     """A set whose rays end where the bench found sends them; those that end on the fringes."""
     dark = replace(phases, screen_mm=np.zeros_like(phases.screen_mm))
     at_mm = -forward_model.residual_mm(
-        solution.bench, dark, state.surface, state.vertex_z_mm, state.elsewhere
+        solution.bench, dark, state.surface, state.vertex_z_mm, state.moved_screens
     )
     return replace(phases, screen_mm=at_mm).subset(
         np.asarray(np.all(np.abs(at_mm) < half_mm[:, None], axis=0))

@@ -71,14 +71,14 @@ def _fit_waves_mm(
     if not phases.period_mm:
         return out
     left_mm = forward_model.residual_mm(
-        bench, phases, state.surface, state.vertex_z_mm, state.elsewhere
+        bench, phases, state.surface, state.vertex_z_mm, state.moved_screens
     )
     root = np.sqrt(RobustWeights.seen(phases, left_mm).weights) / phases.sigma_mm
     rad_per_mm = 2 * np.pi / phases.period_mm
 
     # For each place of the screen and each axis, waves of the fringes, whose amplitudes change
     # linearly over the picture, are fitted together with smooth changes.
-    places = 1 if phases.screen is None else len(phases.elsewhere) + 1
+    places = 1 if phases.screen is None else len(phases.moved_screens) + 1
     for place in range(places):
         some = phases.seen_with(place)
         if not some.any():

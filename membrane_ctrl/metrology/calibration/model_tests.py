@@ -251,9 +251,11 @@ def _free_screen_moves(solution: solver.Solution, k: int) -> FloatArray:
     laser_sigma_um = solution.problem.references.laser_sigma_um
     places = np.arange(bench_poses.SCREEN_MOVE)
     free = of_set.sums.copy()
-    for sums, known, move in zip(of_set.elsewhere, phases.elsewhere, state.elsewhere, strict=True):
+    for sums, known, move in zip(
+        of_set.moved_screens, phases.moved_screens, state.moved_screens, strict=True
+    ):
         # The rows of the stated move, which were added to the normal equations.
-        stated, sigmas = known.known(laser_sigma_um)[:, places]
+        stated, sigmas = known.make_prior(laser_sigma_um)[:, places]
         stated_rows = np.hstack([np.eye(places.size), (stated - move[places])[:, None]])
         stated_rows /= sigmas[:, None]
         own = np.append(places, len(sums) - 1)

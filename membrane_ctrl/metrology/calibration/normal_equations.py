@@ -38,7 +38,7 @@ class Equations:
         Weights of the points.
     residual_rms_mm : float
         RMS of one component, each point counting by its weight.
-    elsewhere : tuple of arrays
+    moved_screens : tuple of arrays
         Of each screen elsewhere, (MOVED + LOCAL + COMMON + 1, squared): its own unknowns first,
         which `sums` eliminates.
     """
@@ -47,7 +47,7 @@ class Equations:
     residual_mm: FloatArray
     robust: RobustWeights
     residual_rms_mm: float
-    elsewhere: tuple[FloatArray, ...] = ()
+    moved_screens: tuple[FloatArray, ...] = ()
 
     @property
     def variance(self) -> float:
@@ -67,7 +67,7 @@ class Equations:
         moved = set_phases.MOVED
         step = np.append(local_step, common_step)
         steps = []
-        for sums in self.elsewhere:
+        for sums in self.moved_screens:
             right = sums[:moved, -1] - sums[:moved, moved:-1] @ step
             steps.append(np.asarray(np.linalg.solve(sums[:moved, :moved], right)))
         return steps
@@ -125,10 +125,12 @@ def linearise_set(
     # The fringes, for each place of the screen.
     root_weights = np.sqrt(robust.weights / robust.variance) / phases.sigma_mm
     residual_mm = np.empty_like(phases.screen_mm)
-    elsewhere = []
-    for k, there, poses, some in forward_model.screen_views(bench, turns, phases, state.elsewhere):
+    moved_screens = []
+    for k, there, poses, some in forward_model.screen_views(
+        bench, turns, phases, state.moved_screens
+    ):
         # Numbers of the place, of which the last two are depth and motion of the film.
-        move = state.elsewhere[k - 1] if k else np.array([0.0, state.motion_mm])
+        move = state.moved_screens[k - 1] if k else np.array([0.0, state.motion_mm])
         deeper_mm, motion_mm = move[-2], move[-1]
         parts = forward_model.linearise_points(
             there,
@@ -142,18 +144,18 @@ def linearise_set(
         found, residual_mm[:, some] = _sum_fringes(parts, root_weights[some], k > 0)
         if k:
             # What is known of the screen's move; then its own unknowns are eliminated.
-            known, sigmas = phases.elsewhere[k - 1].known(references.laser_sigma_um)
+            known, sigmas = phases.moved_screens[k - 1].make_prior(references.laser_sigma_um)
             by_hand = np.hstack([np.eye(set_phases.MOVED), (known - move)[:, None]])
             by_hand /= sigmas[:, None]
             own = np.append(np.arange(set_phases.MOVED), len(found) - 1)
             found[np.ix_(own, own)] += by_hand.T @ by_hand
-            elsewhere.append(found)
+            moved_screens.append(found)
             found = eliminate_first(found, set_phases.MOVED)
         sums = sums + found
 
     weights = robust.weights / phases.sigma_mm**2
     rms_mm = float(np.sqrt(np.mean(residual_mm**2 @ weights) / np.sum(weights)))
-    return Equations(sums, residual_mm, robust, rms_mm, tuple(elsewhere))
+    return Equations(sums, residual_mm, robust, rms_mm, tuple(moved_screens))
 
 
 def _sum_fringes(

@@ -39,7 +39,7 @@ def average_points(
     SetPhases
     """
     # Residuals of the points, and their weights.
-    shape = state.surface, state.vertex_z_mm, state.elsewhere
+    shape = state.surface, state.vertex_z_mm, state.moved_screens
     residual_mm = forward_model.residual_mm(bench, phases, *shape)
     weights = RobustWeights.seen(phases, residual_mm).weights / phases.sigma_mm**2
 

@@ -50,7 +50,7 @@ class ScreenAdvice:
     sag_um: float
 
 
-def screen_advice(solution: Solution, index: int) -> tuple[ScreenAdvice, ...]:
+def advise_screen_sets(solution: Solution, index: int) -> tuple[ScreenAdvice, ...]:
     """Sets of the screen itself, and of the film with the screen elsewhere, that are worth taking.
 
     The second is judged as taken with the first.
@@ -72,7 +72,7 @@ def screen_advice(solution: Solution, index: int) -> tuple[ScreenAdvice, ...]:
     candidates: list[Placement] = []
     if not any(isinstance(phases.artefact, SeenScreen) for phases in problem.sets):
         candidates.append("screen")
-    if not any(problem.sets[k].elsewhere for k in problem.films):
+    if not any(problem.sets[k].moved_screens for k in problem.films):
         candidates.append("screen_moved")
 
     # Add the best candidate, as long as it reduces the sigma enough.
@@ -115,7 +115,7 @@ def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[
         film.subset(film.seen_with(0)),
         displacement_um=np.nan,
         screen=None,
-        elsewhere=(set_phases.ANYWHERE,),
+        moved_screens=(set_phases.ANYWHERE,),
     )
 
     # The distance at which the fringes fill the picture.
@@ -129,7 +129,7 @@ def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[
     # Two sets, tilted about x and about y. The screen faces the camera, and s_y goes up in the
     # picture.
     no_moves = (np.zeros(set_phases.MOVED),)
-    state = set_state.SetState(solution.states[index].surface, 0.0, elsewhere=no_moves)
+    state = set_state.SetState(solution.states[index].surface, 0.0, moved_screens=no_moves)
     more = []
     for axis in ("x", "y"):
         tilt = Rotation.from_euler(axis, TILT_DEG, degrees=True).as_matrix()
@@ -147,9 +147,11 @@ def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Sol
     """
     film = solution.problem.sets[index]
     present = solution.equations[index]
-    known = set_phases.Elsewhere((0.0, 0.0, _RAIL_MM), RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0)
-    move = known.known(solution.problem.references.laser_sigma_um)[0]
-    state = replace(solution.states[index], elsewhere=(move,))
+    known = set_phases.MovedScreen(
+        (0.0, 0.0, _RAIL_MM), RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0
+    )
+    move = known.make_prior(solution.problem.references.laser_sigma_um)[0]
+    state = replace(solution.states[index], moved_screens=(move,))
     there = foreseen_set(solution, film.beside(film, known), state, half_mm)
     again = there.subset(there.seen_with(1))
     all_weights = np.append(present.robust.weights, np.ones(again.sigma_mm.size))

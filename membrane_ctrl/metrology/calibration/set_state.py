@@ -37,7 +37,7 @@ class SetState:
         Height of its vertex.
     motion_mm : float
         By how much the film was deeper in the x frames than in the y frames.
-    elsewhere : tuple of (MOVED,) arrays
+    moved_screens : tuple of (MOVED,) arrays
         Unknowns of each further place of the screen.
     seat : (float, float, float)
         Of a turned mirror: place of its axis along x and y, mm, and by how much it is turned
@@ -47,7 +47,7 @@ class SetState:
     surface: Surface
     vertex_z_mm: float
     motion_mm: float = 0.0
-    elsewhere: tuple[FloatArray, ...] = ()
+    moved_screens: tuple[FloatArray, ...] = ()
     seat: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 

@@ -407,10 +407,12 @@ def move_state(
     vertex_z_mm = state.vertex_z_mm + own[PARAMETERS]
     motion_mm = state.motion_mm + own[forward_model.MOTION]
     steps = linear.moved(own, common_step)
-    elsewhere = tuple(move + step for move, step in zip(state.elsewhere, steps, strict=True))
+    moved_screens = tuple(
+        move + step for move, step in zip(state.moved_screens, steps, strict=True)
+    )
     x_mm, y_mm, turn_rad = (np.array(state.seat) + own[forward_model.SEAT]).tolist()
     seat = (x_mm, y_mm, turn_rad)
-    return set_state.SetState(surface, float(vertex_z_mm), float(motion_mm), elsewhere, seat)
+    return set_state.SetState(surface, float(vertex_z_mm), float(motion_mm), moved_screens, seat)
 
 
 def _with_form_sag(problem: Problem, states: Sequence[set_state.SetState]) -> Problem:
@@ -445,10 +447,10 @@ def _make_first_state(problem: Problem, phases: set_phases.SetPhases) -> set_sta
     artefact = phases.artefact
     radius_mm = problem.radius_mm
     laser_sigma_um = problem.references.laser_sigma_um
-    elsewhere = tuple(each.known(laser_sigma_um)[0] for each in phases.elsewhere)
+    moved_screens = tuple(each.make_prior(laser_sigma_um)[0] for each in phases.moved_screens)
     if isinstance(artefact, SeenScreen):
         flat = Surface.from_parameters(np.zeros(PARAMETERS), radius_mm)
-        return set_state.SetState(flat, 0.0, elsewhere=elsewhere)
+        return set_state.SetState(flat, 0.0, moved_screens=moved_screens)
 
     # The vertex is where the laser, or the artefact, has it.
     vertex_z_mm = 0.0
@@ -459,7 +461,7 @@ def _make_first_state(problem: Problem, phases: set_phases.SetPhases) -> set_sta
         vertex_z_mm = artefact.vertex_mm
         radius_mm = artefact.radius_mm
     fit = fit_on(bench_poses.BenchGeometry(problem.stated), phases, radius_mm, vertex_z_mm)
-    return set_state.SetState(fit.surface, vertex_z_mm, elsewhere=elsewhere)
+    return set_state.SetState(fit.surface, vertex_z_mm, moved_screens=moved_screens)
 
 
 def fit_on(

@@ -137,7 +137,7 @@ def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
     return out
 
 
-def screen_elsewhere(
+def displace_screen(
     bench: BenchGeometry, turns: list[Poses], move: FloatArray
 ) -> tuple[BenchGeometry, list[Poses]]:
     """Move the screen of a bench.

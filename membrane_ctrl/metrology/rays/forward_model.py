@@ -37,7 +37,7 @@ from membrane_ctrl.metrology.rays.bench_poses import (
     SCREEN_MOVE,
     BenchGeometry,
     Poses,
-    screen_elsewhere,
+    displace_screen,
 )
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.lens_derivatives import lens_derivatives
@@ -116,7 +116,7 @@ def residual_mm(
     phases: SetPhases,
     surface: Surface,
     vertex_z_mm: float,
-    elsewhere: Sequence[FloatArray] = (),
+    moved_screens: Sequence[FloatArray] = (),
 ) -> FloatArray:
     """Seen minus predicted screen points.
 
@@ -128,7 +128,7 @@ def residual_mm(
     surface : Surface
     vertex_z_mm : float
         Height of the vertex.
-    elsewhere : sequence of (MOVED,) arrays
+    moved_screens : sequence of (MOVED,) arrays
         Moves of the screen, one for each further place of it.
 
     Returns
@@ -137,7 +137,7 @@ def residual_mm(
         In mm.
     """
     out = np.empty_like(phases.screen_mm)
-    for _, there, _, some in screen_views(bench, [], phases, elsewhere):
+    for _, there, _, some in screen_views(bench, [], phases, moved_screens):
         # The points that were seen with the screen in this place, and their rays.
         seen = phases.subset(some)
         shape = None if isinstance(phases.artefact, SeenScreen) else surface
@@ -186,12 +186,12 @@ def screen_views(
         there = replace(camera, screen_origin_mm=origin_mm, screen_s_x=s_x, screen_s_y=s_y)
         at_rest = Poses(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)))
         before_move = replace(bench, geometry=there)
-        moved = screen_elsewhere(before_move, [at_rest] * len(turns), moves[0][:SCREEN_MOVE])
+        moved = displace_screen(before_move, [at_rest] * len(turns), moves[0][:SCREEN_MOVE])
         yield 1, *moved, phases.seen_with(0)
         return
     yield 0, bench, turns, phases.seen_with(0)
     for k, move in enumerate(moves, start=1):
-        yield k, *screen_elsewhere(bench, turns, move[:SCREEN_MOVE]), phases.seen_with(k)
+        yield k, *displace_screen(bench, turns, move[:SCREEN_MOVE]), phases.seen_with(k)
 
 
 def linearise_points(

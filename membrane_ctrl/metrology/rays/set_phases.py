@@ -20,7 +20,7 @@ _PER_POINT = ("column_px", "row_px", "screen_mm", "sigma_mm")  # arrays whose la
 
 
 @dataclass(frozen=True)
-class Elsewhere:
+class MovedScreen:
     """What is known, besides the fringes, of the same film seen with the screen put elsewhere.
 
     Attributes
@@ -48,7 +48,7 @@ class Elsewhere:
     motion_sigma_um: float
     glass_sigma_mm: float = 0.0
 
-    def known(self, laser_sigma_um: float) -> FloatArray:
+    def make_prior(self, laser_sigma_um: float) -> FloatArray:
         """Values and sigmas (2, MOVED), mm and degrees, of the unknowns of a screen elsewhere.
 
         `laser_sigma_um` is the standard uncertainty of a set's mean laser reading.
@@ -74,7 +74,7 @@ class Elsewhere:
 
 # A screen that is seen directly: nothing is known of its place, and its pixels may lie behind some
 # mm of glass.
-ANYWHERE = Elsewhere((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0, glass_sigma_mm=3.0)
+ANYWHERE = MovedScreen((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0, glass_sigma_mm=3.0)
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,11 @@ class SetPhases:
         RMS motion of the film during the set; that from frame to frame of an axis is corrected.
     artefact : Artefact | SeenScreen, optional
         What is seen instead of the film.
-    elsewhere : tuple of Elsewhere
+    moved_screens : tuple of MovedScreen
     turned : TurnedMirror, optional
         How the mirror stood, if it was turned about its axis.
     screen : (n,) int array, optional
-        Place of the screen (from 1, in `elsewhere`) with which a point was seen; 0 or None: its
+        Place of the screen (from 1, in `moved_screens`) with which a point was seen; 0 or None: its
         own place.
     period_mm : float
         Period of the fringes; 0: unknown, and no waves that repeat with them are removed.
@@ -131,7 +131,7 @@ class SetPhases:
     motion_sigma_um: float = 0.0
     moved_um: float = 0.0
     artefact: Artefact | SeenScreen | None = None
-    elsewhere: tuple[Elsewhere, ...] = ()
+    moved_screens: tuple[MovedScreen, ...] = ()
     turned: TurnedMirror | None = None
     screen: IntArray | None = None
     period_mm: float = 0.0
@@ -151,13 +151,13 @@ class SetPhases:
         parts = {name: getattr(self, name)[..., keep] for name in _PER_POINT}
         return replace(self, **parts, screen=None if self.screen is None else self.screen[keep])
 
-    def beside(self, again: "SetPhases", known: Elsewhere) -> "SetPhases":
+    def beside(self, again: "SetPhases", known: MovedScreen) -> "SetPhases":
         """The set with the points of the same film, seen again with the screen elsewhere."""
         before = self.screen
         if before is None:
             before = np.zeros(self.sigma_mm.size, int)
-        screen = np.append(before, np.full(again.sigma_mm.size, len(self.elsewhere) + 1))
+        screen = np.append(before, np.full(again.sigma_mm.size, len(self.moved_screens) + 1))
         parts: Any = {}
         for name in _PER_POINT:
             parts[name] = np.concatenate([getattr(self, name), getattr(again, name)], -1)
-        return replace(self, **parts, elsewhere=(*self.elsewhere, known), screen=screen)
+        return replace(self, **parts, moved_screens=(*self.moved_screens, known), screen=screen)

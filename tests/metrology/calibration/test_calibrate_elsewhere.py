@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate_to_figure
 from membrane_ctrl.metrology.calibration.point_averages import average_points
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
-from membrane_ctrl.metrology.calibration.screen_advice import screen_advice
+from membrane_ctrl.metrology.calibration.screen_advice import advise_screen_sets
 from membrane_ctrl.metrology.calibration.screen_pose import screen_seen
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve_calibration
 from membrane_ctrl.metrology.calibration.verdict import check_solution
@@ -25,7 +25,7 @@ from membrane_ctrl.metrology.rays.forward_model import (
     screen_views,
 )
 from membrane_ctrl.metrology.rays.geometry import project_points
-from membrane_ctrl.metrology.rays.set_phases import ANYWHERE, Elsewhere, SetPhases
+from membrane_ctrl.metrology.rays.set_phases import ANYWHERE, MovedScreen, SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
 from membrane_ctrl.sim.optics.trace import trace_rays
@@ -94,14 +94,14 @@ def with_moved_screen(
     sigma = PIXEL_SIGMA_MM * np.sqrt(700 / calibration_truth.PIXELS)
     seen = seen[:, inside] / bench.pitch + rng.normal(0, sigma, (2, np.count_nonzero(inside)))
     deeper_um = moved_um / scale + rng.normal() - base.displacement_um
-    known = Elsewhere(SHIFT_MM, SHIFT_SIGMA_MM, TURN_SIGMA_DEG, deeper_um, 0.0, 0.0)
+    known = MovedScreen(SHIFT_MM, SHIFT_SIGMA_MM, TURN_SIGMA_DEG, deeper_um, 0.0, 0.0)
     return replace(
         base,
         column_px=np.append(base.column_px, column[inside]),
         row_px=np.append(base.row_px, row[inside]),
         screen_mm=np.hstack([base.screen_mm, seen]),
         sigma_mm=np.append(base.sigma_mm, np.full(seen.shape[1], sigma)),
-        elsewhere=(known,),
+        moved_screens=(known,),
         screen=np.repeat([0, 1], [base.sigma_mm.size, seen.shape[1]]),
     )
 
@@ -136,7 +136,7 @@ def seen_directly(
         np.full(screen_mm.shape[1], sigma),
         np.nan,
         artefact=screen,
-        elsewhere=(ANYWHERE,),
+        moved_screens=(ANYWHERE,),
     )
 
 
@@ -192,7 +192,7 @@ def test_the_cover_glass_is_not_taken_for_another_screen(seed: int) -> None:
     direct = tuple(seen_directly(values, *each, glass_mm=glass_mm) for each in tilts)
     solution = solve_calibration(replace(problem, sets=(*direct, *problem.sets)))
     assert_true(solution, values, truth, 3)
-    assert [state.elsewhere[0][-2] for state in solution.states[:2]] == pytest.approx(
+    assert [state.moved_screens[0][-2] for state in solution.states[:2]] == pytest.approx(
         [glass_mm] * 2, rel=0.3
     )
 
@@ -203,19 +203,19 @@ def test_the_cover_glass_is_not_taken_for_another_screen(seed: int) -> None:
 def test_advised_screens_keep_their_promise(seed: int) -> None:
     values, truth, problem = bench_of(seed)
     alone = solve_calibration(problem)
-    first, second = screen_advice(alone, 1)
+    first, second = advise_screen_sets(alone, 1)
     assert (first.sets, second.sets) == ("screen", "screen_moved")
     assert second.sag_um < first.sag_um < 0.6 * propagate_to_figure(alone, 1, 475.0).sag_um
     direct = seen_directly(values, (0.0, 25.0), seed), seen_directly(values, (25.0, 0.0), seed + 50)
     obeyed = solve_calibration(replace(problem, sets=(*direct, *problem.sets)))
     assert propagate_to_figure(obeyed, 3, 475.0).sag_um == pytest.approx(first.sag_um, rel=0.2)
-    (left,) = screen_advice(obeyed, 3)
+    (left,) = advise_screen_sets(obeyed, 3)
     assert left.sag_um == pytest.approx(second.sag_um, rel=0.2)
     far = with_moved_screen(values, truth, problem.sets[1], seed)
     both = solve_calibration(replace(problem, sets=(*direct, problem.sets[0], far)))
     assert_true(both, values, truth, 3)
     assert propagate_to_figure(both, 3, 475.0).sag_um == pytest.approx(second.sag_um, rel=0.2)
-    assert screen_advice(both, 3) == ()
+    assert advise_screen_sets(both, 3) == ()
 
 
 def test_a_screen_at_another_place_than_stated_is_reported() -> None:
@@ -263,7 +263,7 @@ def test_derivatives_of_moved_and_seen_screens_are_those_of_the_rays() -> None:
     column, row = rng.uniform(700, 1700, 40), rng.uniform(600, 1400, 40)
     dark, ones = np.zeros((2, 40)), np.ones(40)
     film = SetPhases(
-        "a", column, row, dark, ones, 0.0, elsewhere=(ANYWHERE,), screen=np.repeat([0, 1], 20)
+        "a", column, row, dark, ones, 0.0, moved_screens=(ANYWHERE,), screen=np.repeat([0, 1], 20)
     )
     values = SIGMAS * rng.normal(size=len(NAMES))
     direct = replace(film, screen=None, artefact=seen_directly(values, (10.0, 25.0), 3).artefact)

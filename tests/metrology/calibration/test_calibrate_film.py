@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.calibration.advice import number_advice
+from membrane_ctrl.metrology.calibration.advice import advise_number
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate_to_figure
 from membrane_ctrl.metrology.calibration.film_waves import solve_any_film
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
@@ -140,7 +140,7 @@ def test_the_rim_determines_the_size_and_better_measurements_are_advised() -> No
     claims = [propagate_to_figure(solution, 2, 475.0).sag_um for solution in (with_rim, without)]
     assert claims[0] < 0.95 * claims[1]
     assert abs(calibrated_errors_um(with_rim, truth)[0]) < 3 * claims[0]
-    best = number_advice(without, 2)
+    best = advise_number(without, 2)
     assert best is not None
     better = SIGMAS.copy()
     better[NAMES.index(best.name)] = best.sigma

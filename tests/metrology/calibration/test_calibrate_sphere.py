@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.metrology.calibration.artefact_advice import artefact_advice
+from membrane_ctrl.metrology.calibration.artefact_advice import advise_sphere
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate_to_figure
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve_calibration
@@ -123,7 +123,7 @@ def test_the_sphere_that_is_advised_gives_what_was_promised(seed: int) -> None:
     values = drawn(seed)
     truth, problem = bench_of(values, seed)
     alone = solve_calibration(problem)
-    advice = artefact_advice(alone, 2)
+    advice = advise_sphere(alone, 2)
     assert advice is not None
     assert {"a_mm", "b_mm"} <= set(advice.together)
     assert advice.sag_um < 7 < 12 < propagate_to_figure(alone, 2, 475.0).sag_um
@@ -143,7 +143,7 @@ def test_the_sphere_that_is_advised_gives_what_was_promised(seed: int) -> None:
     free = obeyed.sigmas > 0
     free[NAMES.index("bow_mm")] = False
     assert np.abs((obeyed.values - values)[free] / obeyed.sigmas[free]).max() < 4
-    assert artefact_advice(obeyed, 3) is None
+    assert advise_sphere(obeyed, 3) is None
 
 
 @pytest.mark.campaign
