@@ -14,37 +14,48 @@ WORTHWHILE_SHARE = 0.9  # of the sag's sigma: less of a gain is not worth the tr
 
 @dataclass(frozen=True)
 class Advice:
-    """The one hand measurement that would lower the sag's sigma most."""
+    """The one hand measurement that would lower the sag's sigma most.
+
+    Attributes
+    ----------
+    name : str
+        Of the parameter.
+    sigma : float
+        Standard uncertainty to which it should be known.
+    sag_um : float
+        1 sigma of the sag then.
+    """
 
     name: str
-    sigma: float  # to which it should be known
-    sag_um: float  # 1 sigma then
+    sigma: float
+    sag_um: float
 
 
 def advise_number(solution: Solution, index: int) -> Advice | None:
-    """What to measure better, from the equations alone; None if no single number is worth it."""
-    sums, own = (
-        np.sum([each.reduced() for each in solution.equations], axis=0),
-        solution.problem.sigmas,
-    )
-    found = []
-    for k in np.flatnonzero(own > 0):
-        better = own.copy()
+    """What to measure better, from the equations alone; None if no single number is worth it.
+
+    Parameters
+    ----------
+    solution : Solution
+        The calibration.
+    index : int
+        Number of the set whose sag is considered.
+    """
+    # The sag's sigma with each free parameter known better.
+    sums = np.sum([each.reduced() for each in solution.equations], axis=0)
+    sigmas = solution.problem.sigmas
+    advice = []
+    for k in np.flatnonzero(sigmas > 0):
+        better = sigmas.copy()
         better[k] /= _BETTER
-        moved = replace(
-            solution, covariance=solve_step(sums + solution.known(better), better).covariance
-        )
-        found.append(
-            Advice(
-                bench_parameters.NAMES[k],
-                float(better[k]),
-                sag_um(surface_covariance(moved, index)),
-            )
-        )
-    best = min(found, key=lambda each: each.sag_um, default=None)
-    return (
-        best
-        if best is not None
-        and best.sag_um < WORTHWHILE_SHARE * sag_um(surface_covariance(solution, index))
-        else None
-    )
+        step = solve_step(sums + solution.known(better), better)
+        improved = replace(solution, covariance=step.covariance)
+        sag_then_um = sag_um(surface_covariance(improved, index))
+        advice.append(Advice(bench_parameters.NAMES[k], float(better[k]), sag_then_um))
+
+    # The best of them, if it lowers the sigma enough.
+    best = min(advice, key=lambda each: each.sag_um, default=None)
+    present_um = sag_um(surface_covariance(solution, index))
+    if best is None or best.sag_um >= WORTHWHILE_SHARE * present_um:
+        return None
+    return best

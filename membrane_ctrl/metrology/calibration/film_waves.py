@@ -45,6 +45,8 @@ def solve_any_film(
     ValueError
         As `solve_calibration`.
     """
+    # As the sets state their mirrors' turns; if that gives no usable solution, with the figures of
+    # turned mirrors free.
     refused: ValueError | None = None
     try:
         solution, findings = _solve_as_stated(problem, progress)
@@ -66,6 +68,7 @@ def _solve_as_stated(
     """The solution of sets whose mirrors were turned as stated; with waves where these explain
     most.
     """
+    # An even film, which has no waves beyond the fit's terms.
     failed: ValueError | None = None
     even: Solution | None = None
     try:
@@ -73,10 +76,12 @@ def _solve_as_stated(
     except ValueError as error:
         failed = error
     if even is not None and even.converged and not _may_have_waves(even):
+        # Also where the sets contradict each other: they scatter so much that waves are lost in it.
         judged = verdict.check_solution(even)
-        # sets that contradict each other scatter so much that waves are lost in it
         if not any(finding.fatal for finding in judged):
             return even, judged
+
+    # An uneven film, if its waves explain more than any error of bench or sets.
     uneven = _solve_with_waves(problem, progress)
     if uneven is not None and _waves_explain_most(uneven):
         return uneven, (*verdict.check_solution(uneven), _note_on_waves(uneven))
@@ -93,21 +98,27 @@ def _solve_unturned(
     It is that figure, or what would explain more in its place (Akaike's rule): a camera that was
     bumped looks like another figure, too.
     """
+    # The figure of each turned set alone is freed, then those of all of them.
     turned = [k for k, phases in enumerate(problem.sets) if phases.turned is not None]
-    for group in dict.fromkeys([*((k,) for k in turned), tuple(turned)]):
+    groups = [*((k,) for k in turned), tuple(turned)]
+    for group in dict.fromkeys(groups):
         freed = _solve_with_waves(turn_tests.free_figures(problem, group), progress)
         if not group or freed is None or verdict.list_causes(freed):
             continue
+
+        # What the freed figures explain, and what would explain more in their place.
         bound = turn_tests.bind_figures(freed, problem)
         fall = model_tests.sum_of_squares(bound) - model_tests.sum_of_squares(freed)
         explained = fall - 2 * len(film_form.TURNING) * len(group)
         others = verdict.list_causes_besides_turns(bound)
         if others:
-            share, cause = max(others, key=lambda each: each[0])
-            if share > explained:
-                return freed, (cause,)
-        found = [(k, turn_tests.find_angle_of_set(freed, k)) for k in group]
-        findings = [verdict.describe_unturned(problem, *each) for each in found]
+            largest = verdict.find_largest_cause(others)
+            if largest.explained > explained:
+                return freed, (largest.finding,)
+        findings = []
+        for k in group:
+            found_deg = turn_tests.find_angle_of_set(freed, k)
+            findings.append(verdict.describe_unturned(problem, k, found_deg))
         return freed, tuple(findings)
     return None
 
@@ -134,7 +145,7 @@ def _waves_explain_most(uneven: Solution) -> bool:
     bound = model_tests.bind_waves(uneven)
     fall = model_tests.sum_of_squares(bound) - model_tests.sum_of_squares(uneven)
     explained = fall - 2 * _count_freedom(uneven)
-    others = [share for share, _ in verdict.list_causes(bound)]
+    others = [cause.explained for cause in verdict.list_causes(bound)]
     return explained > max([0.0, *others])
 
 
