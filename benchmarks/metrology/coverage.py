@@ -52,7 +52,7 @@ def live_answer(live: LiveReconstructor, stack: FrameStack, truth: FloatArray) -
         return None
     terms = list(TERMS)
     true_um = 1e3 * truth[: 1 + len(terms)]
-    own = np.append(found.sag_sigma_um, np.sqrt(np.diag(found.covariance_um2)[terms]))
+    own = np.append(found.sag_change_sigma_um, np.sqrt(np.diag(found.covariance_um2)[terms]))
     common = np.append(
         found.geometry_sag_sigma_um, np.sqrt(np.diag(live.common_covariance_um2)[terms])
     )

@@ -270,7 +270,7 @@ class ConsoleModel:
             reference_s = reference.time_s
         if estimate is not None and reference is not None:
             change_um = estimate.sag_um - reference.sag_um
-            sigma_um = math.hypot(estimate.sag_sigma_um, reference.sag_sigma_um)
+            sigma_um = math.hypot(estimate.sag_change_sigma_um, reference.sag_change_sigma_um)
         waits = state in (telemetry.ShapeState.WAITING, telemetry.ShapeState.SUSPENDED)
         loop = status.shape_reason if waits else ""
         return ShapeView(

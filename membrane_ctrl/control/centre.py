@@ -274,7 +274,7 @@ class CentreFilter:
             change_k = air_c - origin.air_temperature_c
             variance = config.thermometer_noise_k**2
             self._use_reading(Sensor.THERMOMETER, _ONE[_AIR], change_k, variance, given.now_s)
-        if math.isfinite(given.sag_um) and 0.0 <= given.sag_sigma_um < _IMPOSSIBLE:
+        if math.isfinite(given.sag_um) and 0.0 <= given.sag_change_sigma_um < _IMPOSSIBLE:
             self._use_frame(given)
         if math.isfinite(given.laser_um):
             row = self._centre + _ONE[_MOUNT]
@@ -333,7 +333,7 @@ class CentreFilter:
         if math.isfinite(after[late]):
             share = float((time_s - times[early]) / (times[late] - times[early]))
             row += share * (_ONE[_PLANT + late] - _ONE[_PLANT + early])
-        variance = given.sag_sigma_um**2 + self._config.optics_noise_um**2
+        variance = given.sag_change_sigma_um**2 + self._config.optics_noise_um**2
         if math.isnan(memory.origin.sag_um):
             memory.origin.sag_um = given.sag_um
         change_um = given.sag_um - memory.origin.sag_um

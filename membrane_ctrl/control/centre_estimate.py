@@ -30,7 +30,7 @@ class CentreReadings:
     ambient_pressure_pa: float
     air_temperature_c: float
     sag_um: float = math.nan
-    sag_sigma_um: float = math.nan
+    sag_change_sigma_um: float = math.nan
     sag_time_s: float = math.nan
     # a third sensor will show whether a jump of the laser was its mount's or the film's
     judged: bool = True

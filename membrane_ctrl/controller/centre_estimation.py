@@ -163,7 +163,7 @@ class CentreEstimation:
             ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,
             air_temperature_c=reading.air_temperature_c if reading else math.nan,
             sag_um=figure.sag_um - self._camera_mount.um if figure else math.nan,
-            sag_sigma_um=figure.sag_sigma_um if figure else math.nan,
+            sag_change_sigma_um=figure.sag_change_sigma_um if figure else math.nan,
             sag_time_s=figure.time_s if figure else math.nan,
             judged=consistency.compares_sensors,
         )

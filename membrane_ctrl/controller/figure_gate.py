@@ -129,7 +129,7 @@ class FigureGate:
             return FigureDefect.NOT_FINITE
         if not self._sag_um / _SAG_FACTOR <= figure.sag_um <= _SAG_FACTOR * self._sag_um:
             return FigureDefect.OTHER_MIRROR
-        if not 0.0 <= figure.sag_sigma_um <= self._sigma_max_um:
+        if not 0.0 <= figure.sag_change_sigma_um <= self._sigma_max_um:
             return FigureDefect.SIGMA
         if not figure.time_s <= now_s or figure.time_s <= self.memory.newest_s:
             return FigureDefect.TIME

@@ -225,8 +225,8 @@ class TruthShape:
 
     Equal seeds give equal shapes.
 
-    `sag_sigma_um` is the standard deviation of a cycle's sag, larger for a bench whose frames are
-    worse than rendered ones.
+    `sag_change_sigma_um` is the standard deviation of a cycle's sag, larger for a bench whose frames
+    are worse than rendered ones.
     """
 
     def __init__(
@@ -234,16 +234,16 @@ class TruthShape:
         bench: virtual_bench.VirtualBench,
         config: Config,
         seed: int,
-        sag_sigma_um: float = SAG_SIGMA_UM,
+        sag_change_sigma_um: float = SAG_SIGMA_UM,
     ) -> None:
         self._bench = bench
         self._rng = np.random.default_rng(seed)
         self._projection = zernike_projection()
-        self._sag_sigma_um = sag_sigma_um
+        self._sag_sigma_um = sag_change_sigma_um
         self._laser_sigma_um = config.twin.laser_noise_um / math.sqrt(
             max(1.0, EXPOSURES_S * config.loop.rate_hz)
         )
-        self._covariance = sag_sigma_um**2 * np.outer(self._projection, self._projection)
+        self._covariance = sag_change_sigma_um**2 * np.outer(self._projection, self._projection)
         self._cycle = 0
 
     def __call__(self, now_s: float) -> shape_estimate.ShapeEstimate | None:
@@ -264,7 +264,7 @@ class TruthShape:
             hencky_um=0.0,
             covariance_um2=self._covariance,
             sag_um=sag_um,
-            sag_sigma_um=self._sag_sigma_um,
+            sag_change_sigma_um=self._sag_sigma_um,
             displacement_um=math.nan if blind else laser_um + self._laser_sigma_um * laser_noise,
             slope_residual_urad=1.0,
             valid_fraction=1.0,

@@ -55,7 +55,7 @@ _RECORDED = (
         "hencky_um", "amplitude of the part of a Hencky bowl that the Zernike terms lack, as sag"
     ),
     _in_tables("sag_um", "height at the rim above the vertex"),
-    _in_tables("sag_sigma_um", "standard deviation of changes of the sag"),
+    _in_tables("sag_change_sigma_um", "standard deviation of changes of the sag"),
     _in_tables("displacement_um", "mean reading of the laser during the exposures"),
     TelemetryColumn(
         "slope_residual_urad",

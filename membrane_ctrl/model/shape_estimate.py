@@ -67,7 +67,7 @@ class ShapeEstimate:
     sag_um: float  # height at `mirror.radius_mm`, mean over azimuth, above the vertex
     # its standard deviation from `covariance_um2`, without motions of the bench that are too small
     # to be found: cycles and frames share those, and the estimator has a state for them
-    sag_sigma_um: float
+    sag_change_sigma_um: float
     displacement_um: float  # mean laser reading during the exposures (NaN without a laser)
     # RMS of measured minus fitted slopes; of "track" the slopes that would leave as much light as
     # the fit does
@@ -80,7 +80,7 @@ class ShapeEstimate:
     latency_s: float = float("nan")  # last frame to this result (filled by the acquisition)
     cycle: int = 0  # number of the cycle in the run (filled by the acquisition)
     # standard deviation of the sag from what all cycles share (geometry, lens, screen, air, blur):
-    # a part of the sag's own beside `sag_sigma_um`, none of a change's; NaN if not stated
+    # a part of the sag's own beside `sag_change_sigma_um`, none of a change's; NaN if not stated
     geometry_sag_sigma_um: float = float("nan")
     # the phases cannot be tracked from the last cycle: a full one is needed
     tracking_lost: bool = False

@@ -207,7 +207,7 @@ def _make_legend(
         "is in its range.\n\n"
         f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{for_people(reason)}\n"
         f"- changes are against cycle {reference.cycle}, at {reference.time_s:.0f} s\n"
-        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} µm in a "
+        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_change_sigma_um:.3f} µm in a "
         f"change{shared}\n"
         f"- slope residual {estimate.slope_residual_urad:.2f} µrad, "
         f"{100 * estimate.valid_fraction:.1f} % valid\n"
@@ -240,5 +240,5 @@ def _make_change_scalars(
     terms = [j - 1 for j in LOW_ORDER_COLUMNS]
     return {
         streams.CHANGE: (change_um[terms].tolist(), variances_um2[terms].tolist()),
-        streams.SAG: (sag_um, [estimate.sag_sigma_um**2, 0.0]),
+        streams.SAG: (sag_um, [estimate.sag_change_sigma_um**2, 0.0]),
     }

@@ -25,7 +25,7 @@ from membrane_ctrl.run_files.streams import STREAMS
 FORMATS = ("parquet", "csv", "hdf5")
 SHAPES = "shapes"
 EVENTS = "events"
-_SHAPE_COLUMNS = ("hencky_um", "sag_um", "sag_sigma_um", "displacement_um")
+_SHAPE_COLUMNS = ("hencky_um", "sag_um", "sag_change_sigma_um", "displacement_um")
 
 
 def refuse_originals(folder: Path) -> None:

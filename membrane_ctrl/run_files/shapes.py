@@ -24,7 +24,7 @@ NUMBERS = (
     "time_s",
     "hencky_um",
     "sag_um",
-    "sag_sigma_um",
+    "sag_change_sigma_um",
     "displacement_um",
     "slope_residual_urad",
     "valid_fraction",
@@ -65,8 +65,9 @@ class Shapes:
 
     Attributes
     ----------
-    time_s, sag_um, sag_sigma_um, displacement_um, slope_residual_urad, valid_fraction, latency_s,
-    hencky_um : array
+    time_s, hencky_um, sag_um, sag_change_sigma_um, displacement_um : array
+        As in `ShapeEstimate`.
+    slope_residual_urad, valid_fraction, latency_s : array
         As in `ShapeEstimate`.
     coeffs_um : (n, terms) array
     verdict : (n,) array of str
@@ -79,7 +80,7 @@ class Shapes:
     coeffs_um: Column
     hencky_um: Column
     sag_um: Column
-    sag_sigma_um: Column
+    sag_change_sigma_um: Column
     displacement_um: Column
     slope_residual_urad: Column
     valid_fraction: Column

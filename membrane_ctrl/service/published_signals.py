@@ -41,7 +41,7 @@ _TICK = tuple(Published(each.name, each.description) for each in PUBLISHED)
 _TERMS = range(4, 12)  # Noll: defocus to the first spherical term
 _FIGURE = (
     Published("sag_um", "sag of the newest figure"),
-    Published("sag_sigma_um", "its standard deviation from noise"),
+    Published("sag_change_sigma_um", "standard deviation of its changes"),
     Published("figure_age_s", "age of that figure"),
     *(Published(f"z{j}_um", f"its Zernike term j = {j} (Noll, RMS)") for j in _TERMS),
 )
@@ -94,7 +94,10 @@ def signal_values(seen: HoldSeen) -> dict[str, Value]:
     if seen.figure is not None:
         age_s = (row.get("mono_s") or math.nan) - seen.figure.time_s
         found |= {"figure_verdict": seen.figure.verdict, "figure_age_s": age_s}
-        found |= {"sag_um": seen.figure.sag_um, "sag_sigma_um": seen.figure.sag_sigma_um}
+        found |= {
+            "sag_um": seen.figure.sag_um,
+            "sag_change_sigma_um": seen.figure.sag_change_sigma_um,
+        }
         found |= {f"z{j}_um": float(seen.figure.coeffs_um[j - 1]) for j in _TERMS}
     return {
         name: None if isinstance(v, float) and not math.isfinite(v) else v

@@ -129,10 +129,12 @@ def test_without_contact_no_number_is_shown() -> None:
 
 
 def test_a_figure_has_its_age_and_terms() -> None:
-    found = signal_values(dataclasses.replace(seen_hold(), figure=figure(sag_sigma_um=math.nan)))
+    found = signal_values(
+        dataclasses.replace(seen_hold(), figure=figure(sag_change_sigma_um=math.nan))
+    )
     assert found["figure_age_s"] == 2.5
     assert [found[f"z{j}_um"] for j in range(4, 12)] == [float(j) for j in range(4, 12)]
-    assert found["sag_sigma_um"] is None, "JSON has no NaN"
+    assert found["sag_change_sigma_um"] is None, "JSON has no NaN"
 
 
 def test_faults_and_notices_are_in_words() -> None:

@@ -151,7 +151,7 @@ def figures_without_a_usable_sigma() -> list[str]:
         stage = by_optics()
         stage.wait(10.0)
         stage.change_figure = lambda figure, sigma_um=sigma_um: replace(  # type: ignore[misc]
-            figure, sag_sigma_um=sigma_um
+            figure, sag_change_sigma_um=sigma_um
         )
         stage.until(State.FAULT, 20.0)
         stage.wait(8.0)

@@ -158,26 +158,26 @@ FIGURE_FAILURES = (
         FilmSensor.OPTICS,
         "sigma NaN",
         Failure.LOST,
-        spoil=lambda f, t, r: replace(f, sag_sigma_um=math.nan),
+        spoil=lambda f, t, r: replace(f, sag_change_sigma_um=math.nan),
     ),
     SensorFailure(
         FilmSensor.OPTICS,
         "sigma 1e3 µm",
         Failure.LOST,
-        spoil=lambda f, t, r: replace(f, sag_sigma_um=1e3),
+        spoil=lambda f, t, r: replace(f, sag_change_sigma_um=1e3),
     ),
     SensorFailure(
         FilmSensor.OPTICS,
         "sigma 1e-9 µm",
         Failure.LOST,
-        spoil=lambda f, t, r: replace(f, sag_sigma_um=1e-9),
+        spoil=lambda f, t, r: replace(f, sag_change_sigma_um=1e-9),
     ),
     SensorFailure(
         FilmSensor.OPTICS,
         "sigma too small, 2 µm of noise",
         Failure.LOST,
         spoil=lambda f, t, r: replace(
-            f, sag_um=f.sag_um + 2.0 * r.standard_normal(), sag_sigma_um=1e-3
+            f, sag_um=f.sag_um + 2.0 * r.standard_normal(), sag_change_sigma_um=1e-3
         ),
     ),
     SensorFailure(FilmSensor.OPTICS, "times of the future", Failure.LOST, spoil=_shift_time(5.0)),

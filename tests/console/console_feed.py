@@ -85,7 +85,7 @@ def shape(
         hencky_um=0.0,
         covariance_um2=np.eye(ZERNIKE_TERMS),
         sag_um=sag_um,
-        sag_sigma_um=0.012,
+        sag_change_sigma_um=0.012,
         displacement_um=0.0,
         slope_residual_urad=3.1,
         valid_fraction=0.99,

@@ -130,7 +130,7 @@ def test_sag_change_is_against_the_first_usable_shape_of_a_settled_hold() -> Non
     given.add_shape(shape(time_s=settled_s + 4.0, sag_um=37100.5))
     seen = given.make_view(settled_s + 6.0).shape
     assert (seen.sag_change_um, seen.reference_s) == (pytest.approx(0.5), settled_s + 1.0)
-    assert seen.change_sigma_um == pytest.approx(math.sqrt(2) * shape().sag_sigma_um)
+    assert seen.change_sigma_um == pytest.approx(math.sqrt(2) * shape().sag_change_sigma_um)
     assert (seen.cycles, seen.rejected, seen.age_s) == (5, 1, 2.0)
 
 

@@ -261,7 +261,8 @@ def _changed(given: CentreReadings, **added: float) -> CentreReadings:
 
 
 @pytest.mark.parametrize(
-    "name", ["laser_um", "sag_um", "ambient_pressure_pa", "air_temperature_c", "sag_sigma_um"]
+    "name",
+    ["laser_um", "sag_um", "ambient_pressure_pa", "air_temperature_c", "sag_change_sigma_um"],
 )
 def test_single_bad_readings_have_no_effect(name: str) -> None:
     bad = [20.0, 1e300, math.inf, -math.inf, math.nan]

@@ -40,7 +40,7 @@ def test_a_sag_that_is_no_number_does_not_count(sag_um: float) -> None:
 
 @pytest.mark.parametrize("sigma_um", [math.nan, -1.0, 1.01 * CONFIG.limits.band_um, math.inf])
 def test_a_figure_less_certain_than_the_band_does_not_count(sigma_um: float) -> None:
-    assert judge(replace(SOUND_FIGURE, sag_sigma_um=sigma_um)) is FigureDefect.SIGMA
+    assert judge(replace(SOUND_FIGURE, sag_change_sigma_um=sigma_um)) is FigureDefect.SIGMA
 
 
 @pytest.mark.parametrize("time_s", [10.001, math.nan, math.inf])

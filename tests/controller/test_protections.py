@@ -277,9 +277,9 @@ def test_a_pause_with_frozen_sensors_ends_in_the_safe_state(process_value: str) 
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda since_s, figure: replace(figure, sag_sigma_um=math.nan),
-        lambda since_s, figure: replace(figure, sag_sigma_um=1e3),
-        lambda since_s, figure: replace(figure, sag_sigma_um=-1.0),
+        lambda since_s, figure: replace(figure, sag_change_sigma_um=math.nan),
+        lambda since_s, figure: replace(figure, sag_change_sigma_um=1e3),
+        lambda since_s, figure: replace(figure, sag_change_sigma_um=-1.0),
         lambda since_s, figure: replace(figure, time_s=math.nan),
         lambda since_s, figure: replace(figure, time_s=figure.time_s + 5.0),
         lambda since_s, figure: replace(figure, time_s=figure.time_s - 30.0),
@@ -553,7 +553,7 @@ def test_a_figure_that_the_shape_loop_cannot_use_is_a_fault_and_no_exception() -
 def noisy_with_a_small_sigma() -> Spoil:
     rng = np.random.default_rng(6)
     return lambda since_s, figure: replace(
-        figure, sag_um=figure.sag_um + 2.0 * rng.standard_normal(), sag_sigma_um=1e-3
+        figure, sag_um=figure.sag_um + 2.0 * rng.standard_normal(), sag_change_sigma_um=1e-3
     )
 
 

@@ -52,7 +52,7 @@ def estimate_of(
         hencky_um=37_100.0,
         covariance_um2=1e-6 * np.eye(ZERNIKE_TERMS),
         sag_um=37_100.0 + sag_change_um,
-        sag_sigma_um=0.01,
+        sag_change_sigma_um=0.01,
         displacement_um=displacement_um,
         slope_residual_urad=3.0,
         valid_fraction=0.99,

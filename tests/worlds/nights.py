@@ -267,7 +267,7 @@ def _shapes(
             hencky_um=0.0,
             covariance_um2=covariance,
             sag_um=float(sag),
-            sag_sigma_um=0.05,
+            sag_change_sigma_um=0.05,
             displacement_um=float(true_um[k] + 0.1 * rng.normal()),
             slope_residual_urad=3.1,
             valid_fraction=0.99,

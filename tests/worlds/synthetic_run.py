@@ -90,7 +90,7 @@ def shape_of(time_s: float, cycle: int, verdict: Verdict = "ok", seed: int = 0) 
         hencky_um=0.0,
         covariance_um2=np.diag(np.linspace(0.02, 0.005, ZERNIKE_TERMS) ** 2),
         sag_um=37_000.0 + 0.1 * rng.normal(),
-        sag_sigma_um=0.1,
+        sag_change_sigma_um=0.1,
         displacement_um=10.0 + 0.1 * rng.normal(),
         slope_residual_urad=3.1 + 0.2 * rng.normal(),
         valid_fraction=0.99,

@@ -25,7 +25,7 @@ def shape_at(time_s: float) -> ShapeEstimate:
         hencky_um=rng.normal(),
         covariance_um2=factor @ factor.T + 1e-4 * np.eye(ZERNIKE_TERMS),
         sag_um=37_000.0 + 0.1 * rng.normal(),
-        sag_sigma_um=0.1 * rng.random(),
+        sag_change_sigma_um=0.1 * rng.random(),
         displacement_um=0.1 * rng.normal(),
         slope_residual_urad=3.1,
         valid_fraction=0.99,

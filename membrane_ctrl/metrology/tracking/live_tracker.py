@@ -240,7 +240,7 @@ def _make_estimate(
         covariance_um2=found.covariance_um2,
         # One digit more: equal sags show a camera that repeats a frame.
         sag_um=round(found.sag_um, _UM_DECIMALS + 1),
-        sag_sigma_um=round(found.sag_change_sigma_um, _UM_DECIMALS + 1),
+        sag_change_sigma_um=round(found.sag_change_sigma_um, _UM_DECIMALS + 1),
         displacement_um=reading_um,
         slope_residual_urad=round(found.rest_share * urad_per_rad, 2),
         valid_fraction=round(found.used_share, _SHARE_DECIMALS),

@@ -284,7 +284,9 @@ class Layer:
         change = np.column_stack(
             (shown.sag_um - shown.sag_um[0], shown.displacement_um - shown.displacement_um[0])
         )
-        variances = np.nan_to_num(np.column_stack((shown.sag_sigma_um**2, np.zeros(len(shown)))))
+        variances = np.nan_to_num(
+            np.column_stack((shown.sag_change_sigma_um**2, np.zeros(len(shown))))
+        )
         sag = streams.SAG
         self._send_measured(sag.path, _names_and_colours(sag), shown.time_s, change, variances)
         residual_urad = shown.slope_residual_urad[:, np.newaxis]

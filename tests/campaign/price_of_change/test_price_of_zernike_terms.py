@@ -234,10 +234,10 @@ def low_terms(figure: dict[str, Any], name: str = "coeffs_um") -> NDArray[np.flo
 def require_alike(found: dict[str, Any], usual: dict[str, Any], moved_um: float) -> None:
     """Compare a figure with the usual number's, and with the truth."""
     assert (found["verdict"], found["reason"]) == ("ok", "")
-    sag_bar_um = np.hypot(found["sag_sigma_um"], usual["sag_sigma_um"])
+    sag_bar_um = np.hypot(found["sag_change_sigma_um"], usual["sag_change_sigma_um"])
     assert found["sag_um"] == pytest.approx(usual["sag_um"], abs=ALIKE_SIGMAS * sag_bar_um)
     assert found["sag_um"] == pytest.approx(
-        1e3 * FILM.sag_mm + moved_um, abs=TRUE_SIGMAS * found["sag_sigma_um"]
+        1e3 * FILM.sag_mm + moved_um, abs=TRUE_SIGMAS * found["sag_change_sigma_um"]
     )
     bars_um = np.hypot(low_terms(found, "sigma_um"), low_terms(usual, "sigma_um"))
     assert (np.abs(low_terms(found) - low_terms(usual)) < ALIKE_SIGMAS * bars_um).all()

@@ -40,7 +40,7 @@ def figure(estimate: ShapeEstimate) -> dict[str, Any]:
         "verdict": received.verdict,
         "reason": received.reason,
         "sag_um": received.sag_um,
-        "sag_sigma_um": received.sag_sigma_um,
+        "sag_change_sigma_um": received.sag_change_sigma_um,
         "coeffs_um": received.coeffs_um.tolist(),
         "sigma_um": np.sqrt(np.diag(received.covariance_um2)).tolist(),
     }

@@ -96,7 +96,7 @@ def test_full_cycle(bin_px: int) -> None:
         rms <= 0.05
     )  # 0.4 ADU of noise on 1/64 of the real sensor's pixels: 8 times the 3 nm there
     assert worst <= 0.3
-    assert estimate.sag_um == pytest.approx(37100, abs=5 * estimate.sag_sigma_um)
+    assert estimate.sag_um == pytest.approx(37100, abs=5 * estimate.sag_change_sigma_um)
     assert estimate.valid_fraction == pytest.approx(1, abs=0.02)
     assert estimate.time_s == pytest.approx(np.mean([*times[:4], *times[8:12]]))
     assert estimate.saturated_fraction == 0
@@ -277,7 +277,7 @@ def test_predicted_sigma_is_the_scatter_of_cycles() -> None:
     estimates = [live.fringes(*_render("fringes")) for _ in range(60)]
     sags = np.array([e.sag_um for e in estimates])
     assert sags.std() == pytest.approx(
-        estimates[0].sag_sigma_um, rel=0.3
+        estimates[0].sag_change_sigma_um, rel=0.3
     )  # 60 cycles give a sigma to 9 %
     coeffs = np.array([e.coeffs_um for e in estimates])
     ratio = coeffs.std(axis=0) / np.sqrt(np.diag(estimates[0].covariance_um2))
@@ -320,7 +320,7 @@ def test_covariance_is_a_covariance() -> None:
     estimate = live.fringes(*_render("fringes"))
     assert estimate.covariance_um2 == pytest.approx(estimate.covariance_um2.T)
     assert np.linalg.eigvalsh(estimate.covariance_um2).min() > -1e-15
-    assert 0 < estimate.sag_sigma_um < 0.1
+    assert 0 < estimate.sag_change_sigma_um < 0.1
 
 
 def test_sag_sensitivity_is_the_change_seen() -> None:
@@ -399,7 +399,7 @@ def test_the_geometrys_covariance_is_what_wrong_geometries_do() -> None:
     assert strong.sum() >= 4
     assert sigmas[strong] == pytest.approx(expected[strong], rel=0.1)
     assert 10 < estimate.geometry_sag_sigma_um < 500  # the paper's: tens of micrometres
-    assert estimate.sag_sigma_um < 1  # what this cycle does not share
+    assert estimate.sag_change_sigma_um < 1  # what this cycle does not share
 
 
 def test_without_a_spread_the_geometry_has_no_error_bar() -> None:
@@ -503,7 +503,10 @@ def test_the_harmonics_of_the_display_move_with_the_film() -> None:
     assert abs(moved.sag_um - still.sag_um) < 0.05
     assert np.abs((moved.coeffs_um - still.coeffs_um)[3:] / bar_um).max() < 4
     pure = _live(bin_px=2)
-    assert moved.sag_sigma_um < 1.5 * pure.fringes(*_render("fringes", where)).sag_sigma_um
+    assert (
+        moved.sag_change_sigma_um
+        < 1.5 * pure.fringes(*_render("fringes", where)).sag_change_sigma_um
+    )
 
 
 def test_the_effect_of_a_wrong_geometry_on_a_measured_motion_is_in_the_error_bar() -> None:
@@ -530,7 +533,7 @@ def test_the_bar_grows_with_the_displacement_until_a_new_reference() -> None:
     which no cycle shows by itself.
     """
     live = LiveReconstructor(OPTICS, 2, spread=PAPER_SPREAD)
-    bars = [live.full(*_render("full", d)).sag_sigma_um for d in (0.0, 80.0, 400.0, 402.0)]
+    bars = [live.full(*_render("full", d)).sag_change_sigma_um for d in (0.0, 80.0, 400.0, 402.0)]
     assert bars[1] > 3 * bars[0]
     assert bars[2:] == pytest.approx([bars[0]] * 2, rel=0.3)
 
