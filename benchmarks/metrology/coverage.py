@@ -47,7 +47,7 @@ def live_answer(live: LiveReconstructor, stack: FrameStack, truth: FloatArray) -
     """Error, own sigma and geometry's sigma (3, 9) of sag and terms in µm, as a running hold has
     them.
     """
-    found = live.full(list(stack.frames), np.arange(18.0), stack.displacement_um)
+    found = live.measure_full(list(stack.frames), np.arange(18.0), stack.displacement_um)
     if found.verdict == "rejected":
         return None
     terms = list(TERMS)

@@ -40,14 +40,14 @@ def run() -> list[Figure]:
     ]
     times, still = 0.1 * np.arange(18), np.zeros(18)
 
-    live.full(full, times, still)  # compiles
-    full_ms = _median_ms(lambda: live.full(full, times, still), 3)
+    live.measure_full(full, times, still)  # compiles
+    full_ms = _median_ms(lambda: live.measure_full(full, times, still), 3)
     copy_ms = _copy_ms(cycles[0])
     durations, errors = [], []
     for k in range(24):
         d = MOVED_UM[k % len(MOVED_UM)]
         begin = time.perf_counter()
-        estimate = live.fringes(cycles[k % len(cycles)], times[:8], np.full(8, d))
+        estimate = live.measure_fringes(cycles[k % len(cycles)], times[:8], np.full(8, d))
         durations.append(1e3 * (time.perf_counter() - begin))
         errors.append(_rms_um(live, estimate.coeffs_um, estimate.hencky_um, d))
     live_ms = statistics.median(durations[4:])

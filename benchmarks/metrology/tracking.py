@@ -42,7 +42,7 @@ def run() -> list[Figure]:
     tracker = Tracker(scene, (camera.height_px, camera.width_px), 255, camera.noise_adu)
     renderer = OpticsRenderer(OPTICS, FILM, seed=2)
     shown = [Pattern("crossed", "", 32, float(x), shift_y_rad=float(y)) for x, y in STEPS]
-    tracker.anchor(
+    tracker.measure_steps(
         [renderer.render_picture(p, 0.0) for p in shown],
         STEPS,
         np.arange(5) / 20,
@@ -50,9 +50,9 @@ def run() -> list[Figure]:
     )
     moved_um = 0.2 * np.sin(np.arange(FRAMES))
     frames = [renderer.render_picture(shown[0], float(um)) for um in moved_um]
-    tracker.follow(renderer.render_picture(shown[0], 0.0), (0.0, 0.0), 0.5)
+    tracker.track_frame(renderer.render_picture(shown[0], 0.0), (0.0, 0.0), 0.5)
     begin, busy = time.perf_counter(), time.process_time()
-    found = [tracker.follow(frame, (0.0, 0.0), 1 + k / 20) for k, frame in enumerate(frames)]
+    found = [tracker.track_frame(frame, (0.0, 0.0), 1 + k / 20) for k, frame in enumerate(frames)]
     passed_s, busy_s = time.perf_counter() - begin, time.process_time() - busy
     coeffs = np.array([f.coeffs_um[1:] for f in found])
     bowl = Surface.hencky_bowl(1.0, FILM.radius_mm).coeffs_mm[1:]

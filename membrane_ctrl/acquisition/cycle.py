@@ -27,12 +27,12 @@ REJECTED_IN_A_ROW = 3
 class Reconstructor(Protocol):
     """Turns frames into the figure; keeps the last absolute phase between calls."""
 
-    def full(
+    def measure_full(
         self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray
     ) -> ShapeEstimate:
         """Figure from sinusoids, Gray codes, white and black, in the order of the full sequence."""
 
-    def fringes(
+    def measure_fringes(
         self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray
     ) -> ShapeEstimate:
         """Figure from the frames after a full cycle alone,
@@ -138,7 +138,9 @@ class ShapeCycle:
         time_s = np.array([frame.time_s for frame in frames])
         with stage_errors.convert_stage_errors("reconstruction"):
             reconstruct = (
-                self._reconstructor.full if kind == "full" else self._reconstructor.fringes
+                self._reconstructor.measure_full
+                if kind == "full"
+                else self._reconstructor.measure_fringes
             )
             estimate = reconstruct([frame.pixels for frame in frames], time_s, displacement_um)
         return replace(

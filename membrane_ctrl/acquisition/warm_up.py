@@ -62,9 +62,9 @@ def warm_up(
     # motion
     still, moving = np.zeros(1), np.array([-10.0, 10.0])
     for full, reconstruct, motion_um in (
-        (True, reconstructor.full, moving),
-        (False, reconstructor.fringes, moving),
-        (False, reconstructor.fringes, still),
+        (True, reconstructor.measure_full, moving),
+        (False, reconstructor.measure_fringes, moving),
+        (False, reconstructor.measure_fringes, still),
     ):
         taken = []
         for pattern in plan.list_patterns(full):

@@ -225,8 +225,8 @@ class TruthShape:
 
     Equal seeds give equal shapes.
 
-    `sag_change_sigma_um` is the standard deviation of a cycle's sag, larger for a bench whose frames
-    are worse than rendered ones.
+    `sag_change_sigma_um` is the standard deviation of a cycle's sag, larger for a bench whose
+    frames are worse than rendered ones.
     """
 
     def __init__(

@@ -119,7 +119,7 @@ def read_anchor(
             f"{where}: kind: a reference must be a full set or one of several frequencies"
         )
     try:
-        return capture.head, checked_set(capture, None).anchor()
+        return capture.head, checked_set(capture, None).make_anchor()
     except RejectedSetError as error:
         raise errors.InputError(f"{folder}: cannot be a reference: {error}") from None
 

@@ -180,7 +180,7 @@ def track_set(
     steps = [picture for picture in first if not isinstance(picture, str)]
     stepped = bool(steps) and len(steps) == len(first)
     if stepped:
-        found = tracker.anchor(
+        found = tracker.measure_steps(
             steps,
             shifts_rad[:ENOUGH_STEPS],
             times_s[:ENOUGH_STEPS],
@@ -196,7 +196,7 @@ def track_set(
             found.append(rejected_frame(at_s, picture))
             continue
         shifts = (shifts_rad[k, 0], shifts_rad[k, 1])
-        found.append(tracker.follow(picture, shifts, at_s, float(readings_um[k])))
+        found.append(tracker.track_frame(picture, shifts, at_s, float(readings_um[k])))
     has_rejected_step = any(frame.verdict == "rejected" for frame in found[:ENOUGH_STEPS])
     return Track(
         tuple(found), stated, stepped and not has_rejected_step, tracker.mean_residual_adu()

@@ -104,7 +104,7 @@ class FakeReconstructor:
         if self.singular:
             raise np.linalg.LinAlgError("singular matrix")
 
-    def full(
+    def measure_full(
         self,
         frames: Sequence[Pixels],
         time_s: NDArray[np.float64],
@@ -112,7 +112,7 @@ class FakeReconstructor:
     ) -> ShapeEstimate:
         return self._answer("full", frames, time_s, displacement_um)
 
-    def fringes(
+    def measure_fringes(
         self,
         frames: Sequence[Pixels],
         time_s: NDArray[np.float64],

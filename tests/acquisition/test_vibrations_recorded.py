@@ -259,14 +259,18 @@ class Film:
             renderer.render_picture(p, float(self.moved_um[0]))
             for p in pattern_sequence.full_sequence(self.optics.pattern)
         ]
-        full = self.tracker.full(still, at_s + 13.0 + 0.1 * np.arange(18), np.full(18, np.nan))
+        full = self.tracker.measure_full(
+            still, at_s + 13.0 + 0.1 * np.arange(18), np.full(18, np.nan)
+        )
         assert full.verdict == "ok", full.reason
         hold.take(full)
         since_s = 2.0
         while since_s < 61.0 * searches + 3.0:
             time_s, um = at_s + 13.0 + since_s, float(self.moved_um[round(50 * since_s)])
             picture = renderer.render_picture(self.tracker.pattern, um, time_s=time_s)
-            hold.take(self.tracker.fringes([picture], np.array([time_s]), np.array([np.nan])))
+            hold.take(
+                self.tracker.measure_fringes([picture], np.array([time_s]), np.array([np.nan]))
+            )
             since_s += self.tracker.interval_factor / 20
         hold.settle(HandClock.moment_s + 0.1)
 

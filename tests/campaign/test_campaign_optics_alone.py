@@ -71,13 +71,13 @@ class Rendered:
         )
         pixels = self._optics.camera.grab().pixels.copy()
         if self.anchored:
-            self._done = self._tracker.fringes([pixels], [now_s], [math.nan])
+            self._done = self._tracker.measure_fringes([pixels], [now_s], [math.nan])
             self.anchored = not self._done.tracking_lost
         else:
             self._frames.append(pixels)
             self._times_s.append(now_s)
             if len(self._frames) == len(self._cycle):
-                self._done = self._tracker.full(
+                self._done = self._tracker.measure_full(
                     self._frames, self._times_s, [math.nan] * len(self._frames)
                 )
                 self.anchored = self._done.verdict != "rejected"

@@ -505,7 +505,7 @@ def test_jumps_lose_no_order_silently(
     optics = reference.head.optics
     scene = make_scene(optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
     tracker = Tracker(scene, (205, 245), 255, optics.camera.noise_adu)
-    first = tracker.follow(still.crossed(0.0), (0.0, 0.0), 0.0)
+    first = tracker.track_frame(still.crossed(0.0), (0.0, 0.0), 0.0)
     random, seen, wrong = np.random.default_rng(8), Counter[str](), []
     for number in range(334):
         deeper_um, tilt_mrad, azimuth = random.uniform(
@@ -514,7 +514,7 @@ def test_jumps_lose_no_order_silently(
         tilt_um = 1e3 * tilt_mrad * RADIUS_MM / 2e3  # Noll 2 and 3 have a slope of 2 / radius
         tilt = {2: tilt_um * math.cos(azimuth), 3: tilt_um * math.sin(azimuth)}
         jumped = BentWorld(**setup, seed=number, deeper_um=deeper_um, more_um=tilt)  # type: ignore[arg-type]
-        found = deepcopy(tracker).follow(jumped.crossed(0.0), (0.0, 0.0), 0.05)
+        found = deepcopy(tracker).track_frame(jumped.crossed(0.0), (0.0, 0.0), 0.05)
         seen[f"{found.verdict} {found.reason[:11]}"] += 1
         off_um = np.array(
             [found.sag_um - first.sag_um - deeper_um, *(found.coeffs_um - first.coeffs_um)[1:3]]

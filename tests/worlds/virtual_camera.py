@@ -53,7 +53,9 @@ class VirtualCamera:
             self._optics.screen.show(shown)
             frames.append(self._optics.camera.grab().pixels.copy())
             readings_um.append(self._plant.sample().displacement_um)
-        take = self._reconstructor.full if self._full else self._reconstructor.fringes
+        take = (
+            self._reconstructor.measure_full if self._full else self._reconstructor.measure_fringes
+        )
         readings = np.full(
             len(frames), np.mean(readings_um)
         )  # the film stands still: so does its mean reading

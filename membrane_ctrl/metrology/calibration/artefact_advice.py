@@ -102,7 +102,7 @@ def advise_sphere(solution: Solution, index: int) -> ArtefactAdvice | None:
 
     # The solution with that set in addition.
     state = set_state.SetState(shape, 0.0)
-    weights = robust_weights.RobustWeights.full(seen)
+    weights = robust_weights.RobustWeights.unweighted(seen)
     more = foreseen_equations(solution, seen, state, weights)
     then = with_equations(solution, (*solution.equations, more))
     then_um = sag_um(surface_covariance(then, index))

@@ -73,7 +73,7 @@ def _fit_waves_mm(
     left_mm = forward_model.residual_mm(
         bench, phases, state.surface, state.vertex_z_mm, state.moved_screens
     )
-    root = np.sqrt(RobustWeights.seen(phases, left_mm).weights) / phases.sigma_mm
+    root = np.sqrt(RobustWeights.from_residual(phases, left_mm).weights) / phases.sigma_mm
     rad_per_mm = 2 * np.pi / phases.period_mm
 
     # For each place of the screen and each axis, waves of the fringes, whose amplitudes change

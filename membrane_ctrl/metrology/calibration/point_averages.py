@@ -41,7 +41,7 @@ def average_points(
     # Residuals of the points, and their weights.
     shape = state.surface, state.vertex_z_mm, state.moved_screens
     residual_mm = forward_model.residual_mm(bench, phases, *shape)
-    weights = RobustWeights.seen(phases, residual_mm).weights / phases.sigma_mm**2
+    weights = RobustWeights.from_residual(phases, residual_mm).weights / phases.sigma_mm**2
 
     # The side of a cell. The mirror is seen as an ellipse: pi / 4 of the rectangle around it.
     width, height = np.ptp(phases.column_px), np.ptp(phases.row_px)

@@ -39,12 +39,14 @@ class RobustWeights:
     pattern_factor: float = 1.0
 
     @classmethod
-    def full(cls, phases: set_phases.SetPhases) -> "RobustWeights":
+    def unweighted(cls, phases: set_phases.SetPhases) -> "RobustWeights":
         """Every point with the weight of its noise."""
         return cls(np.ones(phases.sigma_mm.size), 1.0)
 
     @classmethod
-    def seen(cls, phases: set_phases.SetPhases, residual_mm: FloatArray) -> "RobustWeights":
+    def from_residual(
+        cls, phases: set_phases.SetPhases, residual_mm: FloatArray
+    ) -> "RobustWeights":
         """Huber's weights of residuals (2, n), against their own scatter.
 
         The scatter is not less than the camera's noise.

@@ -136,7 +136,7 @@ def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[
         facing = tilt @ np.diag([1.0, -1.0, -1.0])
         phases = replace(film, artefact=SeenScreen(distance_mm * middle, facing.T))
         seen = foreseen_set(solution, phases, state, half_mm)
-        weights = robust_weights.RobustWeights.full(seen)
+        weights = robust_weights.RobustWeights.unweighted(seen)
         more.append(foreseen_equations(solution, seen, state, weights))
     return with_equations(solution, (*solution.equations, *more)), distance_mm
 

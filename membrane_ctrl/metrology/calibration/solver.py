@@ -293,7 +293,7 @@ def _iterate(
     common: FloatArray,
 ) -> Solution:
     """Gauss-Newton steps from states of the sets and values of the common unknowns (COMMON,)."""
-    weights = tuple(robust_weights.RobustWeights.full(phases) for phases in problem.sets)
+    weights = tuple(robust_weights.RobustWeights.unweighted(phases) for phases in problem.sets)
     changes: list[float] = []
     has_new_weights = False  # since the step before
     has_final_weights = False
@@ -358,7 +358,7 @@ def _iterate(
         has_new_weights = not has_final_weights and (change < _NEARLY or leads_away)
         if has_new_weights:
             weights = tuple(
-                robust_weights.RobustWeights.seen(phases, residual_mm)
+                robust_weights.RobustWeights.from_residual(phases, residual_mm)
                 for phases, residual_mm in zip(problem.sets, left_mm, strict=True)
             )
 

@@ -161,7 +161,7 @@ class LiveReconstructor:
         )
         self._statement: GeometryStatement | None = None
 
-    def full(
+    def measure_full(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
     ) -> ShapeEstimate:
         """One full cycle. Raises ValueError for a wrong number, size or type of frames.
@@ -229,7 +229,7 @@ class LiveReconstructor:
         self._tracked = None
         return make_rejected_cycle("full", times, readings, orientation.describe())
 
-    def fringes(
+    def measure_fringes(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
     ) -> ShapeEstimate:
         """One fringes-only cycle. Raises ValueError for a wrong number, size or type of frames.

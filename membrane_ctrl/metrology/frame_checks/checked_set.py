@@ -112,7 +112,7 @@ class Checked:
         row, column = np.divmod(index, self.phase_rad.shape[2])
         return self.binned.bin_px * np.stack([column, row]) + (self.binned.bin_px - 1) / 2
 
-    def anchor(self) -> Anchor:
+    def make_anchor(self) -> Anchor:
         """For the sets that refer to this one."""
         return Anchor(self.phase_rad, self.view.light)
 

@@ -98,14 +98,14 @@ class LiveTracker:
         """Interval to the next frame over the shortest one."""
         return _INTERVAL_FACTORS[self._step % len(_INTERVAL_FACTORS)]
 
-    def full(
+    def measure_full(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
     ) -> ShapeEstimate:
         """Measure the figure of a full cycle, which becomes the reference of the frames after it.
 
-        Parameters and result as those of `LiveReconstructor.full`.
+        Parameters and result as those of `LiveReconstructor.measure_full`.
         """
-        estimate = self._cycles.full(frames, time_s, displacement_um)
+        estimate = self._cycles.measure_full(frames, time_s, displacement_um)
         self._tracker = None
         if estimate.verdict == "rejected":
             return estimate
@@ -121,7 +121,7 @@ class LiveTracker:
         self._begin()
         return estimate
 
-    def fringes(
+    def measure_fringes(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
     ) -> ShapeEstimate:
         """Measure the figure of one frame of `pattern`.
@@ -139,7 +139,7 @@ class LiveTracker:
                 tracking_lost=True,
             )
         shown = self.pattern
-        found = self._tracker.follow(
+        found = self._tracker.track_frame(
             frames[0], (shown.shift_rad, shown.shift_y_rad), at_s, reading_um
         )
         if found.verdict != "rejected":

@@ -141,7 +141,7 @@ class Tracker:
         self._jumps.begin()
         self._steps: list[step_means.StepMeans] = []
 
-    def anchor(
+    def measure_steps(
         self,
         frames: Sequence[Image],
         shifts_rad: FloatArray,
@@ -159,7 +159,7 @@ class Tracker:
         shifts_rad : (frames, 2) array
             Phase steps of x and y.
         time_s, displacement_um : (frames,) arrays
-            As those of `follow`.
+            As those of `track_frame`.
 
         Returns
         -------
@@ -174,7 +174,7 @@ class Tracker:
         for frame, shifts, at_s, reading_um in zip(
             frames, shown, time_s, displacement_um, strict=True
         ):
-            found.append(self.follow(frame, shifts, float(at_s), float(reading_um)))
+            found.append(self.track_frame(frame, shifts, float(at_s), float(reading_um)))
             fits.append(self._last)
             seen_adu.append(self._clear)
 
@@ -187,7 +187,7 @@ class Tracker:
             # A band was found on the way: fit all frames again with it. Time runs back.
             self._begin_scene(self._fitter.scene, self._last.surface, self._last.light)
             self._last_time_s = math.nan
-            return self.anchor(frames, shifts_rad, time_s, displacement_um)
+            return self.measure_steps(frames, shifts_rad, time_s, displacement_um)
 
         errors_mm2 = np.diag(self._fitter.covariance_mm2(self._last, shown[-1], self._noise_adu))
         moved_mm = self._renew_scene(
@@ -282,7 +282,7 @@ class Tracker:
         """Compute in advance what the next frame, with these phase steps of x and y, needs.
 
         New error bars take three times as long as a frame's fit, light from five steps twenty
-        times: computed between frames, they delay no figure. `follow` computes what was not
+        times: computed between frames, they delay no figure. `track_frame` computes what was not
         prepared.
         """
         self._covariance.estimate_if_due(self._fitter)
@@ -326,7 +326,7 @@ class Tracker:
         """
         return self._places_mm2.get(shifts_rad, np.zeros(surface.PARAMETERS))
 
-    def follow(
+    def track_frame(
         self,
         frame: Image,
         shifts_rad: Shifts,

@@ -52,7 +52,7 @@ def live_figures() -> list[dict[str, Any]]:
     for number, moved_um in enumerate(MOVED_UM):
         patterns = full_sequence(OPTICS.pattern) if number == 0 else fringe_sequence(OPTICS.pattern)
         frames = [renderer.render_picture(pattern, moved_um).copy() for pattern in patterns]
-        reconstruct = live.full if number == 0 else live.fringes
+        reconstruct = live.measure_full if number == 0 else live.measure_fringes
         times_s = 10.0 * number + 0.1 * np.arange(len(patterns))
         out.append(figure(reconstruct(frames, times_s, np.full(len(patterns), moved_um))))
     return out
@@ -64,12 +64,12 @@ def tracked_figures() -> list[dict[str, Any]]:
     tracker = LiveTracker(OPTICS, LiveReconstructor(OPTICS, 1), PERIODS, STEP_S, exposure_s=0.02)
     patterns = full_sequence(OPTICS.pattern)
     frames = [renderer.render_picture(pattern, 0.0).copy() for pattern in patterns]
-    tracker.full(frames, 0.1 * np.arange(len(patterns)), np.zeros(len(patterns)))
+    tracker.measure_full(frames, 0.1 * np.arange(len(patterns)), np.zeros(len(patterns)))
     out = []
     for k in range(FRAMES):
         moved_um, time_s = 0.5 * math.sin(k), 3.0 + k / RATE_HZ
         picture = renderer.render_picture(tracker.pattern, moved_um)
-        estimate = tracker.fringes([picture], np.array([time_s]), np.array([moved_um]))
+        estimate = tracker.measure_fringes([picture], np.array([time_s]), np.array([moved_um]))
         out.append({**figure(estimate), "moved_um": moved_um})
     return out
 

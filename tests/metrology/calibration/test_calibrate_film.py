@@ -156,7 +156,7 @@ def test_residuals_common_to_neighbours_lower_the_weights_and_noise_does_not() -
     pattern = np.sin(column / 90) * np.cos(row / 70)
     for shared, least, most in ((0.0, 1.0, 1.2), (0.8, 1.5, 12.0)):
         left = list(noise + shared * pattern)
-        found = reduce_weights([phases] * 3, left, [RobustWeights.full(phases)] * 3)
+        found = reduce_weights([phases] * 3, left, [RobustWeights.unweighted(phases)] * 3)
         assert all(least <= trust.variance <= most for trust in found), shared
 
 

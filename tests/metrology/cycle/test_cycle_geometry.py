@@ -55,19 +55,19 @@ def test_a_bench_measured_by_hand_is_uncalibrated_and_ok() -> None:
     live = LiveReconstructor(TRUE, 1, spread=PAPER_SPREAD, known_by=KnownBy.STATED, source="rulers")
     assert live.geometry_statement is None
     full, fringes = cycles()
-    assert live.full(*full).verdict == "ok"
+    assert live.measure_full(*full).verdict == "ok"
     statement = live.geometry_statement
     assert statement is not None
     assert statement.state is GeometryState.UNCALIBRATED
     assert statement.rim is not None
     assert abs(statement.rim.offset_mm) < 2.0
     assert statement.slopes.seen_urad < statement.slopes.explained_urad
-    assert live.fringes(*fringes).verdict == "ok"
+    assert live.measure_fringes(*fringes).verdict == "ok"
 
 
 def test_a_covariance_from_a_calibration_makes_it_calibrated() -> None:
     live = LiveReconstructor(TRUE, 1, spread=PAPER_SPREAD, known_by=KnownBy.CALIBRATION)
-    live.full(*cycles()[0])
+    live.measure_full(*cycles()[0])
     assert live.geometry_statement is not None
     assert live.geometry_statement.state is GeometryState.CALIBRATED
 
@@ -82,7 +82,7 @@ def test_a_geometry_that_the_frames_contradict_degrades_both_kinds_of_cycle(
     tight = GeometrySpread(PAPER_SPREAD.names, 1e-2 * PAPER_SPREAD.covariance)
     live = LiveReconstructor(misstated(name, amount), 1, spread=tight, known_by=KnownBy.CALIBRATION)
     full, fringes = cycles()
-    for estimate in (live.full(*full), live.fringes(*fringes)):
+    for estimate in (live.measure_full(*full), live.measure_fringes(*fringes)):
         assert estimate.verdict == "degraded"
         assert message in estimate.reason
     statement = live.geometry_statement
@@ -101,7 +101,7 @@ def test_wrinkles_of_the_film_do_not_contradict_the_geometry() -> None:
     wrinkled = replace(FILM, wrinkles=(Wrinkle(60.0, 12),))
     tight = GeometrySpread(PAPER_SPREAD.names, 1e-4 * PAPER_SPREAD.covariance)
     live = LiveReconstructor(TRUE, 1, spread=tight)
-    live.full(*cycles(wrinkled)[0])
+    live.measure_full(*cycles(wrinkled)[0])
     statement = live.geometry_statement
     assert statement is not None
     assert not statement.slopes.contradicts
@@ -111,7 +111,7 @@ def test_the_statement_is_reported_when_it_changes() -> None:
     live = LiveReconstructor(TRUE, 1, spread=PAPER_SPREAD, known_by=KnownBy.STATED, source="rulers")
     watch = StatementWatch()
     assert watch.check_statement(live.geometry_statement) is None
-    live.full(*cycles()[0])
+    live.measure_full(*cycles()[0])
     event = watch.check_statement(live.geometry_statement)
     assert isinstance(event, acquisition_events.GeometryKnown)
     assert (event.state, event.source, event.level) == ("uncalibrated", "rulers", LogLevel.INFO)

@@ -39,11 +39,11 @@ def cycles(
     """A full cycle at time 0, and fringes-only ones later; no laser."""
     live = LiveReconstructor(optics, 1)
     none = np.full(18, np.nan)
-    first = live.full(frames_of(world, 0.0), 0.1 * np.arange(18), none)
+    first = live.measure_full(frames_of(world, 0.0), 0.1 * np.arange(18), none)
     later = []
     for at_s in times_s:
         frames = [frame for k, frame in enumerate(frames_of(world, at_s)) if k in SINUSOIDS]
-        later.append(live.fringes(frames, at_s + 0.1 * np.arange(8), none[:8]))
+        later.append(live.measure_fringes(frames, at_s + 0.1 * np.arange(8), none[:8]))
     return first, later
 
 

@@ -68,7 +68,7 @@ def _live(
 ) -> LiveReconstructor:
     """A reconstructor after its first full cycle at displacement 0."""
     live = LiveReconstructor(optics, bin_px)
-    first = live.full(*_render("full", 0.0, optics, light))
+    first = live.measure_full(*_render("full", 0.0, optics, light))
     assert first.verdict == "ok", first.reason
     return live
 
@@ -89,7 +89,7 @@ def _error_um(
 def test_full_cycle(bin_px: int) -> None:
     live = LiveReconstructor(OPTICS, bin_px)
     frames, times, where = _render("full")
-    estimate = live.full(frames, times, where)
+    estimate = live.measure_full(frames, times, where)
     assert (estimate.verdict, estimate.reason, estimate.kind) == ("ok", "", "full")
     rms, worst = _error_um(live, estimate, 0.0)
     assert (
@@ -105,7 +105,7 @@ def test_full_cycle(bin_px: int) -> None:
 @pytest.mark.parametrize("displacement_um", [1.0, -30.0, 300.0])
 def test_fringes_follow_the_film(displacement_um: float) -> None:
     live = _live()
-    estimate = live.fringes(*_render("fringes", displacement_um))
+    estimate = live.measure_fringes(*_render("fringes", displacement_um))
     assert (estimate.verdict, estimate.kind) == ("ok", "fringes")
     assert _error_um(live, estimate, displacement_um)[0] <= 0.05
     assert estimate.displacement_um == pytest.approx(displacement_um)
@@ -115,7 +115,7 @@ def test_fringe_orders_are_carried_on_from_cycle_to_cycle() -> None:
     """1.2 mm in steps of 300 µm: more than a fringe in all, less than half a fringe per step."""
     live = _live()
     for displacement_um in (300.0, 600.0, 900.0, 1200.0):
-        estimate = live.fringes(*_render("fringes", displacement_um))
+        estimate = live.measure_fringes(*_render("fringes", displacement_um))
         assert estimate.verdict == "ok", estimate.reason
     assert _error_um(live, estimate, 1200.0)[0] <= 0.05
 
@@ -123,15 +123,15 @@ def test_fringe_orders_are_carried_on_from_cycle_to_cycle() -> None:
 @pytest.mark.parametrize("jump_um", [1100.0, -1500.0, 3000.0])
 def test_a_jump_beyond_half_a_fringe_requires_a_full_cycle(jump_um: float) -> None:
     live = _live()
-    lost = live.fringes(*_render("fringes", jump_um))
+    lost = live.measure_fringes(*_render("fringes", jump_um))
     assert lost.verdict == "rejected"
     assert lost.tracking_lost
     assert lost.reason.startswith("tracking lost")
     assert np.isnan(lost.coeffs_um).all()
     assert (
-        live.fringes(*_render("fringes", 0.0)).verdict == "ok"
+        live.measure_fringes(*_render("fringes", 0.0)).verdict == "ok"
     )  # the old orders are still good there
-    again = live.full(*_render("full", jump_um))
+    again = live.measure_full(*_render("full", jump_um))
     assert again.verdict == "ok"
     assert _error_um(live, again, jump_um)[0] <= 0.05
 
@@ -146,7 +146,7 @@ def test_knock_that_looks_like_a_small_tilt_the_other_way() -> None:
     frames = [
         renderer.render_picture(pattern, 0.0).copy() for pattern in fringe_sequence(OPTICS.pattern)
     ]
-    estimate = live.fringes(frames, np.arange(8.0), np.zeros(8))
+    estimate = live.measure_fringes(frames, np.arange(8.0), np.zeros(8))
     assert (estimate.verdict, estimate.reason) == (
         "rejected",
         "tracking lost: the whole mirror tilted",
@@ -154,23 +154,23 @@ def test_knock_that_looks_like_a_small_tilt_the_other_way() -> None:
 
 
 def test_fringes_before_any_full_cycle() -> None:
-    lost = LiveReconstructor(OPTICS, 1).fringes(*_render("fringes"))
+    lost = LiveReconstructor(OPTICS, 1).measure_fringes(*_render("fringes"))
     assert (lost.verdict, lost.tracking_lost) == ("rejected", True)
 
 
 def test_dark_cycle_is_rejected_and_the_next_one_is_fine() -> None:
     live = _live()
     frames, times, where = _render("fringes", 2.0)
-    dark = live.fringes([frame // 64 for frame in frames], times, where)
+    dark = live.measure_fringes([frame // 64 for frame in frames], times, where)
     assert dark.verdict == "rejected"
-    estimate = live.fringes(frames, times, where)
+    estimate = live.measure_fringes(frames, times, where)
     assert estimate.verdict == "ok"
     assert _error_um(live, estimate, 2.0)[0] <= 0.05
 
 
 def test_full_cycle_of_black_frames_is_rejected() -> None:
     frames, times, where = _render("full")
-    black = LiveReconstructor(OPTICS, 1).full([0 * frame for frame in frames], times, where)
+    black = LiveReconstructor(OPTICS, 1).measure_full([0 * frame for frame in frames], times, where)
     assert (black.verdict, black.reason) == (
         "rejected",
         "only 0 bins see the pattern in the mirror",
@@ -180,8 +180,8 @@ def test_full_cycle_of_black_frames_is_rejected() -> None:
 def test_failed_full_cycle_leaves_nothing_to_follow() -> None:
     live = _live()
     frames, times, where = _render("full")
-    live.full([0 * frame for frame in frames], times, where)
-    assert live.fringes(*_render("fringes")).tracking_lost
+    live.measure_full([0 * frame for frame in frames], times, where)
+    assert live.measure_fringes(*_render("fringes")).tracking_lost
 
 
 def test_overexposed_pixels_are_left_out_and_reported() -> None:
@@ -190,12 +190,12 @@ def test_overexposed_pixels_are_left_out_and_reported() -> None:
     frames = [frame.copy() for frame in frames]
     for frame in frames:
         frame[100:140, 120:160] = 255  # a lamp's reflection: 5 % of the mirror
-    estimate = live.fringes(frames, times, where)
+    estimate = live.measure_fringes(frames, times, where)
     assert estimate.verdict == "degraded"
     assert "saturated" in estimate.reason
     assert estimate.saturated_fraction == pytest.approx(1600 / 33000, rel=0.05)
     assert _error_um(live, estimate, 0.0)[0] <= 0.05
-    assert live.fringes(*_render("fringes")).verdict == "ok"  # its points kept their orders
+    assert live.measure_fringes(*_render("fringes")).verdict == "ok"  # its points kept their orders
 
 
 def test_half_a_mirror_is_rejected() -> None:
@@ -203,7 +203,7 @@ def test_half_a_mirror_is_rejected() -> None:
     frames = [frame.copy() for frame in frames]
     for frame in frames:
         frame[:, :160] = 3
-    estimate = LiveReconstructor(OPTICS, 1).full(frames, times, where)
+    estimate = LiveReconstructor(OPTICS, 1).measure_full(frames, times, where)
     assert estimate.verdict == "rejected"
     assert "of the area" in estimate.reason
 
@@ -213,7 +213,7 @@ def test_other_steps_and_depths(steps: int, bits: int) -> None:
     camera = SMALL.model_copy(update={"bits": bits, "noise_adu": 0.4 * 2 ** (bits - 8)})
     optics = OpticsConfig(camera=camera, pattern=PatternConfig(steps=steps))
     live = _live(optics)
-    estimate = live.fringes(*_render("fringes", 5.0, optics))
+    estimate = live.measure_fringes(*_render("fringes", 5.0, optics))
     assert estimate.verdict == "ok"
     assert _error_um(live, estimate, 5.0)[0] <= 0.06
 
@@ -224,19 +224,19 @@ def test_without_a_laser() -> None:
     """
     live = LiveReconstructor(OPTICS, 1)
     frames, times, where = _render("full")
-    estimate = live.full(frames, times, where * np.nan)
+    estimate = live.measure_full(frames, times, where * np.nan)
     assert estimate.verdict == "ok"
     assert np.isnan(estimate.displacement_um)
     frames, times, where = _render("fringes", 10.0)
-    assert _error_um(live, live.fringes(frames, times, where * np.nan), 10.0)[0] <= 0.1
+    assert _error_um(live, live.measure_fringes(frames, times, where * np.nan), 10.0)[0] <= 0.1
 
 
 def test_first_reading_is_the_reference() -> None:
     live = LiveReconstructor(OPTICS, 1)
     frames, times, where = _render("full")
-    live.full(frames, times, where + 1234.0)
+    live.measure_full(frames, times, where + 1234.0)
     frames, times, where = _render("fringes", 500.0)
-    assert _error_um(live, live.fringes(frames, times, where + 1234.0), 500.0)[0] <= 0.05
+    assert _error_um(live, live.measure_fringes(frames, times, where + 1234.0), 500.0)[0] <= 0.05
 
 
 def _moving(amplitude_um: float) -> np.ndarray:
@@ -248,9 +248,9 @@ def test_motion_during_the_frames_is_corrected() -> None:
     live = _live()
     where = _moving(5.0)
     frames, times, _ = _render("fringes", where)
-    corrected = _error_um(live, live.fringes(frames, times, where), float(where.mean()))[0]
+    corrected = _error_um(live, live.measure_fringes(frames, times, where), float(where.mean()))[0]
     blind = _error_um(
-        live, live.fringes(frames, times, np.full(8, where.mean())), float(where.mean())
+        live, live.measure_fringes(frames, times, np.full(8, where.mean())), float(where.mean())
     )[0]
     assert corrected <= 0.1
     assert blind > 5 * corrected > 0
@@ -261,7 +261,10 @@ def test_noisy_laser_still_helps() -> None:
     where = _moving(5.0)
     frames, times, _ = _render("fringes", where)
     readings = where + np.random.default_rng(3).normal(0, 1.0, 8)
-    assert _error_um(live, live.fringes(frames, times, readings), float(where.mean()))[0] <= 0.5
+    assert (
+        _error_um(live, live.measure_fringes(frames, times, readings), float(where.mean()))[0]
+        <= 0.5
+    )
 
 
 @pytest.fixture
@@ -274,7 +277,7 @@ def rigid(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("rigid")
 def test_predicted_sigma_is_the_scatter_of_cycles() -> None:
     live = _live(bin_px=2)
-    estimates = [live.fringes(*_render("fringes")) for _ in range(60)]
+    estimates = [live.measure_fringes(*_render("fringes")) for _ in range(60)]
     sags = np.array([e.sag_um for e in estimates])
     assert sags.std() == pytest.approx(
         estimates[0].sag_change_sigma_um, rel=0.3
@@ -292,7 +295,13 @@ def test_same_frames_give_the_same_figure() -> None:
     runs = []
     for _ in range(2):
         live = LiveReconstructor(OPTICS, 1)
-        runs.append([live.full(*cycles[0]), live.fringes(*cycles[1]), live.fringes(*cycles[2])])
+        runs.append(
+            [
+                live.measure_full(*cycles[0]),
+                live.measure_fringes(*cycles[1]),
+                live.measure_fringes(*cycles[2]),
+            ]
+        )
     for first, second in zip(*runs, strict=True):
         assert first.coeffs_um == pytest.approx(second.coeffs_um, abs=1e-8, rel=0)
         assert first.covariance_um2 == pytest.approx(second.covariance_um2, rel=1e-9)
@@ -302,13 +311,13 @@ def test_memory_does_not_grow_with_cycles() -> None:
     live = _live()
     cycles = [_render("fringes", d) for d in (0.5, -0.5)]
     for k in range(4):
-        live.fringes(*cycles[k % 2])
+        live.measure_fringes(*cycles[k % 2])
     tracemalloc.start()
     try:
-        live.fringes(*cycles[0])
+        live.measure_fringes(*cycles[0])
         before = tracemalloc.get_traced_memory()[0]
         for k in range(10):
-            live.fringes(*cycles[k % 2])
+            live.measure_fringes(*cycles[k % 2])
         grown = tracemalloc.get_traced_memory()[0] - before
     finally:
         tracemalloc.stop()
@@ -317,7 +326,7 @@ def test_memory_does_not_grow_with_cycles() -> None:
 
 def test_covariance_is_a_covariance() -> None:
     live = _live()
-    estimate = live.fringes(*_render("fringes"))
+    estimate = live.measure_fringes(*_render("fringes"))
     assert estimate.covariance_um2 == pytest.approx(estimate.covariance_um2.T)
     assert np.linalg.eigvalsh(estimate.covariance_um2).min() > -1e-15
     assert 0 < estimate.sag_change_sigma_um < 0.1
@@ -325,7 +334,7 @@ def test_covariance_is_a_covariance() -> None:
 
 def test_sag_sensitivity_is_the_change_seen() -> None:
     live = _live()
-    low, high = (live.fringes(*_render("fringes", d)) for d in (0.0, 200.0))
+    low, high = (live.measure_fringes(*_render("fringes", d)) for d in (0.0, 200.0))
     assert (high.coeffs_um - low.coeffs_um) / 200 == pytest.approx(live.sag_sensitivity(), abs=1e-3)
 
 
@@ -349,7 +358,7 @@ def test_wrong_size_of_frame() -> None:
     live = _live()
     frames, times, where = _render("fringes")
     with pytest.raises(ValueError, match="305, 256"):
-        live.fringes([frame[:, :-1] for frame in frames], times, where)
+        live.measure_fringes([frame[:, :-1] for frame in frames], times, where)
 
 
 UNEQUAL = np.array([[0.0, 1.3, 2.9, 4.4], [0.2, 1.7, 3.4, 4.9]])
@@ -367,10 +376,12 @@ def _render_unequal(kind: str, displacement_um: float) -> Frames:
 def test_unequal_steps() -> None:
     live = LiveReconstructor(OPTICS, 1, shifts_rad=UNEQUAL)
     assert (
-        _error_um(live, live.full(_render_unequal("full", 0.0), np.zeros(18), np.zeros(18)), 0.0)[0]
+        _error_um(
+            live, live.measure_full(_render_unequal("full", 0.0), np.zeros(18), np.zeros(18)), 0.0
+        )[0]
         < 0.05
     )
-    estimate = live.fringes(_render_unequal("fringes", 3.0), np.zeros(8), np.full(8, 3.0))
+    estimate = live.measure_fringes(_render_unequal("fringes", 3.0), np.zeros(8), np.full(8, 3.0))
     assert estimate.verdict == "ok"
     assert _error_um(live, estimate, 3.0)[0] < 0.05
 
@@ -385,14 +396,14 @@ def test_steps_that_determine_no_phase_are_refused() -> None:
 def test_the_geometrys_covariance_is_what_wrong_geometries_do() -> None:
     frames, times, where = _render("full")
     live = LiveReconstructor(OPTICS, 2, spread=PAPER_SPREAD)
-    estimate = live.full(frames, times, where)
+    estimate = live.measure_full(frames, times, where)
     far = np.zeros((ZERNIKE_TERMS, ZERNIKE_TERMS))
     for name, sigma in zip(PAPER_SPREAD.names, PAPER_SPREAD.sigmas, strict=True):
         ends = []
         for sign in (1.0, -1.0):
             geometry = change_geometry(OPTICS.geometry, (name,), [sign * sigma])
             wrong = LiveReconstructor(OPTICS.model_copy(update={"geometry": geometry}), 2)
-            ends.append(wrong.full(frames, times, where).coeffs_um)
+            ends.append(wrong.measure_full(frames, times, where).coeffs_um)
         far += np.outer(ends[0] - ends[1], ends[0] - ends[1]) / 4
     sigmas, expected = np.sqrt(np.diag(live.common_covariance_um2)), np.sqrt(np.diag(far))
     strong = expected > 0.05 * expected.max()
@@ -404,7 +415,7 @@ def test_the_geometrys_covariance_is_what_wrong_geometries_do() -> None:
 
 def test_without_a_spread_the_geometry_has_no_error_bar() -> None:
     live = LiveReconstructor(OPTICS, 2)
-    assert np.isnan(live.full(*_render("full")).geometry_sag_sigma_um)
+    assert np.isnan(live.measure_full(*_render("full")).geometry_sag_sigma_um)
     assert np.isnan(live.common_covariance_um2).all()
 
 
@@ -418,9 +429,9 @@ def _flickering(kind: str, seed: int, share: float) -> Frames:
 
 def test_flicker_is_corrected_and_the_rest_is_in_the_error_bar() -> None:
     live = _live(bin_px=2)
-    still = live.fringes(*_render("fringes"))
+    still = live.measure_fringes(*_render("fringes"))
     found = [
-        live.fringes(_flickering("fringes", seed, 0.02), np.zeros(8), np.zeros(8))
+        live.measure_fringes(_flickering("fringes", seed, 0.02), np.zeros(8), np.zeros(8))
         for seed in range(12)
     ]
     apart_um = np.array([e.coeffs_um - still.coeffs_um for e in found])[:, 3:]
@@ -455,13 +466,13 @@ def test_bands_of_a_pulsed_backlight_are_removed_from_full_and_fringes_cycles(
         ], *rest
 
     still, live = _live(), LiveReconstructor(OPTICS, 1)
-    steady = still.fringes(*_render("fringes"))
+    steady = still.measure_fringes(*_render("fringes"))
     for kind in ("full", "fringes", "fringes"):
         found = getattr(live, kind)(*banded(kind))
         assert np.linalg.norm((found.coeffs_um - steady.coeffs_um)[3:]) < most_um
         assert found.verdict == ("ok" if share < 0.05 else "degraded")
         assert ("bands of 1" in found.reason) == (share > 0.05)
-    again = live.fringes(*_render("fringes"))
+    again = live.measure_fringes(*_render("fringes"))
     assert again.verdict == "ok", again.reason  # steady again
 
 
@@ -470,7 +481,7 @@ def test_bands_that_cannot_be_explained_degrade_the_cycle(monkeypatch: pytest.Mo
     live = _live()
     live._bands_rad = np.array([0.3])
     monkeypatch.setattr(band_removal, "_UNEXPLAINED", -1.0)
-    found = live.fringes(*_render("fringes"))
+    found = live.measure_fringes(*_render("fringes"))
     assert (found.verdict, found.reason[:34]) == ("degraded", "bands of the backlight could not b")
     assert live._bands_rad.size == 1  # looked for again in the next
 
@@ -480,10 +491,10 @@ def test_a_noisy_laser_is_in_the_bar() -> None:
     the pixels.
     """
     live = LiveReconstructor(OPTICS, 2, laser_noise_um=1.0)
-    live.full(*_render("full"))
+    live.measure_full(*_render("full"))
     where, rng = _moving(5.0), np.random.default_rng(4)
     frames, times, _ = _render("fringes", where)
-    found = [live.fringes(frames, times, where + rng.normal(0, 1.0, 8)) for _ in range(40)]
+    found = [live.measure_fringes(frames, times, where + rng.normal(0, 1.0, 8)) for _ in range(40)]
     coeffs = np.array([e.coeffs_um for e in found])[:, 3:]
     bar_um = np.sqrt(np.diag(found[0].covariance_um2))[3:]
     worst = int(np.argmax(bar_um))
@@ -497,15 +508,15 @@ def test_the_harmonics_of_the_display_move_with_the_film() -> None:
     """
     light = Light(gamma=2.0)
     live, where = _live(light=light, bin_px=2), _moving(25.0)
-    still = live.fringes(*_render("fringes", float(where.mean()), light=light))
-    moved = live.fringes(*_render("fringes", where, light=light))
+    still = live.measure_fringes(*_render("fringes", float(where.mean()), light=light))
+    moved = live.measure_fringes(*_render("fringes", where, light=light))
     bar_um = np.sqrt(np.diag(still.covariance_um2 + moved.covariance_um2))[3:]
     assert abs(moved.sag_um - still.sag_um) < 0.05
     assert np.abs((moved.coeffs_um - still.coeffs_um)[3:] / bar_um).max() < 4
     pure = _live(bin_px=2)
     assert (
         moved.sag_change_sigma_um
-        < 1.5 * pure.fringes(*_render("fringes", where)).sag_change_sigma_um
+        < 1.5 * pure.measure_fringes(*_render("fringes", where)).sag_change_sigma_um
     )
 
 
@@ -521,8 +532,11 @@ def test_the_effect_of_a_wrong_geometry_on_a_measured_motion_is_in_the_error_bar
         values[NAMES.index(name)] = sigma_deg
         geometry = general_form(bench_at(Geometry.from_config(OPTICS), values).geometry, OPTICS)
         live = LiveReconstructor(OPTICS.model_copy(update={"geometry": geometry}), 2, spread=spread)
-        live.full(*_render("full"))
-        still, moved = live.fringes(*_render("fringes")), live.fringes(*_render("fringes", where))
+        live.measure_full(*_render("full"))
+        still, moved = (
+            live.measure_fringes(*_render("fringes")),
+            live.measure_fringes(*_render("fringes", where)),
+        )
         bar_um = np.sqrt(np.diag(still.covariance_um2 + moved.covariance_um2))[3:]
         ratios.append(np.abs(moved.coeffs_um - still.coeffs_um)[3:] / bar_um)
     assert np.max(ratios) < 4
@@ -533,7 +547,10 @@ def test_the_bar_grows_with_the_displacement_until_a_new_reference() -> None:
     which no cycle shows by itself.
     """
     live = LiveReconstructor(OPTICS, 2, spread=PAPER_SPREAD)
-    bars = [live.full(*_render("full", d)).sag_change_sigma_um for d in (0.0, 80.0, 400.0, 402.0)]
+    bars = [
+        live.measure_full(*_render("full", d)).sag_change_sigma_um
+        for d in (0.0, 80.0, 400.0, 402.0)
+    ]
     assert bars[1] > 3 * bars[0]
     assert bars[2:] == pytest.approx([bars[0]] * 2, rel=0.3)
 
@@ -556,5 +573,5 @@ def _shared_um2(frames: Frames, times: np.ndarray, where: np.ndarray) -> np.ndar
         update={"geometry": OPTICS.geometry.model_copy(update={"sigmas": exact})}
     )
     live = LiveReconstructor(optics, 2, spread=narrow)
-    assert live.full(frames, times, where).verdict == "ok"
+    assert live.measure_full(frames, times, where).verdict == "ok"
     return live.common_covariance_um2

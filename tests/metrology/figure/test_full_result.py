@@ -272,7 +272,7 @@ def test_tukey_keeps_noise_and_drops_outliers() -> None:
 def test_fringes_lean_on_their_reference() -> None:
     optics = bench()
     full = good_set(optics)
-    anchor = check_set(full, optics).anchor()
+    anchor = check_set(full, optics).make_anchor()
     sinusoids = [k for k, p in enumerate(full.patterns) if p.role == "sin"]
     moved = good_set(optics, motion_um=lambda _t: 30.0, seed=2)
     stack = FrameStack(

@@ -142,6 +142,8 @@ def test_live_cycle_names_saturation_below_full_scale() -> None:
     order = range(len(stack.frames))
     none = np.full(len(stack.frames), np.nan)
     reconstructor = LiveReconstructor(quarter_bench(), 2)
-    estimate = reconstructor.full([stack.frames[k] for k in order], 0.1 * np.arange(18), none)
+    estimate = reconstructor.measure_full(
+        [stack.frames[k] for k in order], 0.1 * np.arange(18), none
+    )
     assert estimate.verdict == "rejected"
     assert "saturated: shorten the exposure" in estimate.reason

@@ -20,7 +20,7 @@ INSIDE = np.hypot(X, Y) <= 475
 
 @pytest.fixture(scope="module")
 def anchor() -> Anchor:
-    return check_set(good_set(bench()), bench()).anchor()
+    return check_set(good_set(bench()), bench()).make_anchor()
 
 
 def fringes_of(stack: FrameStack) -> FrameStack:

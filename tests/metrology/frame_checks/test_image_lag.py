@@ -130,7 +130,7 @@ def test_frames_before_others_by_their_times() -> None:
 
 
 def test_fringes_alone_show_it_where_y_follows_x() -> None:
-    anchor = still_um()[0].anchor()
+    anchor = still_um()[0].make_anchor()
     shown = list(fringe_sequence(OPTICS.pattern))
     frames = render_frames(OPTICS, LightEffects(image_lag_share=0.03), shown, seed=7, before=None)
     stack = FrameStack(frames, tuple(shown), np.full(len(shown), math.nan), {})
@@ -147,7 +147,7 @@ def live_um(
     if kind == "fringes":
         shown = list(fringe_sequence(OPTICS.pattern))
     frames = render_frames(OPTICS, effects, shown, seed=8, before=before)
-    run = reconstructor.full if kind == "full" else reconstructor.fringes
+    run = reconstructor.measure_full if kind == "full" else reconstructor.measure_fringes
     none = np.full(len(shown), math.nan)
     estimate = run(list(frames), 0.1 * np.arange(len(shown)), none)
     assert estimate.verdict == "ok", estimate.reason

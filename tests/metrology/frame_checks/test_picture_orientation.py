@@ -95,7 +95,7 @@ def test_a_full_cycle_names_turned_pictures(what: str) -> None:
     stack = turned(good_set(bench()), TURNED[what])
     nothing = np.full(len(stack.frames), np.nan)
     live = LiveReconstructor(bench(), bin_px=1)
-    estimate = live.full(list(stack.frames), 0.1 * np.arange(len(stack.frames)), nothing)
+    estimate = live.measure_full(list(stack.frames), 0.1 * np.arange(len(stack.frames)), nothing)
     assert estimate.verdict == "rejected"
     assert estimate.reason.startswith(what)
 

@@ -161,7 +161,7 @@ def test_the_live_cycle_has_the_face() -> None:
     optics = _optics(CROOKED)
     stack = good_set(optics)
     nan = np.full(len(stack.frames), np.nan)
-    estimate = LiveReconstructor(optics, bin_px=2).full(list(stack.frames), nan, nan)
+    estimate = LiveReconstructor(optics, bin_px=2).measure_full(list(stack.frames), nan, nan)
     assert estimate.verdict == "ok"
     assert _error_um(Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, 500.0)) < 0.2
 

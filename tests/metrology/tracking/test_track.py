@@ -118,11 +118,11 @@ def with_terms(by_um: dict[int, float]) -> FilmShape:
 def test_every_frame_gives_the_figure_within_its_error_bar(bench: Bench) -> None:
     tracker = bench.tracker()
     stepped = [bench.frame(shifts=(float(x), float(y))) for x, y in STEPS]
-    begun = tracker.anchor(stepped, STEPS, 0.1 * np.arange(-5, 0), np.full(5, math.nan))
+    begun = tracker.measure_steps(stepped, STEPS, 0.1 * np.arange(-5, 0), np.full(5, math.nan))
     # of so few pixels a square of the mirror may show a fringe too few, and is then left out
     assert "rejected" not in {frame.verdict for frame in begun}
     moved = [0.0, 1.0, 3.0, 3.2, 40.0, -60.0]
-    frames = [tracker.follow(bench.frame(um), STILL, 0.1 * k) for k, um in enumerate(moved)]
+    frames = [tracker.track_frame(bench.frame(um), STILL, 0.1 * k) for k, um in enumerate(moved)]
     assert [frame.verdict for frame in frames] == ["ok"] * len(moved), frames
     truth = np.array([FILM.sag_at_mm(um) for um in moved]) * 1e3
     error = np.array([frame.sag_um for frame in frames]) - truth
@@ -144,13 +144,15 @@ def test_a_frame_again_is_frozen_unless_the_camera_has_no_noise(
     ok.
     """
     tracker, frame = Tracker(bench.scene, SIZE, 255, noise_adu), bench.frame()
-    assert tracker.follow(frame, STILL, 0.0).verdict == "ok"
-    assert tracker.follow(frame, STILL, 0.1).verdict == verdict
+    assert tracker.track_frame(frame, STILL, 0.0).verdict == "ok"
+    assert tracker.track_frame(frame, STILL, 0.1).verdict == verdict
 
 
 def test_without_steps_the_reference_gives_the_light(bench: Bench) -> None:
     tracker = bench.tracker()
-    frames = [tracker.follow(bench.frame(um), STILL, 0.1 * k) for k, um in enumerate((0.0, 5.0))]
+    frames = [
+        tracker.track_frame(bench.frame(um), STILL, 0.1 * k) for k, um in enumerate((0.0, 5.0))
+    ]
     assert [frame.verdict for frame in frames] == ["ok", "ok"]
     assert frames[1].sag_um - frames[0].sag_um == pytest.approx(5.0, abs=0.15)
 
@@ -188,7 +190,7 @@ def test_a_hand_makes_the_error_bars_larger_while_it_is_there(bench: Bench) -> N
         tracker = bench.tracker()
         pictures = [bench.frame(), bench.frame(), hand(bench.frame(), 46), bench.frame()]
         _, before, covered, after = [
-            tracker.follow(one, STILL, 0.1 * k) for k, one in enumerate(pictures)
+            tracker.track_frame(one, STILL, 0.1 * k) for k, one in enumerate(pictures)
         ]
         assert covered.verdict == "degraded", covered.reason
         moved_um = (covered.coeffs_um - before.coeffs_um)[1:]
@@ -241,7 +243,7 @@ def test_what_the_next_frame_needs_may_be_made_ahead(bench: Bench) -> None:
     for k, (picture, shown) in enumerate(zip(pictures, shifts, strict=True)):
         ahead.prepare(shown)
         scene = ahead._fitter.scene
-        found.append([one.follow(picture, shown, 0.1 * k) for one in (late, ahead)])
+        found.append([one.track_frame(picture, shown, 0.1 * k) for one in (late, ahead)])
         assert ahead._fitter.scene is scene
     for one, other in found:
         assert np.array_equal(one.coeffs_um, other.coeffs_um)
@@ -262,9 +264,9 @@ def test_a_hand_in_one_of_the_first_five_steps_does_not_change_the_light_of_the_
     tracker = bench.tracker()
     pictures = [bench.frame(shifts=(float(x), float(y))) for x, y in STEPS]
     pictures[2] = hand(pictures[2], 46)
-    found = tracker.anchor(pictures, STEPS, 0.1 * np.arange(5), np.full(5, math.nan))
+    found = tracker.measure_steps(pictures, STEPS, 0.1 * np.arange(5), np.full(5, math.nan))
     assert [frame.verdict for frame in found] == ["ok", "ok", "degraded", "ok", "ok"]
-    later = tracker.follow(bench.frame(), STILL, 0.6)
+    later = tracker.track_frame(bench.frame(), STILL, 0.6)
     assert later.verdict == "ok"
     assert np.all(tracker._fitter.scene.edge == bench.scene.edge)
     for frame in (found[0], found[1], found[3], found[4], later):
@@ -284,10 +286,10 @@ def test_a_fit_that_stays_lost_has_no_removed_bands(
     acquisition.
     """
     tracker, rows = bench.tracker(), np.arange(SIZE[0])[:, None]
-    assert tracker.follow(bench.frame(), STILL, 0.0).verdict == "ok"
+    assert tracker.track_frame(bench.frame(), STILL, 0.0).verdict == "ok"
     banded = (bench.frame() * (1 + 0.1 * np.cos(0.9 * rows))).astype(np.uint8)
     monkeypatch.setattr(RobustFitter, "has_failed", lambda self, fit: True)
-    tracker.follow(banded, STILL, 0.1)
+    tracker.track_frame(banded, STILL, 0.1)
     assert not len(tracker._bands.waves)
 
 
@@ -299,7 +301,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
     """The result of a faulty frame between good ones, and of the good one after it."""
     tracker = bench.tracker()
     good = bench.frame()
-    assert tracker.follow(good, STILL, 0.0).verdict == "ok"
+    assert tracker.track_frame(good, STILL, 0.0).verdict == "ok"
     faulty = {
         "frozen": lambda: good,
         "hand": lambda: hand(bench.frame(), 40),
@@ -322,9 +324,9 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         ).astype(np.uint8),
         "blank screen": lambda: noisy_grey(float(np.median(bench.scene.light_adu[0]))),
     }
-    found = tracker.follow(faulty[name](), STILL, 0.05)
+    found = tracker.track_frame(faulty[name](), STILL, 0.05)
     assert not len(tracker._bands.waves), "what a lost order leaves is no bands"
-    return found, tracker.follow(bench.frame(2.0), STILL, 0.1)
+    return found, tracker.track_frame(bench.frame(2.0), STILL, 0.1)
 
 
 @pytest.mark.parametrize(
@@ -376,12 +378,12 @@ def jumps(bench: Bench, count: int, seed: int) -> list[str]:
     refused.
     """
     generator, silent, good = np.random.default_rng(seed), [], bench.tracker()
-    assert good.follow(bench.frame(), STILL, 0.0).verdict == "ok"
+    assert good.track_frame(bench.frame(), STILL, 0.0).verdict == "ok"
     for _ in range(count):
         sag_um, tilt_mrad, angle = generator.uniform((0, 0, 0), (1000, 10, 2 * math.pi))
         tilt_um = 250.0 * tilt_mrad  # RMS
         film = with_terms({2: tilt_um * math.cos(angle), 3: tilt_um * math.sin(angle)})
-        found = deepcopy(good).follow(bench.frame(sag_um, film), STILL, 0.05)
+        found = deepcopy(good).track_frame(bench.frame(sag_um, film), STILL, 0.05)
         error_um = found.sag_um - 1e3 * bench.scene.surface.sag_mm - sag_um
         if found.verdict != "rejected" and not abs(error_um) < 1.0:
             silent.append(

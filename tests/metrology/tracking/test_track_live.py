@@ -64,7 +64,9 @@ class Bench:
             for p in pattern_sequence.full_sequence(OPTICS.pattern)
         ]
         self.time_s += 2.0
-        return self.tracker.full(frames, self.time_s + 0.1 * np.arange(18), np.full(18, moved_um))
+        return self.tracker.measure_full(
+            frames, self.time_s + 0.1 * np.arange(18), np.full(18, moved_um)
+        )
 
     def frame(
         self, moved_um: float = 0.0, reading_um: float = math.nan, gain: float = 1.0
@@ -77,7 +79,9 @@ class Bench:
         """The last picture as the next frame."""
         self.time_s += 1 / self.rate_hz
         self.shown.append(self.tracker.pattern)
-        return self.tracker.fringes([self.picture], np.array([self.time_s]), np.array([reading_um]))
+        return self.tracker.measure_fringes(
+            [self.picture], np.array([self.time_s]), np.array([reading_um])
+        )
 
     def frames(self, count: int, moved_um: float = 0.0, **given: float) -> list[ShapeEstimate]:
         return [self.frame(moved_um, **given) for _ in range(count)]
@@ -246,14 +250,14 @@ def test_a_hold_finds_the_films_vibrations_and_no_others() -> None:
         renderer.render_picture(p, float(film_um[0]))
         for p in pattern_sequence.full_sequence(optics.pattern)
     ]
-    assert tracker.full(still, 0.1 * np.arange(18), np.full(18, math.nan)).verdict == "ok"
+    assert tracker.measure_full(still, 0.1 * np.arange(18), np.full(18, math.nan)).verdict == "ok"
     time_s = 2.0
     while time_s < 125.0:
         picture = renderer.render_picture(
             tracker.pattern, float(film_um[round(50 * time_s)]), time_s=time_s
         )
         told += listener.add_estimate(
-            tracker.fringes([picture], np.array([time_s]), np.array([math.nan]))
+            tracker.measure_fringes([picture], np.array([time_s]), np.array([math.nan]))
         )
         time_s += tracker.interval_factor / 20
     assert len(told) == 2

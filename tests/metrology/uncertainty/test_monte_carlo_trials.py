@@ -56,7 +56,7 @@ def _first() -> tuple[Checked, BinFigure]:
 def _bench(displacement_um: float = 0.0) -> TrialBench:
     checked, figure = _first()
     if displacement_um:
-        checked = check_set(_stack(displacement_um, "fringes"), _anchored(), checked.anchor())
+        checked = check_set(_stack(displacement_um, "fringes"), _anchored(), checked.make_anchor())
         figure = bin_figure(_anchored(), checked)
     return TrialBench.of(OPTICS, checked, figure)
 
@@ -88,7 +88,7 @@ def test_figure_of_a_moving_film() -> None:
     errors = {}
     for laser in (True, False):
         stack = stack_of(frames, shown, where_um if laser else None)
-        figure = bin_figure(_anchored(), check_set(stack, _anchored(), _first()[0].anchor()))
+        figure = bin_figure(_anchored(), check_set(stack, _anchored(), _first()[0].make_anchor()))
         truth = FILM.height_mm(x, y, float(where_um.mean()))[MAP.inside]
         errors[laser] = np.sqrt(
             np.mean(np.square(1e3 * (MAP.matrix @ figure.fit.surface.parameters - truth)))
@@ -102,7 +102,7 @@ def test_noise_is_that_of_whole_measurements() -> None:
     """Variances of the 36 parameters over 24 sets with new pixel noise, against those of 600
     trials.
     """
-    anchor = _first()[0].anchor()
+    anchor = _first()[0].make_anchor()
     whole = []
     for _ in range(24):
         checked = check_set(_stack(frames="fringes"), OPTICS, anchor)
