@@ -21,7 +21,7 @@ from membrane_ctrl.acquisition.spec import AcquisitionSpec
 from membrane_ctrl.acquisition.twin_truth import TwinTruth
 from membrane_ctrl.acquisition.vibrations import make_vibration_handler
 from membrane_ctrl.acquisition.waiting_clock import WaitingClock
-from membrane_ctrl.acquisition.warm_up import TYPICAL_FILM, coarse_optics, warm_up
+from membrane_ctrl.acquisition.warm_up import FilmAtRest, coarse_optics, warm_up
 from membrane_ctrl.config.schema import Config, OpticsConfig
 from membrane_ctrl.geometry import run_geometry, spread_file
 from membrane_ctrl.metrology.cycle import live_reconstructor
@@ -59,7 +59,7 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
         # Camera and screen, open, and compiled kernels.
         if spec.truth is None:
             bench = optical_bench.configured_bench(config, clock)
-            _warm_up(config, plan, TYPICAL_FILM, clock)
+            _warm_up(config, plan, FilmAtRest(), clock)
         else:
             bench = _make_twin_bench(spec.truth, config, plan, clock, remote, stack)
         signal.signal(child.STOP, lambda number, frame: remote.request_stop())

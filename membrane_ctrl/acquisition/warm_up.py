@@ -15,16 +15,13 @@ _SMALL_PX = 300  # still enough points for the fit of the terms, at a hundredth 
 
 
 @dataclass(frozen=True, slots=True)
-class _StandingFilm:
-    """A film at its usual sag."""
+class FilmAtRest:
+    """A film at its usual sag: that of a metre of film at the usual pressure. That of the real film
+    is unknown before the measurement.
+    """
 
-    displacement_um: float
-    sag_mm: float
-
-
-# A real film's sag is unknown before the measurement; a metre of film at the usual pressure has
-# this one
-TYPICAL_FILM: FilmPosition = _StandingFilm(0.0, 37.1)
+    displacement_um: float = 0.0
+    sag_mm: float = 37.1
 
 
 def coarse_optics(optics: OpticsConfig) -> OpticsConfig:

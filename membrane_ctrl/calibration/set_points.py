@@ -18,6 +18,7 @@ from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.phase.frame_stack import bin_frames
 from membrane_ctrl.metrology.rays import set_phases
 from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.moved_screen import MovedScreen
 from membrane_ctrl.metrology.reconstruction.bin_grid import BinGrid
 from membrane_ctrl.metrology.reconstruction.slope_noise import pixel_sigma_adu
 from membrane_ctrl.model import errors
@@ -108,7 +109,7 @@ def phases_of_screen(capture: CaptureSet) -> set_phases.SetPhases:
         sigma_mm=sigma_mm,
         displacement_um=math.nan,
         artefact=screen,
-        moved_screens=(set_phases.ANYWHERE,),
+        moved_screens=(MovedScreen.anywhere(),),
         period_mm=pattern.period_mm,
     )
 

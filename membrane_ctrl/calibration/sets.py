@@ -14,6 +14,7 @@ from membrane_ctrl.geometry import file, prior_file, set_tables
 from membrane_ctrl.measure.capture_set import CaptureHead, read_head, read_set
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.rays import set_phases
+from membrane_ctrl.metrology.rays.moved_screen import MovedScreen
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -192,7 +193,7 @@ def join_moved_screen(
         )
     nearest = films[int(np.nanargmin(differences_um))]
     base = sets[nearest]
-    known = set_phases.MovedScreen(
+    known = MovedScreen(
         moved.shift_mm,
         moved.shift_sigma_mm,
         moved.turn_sigma_deg,

@@ -11,7 +11,7 @@ from membrane_ctrl.config import sight
 from membrane_ctrl.config.optics import CameraPoseConfig, ScreenPoseConfig
 from membrane_ctrl.config.schema import GeometryConfig
 from membrane_ctrl.metrology.rays.artefacts import Artefact
-from membrane_ctrl.metrology.rays.set_phases import (
+from membrane_ctrl.metrology.rays.turned_mirror import (
     SEAT_SIGMA_MM,
     TURN_SIGMA_DEG,
     TurnedMirror,

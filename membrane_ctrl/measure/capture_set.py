@@ -33,7 +33,7 @@ from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.measure.pixel_format import find_pixel_mistake, find_size_mistake
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.rays.artefacts import Artefact
-from membrane_ctrl.metrology.rays.set_phases import TurnedMirror
+from membrane_ctrl.metrology.rays.turned_mirror import TurnedMirror
 from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry, bench_at
-from membrane_ctrl.metrology.rays.set_phases import SetPhases, TurnedMirror
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
+from membrane_ctrl.metrology.rays.turned_mirror import TurnedMirror
 from tests.support.calibration_truth import (
     NOMINAL_MM,
     PIXEL_SIGMA_MM,

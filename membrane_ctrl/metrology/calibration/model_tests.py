@@ -19,7 +19,13 @@ from membrane_ctrl.metrology.calibration import (
     set_state,
     solver,
 )
-from membrane_ctrl.metrology.rays import bench_parameters, bench_poses, disc_heights, set_phases
+from membrane_ctrl.metrology.rays import (
+    bench_parameters,
+    bench_poses,
+    disc_heights,
+    moved_screen,
+    set_phases,
+)
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 SURE = 1e-6  # probability that good data look as bad
@@ -263,8 +269,8 @@ def _free_screen_moves(solution: solver.Solution, k: int) -> FloatArray:
         without_stated[np.ix_(own, own)] -= stated_rows.T @ stated_rows
 
         # Their effect on the unknowns of the set.
-        free += normal_equations.eliminate_first(without_stated, set_phases.MOVED)
-        free -= normal_equations.eliminate_first(sums, set_phases.MOVED)
+        free += normal_equations.eliminate_first(without_stated, moved_screen.MOVED)
+        free -= normal_equations.eliminate_first(sums, moved_screen.MOVED)
     return np.asarray(free)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from membrane_ctrl.metrology.calibration.reference_rows import reference_rows
 from membrane_ctrl.metrology.calibration.robust_weights import RobustWeights
 from membrane_ctrl.metrology.calibration.set_state import COMMON, References, SetState
-from membrane_ctrl.metrology.rays import bench_poses, forward_model, set_phases
+from membrane_ctrl.metrology.rays import bench_poses, forward_model, moved_screen, set_phases
 from membrane_ctrl.model.arrays import FloatArray
 
 
@@ -64,7 +64,7 @@ class Equations:
 
     def moved(self, local_step: FloatArray, common_step: FloatArray) -> list[FloatArray]:
         """Steps (MOVED,) of the screens elsewhere that go with those."""
-        moved = set_phases.MOVED
+        moved = moved_screen.MOVED
         step = np.append(local_step, common_step)
         steps = []
         for sums in self.moved_screens:
@@ -145,12 +145,12 @@ def linearise_set(
         if k:
             # What is known of the screen's move; then its own unknowns are eliminated.
             known, sigmas = phases.moved_screens[k - 1].make_prior(references.laser_sigma_um)
-            by_hand = np.hstack([np.eye(set_phases.MOVED), (known - move)[:, None]])
+            by_hand = np.hstack([np.eye(moved_screen.MOVED), (known - move)[:, None]])
             by_hand /= sigmas[:, None]
-            own = np.append(np.arange(set_phases.MOVED), len(found) - 1)
+            own = np.append(np.arange(moved_screen.MOVED), len(found) - 1)
             found[np.ix_(own, own)] += by_hand.T @ by_hand
             moved_screens.append(found)
-            found = eliminate_first(found, set_phases.MOVED)
+            found = eliminate_first(found, moved_screen.MOVED)
         sums = sums + found
 
     weights = robust.weights / phases.sigma_mm**2
@@ -166,7 +166,7 @@ def _sum_fringes(
 
     `root` (n,) are the square roots of the points' weights.
     """
-    own = set_phases.MOVED if moved else 0
+    own = moved_screen.MOVED if moved else 0
     size = own + forward_model.LOCAL + COMMON + 1
     sums = np.zeros((size, size))
     residual_mm = np.empty((2, root.size))

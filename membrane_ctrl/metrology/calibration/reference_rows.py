@@ -24,6 +24,7 @@ from membrane_ctrl.metrology.film.terms_beyond_fit import round_of
 from membrane_ctrl.metrology.rays import (
     bench_poses,
     forward_model,
+    moved_screen,
     set_phases,
     surface_basis,
 )
@@ -78,7 +79,7 @@ def reference_rows(
     motion = rows[-1]
     motion[forward_model.MOTION] = 1.0
     motion[-1] = 1e-3 * phases.motion_um - state.motion_mm
-    motion /= max(phases.motion_sigma_um, set_phases.STILL_UM) * 1e-3
+    motion /= max(phases.motion_sigma_um, moved_screen.STILL_UM) * 1e-3
 
     # The ring: the harmonics of the rim's height are those of all sets.
     ring = rows[:RING]
@@ -176,5 +177,5 @@ def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
     # Its vertex, and that it does not move.
     vertex[PARAMETERS] = 1.0 / artefact.vertex_sigma_mm
     vertex[-1] = (artefact.vertex_mm - state.vertex_z_mm) / artefact.vertex_sigma_mm
-    motion[forward_model.MOTION] = 1.0 / (1e-3 * set_phases.STILL_UM)
+    motion[forward_model.MOTION] = 1.0 / (1e-3 * moved_screen.STILL_UM)
     return rows

@@ -15,8 +15,9 @@ from membrane_ctrl.metrology.calibration.foreseen_sets import (
     with_equations,
 )
 from membrane_ctrl.metrology.calibration.solver import Solution
-from membrane_ctrl.metrology.rays import forward_model, set_phases
+from membrane_ctrl.metrology.rays import forward_model, moved_screen
 from membrane_ctrl.metrology.rays.artefacts import SeenScreen
+from membrane_ctrl.metrology.rays.moved_screen import MovedScreen
 from membrane_ctrl.model.arrays import FloatArray
 
 # The screen itself before the camera, tilted to two sides: with one tilt, focal length and distance
@@ -115,7 +116,7 @@ def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[
         film.subset(film.seen_with(0)),
         displacement_um=np.nan,
         screen=None,
-        moved_screens=(set_phases.ANYWHERE,),
+        moved_screens=(MovedScreen.anywhere(),),
     )
 
     # The distance at which the fringes fill the picture.
@@ -128,7 +129,7 @@ def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[
 
     # Two sets, tilted about x and about y. The screen faces the camera, and s_y goes up in the
     # picture.
-    no_moves = (np.zeros(set_phases.MOVED),)
+    no_moves = (np.zeros(moved_screen.MOVED),)
     state = set_state.SetState(solution.states[index].surface, 0.0, moved_screens=no_moves)
     more = []
     for axis in ("x", "y"):
@@ -147,9 +148,7 @@ def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Sol
     """
     film = solution.problem.sets[index]
     present = solution.equations[index]
-    known = set_phases.MovedScreen(
-        (0.0, 0.0, _RAIL_MM), RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0
-    )
+    known = MovedScreen((0.0, 0.0, _RAIL_MM), RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0)
     move = known.make_prior(solution.problem.references.laser_sigma_um)[0]
     state = replace(solution.states[index], moved_screens=(move,))
     there = foreseen_set(solution, film.beside(film, known), state, half_mm)

@@ -16,8 +16,8 @@ from membrane_ctrl.metrology.calibration.set_state import (
 from membrane_ctrl.metrology.film import film_form
 from membrane_ctrl.metrology.rays.forward_model import LOCAL, SEAT
 from membrane_ctrl.metrology.rays.height_projection import height_projection
-from membrane_ctrl.metrology.rays.set_phases import TurnedMirror
 from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.metrology.rays.turned_mirror import TurnedMirror
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 # What does not turn: an upright film hangs by its weight, and its gas is lighter or heavier than

@@ -9,8 +9,6 @@ one radial order to the next. Where the moduli are 12 % apart and the ring is 0.
 the largest of them is 0.4 µm, and these terms leave 1 nm.
 """
 
-import math
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -18,9 +16,9 @@ from numpy.polynomial import Legendre, Polynomial
 
 from membrane_ctrl.metrology.film import film_law, hencky_bowl
 from membrane_ctrl.metrology.film.hencky_bowl import EXCESS_DEGREE, EXCESS_TERMS
+from membrane_ctrl.metrology.film.wave_term import Wave, first_radial_order
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 # Legendre degrees of the round terms that a calibration does not take from Hencky, of unit RMS
 ROUND_DEGREES = (EXCESS_DEGREE + 1, EXCESS_DEGREE + 2, EXCESS_DEGREE + 3)
@@ -43,40 +41,12 @@ _WAVE_ORDERS = (
 _WAVE_FALL = 5.0  # from one radial order to the next; a film of the law has ten
 
 
-@dataclass(frozen=True)
-class Wave:
-    """A Zernike term beyond the fit's that is not round.
-
-    Attributes
-    ----------
-    radial_order, azimuthal_order : int
-        n and m; m below 0: a sine.
-    sigma_mm : float
-        Standard deviation of its amplitude over films that were not measured.
-    """
-
-    radial_order: int
-    azimuthal_order: int
-    sigma_mm: float
-
-    @property
-    def rms_factor(self) -> float:
-        """Height at the rim of the term with unit RMS."""
-        return math.sqrt(2 * (self.radial_order + 1))
-
-
-def _list_waves() -> tuple[Wave, ...]:
-    waves = []
-    for order, count, sigma_mm in _WAVE_ORDERS:
-        first = max(order, ZERNIKE_DEGREE + 1 + (ZERNIKE_DEGREE + 1 - order) % 2)
-        for step in range(count):
-            known_mm = sigma_mm / _WAVE_FALL**step
-            waves.append(Wave(first + 2 * step, order, known_mm))
-            waves.append(Wave(first + 2 * step, -order, known_mm))
-    return tuple(waves)
-
-
-WAVES = _list_waves()
+WAVES = tuple(
+    Wave(first_radial_order(order) + 2 * step, sign * order, sigma_mm / _WAVE_FALL**step)
+    for order, count, sigma_mm in _WAVE_ORDERS
+    for step in range(count)
+    for sign in (1, -1)
+)
 ROUND = slice(0, len(ROUND_DEGREES))  # places among the terms beyond the fit's
 WAVE = slice(len(ROUND_DEGREES), len(ROUND_DEGREES) + len(WAVES))
 BEYOND_TERMS = len(ROUND_DEGREES) + len(WAVES)

@@ -21,12 +21,17 @@ class FrameDefect(Enum):
     DIFFERS = auto()  # from its prediction, without a name
     INCONSISTENT = auto()  # with the other steps of its series
 
-
-# Found by comparing the frame with what the geometry predicts: a wrong geometry blames many frames
-# so.
-FOUND_BY_PREDICTION = frozenset(
-    {FrameDefect.MOVED, FrameDefect.DIFFERS, FrameDefect.WRONG_PICTURE, FrameDefect.FLICKER}
-)
+    @property
+    def is_found_by_prediction(self) -> bool:
+        """Whether the frame was compared with what the geometry predicts: a wrong geometry blames
+        many frames with such defects.
+        """
+        return self in (
+            FrameDefect.MOVED,
+            FrameDefect.DIFFERS,
+            FrameDefect.WRONG_PICTURE,
+            FrameDefect.FLICKER,
+        )
 
 
 @dataclass(frozen=True)

@@ -151,11 +151,7 @@ def _find_doubt(stack: frame_stack.FrameStack, flags: tuple[frame_faults.Flag, .
 
     Pictures that are the same, unreadable or dark need no prediction.
     """
-    blamed = [
-        flag
-        for flag in _of_sinusoids(stack, flags)
-        if flag.defect in frame_faults.FOUND_BY_PREDICTION
-    ]
+    blamed = [flag for flag in _of_sinusoids(stack, flags) if flag.defect.is_found_by_prediction]
     if len(blamed) < _MANY_BLAMED:
         return ""
     return "; with this many frames blamed, check the geometry and the axes of these pictures"

@@ -18,6 +18,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.motion_group import LARGEST, MotionGroup
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -26,64 +27,24 @@ from membrane_ctrl.model.arrays import FloatArray
 _STEP = 1e-1
 _MM_PER_UM = 1e-3
 _RAD_PER_URAD = 1e-6
-LARGEST = 1500.0  # motion that is considered, in µm, µrad or ppm
 _NEWTON_STEPS = 3  # from 0.1 mm off: below 1e-12 mm
-
-
-@dataclass(frozen=True)
-class MotionGroup:
-    """A motion whose direction is free: one or two components, in µm or µrad each.
-
-    Attributes
-    ----------
-    name : str
-        What moved, and how, for people.
-    components : int
-        One or two.
-    unit : str
-        Of the components: "µm", "µrad", or "ppm" of the focal length.
-    allowance : float
-        How far a body may move between a reference and a frame without any sign of it, in `unit`. 3
-        µm: a steel mount of a metre in a quarter of a kelvin; 10 µm: the 2.7 m to the mirror. The
-        mirror has none: only the places of camera and screen relative to it count.
-    knock : float
-        Size of a knock, in `unit`: larger motions count as the cause only if they are well visible.
-    is_of_mirror : bool
-        Whether the figure relative to camera and screen changes as the mirror itself does.
-    is_hidden : bool
-        Whether the motion looks like a change of the bowl, or of the film within its ring, and
-        tilts the ring by less than a mirror that settles: only the ring's saddle shows it.
-    """
-
-    name: str
-    components: int
-    unit: str
-    allowance: float = 3.0
-    knock: float = 100.0
-    is_of_mirror: bool = False
-    is_hidden: bool = False
-
-
-def _hidden(name: str, unit: str, allowance: float = 10.0) -> MotionGroup:
-    """A hidden motion of one component."""
-    return MotionGroup(name, 1, unit, allowance, knock=LARGEST, is_hidden=True)
 
 
 GROUPS = (
     MotionGroup("the camera shifted sideways", 2, "µm"),
-    _hidden("the camera shifted along its axis", "µm"),
+    MotionGroup.hidden("the camera shifted along its axis", "µm"),
     MotionGroup("the camera turned", 2, "µrad"),
     MotionGroup("the camera rolled about its axis", 1, "µrad"),
     MotionGroup("the screen shifted sideways", 2, "µm"),
-    _hidden("the screen shifted along its normal", "µm"),
+    MotionGroup.hidden("the screen shifted along its normal", "µm"),
     MotionGroup("the screen tilted", 2, "µrad", knock=LARGEST),
     MotionGroup("the screen rolled in its plane", 1, "µrad"),
     MotionGroup("the mirror shifted sideways", 2, "µm", allowance=0.0),
-    _hidden("the mirror shifted along z", "µm", allowance=0.0),
+    MotionGroup.hidden("the mirror shifted along z", "µm", allowance=0.0),
     MotionGroup("the mirror tilted", 2, "µrad", allowance=0.0, is_of_mirror=True),
-    _hidden("the mirror rolled about z", "µrad"),
+    MotionGroup.hidden("the mirror rolled about z", "µrad"),
     MotionGroup("the picture shifted on the sensor", 2, "µrad"),
-    _hidden("the focal length changed", "ppm", allowance=1.0),
+    MotionGroup.hidden("the focal length changed", "ppm", allowance=1.0),
 )
 COMPONENTS = sum(group.components for group in GROUPS)
 

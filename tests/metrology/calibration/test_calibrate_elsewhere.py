@@ -25,7 +25,8 @@ from membrane_ctrl.metrology.rays.forward_model import (
     screen_views,
 )
 from membrane_ctrl.metrology.rays.geometry import project_points
-from membrane_ctrl.metrology.rays.set_phases import ANYWHERE, MovedScreen, SetPhases
+from membrane_ctrl.metrology.rays.moved_screen import MovedScreen
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
 from membrane_ctrl.sim.optics.trace import trace_rays
@@ -136,7 +137,7 @@ def seen_directly(
         np.full(screen_mm.shape[1], sigma),
         np.nan,
         artefact=screen,
-        moved_screens=(ANYWHERE,),
+        moved_screens=(MovedScreen.anywhere(),),
     )
 
 
@@ -263,7 +264,14 @@ def test_derivatives_of_moved_and_seen_screens_are_those_of_the_rays() -> None:
     column, row = rng.uniform(700, 1700, 40), rng.uniform(600, 1400, 40)
     dark, ones = np.zeros((2, 40)), np.ones(40)
     film = SetPhases(
-        "a", column, row, dark, ones, 0.0, moved_screens=(ANYWHERE,), screen=np.repeat([0, 1], 20)
+        "a",
+        column,
+        row,
+        dark,
+        ones,
+        0.0,
+        moved_screens=(MovedScreen.anywhere(),),
+        screen=np.repeat([0, 1], 20),
     )
     values = SIGMAS * rng.normal(size=len(NAMES))
     direct = replace(film, screen=None, artefact=seen_directly(values, (10.0, 25.0), 3).artefact)

@@ -20,8 +20,8 @@ from membrane_ctrl.metrology.calibration.verdict import check_before_solving
 from membrane_ctrl.metrology.film import film_form
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas, usual_sigma
 from membrane_ctrl.metrology.rays.forward_model import LOCAL, SEAT
-from membrane_ctrl.metrology.rays.set_phases import TurnedMirror
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.rays.turned_mirror import TurnedMirror
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 from tests.support.calibration_truth import Truth, calibrated_errors_um
 from tests.support.foreign_film_sets import TurnedSet, make_foreign_film
