@@ -40,7 +40,7 @@ class Reconstructor(Protocol):
         """
 
     def prepare(self) -> None:
-        """Do ahead what the next figure needs."""
+        """Precompute for the next figure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,13 +136,12 @@ class ShapeCycle:
         # to come
         displacement_um = np.array([self._laser.at(frame.time_s) for frame in frames])
         time_s = np.array([frame.time_s for frame in frames])
+        pixels = [frame.pixels for frame in frames]
         with stage_errors.convert_stage_errors("reconstruction"):
-            reconstruct = (
-                self._reconstructor.measure_full
-                if kind == "full"
-                else self._reconstructor.measure_fringes
-            )
-            estimate = reconstruct([frame.pixels for frame in frames], time_s, displacement_um)
+            if kind == "full":
+                estimate = self._reconstructor.measure_full(pixels, time_s, displacement_um)
+            else:
+                estimate = self._reconstructor.measure_fringes(pixels, time_s, displacement_um)
         return replace(
             estimate, latency_s=round(self._clock.now() - arrived_s, 5), cycle=self._cycle
         )

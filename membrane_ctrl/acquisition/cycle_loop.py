@@ -53,7 +53,9 @@ def keep_cycling(
         _report_result(result, remote, publish)
         if capture is not None:
             remote.send_event(_capture_event(result, partial(keep, request=capture)))
-        pause_s = result.pause_s if result is not None else 0.0
+        pause_s = 0.0
+        if result is not None:
+            pause_s = result.pause_s
         due_s = next_deadline_s(due_s, period_s(), clock.now() + pause_s)
         taking.prepare_next()
 
@@ -79,7 +81,9 @@ def _capture_event(
         folder = keep(estimate)
     except OSError as error:
         return acquisition_events.Capture(estimate.cycle, failed=error.strerror or str(error))
-    moved_um = estimate.displacement_um if math.isfinite(estimate.displacement_um) else None
+    moved_um = None
+    if math.isfinite(estimate.displacement_um):
+        moved_um = estimate.displacement_um
     name = f"{folder.parent.name}/{folder.name}"
     return acquisition_events.Capture(
         estimate.cycle, name, moved_um, estimate.verdict, estimate.reason
@@ -94,7 +98,9 @@ def _report_result(
     match result:
         case CycleDone(estimate, pause_s):
             publish(estimate)
-            later = f"; next in {pause_s:g} s" if pause_s else ""
+            later = ""
+            if pause_s:
+                later = f"; next in {pause_s:g} s"
             verdict = (
                 f"{estimate.verdict}: {estimate.reason}{later}"
                 if estimate.reason

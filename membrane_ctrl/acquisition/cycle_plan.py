@@ -23,4 +23,6 @@ class CyclePlan:
         """Of the next cycle."""
         if full:
             return self.full
-        return self.fringes if self.standing is None else [self.standing()]
+        if self.standing is None:
+            return self.fringes
+        return [self.standing()]

@@ -126,7 +126,9 @@ class Exposures:
             pending = pattern, slot
         if pending is not None:
             # Both kinds of cycle begin with the same pattern.
-            ahead = patterns[0] if self._shows_ahead else None
+            ahead = None
+            if self._shows_ahead:
+                ahead = patterns[0]
             if ahead is not None:
                 self._show_pattern(ahead)
             taken.append(self._store_frame(*pending, cycle, then=ahead))

@@ -46,7 +46,9 @@ class LaserHistory:
             for mono_s, reading in self._readings
             if abs(mono_s - time_s) <= self.half_window_s
         ]
-        return math.fsum(near) / len(near) if len(near) >= LEAST_READINGS else math.nan
+        if len(near) >= LEAST_READINGS:
+            return math.fsum(near) / len(near)
+        return math.nan
 
     def close(self) -> None:
         """Detach from the telemetry."""

@@ -28,7 +28,9 @@ def format_finding(name: str, measure: Callable[[], str]) -> str:
         problem = measure()
     except ValueError as error:
         problem = str(error)
-    return f"{name}: {problem}" if problem else ""
+    if problem:
+        return f"{name}: {problem}"
+    return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +95,12 @@ def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> Opt
 
 def exposure_s(config: Config) -> float:
     """Exposure time of a frame; 0 for cameras that do not state it."""
-    camera = config.devices.camera if config.devices is not None else None
-    return 0.0 if camera is None else camera.frame_exposure_s or 0.0
+    camera = None
+    if config.devices is not None:
+        camera = config.devices.camera
+    if camera is None:
+        return 0.0
+    return camera.frame_exposure_s or 0.0
 
 
 def _make_camera(config: Config, section: Any, clock: CycleClock, *library: Any) -> GuardedCamera:
@@ -157,7 +163,9 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchF
     if isinstance(bench.camera, GuardedCamera):
         identity = bench.camera.open()
         who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)
-    section = config.devices.screen if config.devices is not None else None
+    section = None
+    if config.devices is not None:
+        section = config.devices.screen
     if section is None or not isinstance(bench.screen, PatternScreen):
         return BenchFindings(who)
     screen = bench.screen

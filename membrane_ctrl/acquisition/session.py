@@ -129,8 +129,12 @@ def _make_cycles(
     spec: AcquisitionSpec, optics: OpticsConfig
 ) -> live_reconstructor.LiveReconstructor:
     """What makes figures of full and fringes-only cycles, with the geometry's uncertainty."""
-    kept = None if spec.run_dir is None else spec.run_dir / run_geometry.GEOMETRY_COPY
-    file = kept if kept is not None and kept.exists() else None
+    kept = None
+    if spec.run_dir is not None:
+        kept = spec.run_dir / run_geometry.GEOMETRY_COPY
+    file = None
+    if kept is not None and kept.exists():
+        file = kept
     spread, source = spread_file.geometry_spread(optics, file)
     return live_reconstructor.LiveReconstructor(
         optics,
@@ -204,8 +208,9 @@ def _open_bench(
     while not remote.stop:
         try:
             found = optical_bench.open_bench(bench, config, clock)
-            who = (f"camera: {found.camera}",) if found.camera else ()
-            for line in (*who, *found.measured, *found.problems):
+            if found.camera:
+                remote.report_state("preparing", f"camera: {found.camera}")
+            for line in (*found.measured, *found.problems):
                 remote.report_state("preparing", line)
             return
         except LinkError as error:

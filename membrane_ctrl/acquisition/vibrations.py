@@ -31,7 +31,9 @@ def make_vibration_handler(
     devices in the folder of runs: a film that moved in between is reported, too. They are stored in
     the run's folder.
     """
-    known = None if run_dir is None else _read_earlier(config, run_dir)
+    known = None
+    if run_dir is not None:
+        known = _read_earlier(config, run_dir)
     follower = VibrationFollower(config.pump.stroke_hz, clock.origin_utc.timestamp(), known)
 
     def follow_vibrations(estimate: ShapeEstimate) -> list[Event]:
@@ -77,4 +79,6 @@ def _read_followed(path: Path) -> FollowedModes:
 
 
 def _bench_name(config: Config) -> str:
-    return "" if config.devices is None else config.devices.name
+    if config.devices is None:
+        return ""
+    return config.devices.name

@@ -28,9 +28,8 @@ def coarse_optics(optics: OpticsConfig) -> OpticsConfig:
     """The same view on a sensor with larger pixels."""
     camera = optics.camera
     larger = max(1, min(camera.width_px, camera.height_px) // _SMALL_PX)
-    column_px, row_px = (
-        (p + 0.5) / larger - 0.5 for p in camera.principal
-    )  # pixel centres are at integers
+    # Pixel centres are at integers.
+    column_px, row_px = ((place + 0.5) / larger - 0.5 for place in camera.principal)
     coarse = camera.model_copy(
         update={
             "width_px": camera.width_px // larger,
@@ -55,9 +54,10 @@ def warm_up(
     `reconstructor` is one for this call alone; it and `optics` are those of `coarse_optics`.
     """
     bench = TwinOptics(optics, TwinConfig(), lambda: position, clock)
-    # displacements that differ by more than noise trigger the kernels that correct the film's
-    # motion
-    still, moving = np.zeros(1), np.array([-10.0, 10.0])
+    # Displacements that differ by more than noise trigger the kernels that correct the film's
+    # motion.
+    still = np.zeros(1)
+    moving = np.array([-10.0, 10.0])
     for full, reconstruct, motion_um in (
         (True, reconstructor.measure_full, moving),
         (False, reconstructor.measure_fringes, moving),

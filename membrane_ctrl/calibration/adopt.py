@@ -57,7 +57,9 @@ def adopt_geometry(new: Path, place: Path) -> Path | None:
     with errors.convert_write_errors(place, errors.DeviceError):
         place.parent.mkdir(parents=True, exist_ok=True)
         place = files.resolve_user_path(place)
-        kept = _backup_path(place) if place.exists() else None
+        kept = None
+        if place.exists():
+            kept = _backup_path(place)
         if kept is not None:
             files.write_bytes_atomic(kept, files.read_bytes(place, files.SMALL_BYTES, follow=True))
         files.write_text_atomic(place, files.read_text(new))

@@ -92,7 +92,9 @@ def calibrate_command(options: CalibrateOptions) -> int:
             f"calibrate: rejected; {options.out} is not written, the old geometry remains in use",
             file=sys.stderr,
         )
-    return errors.Exit.DONE if usable else errors.Exit.REJECTED
+    if usable:
+        return errors.Exit.DONE
+    return errors.Exit.REJECTED
 
 
 def _make_progress_line() -> Any:

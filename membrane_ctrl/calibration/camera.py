@@ -218,7 +218,9 @@ def _format_lens(camera: CameraConfig, lens: Lens, out: Path) -> list[str]:
     scales = (focal_mm, *[1.0] * 6)
     lines = ["what              stated       found        +-           known before"]
     for name, before, value, scale in zip(lens.sigmas, stated, values, scales, strict=True):
-        label = "focal_mm" if name == "focal_relative" else name
+        label = name
+        if name == "focal_relative":
+            label = "focal_mm"
         sigma = lens.sigmas[name] * scale
         usual = usual_sigma(name) * scale
         lines.append(f"{label:<16}{before:>10.5g}{value:>13.6g}  {sigma:<11.2g}  {usual:.2g}")

@@ -48,7 +48,9 @@ def calibrate_pose(options: PoseOptions) -> int:
     CommandError
         If a file is not usable, the set has no figure, or the rim is not in the picture.
     """
-    geometry = None if options.geometry is None else read_geometry(options.geometry)
+    geometry = None
+    if options.geometry is not None:
+        geometry = read_geometry(options.geometry)
     capture = capture_set.read_set(options.folder, geometry)
     optics = capture.head.optics
     for path in options.priors:

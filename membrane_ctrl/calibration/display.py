@@ -25,7 +25,8 @@ def calibrate_display(config: Config, source: str, as_json: bool) -> int:
         raise errors.InputError(
             f"{source}: devices.camera and devices.screen are both needed to measure the screen"
         )
-    section, clock = config.devices.screen, waiting_clock.WaitingClock(RunClock.start())
+    section = config.devices.screen
+    clock = waiting_clock.WaitingClock(RunClock.start())
     try:
         bench = optical_bench.configured_bench(config, clock)
         try:
@@ -86,12 +87,31 @@ def format_display_report(report: dict[str, object]) -> list[str]:
 def fringe_error_mm(response: DisplayResponse, pattern: PatternConfig, corrected: bool) -> float:
     """RMS error of a screen coordinate from this display's sinusoids, whose harmonics appear as
     phase.
+
+    Parameters
+    ----------
+    response : DisplayResponse
+        Light of the display's levels.
+    pattern : PatternConfig
+        The pattern, with its period and number of steps.
+    corrected : bool
+        Whether the levels are chosen by the response, or are proportional to the wanted light.
     """
+    # The light that the steps should have at phases of a period.
     phase = 2 * np.pi * np.arange(_PHASES) / _PHASES
     shifts = 2 * np.pi * np.arange(pattern.steps) / pattern.steps
     wanted = (1 + np.cos(phase + shifts[:, None])) / 2
-    levels = response.find_levels(wanted) if corrected else np.rint(255 * wanted)
+
+    # The light that they have.
+    if corrected:
+        levels = response.find_levels(wanted)
+    else:
+        levels = np.rint(255 * wanted)
     light = np.interp(levels, response.levels, response.light)
-    seen = np.arctan2(-np.sin(shifts) @ light, np.cos(shifts) @ light)
+
+    # The phase that it shows, less the true one, within half a turn.
+    sine = -np.sin(shifts) @ light
+    cosine = np.cos(shifts) @ light
+    seen = np.arctan2(sine, cosine)
     error = np.angle(np.exp(1j * (seen - phase)))
     return float(mm_per_rad(pattern) * np.std(error))

@@ -167,7 +167,9 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
         )
     else:
         kept = adopt_geometry(session.geometry_path, place)
-        before = f"; the previous one is {kept}" if kept else ""
+        before = ""
+        if kept:
+            before = f"; the previous one is {kept}"
         _print_progress(f"adopted: {place}{before}; the next hold uses it")
     return code
 

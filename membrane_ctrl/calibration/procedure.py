@@ -99,7 +99,9 @@ class Procedure:
         self.sweep.go_to_setpoint(setpoint_um, expected_s)
         event = self.sweep.take_set()
         session.keep_set(index, self.link.run_dir / str(event.set))
-        reason = f" ({event.reason})" if event.reason else ""
+        reason = ""
+        if event.reason:
+            reason = f" ({event.reason})"
         self.progress.print_line(f"{step}: {event.verdict}{reason}")
 
     @contextlib.contextmanager
@@ -108,7 +110,9 @@ class Procedure:
         try:
             yield
         except HoldError:
-            off = "; the shape loop is off (ctl shape on)" if session.head.shape_on else ""
+            off = ""
+            if session.head.shape_on:
+                off = "; the shape loop is off (ctl shape on)"
             self.progress.print_line(
                 f"the mirror is left to the client in command{off}; continue with --session "
                 f"{session.path}"
@@ -137,7 +141,9 @@ class Procedure:
         try:
             self.sweep.go_to_setpoint(head.start_um, back_s)
         except KeyboardInterrupt:
-            off = "; then switch the shape loop on (ctl shape on)" if head.shape_on else ""
+            off = ""
+            if head.shape_on:
+                off = "; then switch the shape loop on (ctl shape on)"
             self.progress.print_line(
                 f"left: the hold continues its ramp to {head.start_um:g} µm{off}"
             )

@@ -20,7 +20,9 @@ def format_report(report: dict[str, Any]) -> list[str]:
     """Format the report of `calibration_report` for a terminal."""
     lines = [f"verdict: {report['verdict']}"]
     for finding in report["findings"]:
-        mark = "  ! " if finding["fatal"] else "  note: "
+        mark = "  note: "
+        if finding["fatal"]:
+            mark = "  ! "
         lines.append(mark + finding["description"])
     if "parameters" not in report:
         return lines
@@ -104,7 +106,9 @@ def _format_advice(report: dict[str, Any]) -> list[str]:
     sphere = report["artefact_advice"]
     if sphere is not None:
         confused = " and ".join(sphere["together"][:2])
-        why = f"not separable with these sets: {confused}; put" if confused else "better: put"
+        why = "better: put"
+        if confused:
+            why = f"not separable with these sets: {confused}; put"
         lines.append(
             f"{why} a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
             f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to "

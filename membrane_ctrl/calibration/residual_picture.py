@@ -16,6 +16,7 @@ from membrane_ctrl.model.files import resolve_user_path
 _INCHES = 2.6  # a panel
 _DPI = 110
 _CELLS = 24  # across the picture: each averages enough points to show a pattern below the noise
+_SCALE_PERCENTILE = 98
 
 
 def draw_residuals(path: Path, solution: solver.Solution) -> None:
@@ -26,9 +27,9 @@ def draw_residuals(path: Path, solution: solver.Solution) -> None:
     count = len(solution.states)
     edges = _cell_edges(solution)
     maps = [[_cell_means(solution, k, axis, edges) for k in range(count)] for axis in range(2)]
-    reach = (
-        float(np.nanpercentile(np.abs(maps), 98)) or 1.0
-    )  # single cells at the edge must not set the scale
+
+    # A common scale about 0; single cells at the edge must not set it.
+    reach = float(np.nanpercentile(np.abs(maps), _SCALE_PERCENTILE)) or 1.0
     colours = ScalarMappable(Normalize(-reach, reach), DIVERGING_MAP)
     figure = Figure(figsize=(_INCHES * count, 2 * _INCHES), layout="constrained")
     panels = figure.subplots(2, count, squeeze=False, sharex=True, sharey=True)
@@ -49,7 +50,8 @@ def _cell_edges(solution: solver.Solution) -> tuple[FloatArray, FloatArray]:
     column = np.concatenate([phases.column_px for phases in solution.problem.sets])
     row = np.concatenate([phases.row_px for phases in solution.problem.sets])
     side = max(float(np.ptp(column)), float(np.ptp(row)), 1.0) / _CELLS
-    across, down = (np.arange(part.min(), part.max() + side, side) for part in (column, row))
+    across = np.arange(column.min(), column.max() + side, side)
+    down = np.arange(row.min(), row.max() + side, side)
     return across, down
 
 
@@ -57,11 +59,11 @@ def _cell_means(
     solution: solver.Solution, index: int, axis: int, edges: tuple[FloatArray, FloatArray]
 ) -> FloatArray:
     """Weighted means over cells, (rows, columns); NaN in cells without points."""
-    phases, linear = solution.problem.sets[index], solution.equations[index]
+    phases = solution.problem.sets[index]
+    linear = solution.equations[index]
     weights = linear.robust.weights / phases.sigma_mm**2
+    weighted_mm = weights * linear.residual_mm[axis]
     bins = (edges[1], edges[0])
     total = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weights)[0]
-    summed = np.histogram2d(
-        phases.row_px, phases.column_px, bins, weights=weights * linear.residual_mm[axis]
-    )[0]
-    return np.divide(1e3 * summed, total, out=np.full_like(total, np.nan), where=total > 0)
+    sum_mm = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weighted_mm)[0]
+    return np.divide(1e3 * sum_mm, total, out=np.full_like(total, np.nan), where=total > 0)

@@ -73,7 +73,9 @@ def read_sets(
     RejectedError
         For a set without a figure.
     """
-    stated = None if geometry is None else file.read_geometry(geometry)
+    stated = None
+    if geometry is not None:
+        stated = file.read_geometry(geometry)
     figures = Figures(stated)
     repeated = [folder for folder, count in Counter(folders).items() if count > 1]
     if repeated:

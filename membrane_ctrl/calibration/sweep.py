@@ -145,7 +145,9 @@ class Sweep:
             If both sets are bad.
         """
         first = self._request_capture()
-        event = first if first.set else self._request_capture()
+        event = first
+        if not first.set:
+            event = self._request_capture()
         if not event.set:
             raise errors.RejectedError(
                 f"no good set in two attempts: {first.failed}; {event.failed}"
@@ -203,4 +205,6 @@ class Sweep:
 def _mean_of_finite(values: list[float]) -> float:
     """Mean of the finite values; nan if there are none."""
     finite = [value for value in values if math.isfinite(value)]
-    return sum(finite) / len(finite) if finite else math.nan
+    if finite:
+        return sum(finite) / len(finite)
+    return math.nan

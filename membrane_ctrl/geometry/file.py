@@ -178,4 +178,6 @@ def _optional_table(
     table = tables.get(name)
     if isinstance(table, dict):
         toml_file.prune_unknown_keys(table, model)
-    return None if table is None else toml_file.parse_tables(table, model, f"{path}: {name}")
+    if table is None:
+        return None
+    return toml_file.parse_tables(table, model, f"{path}: {name}")

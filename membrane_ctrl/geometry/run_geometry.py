@@ -73,11 +73,9 @@ def _read_if_present(path: Path | None, config: Config) -> RunGeometry:
     optics = config.optics
     if path is None or not path.exists():
         wanted = optics.geometry_file
-        note = (
-            f"{wanted} does not exist yet: [optics.geometry] is used, as measured by hand"
-            if wanted
-            else ""
-        )
+        note = ""
+        if wanted:
+            note = f"{wanted} does not exist yet: [optics.geometry] is used, as measured by hand"
         return RunGeometry(optics, stated_origin(optics), note=note)
     file = read_geometry(path)
     return RunGeometry(file.apply_to_optics(optics), file.origin, file.calibration, file.text)

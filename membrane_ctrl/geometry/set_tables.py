@@ -47,7 +47,9 @@ class ArtefactTable(Section):
             ("curvature_radius_sigma_mm", spread),
         ):
             if (value is None) != (self.form == "flat"):
-                description = "a sphere needs it" if value is None else "a flat has none"
+                description = "a sphere needs it"
+                if value is not None:
+                    description = "a flat has none"
                 raise errors.InputError(f"{path}: artefact.{name}: {description}")
         known = {"form_sigma_mm": 1e-3 * self.form_sigma_um, "vertex_mm": self.vertex_mm}
         known |= {"vertex_sigma_mm": self.vertex_sigma_mm, "radius_mm": radius_mm}

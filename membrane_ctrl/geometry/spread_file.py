@@ -74,7 +74,9 @@ def find_known_by(optics: schema.OpticsConfig, file: Path | None) -> KnownBy:
     """What `geometry_spread` of the same arguments rests on. Raises InputError."""
     if file is not None and read_spread(file) is not None:
         return KnownBy.CALIBRATION
-    return KnownBy.DATA_SHEETS if stated_spread(optics.geometry) is None else KnownBy.STATED
+    if stated_spread(optics.geometry) is None:
+        return KnownBy.DATA_SHEETS
+    return KnownBy.STATED
 
 
 def _sigma_sources(geometry: schema.GeometryConfig, poses: bool) -> str:
@@ -82,7 +84,9 @@ def _sigma_sources(geometry: schema.GeometryConfig, poses: bool) -> str:
     `SigmasConfig`.
     """
     given = geometry.sigmas.model_fields_set if geometry.sigmas else set()
-    missing = [] if poses else ["a", "b", "alpha"]
+    missing = []
+    if not poses:
+        missing = ["a", "b", "alpha"]
     missing += [name for name in SigmasConfig.model_fields if name not in given]
     if not missing:
         return "sigmas stated with the geometry"

@@ -193,7 +193,9 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
     # The bench. If screen and pattern are incompatible, the error names the geometry's file.
     sections = ("geometry", "camera", "pattern", "mirror")
     bench_tables = {name: getattr(content, name) for name in sections}
-    bench_path = path if geometry is None else geometry.path
+    bench_path = path
+    if geometry is not None:
+        bench_path = geometry.path
     optics = toml_file.parse_tables(bench_tables, schema.OpticsConfig, str(bench_path))
     if geometry is not None:
         optics = geometry.apply_to_optics(optics)
@@ -423,7 +425,9 @@ def _order_rows(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Patter
         found[pattern.name] = (row, pattern)
 
     # The patterns that a set of this kind has.
-    sequence = full_sequence if content.kind == "full" else fringe_sequence
+    sequence = fringe_sequence
+    if content.kind == "full":
+        sequence = full_sequence
     names = [pattern.name for pattern in sequence(content.pattern)]
     if content.kind == "frequencies":
         coarser = sorted({pattern.period_mm for _, pattern in found.values()} - {0.0})

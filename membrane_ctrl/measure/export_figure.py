@@ -61,7 +61,9 @@ def export_command(
         raise errors.InputError(
             f"--remove {unknown[0]}: give piston, tilt, power or sphere, separated by commas"
         )
-    zernike_table = _zernike_table(terms, seen, table, result) if terms else None
+    zernike_table = None
+    if terms:
+        zernike_table = _zernike_table(terms, seen, table, result)
     seen = remove_parts(seen, names)
     target = result.resolve() / f"figure{SUFFIXES[form]}"
     if out:
@@ -72,7 +74,9 @@ def export_command(
         if zernike_table is not None and form != "h5":
             beside = target.with_name(target.name + ".zernike.json")
             files.write_text_atomic(beside, json.dumps(zernike_table, indent=1))
-    step = f", heights in steps of {1e6 * step_mm:.3g} nm" if step_mm else ""
+    step = ""
+    if step_mm:
+        step = f", heights in steps of {1e6 * step_mm:.3g} nm"
     rows, columns = seen.height_mm.shape
     print(
         f"{target}: {columns} x {rows} cells of {seen.pitch_mm:.4g} mm, {seen.removed} "

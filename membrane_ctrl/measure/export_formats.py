@@ -132,7 +132,9 @@ def _write_zygo_xyz(seen: ExportedMap) -> Written:
     points = []
     for row, values in enumerate(height_um.tolist()):
         for column, value in enumerate(values):
-            text = "No Data" if math.isnan(value) else f"{value:.6f}"
+            text = f"{value:.6f}"
+            if math.isnan(value):
+                text = "No Data"
             points.append(f"{column} {row} {text}")
     return ("\n".join([*head, *points]) + "\n#\n").encode(), 1e-9
 

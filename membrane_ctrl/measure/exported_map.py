@@ -80,13 +80,18 @@ def read_result(folder: Path) -> tuple[ExportedMap, dict[str, Any]]:
 
 def _check_map(where: Path, x_mm: FloatArray, y_mm: FloatArray, height_mm: FloatArray) -> None:
     """Raise InputError for a map of another shape, uneven steps, few cells or large heights."""
+    # A grid of at least 2 x 2 cells.
     is_grid = x_mm.ndim == 1 and y_mm.ndim == 1 and height_mm.shape == (y_mm.size, x_mm.size)
     if not is_grid or min(height_mm.shape) < 2:
         raise errors.InputError(f"{where}: h_mm has not the shape of y_mm and x_mm, at least 2 x 2")
+
+    # Even steps, the same along both axes.
     steps = np.concatenate([np.diff(x_mm), np.diff(y_mm)])
     is_rising = np.isfinite(steps).all() and steps.min() > 0
     if not is_rising or np.ptp(steps) > _UNEVEN_STEP * steps.max():
         raise errors.InputError(f"{where}: x_mm and y_mm must rise in even steps of one size")
+
+    # Enough cells, and heights that a mirror may have.
     measured = np.isfinite(height_mm)
     cells = np.count_nonzero(measured)
     if cells < LEAST_CELLS:

@@ -51,7 +51,9 @@ def write_report(
     """
     title = escape_controls(f"Measurement of {name}")
     safe_lines = [escape_controls(line) for line in lines]
-    tables = {} if result["figure"] is None else _make_tables(result["figure"])
+    tables = {}
+    if result["figure"] is not None:
+        tables = _make_tables(result["figure"])
     pictures = [PagePicture(file.stem, file.read_bytes()) for file in drawn]
     sections = [PageSection(heading, [table]) for heading, table in tables.items()]
     quality = result["quality"]
@@ -75,7 +77,9 @@ def write_report(
 def _rank_picture(picture: PagePicture) -> int:
     """The order of the pictures: the figure first, the others as they were drawn."""
     first = _PICTURES_FIRST
-    return first.index(picture.name) if picture.name in first else len(first)
+    if picture.name in first:
+        return first.index(picture.name)
+    return len(first)
 
 
 def _make_tables(figure: dict[str, Any]) -> dict[str, PageTable]:
@@ -113,4 +117,6 @@ def _tabulate_terms(terms: dict[str, Any]) -> PageTable:
 
 
 def _format_cell(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.6g}"
+    if value is None:
+        return "unknown"
+    return f"{value:.6g}"

@@ -352,7 +352,9 @@ def _wave_line(wave: dict[str, Any]) -> str:
     unit, scale = _WAVE_UNITS.get(kind, ("mm", 1.0))
     amount = scale * np.hypot(cosine, sine)
     sigma = scale * max(wave["sigmas"])
-    origin = "film" if kind in _OF_FILM else "ring"
+    origin = "ring"
+    if kind in _OF_FILM:
+        origin = "film"
     along = ""
     if kind == "modulus":
         along = f", along {np.degrees(np.arctan2(sine, cosine)) / 2 % 180:.0f} degrees"
@@ -371,6 +373,7 @@ def _draw_fit(
     """Draw the departures, and the error ellipse of pre-strain and Poisson ratio."""
     from matplotlib.figure import Figure
 
+    # Departures from Hencky's film, and what the law leaves of them.
     drawing = Figure(figsize=(13, 4.2), layout="constrained")
     seen, left, both = drawing.subplots(1, 3)
     for figure, profile, rest in zip(figures, departure.seen_mm, departure.left_mm, strict=True):
@@ -383,11 +386,14 @@ def _draw_fit(
         ylabel="µm",
     )
     seen.legend(fontsize=8)
+
+    # Error ellipses: a circle, stretched by the root of the covariance.
     angle = np.linspace(0, 2 * np.pi, 181)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
     root = np.linalg.cholesky(fit.covariance[:2, :2])
     centre = np.array([fit.law.prestrain, fit.law.poisson], float)
     for sigmas in (1, 2):
-        strain, poisson = centre[:, None] + sigmas * root @ np.stack([np.cos(angle), np.sin(angle)])
+        strain, poisson = centre[:, None] + sigmas * root @ circle
         both.plot(1e6 * strain, poisson, label=f"{sigmas} sigma")
     both.plot(1e6 * centre[0], centre[1], "+", color="black")
     both.set(title="pre-strain and Poisson ratio", xlabel="pre-strain (µm/m)", ylabel="nu")

@@ -56,7 +56,9 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     if data.startswith(b"BM"):
         width, height = struct.unpack_from("<ii", data, 18)
         return abs(width), abs(height)
-    return _jpeg_size(data) if data.startswith(b"\xff\xd8") else None
+    if data.startswith(b"\xff\xd8"):
+        return _jpeg_size(data)
+    return None
 
 
 def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
@@ -68,14 +70,18 @@ def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
         (found[tag],) = struct.unpack_from(
             order + ("H" if kind == _SHORT else "I"), data, entry + 8
         )
-    return (found[_WIDTH], found[_HEIGHT]) if {_WIDTH, _HEIGHT} <= found.keys() else None
+    if {_WIDTH, _HEIGHT} <= found.keys():
+        return (found[_WIDTH], found[_HEIGHT])
+    return None
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     """From the first frame header: segments follow one another, each with its length."""
     place = 2
     while data[place] == 0xFF if place < len(data) else False:
-        marker = data[place + 1] if place + 1 < len(data) else 0
+        marker = 0
+        if place + 1 < len(data):
+            marker = data[place + 1]
         (length,) = struct.unpack_from(">H", data, place + 2)
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack_from(">HH", data, place + 5)

@@ -88,7 +88,9 @@ def measure_command(options: MeasureOptions) -> int:
     folder = options.folder
     if folder.suffix == ".h5":
         return check_sofast_file(folder, options.as_json)
-    geometry = None if options.geometry is None else read_geometry(options.geometry)
+    geometry = None
+    if options.geometry is not None:
+        geometry = read_geometry(options.geometry)
     measurement = measure_set(folder, geometry)
     for key in measurement.head.ignored:
         print(f"{folder / 'capture.toml'}: {key}: unknown key, ignored", file=sys.stderr)
@@ -238,7 +240,9 @@ def _fit_radial_profile(measurement: Measurement) -> RadialProfile | None:
 def _format_measurement(outcome: _Outcome) -> list[str]:
     """The result as lines of text."""
     measurement = outcome.measurement
-    reason = f": {measurement.reason}" if measurement.reason else ""
+    reason = ""
+    if measurement.reason:
+        reason = f": {measurement.reason}"
     lines = [f"verdict   {measurement.verdict}{reason}"]
     lines += [f"flagged   {item['file']}: {item['reason']}" for item in measurement.flagged_files()]
     full = measurement.full
@@ -246,22 +250,27 @@ def _format_measurement(outcome: _Outcome) -> list[str]:
     bars = outcome.bars
     if full is None or profile is None or bars is None:
         return lines
+
+    # Sag, geometry and error budget.
     noise_um, geometry_um = bars.sag_sigma_um
     total = bars.budget.total()
-    largest = ", ".join(
-        f"{row['name']} {row['height_rms_um']:.3g}" for row in bars.budget.rows()[:_NAMED]
-    )
-    residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
-    coeffs_um = 1e3 * full.surface.coeffs_mm
-    astigmatism_um = np.hypot(*coeffs_um[4:6])
-    coma_um = np.hypot(*coeffs_um[6:8])
-    trefoil_um = np.hypot(*coeffs_um[8:10])
+    largest_rows = bars.budget.rows()[:_NAMED]
+    largest = ", ".join(f"{row['name']} {row['height_rms_um']:.3g}" for row in largest_rows)
     lines += [
         f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {noise_um:.2g} µm from noise and the "
         f"film, {geometry_um:.3g} µm from the geometry",
         f"geometry  {bars.statement.describe()}",
         f"budget    1 sigma of height {total['height_rms_um']:.3g} µm RMS, without its plane "
         f"{total['figure_rms_um']:.3g} µm; largest: {largest}",
+    ]
+
+    # The figure and the fit.
+    coeffs_um = 1e3 * full.surface.coeffs_mm
+    astigmatism_um = np.hypot(*coeffs_um[4:6])
+    coma_um = np.hypot(*coeffs_um[6:8])
+    trefoil_um = np.hypot(*coeffs_um[8:10])
+    residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
+    lines += [
         f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
         f"figure    astigmatism {astigmatism_um:.2f} µm, coma {coma_um:.2f} µm, trefoil "
         f"{trefoil_um:.2f} µm (RMS)",
@@ -270,11 +279,15 @@ def _format_measurement(outcome: _Outcome) -> list[str]:
         f"fit       {len(full.fit.changes_mm)} iterations, last change "
         f"{full.fit.changes_mm[-1]:.1e} mm, {np.count_nonzero(full.weights)} pixels",
     ]
+
+    # The light, and the rim in the picture.
     lines += _describe_light(measurement.checked)
     outline = outcome.outline
     if outline is not None:
         rim = bars.statement.rim
-        sigmas = "" if rim is None else f", {rim.sigmas:.1f} sigma of the stated geometry"
+        sigmas = ""
+        if rim is not None:
+            sigmas = f", {rim.sigmas:.1f} sigma of the stated geometry"
         lines.append(
             f"rim       {outline.offset_mm:.1f} mm off the prediction, "
             f"{outline.size_ratio:.4f} of the predicted size{sigmas}"

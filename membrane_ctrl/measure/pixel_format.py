@@ -118,7 +118,9 @@ def _measure_roughness(pictures: Sequence[FloatArray]) -> float:
     """Mean step between neighbours in a row, of the pictures' scatter; 1.1 for pure noise."""
     scatter = sum(float(picture.std()) for picture in pictures)
     steps = sum(float(np.abs(np.diff(picture, axis=1)).mean()) for picture in pictures)
-    return steps / scatter if scatter > 0 else np.inf
+    if scatter > 0:
+        return steps / scatter
+    return np.inf
 
 
 def _find_word_mistake(pictures: Sequence[Image]) -> str:

@@ -168,7 +168,9 @@ class StabilityResult:
             frame = pandas.read_csv(
                 io.BytesIO(data), dtype=dict.fromkeys([*names, "verdict", "reason"], str)
             )
-            return frame.set_index("set") if table == "series" else frame
+            if table == "series":
+                return frame.set_index("set")
+            return frame
         except (OSError, ValueError, KeyError) as error:
             raise errors.InputError(f"{path}: {error}") from None
 
@@ -228,7 +230,9 @@ def _make_axis_labels(unit: str, meaning: str) -> dict[str, str]:
 
 def _require_table(table: dict[str, Any], name: str) -> dict[str, Any]:
     found = table.get(name)
-    return found if isinstance(found, dict) else {}
+    if isinstance(found, dict):
+        return found
+    return {}
 
 
 def _read_coefficients(table: dict[str, Any], name: str) -> FloatArray:
@@ -238,4 +242,6 @@ def _read_coefficients(table: dict[str, Any], name: str) -> FloatArray:
         numbers = np.array(found, dtype=np.float64)
     except (TypeError, ValueError):
         numbers = np.empty(0)
-    return numbers if numbers.shape == (ZERNIKE_TERMS,) else np.full(ZERNIKE_TERMS, np.nan)
+    if numbers.shape == (ZERNIKE_TERMS,):
+        return numbers
+    return np.full(ZERNIKE_TERMS, np.nan)

@@ -84,4 +84,6 @@ def write_picture(path: Path, figure: Figure, dpi: int = 110) -> Path:
 
 
 def number_or_null(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    if math.isfinite(value):
+        return value
+    return None

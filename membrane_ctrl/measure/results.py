@@ -146,7 +146,9 @@ def apply_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measuremen
     doubts = [*bars.doubts, *statement.doubts]
     if not doubts:
         return measurement
-    known = [measurement.reason] if measurement.reason else []
+    known = []
+    if measurement.reason:
+        known = [measurement.reason]
     verdict: shape_estimate.Verdict = "rejected" if statement.slopes.unusable else "degraded"
     return replace(measurement, verdict=verdict, reason="; ".join([*known, *doubts]))
 

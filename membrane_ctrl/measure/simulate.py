@@ -115,7 +115,9 @@ def _of_film(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.
     mounted = film_shape.typical_film(
         options.sag_mm, radius_mm, options.seed, twin.film_prestrain, twin.film_poisson
     )
-    shape = mounted if options.figure else replace(mounted, zernike_um=())
+    shape = mounted
+    if not options.figure:
+        shape = replace(mounted, zernike_um=())
     seat, stated_turn = None, {}
     if options.turned_deg is not None:
         # the film is that of --seed; its seat differs from angle to angle
@@ -213,19 +215,22 @@ def _of_screen(options: SimulateOptions, optics: OpticsConfig) -> simulation_spe
         distance_mm = float(options.artefact.removeprefix("screen:"))
     except ValueError:
         raise ValueError(f"--artefact {options.artefact}: screen:DISTANCE, mm") from None
+    # Rolled about the camera's axis, and tilted towards a side.
     pinhole, (right, down, forward), *_ = sight.compute_poses(optics.geometry)
     side, roll = np.random.default_rng(options.seed).uniform(0, 2 * math.pi, 2)
-    turn = _rotation_matrix(
-        _TILTED_RAD * (math.cos(side) * right + math.sin(side) * down)
-    ) @ _rotation_matrix(roll * forward)
-    before = {
+    tilt_axis = math.cos(side) * right + math.sin(side) * down
+    turn = _rotation_matrix(_TILTED_RAD * tilt_axis) @ _rotation_matrix(roll * forward)
+    pose = {
         "origin_mm": pinhole + distance_mm * forward,
         "s_x": turn @ right,
         "s_y": -turn @ down,
     }
-    screen = (optics.geometry.screen or ScreenPoseConfig()).model_copy(
-        update={name: tuple(value.tolist()) for name, value in before.items()}
+    stated_screen = optics.geometry.screen or ScreenPoseConfig()
+    screen = stated_screen.model_copy(
+        update={name: tuple(value.tolist()) for name, value in pose.items()}
     )
+
+    # The bench with that screen, and a flat that is not seen.
     there = move_screen(optics.geometry, (0.0, 0.0, 0.0)).model_copy(update={"screen": screen})
     shape = simulation_spec.make_artefact_shape(math.inf, optics.mirror.radius_mm, 0.0, 0.0)
     spec = _make_rest_specification(options, optics.model_copy(update={"geometry": there}), shape)
@@ -241,14 +246,16 @@ def _rotation_matrix(vector: FloatArray) -> FloatArray:
 def _adjust_optics(options: SimulateOptions) -> OpticsConfig:
     """The configuration's optics with the depth, noise, steps and size from the options."""
     optics = options.config.optics
-    camera, pattern = optics.camera, optics.pattern
-    camera = shrink_camera(camera, options.shrink)
+    pattern = optics.pattern
+    camera = shrink_camera(optics.camera, options.shrink)
     changes: dict[str, object] = {}
     if options.bits is not None:
         changes["bits"] = options.bits
     if options.noise_adu is not None:
         changes["noise_adu"] = options.noise_adu
-    steps = {} if options.steps is None else {"steps": options.steps}
+    steps = {}
+    if options.steps is not None:
+        steps = {"steps": options.steps}
     return OpticsConfig(
         geometry=optics.geometry,
         camera=type(camera)(**{**camera.model_dump(exclude_none=True), **changes}),

@@ -132,7 +132,9 @@ class StabilityRun:
     @property
     def first_reason(self) -> str:
         """Reason of the first bad set."""
-        return self._bad[0]["reason"] if self._bad else ""
+        if self._bad:
+            return self._bad[0]["reason"]
+        return ""
 
     def state(self, stated: SetStatement) -> None:
         """Take what `measure` states of the first set with a figure: it anchors the others."""
@@ -462,7 +464,9 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
 
 def _state_first_set(folders: list[Path], run: StabilityRun, geometry: Path | None) -> None:
     """Judge the first set that gives a figure as `measure` does."""
-    given = None if geometry is None else read_geometry(geometry)
+    given = None
+    if geometry is not None:
+        given = read_geometry(geometry)
     for folder in folders:
         try:
             run.state(state_set(folder, given, geometry))

@@ -1,7 +1,9 @@
 """The table of a stability run, one line a set: written, read back, and summarised in lines."""
 
 import csv
+import math
 from collections.abc import Iterable, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -31,32 +33,37 @@ def read_series(
     At most about `most` of them, evenly spaced, however long the run.
     """
     with path.open(newline="", encoding="utf-8") as file:
-        stride = max(1, -(-(sum(1 for _ in file) - 1) // most))
+        # Every stride-th row, so that at most `most` are left; the first line is the head.
+        count = sum(1 for _ in file) - 1
+        stride = max(1, math.ceil(count / most))
         file.seek(0)
         rows = csv.reader(file)
         next(rows)
         good = (row for row in rows if len(row) > len(_HEAD))
-        kept = [
-            [float(cell) for cell in row[len(_HEAD) :]]
-            for k, row in enumerate(good)
-            if k % stride == 0
-        ]
+        some = islice(good, 0, None, stride)
+        kept = [[float(cell) for cell in row[len(_HEAD) :]] for row in some]
     table = np.array(kept).reshape(len(kept), len(_NUMBERS) + points + len(_ZERNIKE))
-    first = len(_NUMBERS)
-    return table[:, 0], table[:, first : first + points], table[:, first + points :]
+    first_point = len(_NUMBERS)
+    first_term = first_point + points
+    return table[:, 0], table[:, first_point:first_term], table[:, first_term:]
 
 
 def format_stability(table: Mapping[str, Any]) -> list[str]:
     """The table of `stability.json` as lines of text."""
-    sets, sd_um, rmse_um = table["sets"], table["sd_um"], table["rmse_um"]
+    sets = table["sets"]
+    sd_um = table["sd_um"]
+    rmse_um = table["rmse_um"]
     out = [
         f"sets      {sets['used']} of {sets['found']} used, {sets['degraded']} degraded, "
         f"{sets['bad']} bad",
         f"SD        mean {sd_um['mean']:.4g} µm, largest {sd_um['max']:.4g} µm",
     ]
-    if (first := table["first_set"]) is not None:
+    first = table["first_set"]
+    if first is not None:
         known = first["geometry_known"]
-        reason = f": {first['reason']}" if first["reason"] else ""
+        reason = ""
+        if first["reason"]:
+            reason = f": {first['reason']}"
         out.append(f"first set {first['verdict']}{reason}")
         out.append(f"geometry  {known['state']}: {known['source']}")
     out += [
@@ -76,7 +83,9 @@ def _pair_line(pair: dict[str, Any]) -> str:
     lag = f"{pair['lag_s'] / 60:g} min"
     if not pair["count"]:
         return f"{lag:9s} no pairs"
-    change, rmse = pair["change_rms_um"]["mean"], pair["rmse_um"]["mean"]
+    change_um = pair["change_rms_um"]["mean"]
+    rmse_um = pair["rmse_um"]["mean"]
     return (
-        f"{lag:9s} {pair['count']} pairs: change {change:.4g} µm RMS, RMSE {rmse:.4g} µm on average"
+        f"{lag:9s} {pair['count']} pairs: change {change_um:.4g} µm RMS, RMSE {rmse_um:.4g} µm on "
+        "average"
     )

@@ -120,7 +120,9 @@ def track_command(
 ) -> int:
     """Track a set, write the result and report it. Returns the exit code; raises CommandError."""
     begin_s = time.perf_counter()
-    given = None if geometry is None else read_geometry(geometry)
+    given = None
+    if geometry is not None:
+        given = read_geometry(geometry)
     track = track_set(folder, given, geometry)
     passed_s = time.perf_counter() - begin_s
     out = out.resolve() if out else folder / "result"
@@ -330,7 +332,9 @@ def _format_track(table: dict[str, Any]) -> list[str]:
     lines = [f"frames    {table['frames']} in {table['seconds']:.1f} s: {verdicts}"]
     reasons = list(table["reasons"].items())[:_SHOWN_REASONS]
     lines += [f"          {count} x {reason}" for reason, count in reasons]
-    light = "five steps of the first frames" if table["stepped"] else "the reference"
+    light = "the reference"
+    if table["stepped"]:
+        light = "five steps of the first frames"
     known = table["reference"]["geometry_known"]
     judged = table["reference"]
     lines.append(

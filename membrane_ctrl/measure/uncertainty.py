@@ -61,7 +61,9 @@ def run_everywhere(
     batches = [range(first, min(first + _BATCH, trials)) for first in range(0, trials, _BATCH)]
     job = partial(monte_carlo.run_trials, benches, spread, seed)
     if workers is None:
-        workers = (os.cpu_count() or 1) if trials * len(benches) >= _WORTH_PROCESSES else 1
+        workers = 1
+        if trials * len(benches) >= _WORTH_PROCESSES:
+            workers = os.cpu_count() or 1
     try:
         with run_jobs(job, batches, min(workers, len(batches)), scheduler) as results:
             return np.concatenate(list(terminal.track_progress(results, "trials", len(batches))))
@@ -113,7 +115,9 @@ class Spread:
 def uncertainty_command(options: UncertaintyOptions) -> int:
     """Run the trials, write map, table and picture, and report. Raises CommandError."""
     # The sets, and the spread of their geometry.
-    given = None if options.geometry is None else file.read_geometry(options.geometry)
+    given = None
+    if options.geometry is not None:
+        given = file.read_geometry(options.geometry)
     folders = [folder for folder in (options.folder, options.against) if folder is not None]
     figures = Figures(given)
     sets = [figures.measure_folder(folder) for folder in folders]
@@ -262,7 +266,9 @@ def _write_comparison(
 
 def _format_comparison(table: dict[str, Any]) -> list[str]:
     """The result as lines of text."""
-    what = "height" if table["against"] is None else "change of height"
+    what = "height"
+    if table["against"] is not None:
+        what = "change of height"
     motion = []
     if table["motion_um"] is not None:
         motion.append(
@@ -291,7 +297,9 @@ def _format_comparison(table: dict[str, Any]) -> list[str]:
 
 def _format_verdict(each: dict[str, Any]) -> list[str]:
     """How good a set is, and how well its geometry is known."""
-    reason = f": {each['reason']}" if each["reason"] else ""
+    reason = ""
+    if each["reason"]:
+        reason = f": {each['reason']}"
     known = each["geometry_known"]
     return [
         f"{each['set']}: {each['verdict']}{reason}",

@@ -137,7 +137,9 @@ def _solve_with_waves(
         found = solve_calibration(replace(problem, references=references), progress)
     except ValueError:
         return None
-    return found if found.converged else None
+    if found.converged:
+        return found
+    return None
 
 
 def _waves_explain_most(uneven: Solution) -> bool:

@@ -78,7 +78,9 @@ def _fit_waves_mm(
 
     # For each place of the screen and each axis, waves of the fringes, whose amplitudes change
     # linearly over the picture, are fitted together with smooth changes.
-    places = 1 if phases.screen is None else len(phases.moved_screens) + 1
+    places = 1
+    if phases.screen is not None:
+        places = len(phases.moved_screens) + 1
     for place in range(places):
         some = phases.seen_with(place)
         if not some.any():

@@ -129,9 +129,13 @@ def linearise_set(
     for k, there, poses, some in forward_model.screen_views(
         bench, turns, phases, state.moved_screens
     ):
-        # Numbers of the place, of which the last two are depth and motion of the film.
-        move = state.moved_screens[k - 1] if k else np.array([0.0, state.motion_mm])
-        deeper_mm, motion_mm = move[-2], move[-1]
+        # Depth and motion of the film with the screen there: the last two unknowns of its place.
+        deeper_mm = 0.0
+        motion_mm = state.motion_mm
+        if k:
+            move = state.moved_screens[k - 1]
+            deeper_mm = move[-2]
+            motion_mm = move[-1]
         parts = forward_model.linearise_points(
             there,
             poses,
@@ -166,7 +170,9 @@ def _sum_fringes(
 
     `root` (n,) are the square roots of the points' weights.
     """
-    own = moved_screen.MOVED if moved else 0
+    own = 0
+    if moved:
+        own = moved_screen.MOVED
     size = own + forward_model.LOCAL + COMMON + 1
     sums = np.zeros((size, size))
     residual_mm = np.empty((2, root.size))

@@ -117,7 +117,9 @@ def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
         there = round_of(excess_mm + _EXCESS_STEP_MM, surface.sag_mm)
         rows[:, PARAMETERS - 1] = (here - there) / _EXCESS_STEP_MM
         rows[:, -1] += here
-    sigma_mm = _FREE_MM if film == "free" else _LAW_MM
+    sigma_mm = _LAW_MM
+    if film == "free":
+        sigma_mm = _FREE_MM
     return rows / sigma_mm
 
 
@@ -125,13 +127,19 @@ def wave_rows(phases: set_phases.SetPhases, state: SetState, free: bool) -> Floa
     """The waves beyond the fit's as weighted rows [derivatives, miss]: of a film that may be
     orthotropic, or only those of a round film whose axis is not the bench's.
     """
-    sigmas_mm = np.array([wave.sigma_mm if free else _HELD_MM for wave in terms_beyond_fit.WAVES])
+    # Sizes of the waves; a shifted film has some of azimuthal order 1.
+    waves = terms_beyond_fit.WAVES
+    sigmas_mm = np.full(len(waves), _HELD_MM)
+    if free:
+        sigmas_mm = np.array([wave.sigma_mm for wave in waves])
     if phases.turned is not None:
-        once = np.array([abs(wave.azimuthal_order) == 1 for wave in terms_beyond_fit.WAVES])
+        once = np.array([abs(wave.azimuthal_order) == 1 for wave in waves])
         sigmas_mm = np.hypot(sigmas_mm, np.where(once, _SHIFTED_MM, 0.0))
+
+    # Each wave is what the shift of the film makes of it.
     rows = _beyond_rows(state.surface)[terms_beyond_fit.WAVE]
-    waves = PARAMETERS + np.arange(terms_beyond_fit.BEYOND_TERMS)[terms_beyond_fit.WAVE]
-    by_shift = shift_derivatives(state.surface, waves)
+    places = PARAMETERS + np.arange(terms_beyond_fit.BEYOND_TERMS)[terms_beyond_fit.WAVE]
+    by_shift = shift_derivatives(state.surface, places)
     rows[:, forward_model.SEAT.start : forward_model.SEAT.start + 2] = by_shift
     rows[:, -1] -= by_shift @ state.seat[:2]
     return np.asarray(rows / sigmas_mm[:, None])
@@ -167,6 +175,9 @@ def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
     expected_mm = artefact.terms_mm(*tilt)
     beyond_mm = surface.beyond_mm or [0.0] * terms_beyond_fit.BEYOND_TERMS
     present_mm = np.append(surface.parameters, beyond_mm)
+
+    # The form: each term is the expected one, which changes with the tilt (by differences), and all
+    # are weighted by the root of their covariance.
     form[:, terms] = np.eye(len(terms))[2:]
     form[:, -1] = (expected_mm - present_mm)[2:]
     for step, by_parameters in zip(_TILT_STEP * np.eye(2), tilt_by_parameters, strict=True):
@@ -174,7 +185,7 @@ def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
         form[:, :PARAMETERS] -= np.outer(change_mm[2:] / _TILT_STEP, by_parameters)
     form[:] = np.linalg.solve(np.linalg.cholesky(artefact.covariance_mm2()[2:, 2:]), form)
 
-    # Its vertex, and that it does not move.
+    # Its vertex, as stated; and it does not move.
     vertex[PARAMETERS] = 1.0 / artefact.vertex_sigma_mm
     vertex[-1] = (artefact.vertex_mm - state.vertex_z_mm) / artefact.vertex_sigma_mm
     motion[forward_model.MOTION] = 1.0 / (1e-3 * moved_screen.STILL_UM)

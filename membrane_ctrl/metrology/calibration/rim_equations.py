@@ -37,9 +37,9 @@ class Rim:
         cls, edges_px: Sequence[FloatArray], radius_mm: float, radius_sigma_mm: float
     ) -> "Rim | None":
         """The edges of several sets together; None without any."""
-        return (
-            cls(np.concatenate(edges_px, axis=1), radius_mm, radius_sigma_mm) if edges_px else None
-        )
+        if edges_px:
+            return cls(np.concatenate(edges_px, axis=1), radius_mm, radius_sigma_mm)
+        return None
 
     def sums(self, stated: Geometry, common: FloatArray) -> FloatArray:
         """Normal equations (COMMON + 1, squared) of the five

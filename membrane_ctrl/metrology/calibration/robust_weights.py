@@ -96,7 +96,9 @@ def reduce_weights(
     chi_square_of_films = _reduced_chi_square(of_films)
     reduced = []
     for phases, means, weights in zip(sets, patches, robust, strict=True):
-        common = chi_square_of_films if phases.artefact is None else 0.0
+        common = chi_square_of_films
+        if phases.artefact is not None:
+            common = 0.0
         factor = max(1.0, _reduced_chi_square(means) - _CHANCE, common - _CHANCE)
         reduced.append(replace(weights, variance=weights.variance * factor, pattern_factor=factor))
     return tuple(reduced)

@@ -103,6 +103,8 @@ def rim_beyond() -> FloatArray:
     for column, wave in enumerate(terms_beyond_fit.WAVES):
         order = wave.azimuthal_order
         if abs(order) <= ZERNIKE_DEGREE:
-            row = order if order > 0 else ZERNIKE_DEGREE - order
+            row = order
+            if order <= 0:
+                row = ZERNIKE_DEGREE - order
             waves[row, column] = wave.rms_factor
     return out

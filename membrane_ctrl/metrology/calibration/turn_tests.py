@@ -46,7 +46,9 @@ def find_unturned_figures(solution: Solution) -> tuple[UnturnedFigure, ...]:
         if chi2.sf(fall, 1) < model_tests.SURE:
             more_deg = float(np.degrees(turned.states[k].seat[2]))
             linear_deg = phases.turned.angle_deg + more_deg
-            angle_deg = linear_deg if found_deg is None else found_deg
+            angle_deg = linear_deg
+            if found_deg is not None:
+                angle_deg = found_deg
             out.append(UnturnedFigure(k, fall - 2, angle_deg))
     return tuple(out)
 
@@ -157,7 +159,9 @@ def _find_angle(
     misfits = np.array([misfit(angle_deg) for angle_deg in _ANGLES_DEG])
     best_deg = float(_ANGLES_DEG[np.argmin(misfits)])
     better = float(misfits.min()) < _FITS_BETTER * misfit(stated_deg)
-    return best_deg if better and _angle_between(best_deg, stated_deg) >= _NEAR_DEG else None
+    if better and _angle_between(best_deg, stated_deg) >= _NEAR_DEG:
+        return best_deg
+    return None
 
 
 def _angle_between(one_deg: float, other_deg: float) -> float:

@@ -247,7 +247,9 @@ def _judge_film(solution: Solution) -> list[Cause]:
     if kind == "free":
         return []
     free = replace(problem, references=replace(problem.references, film="free"))
-    start = solution if solution.converged else None
+    start = None
+    if solution.converged:
+        start = solution
     try:
         other = solve_calibration(free, start=start)
     except ValueError:

@@ -251,7 +251,9 @@ def _axis_phases(
         chosen = slice(every[0], every[-1] + 1)  # a slice does not copy the frames
     frames = stack.frames[chosen]
     reference_rad = checked.phase_rad[axis].reshape(-1)[in_bin]
-    gain = None if stack.gain is None else stack.gain[used]
+    gain = None
+    if stack.gain is not None:
+        gain = stack.gain[used]
     return pixel_phases(
         frames,
         stack.design(used),

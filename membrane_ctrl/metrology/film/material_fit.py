@@ -305,7 +305,9 @@ def _fit_round(
         finite_mm[:] = _finite_terms_mm(*make_bowls(x), reach)
         slopes = _numerical_slopes(predict, x)
         rest = target - predict(x)
-        tried_misfits = misfits[-1:] if is_far else misfits
+        tried_misfits = misfits
+        if is_far:
+            tried_misfits = misfits[-1:]
         solved = average_over_misfits(
             slopes, rest, noise, tried_misfits, known - x, precision, seen_mm
         )

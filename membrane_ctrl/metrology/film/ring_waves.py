@@ -252,7 +252,9 @@ def unexplained_term_mm(figures: Sequence[FilmFigure], bowls: Bowl, reach: float
                 data = data - (columns @ amounts).reshape(data.shape)
             squares += (float(np.sum(data**2)) - noise) / len(figures)
             freedom += terms.size - fitted
-    return float(np.sqrt(max(squares / freedom, 0.0))) if freedom else 0.0
+    if freedom:
+        return float(np.sqrt(max(squares / freedom, 0.0)))
+    return 0.0
 
 
 def wave_responses_mm(bowls: Bowl, order: int, reach: float) -> FloatArray:

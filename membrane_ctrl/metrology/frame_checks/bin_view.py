@@ -92,7 +92,9 @@ def combine_frames(
         saturated |= binned.saturated[frames].any(axis=0)
     light_estimates = light
     swing_estimates = swing
-    third = _third_estimate(stack, binned, excluded) if estimate is None else estimate
+    third = estimate
+    if estimate is None:
+        third = _third_estimate(stack, binned, excluded)
     if third is not None:
         light_estimates = [*light, third]
         swing_estimates = [*swing, third]

@@ -282,7 +282,9 @@ def _find_exchange(
         if other.inconsistent_share() > INCONSISTENT_SHARE:
             continue
         found.append(((a, b), other))
-    return found[0] if len(found) == 1 else None
+    if len(found) == 1:
+        return found[0]
+    return None
 
 
 def _find_same_picture(

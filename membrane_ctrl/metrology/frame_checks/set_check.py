@@ -122,7 +122,9 @@ def _phases_alone(
     """
     excluded = set(stack.unusable)
     excluded |= {flag.frame for flag in frame_inspection.find_obvious_faults(stack, binned)}
-    light = None if anchor is None else anchor.light
+    light = None
+    if anchor is not None:
+        light = anchor.light
     try:
         view = bin_view.combine_frames(stack, binned, excluded, light)
         return absolute_phases_of_bins(stack, binned, view, anchor, optics)
@@ -200,7 +202,9 @@ def _put_back(
                 _flag_swapped(b, stack.patterns[a].name, a),
             )
             found.append(replace(checked, flags=flags))
-    return found[0] if len(found) == 1 else None
+    if len(found) == 1:
+        return found[0]
+    return None
 
 
 def _exchange(count: int, a: int, b: int) -> list[int]:
@@ -259,7 +263,9 @@ def _check_rounds(
             # All frames agree. If their light differs, repeat the fit with the light of each.
             light, film_um, film_noise_um = _estimate_light_and_film(stack, binned, attempt, optics)
             light_error = light - (1.0 if stack.light is None else stack.light)
-            allowed = _UNEVEN if stack.light is None else _LIGHT_KNOWN
+            allowed = _UNEVEN
+            if stack.light is not None:
+                allowed = _LIGHT_KNOWN
             if np.abs(light_error).max() > allowed and done < rounds:
                 stack = replace(stack, light=light)
                 continue
@@ -360,7 +366,9 @@ def _find_swapped_pair(
     for flag in fresh:
         if flag.swapped_with is not None:
             pair = (flag.frame, flag.swapped_with)
-            return None if set(pair) & set(known) else pair
+            if set(pair) & set(known):
+                return None
+            return pair
     return None
 
 
@@ -457,7 +465,9 @@ def _attempt_fit(
     tracer = ray_tracing.Tracer(bench.geometry, optics.mirror.radius_mm, vertex_mm)
 
     # Light, wrapped and absolute phases of the bins.
-    light_of_anchor = None if anchor is None else anchor.light
+    light_of_anchor = None
+    if anchor is not None:
+        light_of_anchor = anchor.light
     view = bin_view.combine_frames(stack, binned, excluded, light_of_anchor)
     phase_rad = absolute_phases_of_bins(stack, binned, view, anchor, optics)
 

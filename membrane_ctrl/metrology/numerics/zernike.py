@@ -23,10 +23,18 @@ def noll_orders(j: int) -> tuple[int, int]:
     """Radial order n and azimuthal order m (negative: sine) of Noll's index j >= 1."""
     if j < 1:
         raise ValueError(f"Noll's index starts at 1, got {j}")
+    # Order n has n + 1 terms, places 1 .. n + 1; azimuthal orders have the parity of n.
     n = (math.isqrt(8 * j - 7) - 1) // 2
-    place = j - n * (n + 1) // 2  # 1 .. n + 1 within the order
-    m = 2 * (place // 2) if n % 2 == 0 else 2 * ((place - 1) // 2) + 1
-    return n, (m if j % 2 == 0 else -m)
+    place = j - n * (n + 1) // 2
+    if n % 2 == 0:
+        m = 2 * (place // 2)
+    else:
+        m = 2 * ((place - 1) // 2) + 1
+
+    # Odd j are sines.
+    if j % 2 == 1:
+        m = -m
+    return n, m
 
 
 def osa_from_noll(per_term: FloatArray) -> FloatArray:
@@ -47,10 +55,15 @@ def fringe_set_orders(j: int) -> tuple[int, int]:
         raise ValueError(f"the Fringe set has the terms 1 to {FRINGE_TERMS}, got {j}")
     if j == FRINGE_TERMS:
         return 12, 0
-    half = math.isqrt(j - 1)  # (n + |m|) / 2
-    place = j - half**2 - 1  # 0 .. 2 half within the shell: m falls, cosine before sine
+
+    # Shells of one half = (n + |m|) / 2, places 0 .. 2 half: m falls, cosine before sine.
+    half = math.isqrt(j - 1)
+    place = j - half**2 - 1
     m = half - place // 2
-    return 2 * half - m, (m if place % 2 == 0 else -m)
+    n = 2 * half - m
+    if place % 2 == 1:
+        m = -m
+    return n, m
 
 
 @cache

@@ -89,7 +89,9 @@ def resolve_orders_by_votes(
     # Each pixel votes for the number of periods that its region lacks.
     lacking = np.round((voted_rad - smooth_rad) / (2 * math.pi))
     is_voting = mask & np.isfinite(voted_rad)
-    regions = region.max() + 1 if mask.any() else 0
+    regions = 0
+    if mask.any():
+        regions = region.max() + 1
     votes = np.zeros((regions, 2 * _MOST_ORDERS + 1), np.int64)
     ballot = np.clip(lacking[is_voting], -_MOST_ORDERS, _MOST_ORDERS).astype(np.int64)
     np.add.at(votes, (region[is_voting], ballot + _MOST_ORDERS), 1)

@@ -78,4 +78,6 @@ def tear_share(phase_rad: FloatArray) -> float:
     """
     steps = np.concatenate([np.diff(phase_rad, axis=0).ravel(), np.diff(phase_rad, axis=1).ravel()])
     steps = steps[np.isfinite(steps)]
-    return float(np.mean(np.abs(steps) > math.pi)) if steps.size else 0.0
+    if steps.size:
+        return float(np.mean(np.abs(steps) > math.pi))
+    return 0.0

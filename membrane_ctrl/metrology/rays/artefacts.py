@@ -37,7 +37,9 @@ class Artefact:
     @property
     def name(self) -> str:
         """For a person."""
-        return "sphere" if self.curvature_per_mm else "flat"
+        if self.curvature_per_mm:
+            return "sphere"
+        return "flat"
 
     @property
     def doubt(self) -> str:

@@ -140,7 +140,7 @@ def residual_mm(
     for _, there, _, some in screen_views(bench, [], phases, moved_screens):
         # The points that were seen with the screen in this place, and their rays.
         seen = phases.subset(some)
-        shape = None if isinstance(phases.artefact, SeenScreen) else surface
+        shape = _reflecting_surface(phases, surface)
         points = place_rays(there, seen, surface, vertex_z_mm)
 
         # Where the rays meet the screen, from mm on the panel to stated mm.
@@ -224,7 +224,7 @@ def linearise_points(
     Chunk
     """
     points = place_rays(bench, phases, surface, vertex_z_mm)
-    shape = None if isinstance(phases.artefact, SeenScreen) else surface
+    shape = _reflecting_surface(phases, surface)
     for part in _split_points(points.t_mm.size):
         meeting = _intersect_screen(bench, points, shape, part)
         column_px = phases.column_px[part]
@@ -238,6 +238,13 @@ def linearise_points(
         at_rest_mm = meeting.screen_mm / bench.pitch
         predicted_mm = at_rest_mm + motion_mm * by_motion + deeper_mm * by_depth
         yield Chunk(part, phases.screen_mm[:, part] - predicted_mm, derivatives)
+
+
+def _reflecting_surface(phases: SetPhases, surface: Surface) -> Surface | None:
+    """The surface that reflects the rays of a set; None if the camera sees the screen itself."""
+    if isinstance(phases.artefact, SeenScreen):
+        return None
+    return surface
 
 
 def _split_points(count: int) -> Iterator[slice]:
@@ -311,7 +318,9 @@ def _intersect_screen(
     k = -start[2] / along[2]
 
     # From there to a face that is no plane, by Newton's steps on (P + k u)_normal = w.
-    steps = 0 if geometry.face.is_plane else kernels.FACE_STEPS
+    steps = 0
+    if not geometry.face.is_plane:
+        steps = kernels.FACE_STEPS
     for _ in range(steps):
         place = start + k * along
         w, by_x, by_y = geometry.face.heights(place[:2])

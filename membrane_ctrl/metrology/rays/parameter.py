@@ -39,4 +39,6 @@ class Parameter:
     def unit(self) -> str:
         """The unit in the name; empty for a plain number."""
         tail = self.name.rsplit("_", 1)[-1]
-        return tail if tail in ("mm", "deg", "px") else ""
+        if tail in ("mm", "deg", "px"):
+            return tail
+        return ""

@@ -42,7 +42,9 @@ class Face(NamedTuple):
     @classmethod
     def of(cls, screen: ScreenPoseConfig | None) -> "Face":
         """The face that a configuration describes; a plane for None."""
-        bow_mm = 0.0 if screen is None else screen.bow_mm
+        bow_mm = 0.0
+        if screen is not None:
+            bow_mm = screen.bow_mm
         cells, low, pitch = _make_cells(None if screen is None else screen.height_map)
         return cls(bow_mm / BOW_RADIUS_MM**2, cells, low, pitch)
 

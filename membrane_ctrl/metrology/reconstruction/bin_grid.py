@@ -36,11 +36,13 @@ class BinGrid:
         self.row_px = grid_rows.ravel()
         self.rays = geometry.rays(self.column_px, self.row_px)
         # Rays around the centres, for `averaging_bias_mm`; a bin of one pixel needs none.
-        h = math.sqrt((bin_px**2 - 1) / 6)
-        offsets = ((h, 0.0), (-h, 0.0), (0.0, h), (0.0, -h)) if bin_px > 1 else ()
-        self._around = [
-            geometry.rays(self.column_px + right, self.row_px + down) for right, down in offsets
-        ]
+        self._around: list[FloatArray] = []
+        if bin_px > 1:
+            h = math.sqrt((bin_px**2 - 1) / 6)
+            self._around = [
+                geometry.rays(self.column_px + right, self.row_px + down)
+                for right, down in ((h, 0.0), (-h, 0.0), (0.0, h), (0.0, -h))
+            ]
 
     def near_mirror(self, radius_mm: float) -> BoolArray:
         """Bins whose ray meets the plane z = 0 within a radius."""

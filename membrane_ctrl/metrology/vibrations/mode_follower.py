@@ -125,7 +125,9 @@ class VibrationFollower:
     def _judge_tension(self, modes: "Sequence[FollowedMode]", utc_s: float) -> list[events.Event]:
         """A notice when a mode has moved, and when none has within a week."""
         is_active = "film_tension" in self.followed.active_notices
-        limit = MOVED / 2 if is_active else MOVED
+        limit = MOVED
+        if is_active:
+            limit = MOVED / 2
         moved = next((mode for mode in modes if abs(mode.moved[0]) > limit), None)
         sentence = ""
         if moved is not None:

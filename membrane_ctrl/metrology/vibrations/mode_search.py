@@ -53,6 +53,7 @@ _MOST_MODES = 24
 _CHANCE = 1e-9  # probability of a false line in one search
 # Difference of T, a factor of 2e4 in likelihood, below which two frequencies are equally possible.
 _EQUALLY_LIKELY = 10.0
+_EQUAL = 0.1  # difference of T of two frequencies that are aliases of each other in all pieces
 # Share of T that a line leaves where its alias is as slow as drift, and that another frequency
 # takes over.
 _LEAKED = 0.1
@@ -160,7 +161,9 @@ class _Piece:
                 continue
             remaining = inside & ~gone
             most_remains = 2 * remaining.sum() > inside.sum()
-            band = remaining if most_remains else inside
+            band = inside
+            if most_remains:
+                band = remaining
             levels.append(np.median(power[band], axis=0) / _MEDIAN_OF_POWER)
             middles.append(np.log(np.sqrt(low * high)))
 
@@ -207,13 +210,16 @@ def find_modes(
     tuple of VibrationMode or None
         The modes, the strongest first; None if there are less than 20 s of frames at a steady rate.
     """
+    # The good frames in pieces of one rate. The first term only puts the vertex at 0: it would
+    # count what moves the vertex twice.
     good = np.isfinite(coeffs_um).all(axis=1)
     grid_hz = np.arange(_LEAST_HZ, most_hz, 1 / (_GRID * PIECE_S))
-    # The first term only puts the vertex at 0: it would count what moves the vertex twice.
     pieces, terms = _split_frames(time_s[good], coeffs_um[good, 1:], grid_hz)
     if sum(piece.time_s[-1] - piece.time_s[0] for piece in pieces) < 0.9 * LEAST_S:
         return None
-    margin = _MARGIN if _one_rate([piece.rate_hz for piece in pieces]) else 1.0
+    margin = 1.0
+    if _one_rate([piece.rate_hz for piece in pieces]):
+        margin = _MARGIN
     visible = np.sum([~piece.blind for piece in pieces], axis=0)
     whole_power = [np.abs(spectrum) ** 2 for spectrum in _project_pieces(pieces, terms)]
     # For each piece, the frequencies whose aliases were removed with a line.
@@ -277,16 +283,20 @@ def _split_frames(
     time_s: FloatArray, coeffs_um: FloatArray, grid_hz: FloatArray
 ) -> tuple[list[_Piece], list[FloatArray]]:
     """The frames in pieces, and their terms without drift."""
-    pieces, terms = [], []
+    pieces = []
+    terms = []
     for frames in _find_runs(time_s):
+        # The frame rate, and where each frequency of the search appears at it.
         t = time_s[frames]
         rate_hz = 1 / float(np.median(np.diff(t)))
         alias_hz = np.abs(grid_hz - rate_hz * np.round(grid_hz / rate_hz))
+        blind = (alias_hz < _LEAST_HZ) | (alias_hz > rate_hz / 2 - 2 / PIECE_S)
+
+        # Hann's window, which is 0 one frame beyond both ends, and the waves of the projection.
         middle = (t[0] + t[-1]) / 2
         half = (t[-1] - t[0]) / 2 + 1 / rate_hz
         window = np.cos(np.pi / 2 * (t - middle) / half) ** 2
         waves = np.exp(-2j * np.pi * grid_hz[:, None] * (t - t[0]))
-        blind = (alias_hz < _LEAST_HZ) | (alias_hz > rate_hz / 2 - 2 / PIECE_S)
         pieces.append(_Piece(t, rate_hz, window, waves, alias_hz, blind))
         terms.append(_without_drift(t, coeffs_um[frames]))
     return pieces, terms
@@ -299,8 +309,9 @@ def _find_runs(time_s: FloatArray) -> list[slice]:
     intervals = np.diff(time_s)
     if intervals.size <= 2 * _HALF:
         return []
-    usual = ndimage.median_filter(intervals, 2 * _HALF + 1, mode="nearest")
+
     # The rate changes in the middle of each stretch where the medians on both sides differ.
+    usual = ndimage.median_filter(intervals, 2 * _HALF + 1, mode="nearest")
     before = usual[: -2 * _HALF]
     after = usual[2 * _HALF :]
     differs = np.append(0, np.abs(after - before) > _OTHER_RATE * before)
@@ -308,6 +319,8 @@ def _find_runs(time_s: FloatArray) -> list[slice]:
     begins = np.flatnonzero(edges_of_stretches == 1)
     ceases = np.flatnonzero(edges_of_stretches == -1)
     rate_changes = (begins + ceases) // 2 + _HALF
+
+    # Runs between these changes and the gaps, each split evenly.
     gaps = np.flatnonzero(intervals > _GAP * usual)
     ends = np.union1d(rate_changes, gaps)
     pieces = []
@@ -388,8 +401,9 @@ def _find_likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]
     most_per_piece = max(per_piece.values())
     candidates = [k for k in candidates if per_piece[k] > _MISSING * most_per_piece]
 
+    # The lowest of nearly equal ones, and the others that may not be excluded.
     most = max(seen[k] for k in candidates)
-    likeliest = min(k for k in candidates if seen[k] > most - 0.1)
+    likeliest = min(k for k in candidates if seen[k] > most - _EQUAL)
     rivals = [k for k in candidates if k != likeliest and seen[k] > most - _EQUALLY_LIKELY]
     return likeliest, sorted(rivals)
 

@@ -120,7 +120,9 @@ class OpticsRenderer:
         has another shape or type.
         """
         camera = self.optics.camera
-        picture = self.make_blank_picture() if out is None else out
+        picture = out
+        if picture is None:
+            picture = self.make_blank_picture()
         depth = np.dtype(np.uint8 if camera.bits == 8 else np.uint16)
         if picture.shape != (camera.height_px, camera.width_px) or picture.dtype != depth:
             raise ValueError(
@@ -138,7 +140,9 @@ class OpticsRenderer:
         for mode in self.modes:
             nodes = nodes + mode.swing_um(times_s) * self._swing_maps(mode)
         if self._disturber is not None:
-            pattern = shown if isinstance(shown, Pattern) else _NO_PATTERN
+            pattern = _NO_PATTERN
+            if isinstance(shown, Pattern):
+                pattern = shown
             nodes = np.concatenate([nodes, self._disturber.light_disturbance(time_s, pattern)])
 
         # Half of the rows on each of two threads.
@@ -441,7 +445,9 @@ class TwinOptics:
                 self._twin.film_poisson,
             )
             stated = self._optics.geometry.reference_displacement_um
-            reference_um = position.displacement_um if stated is None else stated
+            reference_um = stated
+            if reference_um is None:
+                reference_um = position.displacement_um
             self._renderer = OpticsRenderer(
                 self._optics,
                 film,

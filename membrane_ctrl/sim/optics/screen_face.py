@@ -29,7 +29,9 @@ def project_onto_face(
     """
     if bow_per_mm == 0.0 and height_map is None:
         return place_mm
-    spline = None if height_map is None else _make_height_spline(height_map)
+    spline = None
+    if height_map is not None:
+        spline = _make_height_spline(height_map)
     found = place_mm
     for _ in range(_FACE_MAX_STEPS):
         off_mm = bow_per_mm * np.sum(found**2, axis=0)

@@ -90,7 +90,9 @@ class FrameFault:
                 "flicker:x_sin_2:0.8"
             )
         try:
-            strength = float(amount) if amount else None
+            strength = None
+            if amount:
+                strength = float(amount)
         except ValueError:
             raise ValueError(f"faults: amount {amount!r} of {text!r} is not a number") from None
         return cls(kind, frame, strength)  # type: ignore[arg-type]  # checked above

@@ -49,7 +49,9 @@ def _zernike_monomials(j: int) -> dict[tuple[int, int], float]:
         norm = sqrt(2 * (n + 1))
 
     # (x + i y)^m: y^k carries i^k, which is real (cosine) for even k, imaginary (sine) for odd k.
-    first = 1 if signed_m < 0 else 0
+    first = 0
+    if signed_m < 0:
+        first = 1
     angular = {(m - k, k): comb(m, k) * (-1) ** (k // 2) for k in range(first, m + 1, 2)}
 
     # Times each radial coefficient and (x^2 + y^2)^power.
