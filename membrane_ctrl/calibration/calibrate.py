@@ -87,13 +87,12 @@ def calibrate_command(options: CalibrateOptions) -> int:
         "timing_s": timing,
     }
     print(json.dumps(report) if options.as_json else "\n".join(format_report(report)))
-    if not usable:
-        print(
-            f"calibrate: rejected; {options.out} is not written, the old geometry remains in use",
-            file=sys.stderr,
-        )
     if usable:
         return errors.Exit.DONE
+    print(
+        f"calibrate: rejected; {options.out} is not written, the old geometry remains in use",
+        file=sys.stderr,
+    )
     return errors.Exit.REJECTED
 
 

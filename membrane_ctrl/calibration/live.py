@@ -63,7 +63,7 @@ def calibrate_live(options: LiveOptions) -> int:
     Raises
     ------
     InputError
-        If the options do not fit one another, or nobody agrees to move the mirror.
+        If the options do not fit one another, or no person agrees to move the mirror.
     """
     parse_freed(options.solving.free)  # check these before the mirror moves
     for path in options.solving.priors:

@@ -20,7 +20,7 @@ import numpy as np
 from membrane_ctrl.config.schema import CameraConfig
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
-LEAST_VIEWS = 4  # each has a pose of its own; with fewer the lens hides in the poses
+LEAST_VIEWS = 4  # each has its own pose; with fewer, the poses absorb errors of the lens
 LEAST_CORNERS = 12  # of a view
 _WORSE = 3.0  # times the median view's error
 # Bow of a board over its longest side: paper on a plate, a screen
@@ -325,7 +325,7 @@ def _jackknife_focal(views: Sequence[BoardView], stated: CameraConfig) -> float:
 
 
 def _fit_camera(views: Sequence[BoardView], stated: CameraConfig) -> _CameraFit:
-    """Fit one camera to views, each with a pose of its own. Raises ValueError if nothing fits."""
+    """Fit one camera to views, each with its own pose. Raises ValueError if nothing fits."""
     places = [view.place.astype(np.float32)[:, None] for view in views]
     seen = [view.seen_px.astype(np.float32)[:, None] for view in views]
     size = (stated.width_px, stated.height_px)

@@ -226,7 +226,7 @@ def _judge_gray(
     light_limit = max(GRAY_SHARE, bright_limit / max(bright, _TINY))
     flags = []
     for k in gray:
-        # A bit without an edge on the mirror is as good as white or black.
+        # A bit without an edge on the mirror is a flat frame, bright or dark.
         own = evidence[k]
         if not _NO_EDGE < own.lit < 1 - _NO_EDGE:
             flags += _judge_flat(k, own, bright, is_white=own.lit > 0.5)

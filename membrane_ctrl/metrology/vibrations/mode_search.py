@@ -10,7 +10,7 @@ frame rate,
 with a Hann window w. T(f) is the power of all X_p of one shape, in units of their noise: the
 largest eigenvalue over the shapes. Without a vibration it follows about a gamma distribution, whose
 scale and order its quantiles give. The largest T is a vibration if chance would give it once in ten
-thousand nights; it is subtracted from the terms, and the search goes on with what is left. T is
+thousand nights; it is subtracted from the terms, and the search continues with the rest. T is
 also the logarithm of the likelihood (Bretthorst 1988, chapter 3), so that its curvature is the
 frequency's variance, and frequencies with a T nearly as large are named as equally possible.
 """

@@ -45,7 +45,7 @@ def project_onto_face(
 
 def _make_height_spline(height_map: HeightMapConfig) -> RectBivariateSpline:
     """Through the nodes, cubic along an axis with four or more of them; beyond the grid its edge's
-    height goes on.
+    height continues.
     """
     rows, columns = (min(3, len(axis) - 1) for axis in (height_map.s_y_mm, height_map.s_x_mm))
     return RectBivariateSpline(
