@@ -197,7 +197,7 @@ class ForeignCamera:
             hencky_um=0.0,
             covariance_um2=self.sigma_um**2 * np.eye(_TERMS),
             sag_um=sag_um,
-            sag_sigma_um=self.sigma_um,
+            sag_change_sigma_um=self.sigma_um,
             displacement_um=math.nan,
             slope_residual_urad=1.0,
             valid_fraction=1.0,
