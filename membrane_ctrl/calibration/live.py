@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.calibration import session as sessions
-from membrane_ctrl.calibration.adopt import adopt_geometry, compare_geometries
+from membrane_ctrl.calibration.adopt import adopt_geometry
 from membrane_ctrl.calibration.calibrate import calibrate_command
 from membrane_ctrl.calibration.calibrate_options import CalibrateOptions, parse_freed
+from membrane_ctrl.calibration.compare_geometries import compare_geometries
 from membrane_ctrl.calibration.procedure import Procedure
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
 from membrane_ctrl.calibration.setpoints import HeldMirror, plan_setpoints_um, setpoint_reach

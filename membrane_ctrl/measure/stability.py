@@ -23,6 +23,7 @@ from membrane_ctrl.measure import (
     result_files,
     stability_pictures,
     stability_results,
+    stability_text,
 )
 from membrane_ctrl.measure.set_statement import SetStatement, state_set
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, parameter_to_coeffs
@@ -232,7 +233,7 @@ class StabilityRun:
 
     def format_lines(self) -> list[str]:
         """The result as lines of text."""
-        return stability_results.format_stability(self.make_table())
+        return stability_text.format_stability(self.make_table())
 
     def draw_pictures(self) -> list[Path]:
         """Write the SD map and the pictures, and return the latter.
@@ -298,9 +299,9 @@ class StabilityRun:
     def _spread_for(self, one: measurement.SetFigure) -> geometry_spread.GeometrySpread:
         """The spread of the geometry, that of the first set."""
         if self._spread is None:
-            self._spread, self._source = spread_file.geometry_spread(
-                one.head.optics, self._geometry
-            )
+            spread, source = spread_file.geometry_spread(one.head.optics, self._geometry)
+            self._spread = spread
+            self._source = source
             self._origin = one.head.geometry.make_table()
         return self._spread
 

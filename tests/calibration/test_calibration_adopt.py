@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.calibration.adopt import adopt_geometry, compare_geometries
+from membrane_ctrl.calibration.adopt import adopt_geometry
+from membrane_ctrl.calibration.compare_geometries import compare_geometries
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
 from membrane_ctrl.geometry.file import read_geometry, stated_origin
 from membrane_ctrl.model.errors import DeviceError

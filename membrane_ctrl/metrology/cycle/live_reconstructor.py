@@ -138,7 +138,7 @@ class LiveReconstructor:
         # What the last full cycle found of the light: frequencies of backlight bands, the share of
         # the previous picture, and why a cycle is degraded by either.
         self._bands_rad = np.zeros(0)
-        self._lag = image_lag.UNKNOWN
+        self._lag = image_lag.ImageLag.unknown()
         self._doubt = ""
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)

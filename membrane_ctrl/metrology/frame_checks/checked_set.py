@@ -1,7 +1,7 @@
 """A capture set whose frames have been checked and whose bins have been fitted."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -86,9 +86,13 @@ class Checked:
     film_um: FloatArray
     film_noise_um: float
     light_left: float
-    lag: image_lag.ImageLag = image_lag.UNKNOWN
-    second: second_reflection.SecondReflection = second_reflection.UNKNOWN
-    response: light_response.LightResponse = light_response.UNKNOWN
+    lag: image_lag.ImageLag = field(default_factory=image_lag.ImageLag.unknown)
+    second: second_reflection.SecondReflection = field(
+        default_factory=second_reflection.SecondReflection.unknown
+    )
+    response: light_response.LightResponse = field(
+        default_factory=light_response.LightResponse.unknown
+    )
 
     @property
     def verdict(self) -> tuple[Verdict, str]:

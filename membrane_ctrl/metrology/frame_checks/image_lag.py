@@ -78,6 +78,11 @@ class ImageLag:
     sigma: float
     corrected: bool = False
 
+    @classmethod
+    def unknown(cls) -> "ImageLag":
+        """A share that the set does not show."""
+        return cls(0.0, 0.0, math.nan)
+
     @property
     def share(self) -> float:
         """Mean of the two."""
@@ -89,9 +94,6 @@ class ImageLag:
         if self.corrected:
             return self.sigma
         return math.hypot(self.share, self.sigma)
-
-
-UNKNOWN = ImageLag(0.0, 0.0, math.nan)
 
 
 def estimate_image_lag(
@@ -113,7 +115,7 @@ def estimate_image_lag(
     Returns
     -------
     ImageLag
-        `UNKNOWN` if no frame shows both shares, or only with an uncertainty above 3 %.
+        `ImageLag.unknown()` if no frame shows both shares, or only with an uncertainty above 3 %.
     """
     scene = scene.thinned()
     means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
@@ -137,7 +139,7 @@ def estimate_image_lag(
         rises += rises_of_frame
         falls += falls_of_frame
     if not rises or not falls:
-        return UNKNOWN
+        return ImageLag.unknown()
 
     # Their medians over the frames.
     rise, rise_sigma = _combine_frames(rises)
@@ -146,7 +148,7 @@ def estimate_image_lag(
     if len(rises) == 1:  # one frame has no scatter: only the difference of the shares is evidence
         sigma = math.hypot(sigma, rise - fall)
     if sigma > _UNKNOWN_SIGMA:
-        return UNKNOWN
+        return ImageLag.unknown()
     return ImageLag(rise, fall, math.hypot(sigma, _FLOOR_SIGMA))
 
 
@@ -231,7 +233,7 @@ def find_image_lag(stack: FrameStack, binned: Binned, phase_rad: FloatArray) -> 
     x_frames = stack.sinusoids(AXES[0])
     mean_of_steps = stack.weights(x_frames)[0]
     index = np.arange(phase_rad.shape[1])
-    lag = UNKNOWN
+    lag = ImageLag.unknown()
     corrected = binned
     for _ in range(ROUNDS):
         # The light is the mean of the x steps, in the frames as corrected so far.

@@ -42,8 +42,10 @@ class LightResponse:
     edge_loss: float
     side_loss: float
 
-
-UNKNOWN = LightResponse(math.nan, math.nan, math.nan)
+    @classmethod
+    def unknown(cls) -> "LightResponse":
+        """A response that the set does not show."""
+        return cls(math.nan, math.nan, math.nan)
 
 
 def estimate_response(
@@ -72,10 +74,10 @@ def estimate_response(
     Returns
     -------
     LightResponse
-        `UNKNOWN` with fewer than 300 bins.
+        `LightResponse.unknown()` with fewer than 300 bins.
     """
     if index.size < _LEAST_BINS:
-        return UNKNOWN
+        return LightResponse.unknown()
     means = binned.means.reshape(len(stack.patterns), -1)[:, index].astype(float)
     mean_of_axes = [stack.weights(frames)[0] @ means[frames] for frames in used]
     mean_of_fringes = np.mean(mean_of_axes, axis=0)

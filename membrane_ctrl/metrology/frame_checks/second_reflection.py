@@ -73,13 +73,15 @@ class SecondReflection:
     shift_rad: tuple[float, float] = (math.nan, math.nan)
     mm_per_rad: float = math.nan
 
+    @classmethod
+    def unknown(cls) -> "SecondReflection":
+        """No second image found, and none excluded."""
+        return cls(0.0, math.nan)
+
     @property
     def found(self) -> bool:
         """Whether there is one."""
         return self.share > 0
-
-
-UNKNOWN = SecondReflection(0.0, math.nan)
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ def find_second_reflection(
     Returns
     -------
     SecondReflection
-        `UNKNOWN` without usable Gray frames.
+        `SecondReflection.unknown()` without usable Gray frames.
     """
     centre_rad = screen_scale.centre_phase_rad(pattern)
     scene = scene.thinned(_BINS)
@@ -156,7 +158,7 @@ def find_second_reflection(
     ]
     known = [place for place in places if place is not None]
     if not known:
-        return UNKNOWN
+        return SecondReflection.unknown()
     sigma = max(place.sigma for place in known)
     seen = [place for place in known if place.clear > _CLEAR and place.share > _LEAST_SHARE]
     if not seen:

@@ -28,13 +28,14 @@ from membrane_ctrl.metrology.frame_checks import (
     picture_orientation,
     second_reflection,
 )
-from membrane_ctrl.metrology.frame_checks.bin_orders import absolute_phases_of_bins, confirm_orders
+from membrane_ctrl.metrology.frame_checks.bin_orders import absolute_phases_of_bins
 from membrane_ctrl.metrology.frame_checks.checked_set import (
     Anchor,
     Checked,
     RejectedSetError,
     vertex_z_mm,
 )
+from membrane_ctrl.metrology.frame_checks.order_check import confirm_orders
 from membrane_ctrl.metrology.phase import frame_stack
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.metrology.phase.screen_scale import centre_phase_rad, inside_pattern, mm_per_rad
@@ -435,7 +436,7 @@ def _attempt_without_lag(
     """
     stack = replace(stack, lag_shares=(0.0, 0.0))
     binned = taken
-    lag = image_lag.UNKNOWN
+    lag = image_lag.ImageLag.unknown()
     attempt = _attempt_fit(stack, binned, bench, excluded)
     for _ in range(image_lag.ROUNDS):
         found = image_lag.estimate_image_lag(stack, binned, attempt.scene, excluded)

@@ -67,7 +67,9 @@ class TrackedPoints:
         """Make the fresh phases the reference; points that gave none keep theirs."""
         not_usable = np.flatnonzero(~usable)
         self.fresh[:, :, not_usable] = self.accepted[:, :, not_usable]
-        self.accepted, self.fresh = self.fresh, self.accepted
+        before = self.accepted
+        self.accepted = self.fresh
+        self.fresh = before
         self.surface = surface
 
 

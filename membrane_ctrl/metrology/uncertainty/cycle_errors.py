@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
-from membrane_ctrl.metrology.frame_checks.image_lag import UNKNOWN, ImageLag
+from membrane_ctrl.metrology.frame_checks.image_lag import ImageLag
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.surface import PARAMETERS
@@ -330,7 +330,7 @@ class ErrorWatch:
         self._spread = spread
         self._mm_per_rad = screen_scale.mm_per_rad(optics.pattern)
         self._errors: LiveErrors | None = None
-        self._lag = UNKNOWN
+        self._lag = ImageLag.unknown()
         self._examined: IntArray = np.empty(0, int)  # numbers of tracked points
         self._reference_um = math.nan  # displacement of the reference cycle
         # Phases of all bins less those of the surface, in the reference cycle; NaN where unknown.
@@ -345,11 +345,13 @@ class ErrorWatch:
             return np.full((PARAMETERS, PARAMETERS), np.nan)
         return self._errors.common_mm2
 
-    def begin(self, state: tracked_points.TrackedPoints, lag: ImageLag = UNKNOWN) -> None:
+    def begin(self, state: tracked_points.TrackedPoints, lag: ImageLag | None = None) -> None:
         """Choose the points that are examined from those of a full cycle.
 
-        `lag` is the share of the previous frames that its frames show.
+        `lag` is the share of the previous frames that its frames show; None: unknown.
         """
+        if lag is None:
+            lag = ImageLag.unknown()
         self._lag = lag
         places_px = self._places_px[:, state.index]
         chosen = trial_bench.spread_evenly(places_px, self._optics.camera.width_px, POINTS)
