@@ -91,7 +91,7 @@ def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> SetSeries:
             renderer.render_picture(pattern, float(moved_um), time_s=float(at_s))
             for pattern, moved_um, at_s in zip(patterns, film_um[part], time_s, strict=True)
         ]
-        cycle = live.full if number == 0 else live.fringes
+        cycle = live.measure_full if number == 0 else live.measure_fringes
         estimate = cycle(frames, time_s, readings_um[part])
         begin = part.stop
         if estimate.verdict == "rejected":

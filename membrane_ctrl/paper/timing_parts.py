@@ -29,12 +29,13 @@ def compare_timings(bench: MeasuredBench) -> PartResult:
     readings_um = np.zeros(len(stack.frames))
     time_s = np.arange(len(stack.frames), dtype=float)
     frames = list(stack.frames)
-    live_full_s = _time(lambda: live.full(frames, time_s, readings_um))
+    live_full_s = _time(lambda: live.measure_full(frames, time_s, readings_um))
     slots = pattern_sequence.FullSlots(bench.optics.pattern.steps)
     fringes = [frames[index] for part in slots.sinusoids for index in range(*part.indices(99))]
     count = len(fringes)
     live_fringes_s = min(
-        _time(lambda: live.fringes(fringes, time_s[:count], readings_um[:count])) for _ in range(3)
+        _time(lambda: live.measure_fringes(fringes, time_s[:count], readings_um[:count]))
+        for _ in range(3)
     )
     rows = {
         "frame checks and phases of the bins": ("", check_s),
