@@ -41,5 +41,5 @@ def test_each_file_is_a_path_from_the_configurations_folder(
 
 
 def test_what_is_not_named_stays_unnamed(tmp_path: Path) -> None:
-    (tmp_path / "bench.toml").write_text("")
+    (tmp_path / "bench.toml").write_text('[shape]\nmode = "auto"\n')  # as without a file
     assert load_configuration(tmp_path / "bench.toml") == load_configuration(None)
