@@ -19,7 +19,7 @@ from membrane_ctrl.run_files.event_log import LoggedEvent
 from membrane_ctrl.run_files.run import Run, open_run
 from membrane_ctrl.run_files.table_store.reader import TableReader
 
-REPORT_NAME = "report.html"
+REPORT_NAME = "report/report.html"  # in a run's folder, as `report` writes it
 _EVENTS_MOST = 200
 _LAST_TICKS_S = 1.0
 _STOP_BEFORE_END_S = 120.0  # a stop that is older ended nothing: the run went on

@@ -26,6 +26,7 @@ from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_log import LiveLog
 from membrane_ctrl.sessions.progress import Progress
 from membrane_ctrl.web import cli, runs_panel, server
+from tests.support import review_runs
 from tests.support.browser import Tab, browser_tab
 from tests.support.machine_needs import needs
 from tests.worlds.free_port import free_port
@@ -324,14 +325,24 @@ def test_other_machines_need_tls_and_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["..", ".", "", "../secret", "a/b", ".hidden"])
 def test_a_report_is_that_of_a_run_in_the_folder(tmp_path: Path, name: str) -> None:
     (tmp_path / "logs").mkdir()
-    (tmp_path / "report.html").write_text("secret")
-    (tmp_path / "logs" / "report.html").write_text("secret")
+    for folder in (tmp_path, tmp_path / "logs"):
+        (folder / "report").mkdir(exist_ok=True)
+        (folder / REPORT_NAME).write_text("secret")
     assert b"secret" not in bytes(server.report_page(tmp_path / "logs", name).body)
 
 
+def test_the_report_of_a_run_is_written_and_shown(tmp_path: Path) -> None:
+    run = review_runs.written(tmp_path, 0.05)
+    assert server.report_page(tmp_path, run.name).status_code == 404
+    assert runs_panel.report_problem(run, WebUser("anna", "operate")) == ""
+    shown = server.report_page(tmp_path, run.name)
+    assert shown.status_code == 200
+    assert run.name.encode() in bytes(shown.body)
+
+
 def test_a_report_of_a_stranger_runs_in_a_sandbox(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "report.html").write_text("<script>fetch('/')</script>")
+    (tmp_path / "run" / "report").mkdir(parents=True)
+    (tmp_path / "run" / REPORT_NAME).write_text("<script>fetch('/')</script>")
     answer = server.report_page(tmp_path, "run")
     policy = answer.headers["content-security-policy"]
     assert policy.startswith("sandbox")
@@ -349,6 +360,7 @@ def test_a_reader_starts_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert started == []
     assert runs_panel.report_problem(run, operator) == ""
     assert started == [("report", str(run))]
+    (run / "report").mkdir()
     (run / REPORT_NAME).write_text("written")
     assert runs_panel.report_problem(run, reader) == "", "what exists may be read"
     assert len(started) == 1
