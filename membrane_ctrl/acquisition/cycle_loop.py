@@ -36,16 +36,21 @@ def keep_cycling(
     """
     due_s = clock.now()
     while not remote.stop:
+        # Paused: wait for a command, and begin a new period after it.
         if remote.paused:
             remote.report_state("paused", "until the command to resume")
             while remote.paused and not remote.stop:
                 remote.take_commands(math.inf)
             due_s = clock.now()
             continue
+
+        # Wait for the deadline; a command may arrive meanwhile.
         remaining_s = due_s - clock.now()
         if remaining_s > 0:
             remote.take_commands(remaining_s)
             continue
+
+        # One cycle. A capture that was asked for is a full one.
         capture = remote.take_capture()
         if remote.take_full() or capture is not None:
             taking.want_full()
@@ -53,6 +58,8 @@ def keep_cycling(
         _report_result(result, remote, publish)
         if capture is not None:
             remote.send_event(_capture_event(result, partial(keep, request=capture)))
+
+        # The next deadline on the grid of the period; those that have passed are skipped.
         pause_s = 0.0
         if result is not None:
             pause_s = result.pause_s

@@ -163,11 +163,15 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchF
     if isinstance(bench.camera, GuardedCamera):
         identity = bench.camera.open()
         who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)
+
+    # Only a screen that shows patterns is tested.
     section = None
     if config.devices is not None:
         section = config.devices.screen
     if section is None or not isinstance(bench.screen, PatternScreen):
         return BenchFindings(who)
+
+    # What the camera sees of it: exposure and checkerboard.
     screen = bench.screen
     screen.open()
     test = DisplayTest(screen, bench.camera, clock, section.width_px, section.height_px)
@@ -178,6 +182,8 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchF
             _check_exposure(config, test),
             format_finding("screen", test.check_checkerboard),
         ]
+
+    # Settling time and response: as stated, or measured.
     if section.settle_ms is not None:
         screen.settle_s = test.settle_s = section.settle_ms / 1000.0
     else:

@@ -168,9 +168,12 @@ class RawFrames:
 
     def _copy_and_queue(self, cycle: int) -> Path | None:
         """Copy a cycle's frames and queue them for writing; None if impossible."""
+        # A cycle is kept once.
         if cycle in self._kept:
             return self._kept[cycle]
         self._collect_writes()
+
+        # Its frames, unless the ring has overwritten them, or there is no room.
         found = self._copy_frames(cycle)
         if found is None:
             self._leave_out("")
@@ -179,6 +182,8 @@ class RawFrames:
         if objection:
             self._leave_out(objection)
             return None
+
+        # The set's table; fringes refer to the full set that has their orders.
         path = self._find_free_name(cycle)
         self._kept[cycle] = path
         reference = None
@@ -186,6 +191,8 @@ class RawFrames:
             reference = f"../{self._reference.name}"
             self._reference_needed = True
         table = _make_set_table(found, self._optics, self._patterns, reference)
+
+        # Written by another thread.
         done = self._writer.submit(_write_set, path, table, found)
         self._writing.append(_Write(cycle, path, found.size_bytes, done))
         return path

@@ -51,11 +51,15 @@ def calibrate_pose(options: PoseOptions) -> int:
     geometry = None
     if options.geometry is not None:
         geometry = read_geometry(options.geometry)
+
+    # The set, with what other calibrations found of the lens.
     capture = capture_set.read_set(options.folder, geometry)
     optics = capture.head.optics
     for path in options.priors:
         optics = read_prior(path).apply_to_optics(optics)
     capture = replace(capture, head=replace(capture.head, optics=optics))
+
+    # The rough rim by the stated pose, then the pose by its edges.
     stated = Geometry.from_config(optics)
     light = _white_minus_black(capture)
     rim_z, rim_mean_mm = _rim_height(capture)
@@ -69,6 +73,8 @@ def calibrate_pose(options: PoseOptions) -> int:
         )
     except ValueError as error:
         raise errors.RejectedError(f"{options.folder}: {error}") from None
+
+    # The prior's file, and the report.
     sigmas = dict(zip(ring_pose.POSE_NAMES, pose.sigmas.tolist(), strict=True))
     tables = {
         "geometry": geometry_tables.general_form(pose.bench(stated), optics).model_dump(

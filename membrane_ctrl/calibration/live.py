@@ -151,11 +151,14 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     if code != Exit.DONE:
         return code
 
+    # Old and new geometry beside each other, for the person who decides.
     place = session.config.optics.geometry_file
     old = read_head(session.set_folders[0]).optics
     new = read_geometry(session.geometry_path)
     for line in compare_geometries(old, _set_origin(session, place), new):
         _print_progress(line)
+
+    # Adopted only where the configuration has a place for it, and if the person agrees.
     if place is None:
         _print_progress(
             "not adopted: the configuration names no optics.geometry_file; the geometry is "

@@ -51,6 +51,7 @@ def export_command(
     InputError
         An option or the result is not valid.
     """
+    # Options that are not valid are refused before anything is read.
     if form not in SUFFIXES:
         raise errors.InputError(f"--format {form}: give one of {', '.join(SUFFIXES)}")
     if terms and terms not in _TERM_SETS:
@@ -61,10 +62,14 @@ def export_command(
         raise errors.InputError(
             f"--remove {unknown[0]}: give piston, tilt, power or sphere, separated by commas"
         )
+
+    # The table of the whole height; then the map without the named parts.
     zernike_table = None
     if terms:
         zernike_table = _zernike_table(terms, seen, table, result)
     seen = remove_parts(seen, names)
+
+    # Map and table, each complete before it has its name.
     target = result.resolve() / f"figure{SUFFIXES[form]}"
     if out:
         target = files.resolve_user_path(out)
@@ -74,6 +79,8 @@ def export_command(
         if zernike_table is not None and form != "h5":
             beside = target.with_name(target.name + ".zernike.json")
             files.write_text_atomic(beside, json.dumps(zernike_table, indent=1))
+
+    # What was written.
     step = ""
     if step_mm:
         step = f", heights in steps of {1e6 * step_mm:.3g} nm"

@@ -105,6 +105,8 @@ class _Departure:
 def film_command(options: FilmOptions) -> int:
     """Fit the law to the sets, write the result and report it. Raises CommandError."""
     measured = Figures(None if options.geometry is None else file.read_geometry(options.geometry))
+
+    # The sets' figures, all of one film.
     sets = [
         measured.measure_folder(folder)
         for folder in terminal.track_progress(options.folders, "sets")
@@ -119,6 +121,8 @@ def film_command(options: FilmOptions) -> int:
             raise errors.InputError(
                 f"{one.head.folder / 'capture.toml'}: mirror.radius_mm: not that of the first set"
             )
+
+    # The film's material, and what it does not explain.
     figures, source = _read_figures(sets, options.geometry)
     try:
         fit = material_fit.fit_film(
@@ -129,6 +133,8 @@ def film_command(options: FilmOptions) -> int:
     departure = _compute_departure(figures, fit, mirror.analysis_radius_mm)
     notes = _list_limits(figures, fit, departure)
     table = _make_fit_table(figures, fit, departure, source, notes)
+
+    # Files and the text for the terminal.
     out = options.out.resolve() if options.out else options.folders[0].resolve().parent / "film"
     with errors.convert_write_errors(out):
         files.make_folder(out)
@@ -220,6 +226,8 @@ def _list_limits(
         + " or ".join(_CAUSES[cause] for cause in waves.likely[:2])
         for waves in fit.unexplained
     ]
+
+    # What the sets do not determine.
     if not gauged:
         notes.append(
             "E t is not determined: no set states pressure_pa; pre-strain and nu need none"
@@ -231,6 +239,8 @@ def _list_limits(
         notes.append(
             "nu is not determined: its bar is what was known before; take sets at other pressures"
         )
+
+    # What they determine only together.
     together = fit.covariance[0, 1] / (strain * poisson)
     if abs(together) > _TOGETHER:
         sags = [figure.sag_mm for figure in figures]
@@ -239,6 +249,8 @@ def _list_limits(
             f"sags, {min(sags):.1f} to "
             f"{max(sags):.1f} mm, are too close"
         )
+
+    # What contradicts the law.
     if departure.contradicts:
         notes.append(
             "the film departs from this law: it crept between the sets, its ring moved, or "
@@ -259,6 +271,9 @@ def _make_fit_table(
     strain, poisson, relative = fit.sigmas
     gauged = any(np.isfinite(figure.pressure_pa) for figure in figures)
     edge = [float(profile[-1]) for profile in departure.seen_mm]
+
+    # Without a pressure the stiffness has no meaning; the paper's then serves for the pre-strain
+    # that would explain its edge.
     stiffness = None
     stiffness_n_per_m: FloatArray | float = _STIFFNESS_N_PER_M
     if gauged:
@@ -267,6 +282,8 @@ def _make_fit_table(
             "value": law.stiffness_n_per_m,
             "sigma": float(relative) * float(law.stiffness_n_per_m),
         }
+
+    # The table of `film.json`.
     return {
         **program.file_origin("membrane-film/1"),
         "sets": [

@@ -199,6 +199,7 @@ def show_map(
         Centre the scale on 0; values far beyond those of the rest of the map make it logarithmic
         beyond these.
     """
+    # A scale from typical values, which single cells at the edge do not set.
     every = max(1, values.shape[0] // _MAP_CELLS)
     low, high = np.nanpercentile(values[::every, ::every], _TYPICAL_PERCENTILES)
     scale: dict[str, Any] = {"vmin": low, "vmax": high}
@@ -209,6 +210,8 @@ def show_map(
         if most > _STEEP * high:
             scale = {"norm": SymLogNorm(high, vmin=-most, vmax=most)}
             title += f", linear to +-{high:.2g}"
+
+    # The map.
     extent = (axis[0], axis[-1], axis[0], axis[-1])
     shown = axes.imshow(
         values[::every, ::every],
@@ -219,6 +222,8 @@ def show_map(
         **scale,
     )
     axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
+
+    # Its peak to valley and RMS, in the unit of the title.
     known = values[np.isfinite(values)]
     figures = f"PV {np.ptp(known):.3g}\nRMS {np.std(known):.3g}"  # in the unit of the title
     axes.text(0.02, 0.98, figures, transform=axes.transAxes, va="top", fontsize=8)

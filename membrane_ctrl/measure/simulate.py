@@ -62,6 +62,7 @@ def simulate_command(options: SimulateOptions) -> int:
             f"{options.folder}: is not empty; simulate needs a new or empty folder"
         )
     try:
+        # One track, one set, or a run of sets.
         spec = make_specification(options)
         with errors.convert_write_errors(options.folder):
             if options.track:

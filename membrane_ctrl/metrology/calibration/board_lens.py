@@ -326,6 +326,7 @@ def _jackknife_focal(views: Sequence[BoardView], stated: CameraConfig) -> float:
 
 def _fit_camera(views: Sequence[BoardView], stated: CameraConfig) -> _CameraFit:
     """Fit one camera to views, each with its own pose. Raises ValueError if nothing fits."""
+    # OpenCV takes single precision, with an axis for the point.
     places = [view.place.astype(np.float32)[:, None] for view in views]
     seen = [view.seen_px.astype(np.float32)[:, None] for view in views]
     size = (stated.width_px, stated.height_px)

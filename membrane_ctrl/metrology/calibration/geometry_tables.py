@@ -54,6 +54,8 @@ class Origin:
 def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:
     """The content of `geometry.toml`; `optics` is the stated bench."""
     free = [bench_parameters.NAMES.index(name) for name in solution.free]
+
+    # Geometry, its covariance in the general form, and the parameters as solved.
     tables: dict[str, Any] = {
         **file_origin(SCHEMA),
         "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
@@ -68,6 +70,8 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
             "covariance": solution.covariance[np.ix_(free, free)].tolist(),
         },
     }
+
+    # Lens and period, if they were free.
     bench = solution.bench
     if set(solution.free) & set(_LENS):
         of_camera = {
@@ -80,6 +84,8 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
         }
     if "pitch_relative" in solution.free:
         tables["pattern"] = {"period_mm": optics.pattern.period_mm * bench.pitch}
+
+    # Where the numbers come from, and the hash of all tables before.
     tables["calibration"] = {
         "date_utc": origin.date_utc,
         "sets": list(origin.sets),

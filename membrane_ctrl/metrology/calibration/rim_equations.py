@@ -79,8 +79,11 @@ class Rim:
             turns = np.outer(orders, np.arctan2(y, x))
             return np.asarray(ring[0] + np.concatenate([np.cos(turns), np.sin(turns)]).T @ ring[1:])
 
+        # Where the edges' rays meet that rim, and their distance from the circle.
         x, y = on_rim(geometry, self.edges_px, height)
         theta = np.arctan2(y, x)
+
+        # Harmonics 0 to 2 of this distance: size, place and ellipse.
         waves = [
             np.ones_like(theta),
             np.cos(theta),

@@ -267,20 +267,27 @@ def _solve_sets(
     """Solve with some of the bins first where there are very many."""
     largest = max(phases.sigma_mm.size for phases in problem.sets)
     if start is None and largest > 2 * _FEW:
+        # Some of the bins give a bench that is nearly right.
         some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
         start = _solve_sets(some, progress, None)
         if not start.converged:
             return start  # means about a diverged bench would be meaningless
+
+        # About it, waves of the fringes are removed and the bins averaged.
         clean = fringe_waves.remove_fringe_waves(start.bench, problem.sets, start.states)
         averaged = tuple(
             point_averages.average_points(start.bench, phases, state, _FEW)
             for phases, state in zip(clean, start.states, strict=True)
         )
         problem = replace(problem, sets=averaged)
+
+    # From there, with the sag at which the film's figure is stated.
     if start is not None:
         sag_mm = start.problem.references.form_sag_mm
         problem = replace(problem, references=replace(problem.references, form_sag_mm=sag_mm))
         return _iterate(problem, progress, start.states, start.common)
+
+    # Without a start: from the stated bench.
     states = first_states(problem)
     problem = _with_form_sag(problem, states)
     return _iterate(problem, progress, states, _make_first_common(problem, states))

@@ -35,12 +35,16 @@ def find_unturned_figures(solution: Solution) -> tuple[UnturnedFigure, ...]:
     for k, phases in enumerate(solution.problem.sets):
         if phases.turned is None or not phases.turned.figure_turns:
             continue
+
+        # The whole figure of this set is free: does it not turn as stated?
         freed = _free_figure(solution, k)
         found_deg = find_angle_of_set(freed, k)
         fall = everything - model_tests.sum_of_squares(freed)
         if chi2.sf(fall, len(film_form.TURNING)) < model_tests.SURE:
             explained = fall - 2 * len(film_form.TURNING)
             out.append(UnturnedFigure(k, explained, found_deg))
+
+        # Its angle alone is free: was it turned by another one?
         turned = _free_angle(solution, k)
         fall = everything - model_tests.sum_of_squares(turned)
         if chi2.sf(fall, 1) < model_tests.SURE:

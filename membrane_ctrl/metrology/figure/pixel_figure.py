@@ -245,11 +245,15 @@ def _axis_phases(
     stack = checked.stack
     used = checked.view.used[axis]
     combined = combine_axis_steps(checked, axis, motion_um)
+
+    # The frames; a slice does not copy them.
     every = stack.sinusoids(pattern_sequence.AXES[axis])
     chosen: slice | list[int] = used
     if used == every:
         chosen = slice(every[0], every[-1] + 1)  # a slice does not copy the frames
     frames = stack.frames[chosen]
+
+    # The phase of its bin chooses each pixel's period.
     reference_rad = checked.phase_rad[axis].reshape(-1)[in_bin]
     gain = None
     if stack.gain is not None:

@@ -125,6 +125,8 @@ class _Steps:
         waves = row_waves(rad_per_row, self._rows)
         steady = np.ones(self._rows.size)
         off = np.eye(count) - self._design @ self._inverse  # the projector P
+
+        # Fit, add what the rest shows of the amplitudes, and fit again.
         self.rad_per_row = rad_per_row
         self.amplitudes = np.zeros((count, len(waves)))
         turns = 1
@@ -140,6 +142,8 @@ class _Steps:
             flicker = of_frames[:, -1:]
             self._others = off @ (flicker * self._lit) + np.tensordot(of_harmonics, harmonics, 1)
         self._fit()
+
+        # Bands that wrong pictures seem to have explain little of the rest.
         share_left = np.sum(self._rest**2) / self._first_squares
         self.unexplained = float(np.abs(self.amplitudes).max(initial=0.0) * share_left)
         return self.unexplained

@@ -270,17 +270,25 @@ def _make_model(
     pattern = stack.patterns[frame]
     ones = np.ones(scene.index.size)
     every_bin = ones.astype(bool)
+
+    # White and black: one level.
     if pattern.role in ("white", "black"):
         return _FrameModel(pattern.role, ones[None], every_bin)
+
+    # The phase during this frame: the predicted one, moved with the film.
     axis = AXES.index(pattern.axis)
     sensitivity = scene.sensitivity_rad_per_um[axis]
     phase_rad = scene.phase_rad[axis] + sensitivity * reading_um
+
+    # A Gray frame: two levels, away from the edges of its bit.
     if pattern.role == "gray":
         shown, from_edge_rad = gray_bit(phase_rad, pattern.index)
         sure = from_edge_rad > _EDGE_RAD
         if not sure.any():  # edges everywhere: the prediction is nonsense, and all bins are used
             sure = every_bin
         return _FrameModel("gray", np.stack([ones, shown.astype(float)]), sure)
+
+    # A sinusoid: level, fundamental, motion of the film, and harmonics of the display.
     psi_rad = phase_rad + pattern.shift_rad
     sine = np.sin(psi_rad)
     motion = -(sensitivity - sensitivity.mean()) * sine
@@ -313,6 +321,8 @@ def _make_evidence(
 ) -> FrameEvidence:
     """The evidence of one frame, whose bins have the light `seen` (n,)."""
     solved, sigma, rest = _solve_coefficients(seen, model, light)
+
+    # A sinusoid: b cos delta and b sin delta give swing and step.
     if model.role == "sin":
         swing = float(np.hypot(solved[1], solved[2]))  # b cos delta and b sin delta
         return FrameEvidence(
@@ -325,6 +335,8 @@ def _make_evidence(
             saturated=saturated,
             shows=shows,
         )
+
+    # A Gray frame: lo and hi - lo.
     if model.role == "gray":
         lit = float(np.mean(model.columns[1][model.sure]))
         level = float(solved.sum())

@@ -151,6 +151,7 @@ def find_second_reflection(
     SecondReflection
         `SecondReflection.unknown()` without usable Gray frames.
     """
+    # The best place along each axis, by itself.
     centre_rad = screen_scale.centre_phase_rad(pattern)
     scene = scene.thinned(_BINS)
     places = [
@@ -159,11 +160,15 @@ def find_second_reflection(
     known = [place for place in places if place is not None]
     if not known:
         return SecondReflection.unknown()
+
+    # A place counts if it is far beyond chance, and bright enough.
     sigma = max(place.sigma for place in known)
     seen = [place for place in known if place.clear > _CLEAR and place.share > _LEAST_SHARE]
     if not seen:
         return SecondReflection(0.0, sigma)
     best = max(seen, key=lambda place: place.clear)
+
+    # Scale and shift along each axis in which it was seen.
     scales = [1.0, 1.0]
     shifts_rad = [math.nan, math.nan]
     for axis, place in enumerate(places):

@@ -187,6 +187,8 @@ def _put_back(
     """
     if stack.unusable or len(stack.sinusoids(AXES[0])) > _FEW_STEPS:
         return None
+
+    # Each exchange of two sinusoids of an axis is tried.
     found: list[Checked] = []
     pairs = [pair for axis in AXES for pair in combinations(stack.sinusoids(axis), 2)]
     for a, b in pairs:
@@ -203,6 +205,8 @@ def _put_back(
                 _flag_swapped(b, stack.patterns[a].name, a),
             )
             found.append(replace(checked, flags=flags))
+
+    # Only a unique one is the cause.
     if len(found) == 1:
         return found[0]
     return None

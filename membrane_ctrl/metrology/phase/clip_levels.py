@@ -60,16 +60,22 @@ def find_clip_levels(frames: Sequence[Image], full_scale_adu: int) -> ClipLevels
     unclipped = ClipLevels(full_scale_adu)
     if not frames:
         return unclipped
+
+    # Levels of the lit pixels in all sinusoids.
     thinned = _thin(frames)
     brightest = thinned.max(axis=0)
     lit = brightest > _LIT_SHARE * float(np.quantile(brightest, _BRIGHTEST_QUANTILE))
     histogram = np.bincount(thinned[:, lit].ravel())
     levels = np.flatnonzero(histogram)
     counts = histogram[levels]
+
+    # Levels at both ends at which the pixels pile up.
     white_adu = _piled_level(levels[::-1], counts[::-1], _PILE_WHITE)
     black_adu = _piled_level(levels, counts, _PILE_BLACK)
     if white_adu is not None and white_adu == black_adu:  # one level only: an empty picture
         return unclipped
+
+    # Without a pile, the converter clips at its own ends.
     if white_adu is None:
         white_adu = full_scale_adu
     if black_adu is None:

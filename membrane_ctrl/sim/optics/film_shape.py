@@ -180,6 +180,7 @@ class FilmShape:
 
 def _film_terms(film: FilmShape) -> FilmTerms:
     """The film as numbers for the kernel, its offset chosen so that h(0, 0) = 0."""
+    # Ripples as wave vectors, wrinkles and bumps as rows of numbers in mm.
     ripples = []
     for ripple in film.ripples:
         rad_per_mm = 2.0 * pi / ripple.wavelength_mm
@@ -189,6 +190,8 @@ def _film_terms(film: FilmShape) -> FilmTerms:
         ripples.append((ripple.amplitude_um / 1000.0, k_x, k_y, ripple.phase_rad))
     wrinkles = [(w.amplitude_um / 1000.0, float(w.lobes), w.phase_rad) for w in film.wrinkles]
     bumps = [(b.amplitude_um / 1000.0, b.x_mm, b.y_mm, b.sigma_mm) for b in film.bumps]
+
+    # The film with an offset of 0, and then with that which puts its vertex at 0.
     raised = FilmTerms(
         radius_mm=film.radius_mm,
         offset_mm=0.0,

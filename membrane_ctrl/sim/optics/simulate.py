@@ -385,9 +385,13 @@ def _make_renderer(spec: SimulationSpec) -> OpticsRenderer:
 def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> None:
     """Write one set with its faults. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
+
+    # Laser readings.
     noise = np.random.default_rng(spec.seed).normal(0.0, spec.laser_noise_um, len(spec.patterns))
     readings_um = noise + [spec.displacement_um(frame) for frame in range(len(spec.patterns))]
     faults = {(fault.kind, fault.frame) for fault in spec.faults}
+
+    # The pictures, with the faults of single frames.
     before: optical_roles.Pixels | None = None
     for pattern, exposure in zip(spec.patterns, _list_exposures(spec), strict=True):
         if ("stale", pattern.name) in faults and before is not None:
@@ -406,6 +410,8 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
             picture = _other_depth(picture)
         if ("missing", pattern.name) not in faults:
             _write_png(folder / f"{pattern.name}.png", picture)
+
+    # The set's file, and the truth beside it.
     write_capture_toml(folder, spec, readings_um)
     write_truth(folder, spec)
 
