@@ -32,8 +32,20 @@ _IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """Options of the command: a folder of photographs, the board in them,
-    the camera as configured.
+    """Options of `calibrate-camera`.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the photographs.
+    board : str
+        The board in them, as `Board.parse` reads it.
+    config : Config
+        The configuration, with the stated camera.
+    out : Path
+        File of the prior.
+    as_json : bool
+        Whether to print the report as JSON.
     """
 
     folder: Path

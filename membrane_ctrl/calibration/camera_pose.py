@@ -25,7 +25,23 @@ from membrane_ctrl.model.arrays import FloatArray
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """Options of the command."""
+    """Options of `calibrate-pose`.
+
+    Attributes
+    ----------
+    folder : Path
+        The set.
+    geometry : Path or None
+        File of the stated geometry; None: that of the set.
+    priors : sequence of Path
+        Results of other auxiliary calibrations.
+    radius_sigma_mm : float
+        Standard uncertainty of the ring's radius.
+    out : Path
+        File of the prior.
+    as_json : bool
+        Whether to print the report as JSON.
+    """
 
     folder: Path
     geometry: Path | None

@@ -64,16 +64,21 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
 
     Raises InputError if the set or its reference is invalid.
     """
+    # The set, and the one that has its fringe orders. It need not know its film's depth.
     begin = time.perf_counter()
-    capture, anchor = read_set(folder, geometry), None
-    where = capture.head.folder / "capture.toml" if geometry is None else geometry.path
-    require_plausible(
-        capture.head.optics, where, depth_known=False
-    )  # the set need not know its film's depth
+    capture = read_set(folder, geometry)
+    where = capture.head.folder / "capture.toml"
+    if geometry is not None:
+        where = geometry.path
+    require_plausible(capture.head.optics, where, depth_known=False)
+    anchor = None
     if capture.head.reference is not None:
         reference, anchor = read_anchor(capture.head.reference, geometry)
         capture = replace(capture, head=anchor_head(capture.head, reference))
-    optics, loaded = capture.head.optics, time.perf_counter()
+    optics = capture.head.optics
+    loaded = time.perf_counter()
+
+    # Its frames, without those that do not belong.
     try:
         checked = checked_set(capture, anchor)
     except RejectedSetError as error:
@@ -90,6 +95,8 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
             timing,
             error.saturated_fraction,
         )
+
+    # The figure from every pixel, and its verdict.
     pixels = measure_pixels(optics, checked)
     middle = time.perf_counter()
     full = reconstruct_full(optics, checked, pixels)
@@ -98,11 +105,11 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
     if verdict == "ok":
         verdict, reason = checked.verdict
     timing = {"load": loaded - begin, "phase": middle - loaded, "reconstruct": end - middle}
+
+    # What follows needs no frames: they are large.
     stack = checked.stack
-    none = np.empty(
-        (len(stack.patterns), 0, 0), stack.frames.dtype
-    )  # what follows needs no frames: they are large
-    checked = replace(checked, stack=replace(stack, frames=none))
+    no_frames = np.empty((len(stack.patterns), 0, 0), stack.frames.dtype)
+    checked = replace(checked, stack=replace(stack, frames=no_frames))
     return Measurement(
         capture.head, verdict, reason, checked.flags, checked, full, stack.mean_reading_um, timing
     )

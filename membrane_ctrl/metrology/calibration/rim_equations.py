@@ -69,15 +69,16 @@ class Rim:
 
     def _seen_mm(self, stated: Geometry, common: FloatArray) -> FloatArray:
         """Mean radius less the ring's, place (2,) and ovalness (2,) of the edges."""
-        geometry, ring = (
-            bench_poses.bench_at(stated, common[: len(bench_parameters.NAMES)]).geometry,
-            common[RING_PLACE],
-        )
+        values = common[: len(bench_parameters.NAMES)]
+        geometry = bench_poses.bench_at(stated, values).geometry
+        ring = common[RING_PLACE]
         orders = np.arange(1, ring.size // 2 + 1)
 
         def height(x: FloatArray, y: FloatArray) -> FloatArray:
-            turns = np.outer(orders, np.arctan2(y, x))
-            return np.asarray(ring[0] + np.concatenate([np.cos(turns), np.sin(turns)]).T @ ring[1:])
+            """Height of the rim: a constant, and cosines and sines of the azimuth."""
+            angles = np.outer(orders, np.arctan2(y, x))
+            waves = np.concatenate([np.cos(angles), np.sin(angles)])
+            return np.asarray(ring[0] + waves.T @ ring[1:])
 
         # Where the edges' rays meet that rim, and their distance from the circle.
         x, y = on_rim(geometry, self.edges_px, height)
@@ -91,6 +92,5 @@ class Rim:
             np.cos(2 * theta),
             np.sin(2 * theta),
         ]
-        return np.asarray(
-            np.linalg.lstsq(np.stack(waves, axis=1), np.hypot(x, y) - self.radius_mm, rcond=None)[0]
-        )
+        off_mm = np.hypot(x, y) - self.radius_mm
+        return np.asarray(np.linalg.lstsq(np.stack(waves, axis=1), off_mm, rcond=None)[0])

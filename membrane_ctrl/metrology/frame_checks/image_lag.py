@@ -105,10 +105,8 @@ def estimate_image_lag(
 
     Parameters
     ----------
-    stack, binned : FrameStack, Binned
-        The set, and its frames as means over bins.
-    scene : SampledBins
-        The mirror's bins, with the phases that the fitted surface predicts.
+    stack, binned, scene
+        As in `frame_evidence.measure_frames`.
     excluded : collection of int
         Frames that do not belong to the set: neither used nor compared with.
 

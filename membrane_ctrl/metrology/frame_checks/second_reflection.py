@@ -137,10 +137,8 @@ def find_second_reflection(
 
     Parameters
     ----------
-    stack, binned : FrameStack, Binned
-        The set, and its frames as means over bins.
-    scene : SampledBins
-        The mirror's bins, with the phases that the fitted surface predicts.
+    stack, binned, scene
+        As in `frame_evidence.measure_frames`.
     excluded : collection of int
         Frames that do not belong to the set.
     pattern : PatternConfig
