@@ -29,6 +29,8 @@ def require_optics(devices: DevicesConfig) -> None:
         isinstance(table, settings.ExternalSection) for table in (devices.camera, devices.screen)
     ):
         return
+
+    # The packages load in a process of their own, which they may end.
     ours, theirs = event_pipe.make_pipe()
     loading = child.Child("driver check", f"{__name__}:report_problem", (devices, theirs), _NICE)
     loading.start()

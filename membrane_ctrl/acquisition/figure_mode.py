@@ -96,15 +96,21 @@ def _judge_mode(
 ) -> tuple[Literal["cycle", "track"], str, Machine]:
     camera = config.optics.camera
     machine = measure(camera.width_px * camera.height_px)
+
+    # What the configuration decides.
     if config.by_optics:
         return "track", "without a laser every frame must be a figure", machine
     if not config.shape.enabled:
         return "cycle", "figures are not measured", machine
+
+    # What the camera allows.
     exposure_s = 0.0
     if config.devices is not None and config.devices.camera is not None:
         exposure_s = config.devices.camera.frame_exposure_s or 0.0
     if exposure_s > 1.0 / _RATE_LEAST_HZ:
         return "cycle", f"an exposure takes {exposure_s:g} s", machine
+
+    # What the machine allows.
     if machine.processors < _PROCESSORS_LEAST:
         return "cycle", "the program may use one processor only", machine
     rate_hz = math.inf

@@ -74,6 +74,8 @@ def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> Opt
     devices = config.devices
     if devices is None:
         return OpticalBench(camera, screen)
+
+    # A screen of a package, which draws on the simulated panel.
     if isinstance(devices.screen, ExternalScreenConfig) and drivers.has_emulator(
         devices.screen.name, drivers.SCREENS
     ):
@@ -85,6 +87,8 @@ def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> Opt
             lambda levels: optics.screen.show_picture(levels, raster),
         )
         screen = _make_screen(config, devices.screen, clock, panel)
+
+    # A camera of a package, which sees the simulated picture.
     if isinstance(devices.camera, ExternalCameraConfig) and drivers.has_emulator(
         devices.camera.name, drivers.CAMERAS
     ):

@@ -70,14 +70,19 @@ def calibrate_camera(options: CameraOptions) -> int:
     """
     board = _parse_board(options.board)
     camera = options.config.optics.camera
+
+    # The corners in each photograph.
     paths = _list_photographs(options.folder)
     views = [_read_view(path, board, camera) for path in paths]
     _refuse_mirrored(paths, views, board, camera)
     try:
+        # The lens.
         lens = calibrate_lens(views, camera)
     except ValueError as error:
         why = f"{error}{_explain_unseen_board(board, paths, views, camera)}"
         raise errors.RejectedError(f"{options.folder}: {why}") from None
+
+    # The prior's file, and the report.
     tables = {"camera": _camera_table(camera, lens), "sigmas": lens.sigmas}
     write_prior(options.out, tables, "calibrate-camera", lens.used, lens.rms_px)
     report = {

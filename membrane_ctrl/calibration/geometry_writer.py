@@ -24,6 +24,8 @@ def write_geometry(
 ) -> str:
     """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
     films = [(solution.states[k], problem.sets[k]) for k in problem.films]
+
+    # Residual of the slopes, and what the noise of the screen points makes of it.
     slopes = [_slope_residual(solution, problem.sets[k], k) for k in problem.films]
     noises = [
         geometry_monitors.noise_urad(
@@ -31,6 +33,8 @@ def write_geometry(
         )
         for state, phases in films
     ]
+
+    # Where the geometry comes from.
     origin = geometry_tables.Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         sets=tuple(phases.name for phases in problem.sets),

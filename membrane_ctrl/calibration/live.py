@@ -109,6 +109,8 @@ def take_sets(
     try:
         held = sweep.observe_hold()
         procedure = Procedure(link, sweep, held, progress)
+
+        # Continue a session, or plan the setpoints of a new one.
         if session is not None:
             head, missing = session.head, session.missing_indices
             _check_same_bench(link, session)
@@ -120,11 +122,15 @@ def take_sets(
                 link.name, now_utc(), held.setpoint_um, held.shape_on, setpoints_um
             )
             missing = tuple(range(sets))
+
+        # The plan, and the agreement of a person, before anything moves.
         procedure.check_setpoints(head)
         minutes = sum(procedure.times_s(head, missing)) / 60
         progress.print_line(_format_plan(head, len(missing), held, minutes))
         progress.print_line(_format_forecast(link, head, held, options))
         _require_agreement(f"move the mirror through {len(missing)} setpoints?", options.yes)
+
+        # From here on the mirror moves.
         sweep.claim_command(held.setpoint_um)
         session = session or sessions.begin_session(
             options.where.logs, options.name, head, link.config

@@ -53,6 +53,8 @@ class Procedure:
         """
         held = self.held
         config = self.link.config
+
+        # Within the range that limits and pump allow.
         low_um = min(head.setpoints_um)
         high_um = max(head.setpoints_um)
         reach = setpoint_reach(held, config)
@@ -62,6 +64,8 @@ class Procedure:
                 f"to {reach.high_um:.0f}, "
                 f"which {reach.low_why} and {reach.high_why} allow"
             )
+
+        # And reachable both ways.
         up_s = ramp_s(held, low_um, high_um, config)
         down_s = ramp_s(held, high_um, low_um, config)
         if math.isinf(up_s + down_s):

@@ -45,6 +45,8 @@ def calibration_report(
     }
     if solution is None or not solution.converged:
         return table
+
+    # What the calibration claims, and what to measure next, for the middle set.
     middle = solution.problem.middle
     claim = figure_uncertainty.propagate_to_figure(solution, middle, analysis_radius_mm)
     scale = model_tests.laser_scale(solution)

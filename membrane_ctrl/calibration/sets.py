@@ -186,6 +186,7 @@ def join_moved_screen(
     InputError
         If no set of the film has a laser reading near enough.
     """
+    # The set of the film whose laser reading is nearest.
     films = [k for k, each in enumerate(sets) if each.artefact is None and phases.artefact is None]
     differences_um = [abs(phases.displacement_um - sets[k].displacement_um) for k in films]
     if not any(difference_um <= _SAME_FILM_UM for difference_um in differences_um):
@@ -195,6 +196,8 @@ def join_moved_screen(
         )
     nearest = films[int(np.nanargmin(differences_um))]
     base = sets[nearest]
+
+    # The move, and by how much the film was deeper then.
     known = MovedScreen(
         moved.shift_mm,
         moved.shift_sigma_mm,

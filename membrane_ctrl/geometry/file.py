@@ -134,15 +134,21 @@ def read_geometry(path: str | Path) -> GeometryFile:
     calibrated = tables.get("schema") == geometry_hash.SCHEMA
     table = tables.get("geometry", tables)
     toml_file.with_height_map(table, path)
+
+    # The hash of the numbers as written in the file.
     hashed = geometry_hash.hash_content(tables if "geometry" in tables else {"geometry": tables})
     text = tomli_w.dumps(tables)
     if isinstance(table, dict):
         toml_file.prune_unknown_keys(table, GeometryConfig)
+
+    # The geometry; one measured by hand has nothing else.
     geometry = toml_file.parse_tables(table, GeometryConfig, str(path))
     if not calibrated:
         return GeometryFile(
             path, geometry, None, None, None, GeometryOrigin(hashed, str(path)), text
         )
+
+    # A calibrated one must have the hash that its calibration states.
     calibration = _optional_table(tables, "calibration", CalibrationTable, path)
     if calibration is not None and calibration.hash != hashed:
         raise errors.InputError(

@@ -35,12 +35,15 @@ class ArtefactTable(Section):
 
     def make_artefact(self, radius_mm: float, path: Path) -> Artefact | Literal["screen"]:
         """The surface, over its disc, or the screen itself. Raises InputError."""
+        # The screen itself.
         if self.form == "screen":
             if len(self.model_fields_set) > 1:
                 raise errors.InputError(
                     f"{path}: artefact: the screen itself needs nothing but its form"
                 )
             return self.form
+
+        # A sphere states its radius of curvature, a flat does not.
         curvature, spread = self.curvature_radius_mm, self.curvature_radius_sigma_mm
         for name, value in (
             ("curvature_radius_mm", curvature),
@@ -51,6 +54,8 @@ class ArtefactTable(Section):
                 if value is not None:
                     description = "a flat has none"
                 raise errors.InputError(f"{path}: artefact.{name}: {description}")
+
+        # The flat, or the sphere.
         known = {"form_sigma_mm": 1e-3 * self.form_sigma_um, "vertex_mm": self.vertex_mm}
         known |= {"vertex_sigma_mm": self.vertex_sigma_mm, "radius_mm": radius_mm}
         if curvature is None or spread is None:

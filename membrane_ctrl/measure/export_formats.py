@@ -128,6 +128,8 @@ def _write_zygo_xyz(seen: ExportedMap) -> Written:
         "1 0",
         "#",
     )
+
+    # One line a cell: column, row and height.
     height_um = 1e3 * seen.height_mm[::-1]
     points = []
     for row, values in enumerate(height_um.tolist()):

@@ -51,15 +51,21 @@ def write_report(
     """
     title = escape_controls(f"Measurement of {name}")
     safe_lines = [escape_controls(line) for line in lines]
+
+    # Tables and pictures.
     tables = {}
     if result["figure"] is not None:
         tables = _make_tables(result["figure"])
     pictures = [PagePicture(file.stem, file.read_bytes()) for file in drawn]
     sections = [PageSection(heading, [table]) for heading, table in tables.items()]
+
+    # The verdict, in a text that cannot contain control characters.
     quality = result["quality"]
     verdict, reason = str(quality["verdict"]), escape_controls(str(quality["reason"]))
     stated = PageText(f"{verdict}: {reason}" if reason else verdict, _MARKS[verdict])
     pictures.sort(key=_rank_picture)
+
+    # The page in HTML, and the same as PDF.
     page = ReportPage(
         title,
         [

@@ -91,6 +91,8 @@ def figure_table(
         )
         for name, value in vars(found.figure.numbers).items()
     }
+
+    # Numbers that the surface does not have, with the reason.
     missing = {
         name: "a surface that is nearly flat has none"
         for name, item in numbers.items()
@@ -140,10 +142,14 @@ def _zernike_tables(
         if measurement.full
         else np.full(ZERNIKE_TERMS, np.nan)
     )
+
+    # Standard deviations by noise and by the geometry.
     of_noise, of_geometry = (
         1e3 * np.sqrt(np.maximum(np.diag(to_coeffs @ c @ to_coeffs.T), 0.0))
         for c in (bars.noise, bars.geometry)
     )
+
+    # The same terms in OSA's order; those of the Fringe set are their own fit.
     osa = [zernike.osa_from_noll(row) for row in (coeffs, of_noise, of_geometry)]
     fringe = found.figure.fringe_um, found.noise.fringe_um, found.geometry.fringe_um
     return [

@@ -149,10 +149,14 @@ def _write_files(
     """Write result, maps, pictures and recording. Raises OSError."""
     measurement = outcome.measurement
     bars = outcome.bars
+
+    # Numbers and maps.
     details = results.details_table(measurement, outcome.profile, outcome.outline, bars)
     results.write_result(target, measurement, result, details, bars)
     if outcome.figure is not None:
         figure_results.write_figure_maps(target / "figure.npz", outcome.figure)
+
+    # Pictures, report and recording, as far as they were asked for.
     drawn: list[Path] = []
     if options.pictures or options.report:
         from membrane_ctrl.measure.pictures import draw_measurement

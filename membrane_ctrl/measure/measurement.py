@@ -227,16 +227,21 @@ class Figures:
         Raises InputError if the set or its reference is invalid; RejectedError if its frames give
         no usable figure.
         """
+        # The set, and the one that has its fringe orders.
         capture = read_set(folder, self._geometry)
         anchor = None
         if capture.head.reference is not None:
             reference, anchor = self._anchored_by(capture.head.reference)
             capture = replace(capture, head=anchor_head(capture.head, reference))
+
+        # Its frames, without those that do not belong.
         optics = capture.head.optics
         try:
             checked = checked_set(capture, anchor)
         except RejectedSetError as error:
             raise errors.RejectedError(f"{folder}: rejected: {error}") from None
+
+        # The figure of its bins, and its verdict.
         figure = bin_figure(optics, checked)
         verdict, reason = shape_estimate.judge_quality(figure.quality)
         if verdict == "rejected":

@@ -303,6 +303,8 @@ def _draw_frames(measurement: Measurement) -> Figure:
 def _draw_profile(profile: radial_profile.RadialProfile) -> Figure:
     """Draw the mean height over azimuth, and its difference from Hencky's film."""
     figure, (upper, lower) = new_sheet(7, 6, 2, 1)
+
+    # Above, the height.
     upper.fill_between(
         profile.radius_mm, profile.low_mm, profile.high_mm, alpha=0.4, label="95 % of the ring"
     )
@@ -315,6 +317,8 @@ def _draw_profile(profile: radial_profile.RadialProfile) -> Figure:
         title=f"radial profile; pressure equivalent {profile.pressure_pa:.0f} Pa",
     )
     upper.legend(loc="best")
+
+    # Below, its difference from Hencky's bowl.
     low_um = 1e3 * (profile.low_mm - profile.hencky_mm)
     mean_um = 1e3 * (profile.mean_mm - profile.hencky_mm)
     high_um = 1e3 * (profile.high_mm - profile.hencky_mm)

@@ -242,6 +242,8 @@ def details_table(
     }
     if measurement.checked is not None:
         table |= _light_table(measurement.checked)
+
+    # What the fit left, and how it converged.
     if full is not None:
         residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
         table |= {
@@ -254,6 +256,8 @@ def details_table(
         }
     if profile is not None:
         table |= {"hencky_sag_mm": profile.sag_mm, "pressure_equivalent_pa": profile.pressure_pa}
+
+    # The sag's error bar, and the rim in the picture.
     if bars is not None:
         of_noise_um, of_geometry_um = bars.sag_sigma_um
         table["sag_sigma_um"] = {

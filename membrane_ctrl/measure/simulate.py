@@ -159,6 +159,7 @@ def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_s
 
     Raises ValueError for a text that names none, and for a run of sets.
     """
+    # Form and sizes as the option states them.
     form, *sizes = options.artefact.split(":")
     try:
         curvature_mm, radius_mm = [math.inf, *map(float, sizes)][-2:]
@@ -168,6 +169,8 @@ def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_s
         raise ValueError(
             f"--artefact {options.artefact}: flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS, mm"
         )
+
+    # What the set's file states of it.
     table: dict[str, str | float] = {
         "form": form,
         "vertex_sigma_mm": _VERTEX_KNOWN_MM,
@@ -178,6 +181,8 @@ def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_s
             "curvature_radius_mm": curvature_mm,
             "curvature_radius_sigma_mm": _RADIUS_KNOWN * curvature_mm,
         }
+
+    # The artefact itself, leaning as a hand leaves it.
     lean_x, lean_y = np.random.default_rng(options.seed).uniform(-_LEANS, _LEANS, 2).tolist()
     shape = simulation_spec.make_artefact_shape(curvature_mm, radius_mm, lean_x, lean_y)
     mirror = type(optics.mirror)(radius_mm=radius_mm, analysis_radius_mm=_USED * radius_mm)

@@ -50,6 +50,7 @@ def read_sofast_file(path: Path) -> SofastMeasurement:
     """Read frames and their data. Raises ValueError, FileNotFoundError or InputError with one
     line.
     """
+    # What the file contains.
     with open_hdf5(path) as file:
         group = "MeasurementSofastFringe"
         frames = np.moveaxis(read_floats(file, f"{group}/fringe_images"), 2, 0)
@@ -58,6 +59,8 @@ def read_sofast_file(path: Path) -> SofastMeasurement:
             read_floats(file, f"{group}/fringe_periods_{axis}") for axis in "xy"
         )
         distance_m = float(read_floats(file, f"{group}/dist_optic_screen").item())
+
+    # Its frames, of y and then of x.
     count_y = SOFAST_STEPS * len(periods_y)
     if len(frames) != count_y + SOFAST_STEPS * len(periods_x):
         raise ValueError(
@@ -94,6 +97,7 @@ def read_item(file: Any, name: str) -> Any:
     import h5py
 
     try:
+        # Each link on the way must be one inside this file.
         parts = name.split("/")
         for end in range(1, len(parts) + 1):
             link = file.get("/".join(parts[:end]), getlink=True)
@@ -103,6 +107,8 @@ def read_item(file: Any, name: str) -> Any:
                 raise ValueError(
                     f"{file.filename}: {name} is a link, and links are not followed here"
                 )
+
+        # The item must be a data set of a size that can be read.
         found = file[name]
         if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
             raise ValueError(f"{file.filename}: {name} is not a data set of this file")

@@ -371,9 +371,13 @@ def stability_command(options: StabilityOptions) -> int:
     figures = measurement.Figures(
         None if options.geometry is None else read_geometry(options.geometry)
     )
+
+    # The sets of the run, and the points whose height is followed.
     folders = set_folders(options.folder, out)
     size_px, analysis_radius_mm = common_size(folders)
     points = points_mm(options.points, analysis_radius_mm)
+
+    # One set after the other; then the table and the pictures.
     with errors.convert_write_errors(out):
         files.make_folder(out)
         with StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:

@@ -43,11 +43,15 @@ def draw_stability(
     """
     figure = Figure(figsize=(12, 2.2 * max(2, len(points))), layout="constrained")
     grid = figure.add_gridspec(len(points), 2, width_ratios=(1.4, 1))
+
+    # On the left, each point over time.
     for k, name in enumerate(points):
         axes = figure.add_subplot(grid[k, 0])
         change = heights_um[:, k] - heights_um[:, k].mean()
         axes.plot(time_s, change, ".-", markersize=3, linewidth=0.7)
         axes.set(ylabel=f"{name} (µm)", xlabel="time (s)" if k == len(points) - 1 else "")
+
+    # On the right, the map of the standard deviation with the points.
     shown = figure.add_subplot(grid[:, 1])
     show_map(shown, f"SD (µm), mean {np.nanmean(sd_um):.3g}", axis_mm, sd_um, "magma")
     for name, (x, y) in points.items():

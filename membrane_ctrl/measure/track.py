@@ -223,6 +223,8 @@ def read_track(folder: Path) -> TrackFile:
     path = folder / "capture.toml"
     if not folder.is_dir():
         raise errors.InputError(f"{folder}: no such tracking set")
+
+    # The set's file; another kind of set names the command for it.
     tables = toml_file.read_toml(path, follow=False)
     if tables.get("kind") in ("full", "fringes"):
         raise errors.InputError(
@@ -231,6 +233,8 @@ def read_track(folder: Path) -> TrackFile:
     for key in toml_file.prune_unknown_keys(tables, TrackFile):
         print(f"{path}: {key}: unknown key, ignored", file=sys.stderr)
     content = toml_file.parse_tables(tables, TrackFile, str(path))
+
+    # Frames inside the folder, in the order of their times, each once.
     for row in content.frames:
         require_inside(row.file, folder, path)
     for before, after in pairwise(content.frames):
@@ -293,6 +297,8 @@ def _read_pictures(
 def _make_track_table(track: Track) -> dict[str, Any]:
     """The result in numbers."""
     used = [frame for frame in track.frames if frame.verdict != "rejected"]
+
+    # Means over the usable frames; null without any.
     figures: dict[str, float | None] = dict.fromkeys(
         (
             "sag_mean_um",
@@ -308,6 +314,8 @@ def _make_track_table(track: Track) -> dict[str, Any]:
         figures["sag_sd_um"] = float(sags_um.std())
         for name in ("sag_sigma_um", "sag_change_sigma_um", "rest_share"):
             figures[name] = float(np.median([getattr(frame, name) for frame in used]))
+
+    # How often each verdict occurs, and why.
     reasons = Counter(f"{frame.verdict}: {frame.reason}" for frame in track.frames if frame.reason)
     counts = Counter(frame.verdict for frame in track.frames)
     return {
@@ -332,6 +340,8 @@ def _format_track(table: dict[str, Any]) -> list[str]:
     lines = [f"frames    {table['frames']} in {table['seconds']:.1f} s: {verdicts}"]
     reasons = list(table["reasons"].items())[:_SHOWN_REASONS]
     lines += [f"          {count} x {reason}" for reason, count in reasons]
+
+    # The reference, and what gives the light of the bins.
     light = "the reference"
     if table["stepped"]:
         light = "five steps of the first frames"
@@ -342,6 +352,8 @@ def _format_track(table: dict[str, Any]) -> list[str]:
     )
     lines.append(f"geometry  {known['state']}: {known['source']}")
     lines.append(f"anchor    light and phases of the bins from {light}")
+
+    # The figures.
     if table["usable"]:
         lines.append(
             f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation "
@@ -366,6 +378,8 @@ def _write_pictures(out: Path, track: Track, lines: Sequence[str]) -> None:
     time_s = columns["time_s"]
     sag_um = columns["sag_um"]
     sigma_um = columns["sag_change_sigma_um"]
+
+    # The terms about their means.
     change_um = None
     if np.isfinite(sag_um).any():
         change_um = columns["coeffs_um"] - np.nanmean(columns["coeffs_um"], axis=0)
@@ -380,6 +394,8 @@ def _write_pictures(out: Path, track: Track, lines: Sequence[str]) -> None:
             recording.log("track/terms_um", rr.SeriesLines(names=names), static=True)
             terms = rr.Scalars.columns(scalars=change_um[:, 1:])
             recording.send_columns("track/terms_um", at, terms)
+
+        # A line of text at each change of the verdict.
         states = [f"{frame.verdict} {frame.reason}".strip() for frame in track.frames]
         for k, (frame, state) in enumerate(zip(track.frames, states, strict=True)):
             if k == 0 or state != states[k - 1]:

@@ -366,11 +366,15 @@ def _judge_divergence(solution: Solution) -> CalibrationFinding:
     problem = solution.problem
     sets = problem.sets
     count = len(sets)
+
+    # Without one of the sets?
     if count > 2:
         for k in range(count):
             others = replace(problem, sets=sets[:k] + sets[k + 1 :])
             if _have_common_bench(others):
                 return _make_disagreement(problem, k, _describe_doubt(problem, k))
+
+    # Before and after a moment?
     for k in range(2, count - 1):
         before = replace(problem, sets=sets[:k])
         after = replace(problem, sets=sets[k:])

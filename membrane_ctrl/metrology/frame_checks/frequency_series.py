@@ -140,6 +140,8 @@ def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatAr
     flags: list[SeriesFlag] = _judge_white_and_black(axes, black, white)
     repaired = []
     failures = []
+
+    # Each series of each axis is repaired if one frame alone is wrong.
     for axis in axes:
         for index in range(len(axis.periods)):
             found, axis = _repair_series(axis, index, limits[axis.axis][index], axes)
@@ -148,6 +150,8 @@ def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatAr
         failure = _describe_failure(axis, limits[axis.axis])
         if failure:
             failures.append(failure)
+
+    # The verdict.
     if failures:
         return SeriesCheck("rejected", failures[0], tuple(flags), tuple(repaired))
     if flags:

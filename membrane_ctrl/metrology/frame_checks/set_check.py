@@ -91,11 +91,14 @@ def check_set(
         The frames give no figure: too few of them agree, they are clipped, or pictures or pattern
         are turned or mirrored.
     """
+    # Bins without the bands of the backlight.
     full_scale_adu = 2**optics.camera.bits - 1
     stack, binned, _ = band_removal.remove_bands(
         stack, frame_stack.bin_frames(stack, full_scale_adu)
     )
     try:
+        # Rounds without the frames that do not belong; if these leave no figure, two frames may be
+        # exchanged.
         found = _check_rounds(stack, binned, optics, anchor)
     except RejectedSetError as error:
         put_back = _put_back(stack, binned, optics, anchor)
@@ -105,6 +108,8 @@ def check_set(
             reason = str(error) + _find_doubt(stack, error.flags)
             raise RejectedSetError(reason, error.flags, error.saturated_fraction) from None
         found = put_back
+
+    # Frames that agree but fit no surface may be exchanged, too.
     if not _is_one_surface(found):
         found = _put_back(stack, binned, optics, anchor) or found
     _require_stated_orientation(optics, stack, found.phase_rad, binned.bin_px)

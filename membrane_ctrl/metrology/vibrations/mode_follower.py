@@ -86,6 +86,8 @@ class VibrationFollower:
         found = find_modes(time_s, terms_um)
         if found is None:
             return []
+
+        # Each line belongs to a mode that is followed, or begins one.
         utc_s = self._begin_utc_s + float(time_s[-1])
         modes = self.followed.modes
         for mode in modes:
@@ -95,6 +97,8 @@ class VibrationFollower:
                 self._assign_line(line, utc_s)
         if not modes:
             return []
+
+        # Only modes with a past are judged.
         settled = [mode for mode in modes if mode.past and not mode.gone]
         return [
             _make_vibrations_event(modes),
@@ -105,6 +109,8 @@ class VibrationFollower:
     def _assign_line(self, line: VibrationMode, utc_s: float) -> None:
         """Add a line to the mode that it is like, or to a free place."""
         modes = self.followed.modes
+
+        # The nearest mode that is like the line.
         candidates = [
             mode
             for mode in modes
@@ -116,6 +122,8 @@ class VibrationFollower:
             )
             nearest.add(line, utc_s)
             return
+
+        # Else a new mode, in the place of one that is gone.
         free = next((k for k, mode in enumerate(modes) if mode.gone), len(modes))
         if free < MODES:
             mode = FollowedMode(line)

@@ -435,6 +435,7 @@ class TwinOptics:
     def _find_renderer(self) -> OpticsRenderer:
         """The renderer, made at the first call from the film's position then."""
         if self._renderer is None:
+            # The film at the laser's zero.
             position = self._truth()
             sag_mm = position.sag_mm - position.displacement_um / 1000.0
             film = self._film or typical_film(
@@ -444,6 +445,8 @@ class TwinOptics:
                 self._twin.film_prestrain,
                 self._twin.film_poisson,
             )
+
+            # The displacement for which the geometry holds.
             stated = self._optics.geometry.reference_displacement_um
             reference_um = stated
             if reference_um is None:

@@ -216,6 +216,8 @@ def simulate_run(
             f"interval_s = {interval_s:g} is shorter than the {len(spec.patterns)} frames of "
             "the first set"
         )
+
+    # The first set is full; the others are fringes that refer to it.
     spec = _anchor_specification(spec)
     renderer = _make_renderer(spec)
     for number in range(sets):
