@@ -65,9 +65,13 @@ class CycleMotion:
         """At points that stand on the reference's surface; `index` (n,) are their bins."""
         order = np.argsort(index)
         points, index = points.subset(order), index[order]
+
+        # Effect of each motion of the bench on the screen points.
         changes = bench_motions.screen_changes(
             tracer.geometry, points.rays, points.t_mm, surface, tracer.vertex_z_mm
         )
+
+        # Effect of each parameter of the surface, by central differences.
         jacobian = np.empty((2, PARAMETERS, index.size))
         for k, step in enumerate(_STEP_MM * np.eye(PARAMETERS)):
             seen = []
@@ -77,6 +81,8 @@ class CycleMotion:
                 seen.append(tracer.predict_screen(points, shape))
             jacobian[:, k] = (seen[0] - seen[1]) / (2 * _STEP_MM)
         tracer.intersect(points, surface, newton=2)
+
+        # The square of the mirror in which each bin is.
         place = tracer.position_mm(points) / surface.radius_mm
         column, row = np.floor((place + 1) / 2 * _SQUARES).astype(int)
         effects = MotionEffects.of(changes, jacobian, np.ones((2, index.size)))
@@ -103,14 +109,20 @@ class CycleMotion:
         covariance_mm2 : (parameters, parameters) array
             Of the cycle's parameters.
         """
+        # The bins that both cycles have, and by how much their screen points changed.
         place = np.minimum(np.searchsorted(self.index, index), self.index.size - 1)
         changed_mm = changed_mm - self.changed_mm[:, place]
         known = np.isfinite(changed_mm).all(axis=0) & (self.index[place] == index)
         place = place[known]
+
+        # Sums over the squares: independent errors of each show what scatter alone gives.
         left = self.effects.left[:, :, place]
         parts = np.einsum("kan,an->kn", left, changed_mm[:, known])
         squares = sums_by(self.square[place], parts, (_SQUARES + 2) ** 2)
         flat = left.reshape(len(left), -1)
+
+        # The test of each motion, with the tilt of the ring, which the mirror's own change also
+        # shows.
         ring = ring_tilt()
         test = MotionTest(
             self.effects,

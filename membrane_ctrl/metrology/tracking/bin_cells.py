@@ -72,6 +72,7 @@ class Cells:
         counted = counted.reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2)
         index = index[order][bins]
 
+        # Places of the bins relative to the middle of their cell.
         place = np.stack([index % columns, index // columns], axis=1)
         middle = place.mean(axis=2, keepdims=True)
         offset = (place - middle).astype(np.float32, order="C")

@@ -378,6 +378,8 @@ class FrameFitter:
         """
         # Place of the bins in units of a square; each is shared by the four nearest squares.
         place = (self.scene.position_mm / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
+
+        # The lower left of them, and how much belongs to the upper and right ones.
         low = np.floor(self._cells.planes(place)[:, 0]).astype(int)
         upper = np.sin(np.pi / 2 * np.clip(place - self._cells.each(low), 0, 1)) ** 2
         (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
@@ -389,6 +391,8 @@ class FrameFitter:
             (left * above, side),
             (right * above, side + 1),
         )
+
+        # Sums of the pulls on the surface's terms, over each square.
         total = np.zeros((len(slow), side**2))
         for share, offset in shares_of_squares:
             pull = np.einsum("pkiq,kiq->pq", slow, self._cells.moments(share * values))

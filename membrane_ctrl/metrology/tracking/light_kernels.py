@@ -35,6 +35,8 @@ def _compute_light(rows, base, light, response, begin):  # type: ignore[no-untyp
     one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
     for k in range(BLOCK_BINS):
         p = begin + k
+
+        # Fringes of x and y, with the light of this frame: level and swings.
         cx, sx = cos_sin(base[0, p] + rows[k])
         cy, sy = cos_sin(base[1, p] + rows[BLOCK_BINS + k])
         level = light[0, p] * rows[2 * BLOCK_BINS + k]
@@ -55,6 +57,7 @@ def _compute_light(rows, base, light, response, begin):  # type: ignore[no-untyp
         cy = cy + two * bent
         steeper = half * (swing_x + swing_y) * slope
 
+        # Derivatives by both phases, level and swings; and the light itself.
         rows[k] = -(swing_x + steeper) * sx
         rows[BLOCK_BINS + k] = -(swing_y + steeper) * sy
         rows[2 * BLOCK_BINS + k] = light[0, p]
@@ -79,6 +82,7 @@ def _weigh_derivatives(rows, edge, gain, seen, reach, begin):  # type: ignore[no
         far = far if reach[p] > zero else one
         w = (one - min(far, one) ** 2) ** 2
 
+        # The weighted residual times each derivative, and what the light's own unknowns need.
         left = w * r * edge[p] * gain[p]
         for j in range(5):
             rows[j * BLOCK_BINS + k] *= left
@@ -157,6 +161,8 @@ def light_left(  # type: ignore[no-untyped-def]
     planes = np.empty(3 * BLOCK_CELLS, np.float32)
     squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)
     right[:] = 0
+
+    # A block of bins at a time: its light, its residual, and the sums for the right-hand side.
     for b in range(offset.shape[0]):
         _compute_block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
         _weigh_derivatives(rows, edge, gain, seen, reach, b * BLOCK_BINS)

@@ -143,9 +143,13 @@ def _solve_amplitudes(table: FloatArray) -> FloatArray:
 
     `table` (frames, columns + 1, n) are the columns, and the frame itself.
     """
+    # Products of the columns with each other and with the residual (the last row), scaled to a unit
+    # diagonal.
     gram = table @ table.transpose(0, 2, 1)
     scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), _TINY))
     gram = gram / (scale[:, :, None] * scale[:, None, :])
+
+    # Normal equations, kept regular; and the scale undone.
     normal = gram[:, :-1, :-1] + _REGULAR * np.eye(_COLUMNS)
     solved = np.linalg.solve(normal, gram[:, :-1, -1:])[:, :, 0]
     return np.asarray(solved * scale[:, -1:] / scale[:, :-1])

@@ -88,6 +88,7 @@ def round_effect(
     terms_of_slopes = np.linalg.pinv(left / sigma[:, None]) / sigma * radius_mm
     answer = error @ terms_of_slopes
 
+    # Effect of the slopes that are seen, and its covariance by noise and by scatter.
     seen = answer @ rings.slope
     by_noise = (answer * noise**2) @ answer.T
     by_scatter = (answer * sigma**2) @ answer.T

@@ -73,6 +73,7 @@ def measure_rim_misfit(bench: TrialBench, spread: GeometrySpread, outline: Outli
     outline : Outline
         The rim as it is seen.
     """
+    # The rim on the mirror.
     theta = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     radius_mm = bench.surface.radius_mm
     rim_z_mm = np.full(theta.size, bench.vertex_z_mm + bench.surface.sag_mm)
@@ -85,6 +86,7 @@ def measure_rim_misfit(bench: TrialBench, spread: GeometrySpread, outline: Outli
         mean_radius_px = np.mean(np.hypot(*(points_px - middle_px[:, None])))
         return np.append(middle_px, mean_radius_px)
 
+    # Where the geometry puts it, and by how much each of its numbers moves that.
     nominal_px = predict_px((), np.zeros(0))
     changes_px = [
         predict_px((name,), np.array([sigma])) - nominal_px

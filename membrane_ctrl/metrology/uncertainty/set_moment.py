@@ -44,12 +44,18 @@ def moment_sigma_um(
     """
     rate_um, rate_sigma_um = drift_um(frames, film_um), 0.0
     left = []
+
+    # The scatter about an even drift, and how well each axis shows the drift.
     for numbers, places_um in zip(frames, np.split(film_um, [len(frames[0])]), strict=True):
         from_middle = numbers - numbers.mean()
         square = float(from_middle @ from_middle)
         rate_sigma_um = max(rate_sigma_um, noise_um / math.sqrt(square))
         left.append(places_um - places_um.mean() - rate_um * from_middle)
+
+    # Motion beyond drift and noise.
     uneven_um = math.sqrt(max(float(np.mean(np.concatenate(left) ** 2)) - noise_um**2, 0.0))
+
+    # The mean of the sinusoids is this many frames before the middle of the set.
     later = (count_frames - 1) / 2 - float(np.concatenate(frames).mean())
     return math.hypot(later * rate_um, later * rate_sigma_um, _UNEVEN_SHARE * uneven_um)
 

@@ -108,6 +108,8 @@ def measure_curl_urad(grid: ResidualGrid, height_mm: FloatArray) -> float:
     measured_y = (grid.slope_y[:-1] + grid.slope_y[1:]) / 2
     off_x = measured_x - np.diff(height_mm, axis=1) / grid.step_mm
     off_y = measured_y - np.diff(height_mm, axis=0) / grid.step_mm
+
+    # Their differences as means over patches, in which the noise of single cells averages out.
     patches_x = _average_patches(off_x, seen[:, :-1] & seen[:, 1:])
     patches_y = _average_patches(off_y, seen[:-1] & seen[1:])
     patches = np.concatenate([patches_x, patches_y])
