@@ -376,6 +376,11 @@ class Config(Section):
         return self.estimator.process_value == "optics"
 
     @property
+    def has_pi(self) -> bool:
+        """Whether the PI on the laser may hold the mirror: its gains then matter."""
+        return self.estimator.process_value in ("auto", "laser")
+
+    @property
     def estimates_centre(self) -> bool:
         """Whether an estimate of the centre runs beside the states."""
         match self.estimator.process_value:

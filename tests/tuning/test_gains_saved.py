@@ -346,3 +346,28 @@ def test_a_curve_is_not_saved_over_that_of_another_pump(
         == Exit.BAD_INPUT
     )
     assert "pump.flow_full_um_per_s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("value", ["auto", "laser"])
+def test_a_hold_that_decides_by_itself_is_given_gains_and_pump_in_one_session(
+    value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimator = {"estimator": {"process_value": value}}
+    hold = Config.model_validate(tomllib.loads(TEXT) | estimator)
+    kept_session(tmp_path / "logs", config=hold)
+    monkeypatch.setattr("tuning.commands.save.SessionFolder.is_done", lambda self, step: True)
+    monkeypatch.setattr("tuning.commands.save.map_pump.has_pump_map", lambda folder: False)
+    monkeypatch.setattr(
+        "tuning.estimator_levels.derive_estimator_levels", lambda folder: {"pump_delay_s": 1.1}
+    )
+    path = tmp_path / "lab.toml"
+    assert saved(path, "--yes") == Exit.DONE
+    now = load_toml(path, Config)
+    assert now.loop.kp_per_s == AFTER.kp_per_s
+    assert now.estimator.pump_delay_s == (1.1 if value == "auto" else 0.08)
+
+
+def test_a_session_designs_gains_wherever_a_pi_may_hold_the_mirror() -> None:
+    values = ("auto", "laser", "estimate", "optics")
+    configs = [Config.model_validate({"estimator": {"process_value": value}}) for value in values]
+    assert [config.has_pi for config in configs] == [True, True, False, False]

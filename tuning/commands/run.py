@@ -84,7 +84,7 @@ def _run_steps(
 ) -> None:
     """Run steps in their order, until one is refused or a person wants no new gains."""
     for number, step in enumerate(steps):
-        if step in _OF_GAINS and folder.config.estimator.process_value != "laser":
+        if step in _OF_GAINS and not folder.config.has_pi:
             no_gains = _NO_GAINS.format(folder.path)
             if steps == [step]:
                 raise RejectedError(f"{step}: {no_gains}")

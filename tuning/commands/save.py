@@ -26,7 +26,7 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
     Raises InputError if the gains were not kept, or are not for this configuration.
     """
     config = toml_file.load_toml(path, schema.Config)
-    if config.estimator.process_value != "laser":
+    if not config.has_pi:
         return _save_estimator(
             path, find_newest_session(logs) if name is None else open_session(name), config, yes
         )
@@ -52,6 +52,9 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
         "pump": list_changes(config.pump, pump),
         "shape": list_changes(config.shape, shape),
     }
+    if folder.config.estimator.process_value == "auto" and folder.is_done("observe"):
+        measured = _find_estimator(folder, config)
+        changed["estimator"] = list_changes(config.estimator, measured)
     after = edit_text(before, changed, path)
     loop = schema.LoopConfig.model_validate(config.loop.model_dump() | changed["loop"])
     require_sound(config.model_copy(update={"loop": loop, "pump": pump, "shape": shape}), str(path))
@@ -86,10 +89,7 @@ def _save_estimator(path: Path, folder: SessionFolder, config: schema.Config, ye
         keys = {*GAIN_KEYS, "flow_max_um_per_s"}
         loop = config.loop.model_copy(update=folder.head.before.model_dump(include=keys))
         tables = {"pump": pump, "loop": loop}
-    levels = estimator_levels.derive_estimator_levels(folder)
-    known = config.estimator.model_dump() | levels | {"pump_response": "stated"}
-    estimator = toml_file.parse_tables(known, schema.EstimatorConfig, str(folder.path))
-    tables["estimator"] = estimator
+    tables["estimator"] = _find_estimator(folder, config)
     require_sound(config.model_copy(update=tables), str(path))
     changed = {name: list_changes(getattr(config, name), table) for name, table in tables.items()}
     if not any(changed.values()):
@@ -98,6 +98,13 @@ def _save_estimator(path: Path, folder: SessionFolder, config: schema.Config, ye
     before = files.read_text(path, follow=True)
     confirm_and_replace(path, before, edit_text(before, changed, path), folder, yes)
     return errors.Exit.DONE
+
+
+def _find_estimator(folder: SessionFolder, config: schema.Config) -> schema.EstimatorConfig:
+    """The estimator's settings with the pump and the noise levels that a session measured."""
+    levels = estimator_levels.derive_estimator_levels(folder)
+    known = config.estimator.model_dump() | levels | {"pump_response": "stated"}
+    return toml_file.parse_tables(known, schema.EstimatorConfig, str(folder.path))
 
 
 def _find_session(name: Path | None, logs: Path) -> tuple[SessionFolder, float | None]:
