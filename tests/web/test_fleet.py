@@ -8,6 +8,7 @@ import json
 import time
 from contextlib import AsyncExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -16,6 +17,7 @@ from membrane_ctrl.control_port.ctl import Where, fleet
 from membrane_ctrl.control_port.service_client import ServiceAddress
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.service.ended_run import EndKind
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.web.fleet_panel import fleet_rows
 from tests.support.browser import browser_tab
@@ -99,7 +101,7 @@ def test_a_fleet_that_cannot_be_is_refused(tmp_path: Path, text: str, message: s
 
 
 def test_the_table_shows_alarms_first_and_no_old_numbers() -> None:
-    feeds = {name: HoldFeed(Where()) for name in ("good", "bad", "gone")}
+    feeds = {name: HoldFeed(Where()) for name in ("good", "bad", "gone", "stopped", "tripped")}
     now_s = time.monotonic()
     status = {"state": "hold", "why": "", "row": {"error_um": 0.256}}
     good = dataclasses.replace(feeds["good"].seen, problem="", seen_s=now_s, status=status)
@@ -108,15 +110,26 @@ def test_the_table_shows_alarms_first_and_no_old_numbers() -> None:
         good, status={**status, "notices": [{"topic": "maintenance", "text": "the leak grows"}]}
     )
     feeds["gone"].seen = dataclasses.replace(good, seen_s=now_s - 100.0)
-    assert fleet_rows(feeds) == [
-        {"hold": "good", "state": "hold", "error": 0.26, "description": "as it should be"},
-        {"hold": "bad", "state": "hold", "error": 0.26, "description": "the leak grows"},
-        {
-            "hold": "gone",
-            "state": "no contact",
-            "error": None,
-            "description": "no status for 100 s",
-        },
+    for name, kind, is_regular in (
+        ("stopped", EndKind.STOPPED, True),
+        ("tripped", EndKind.FAULT, False),
+    ):
+        ended = SimpleNamespace(kind=kind, is_regular=is_regular, headline=f"run ended: {name}")
+        feeds[name].seen = dataclasses.replace(
+            good,
+            problem="no hold runs",
+            ended=ended,  # type: ignore[arg-type]
+        )
+    shown = [
+        tuple(row[key] for key in ("hold", "state", "error", "description", "is_red"))
+        for row in fleet_rows(feeds)
+    ]
+    assert shown == [
+        ("good", "hold", 0.26, "as it should be", False),
+        ("bad", "hold", 0.26, "the leak grows", True),
+        ("gone", "no contact", None, "no status for 100 s", True),
+        ("stopped", "ended", None, "run ended: stopped", False),
+        ("tripped", "fault", None, "run ended: tripped", True),
     ]
 
 
