@@ -266,7 +266,7 @@ def paper(
 ) -> int:
     """Compute each figure and table of the paper again, and write them beside the paper's.
 
-    What is finished is kept in OUT/parts: the same command goes on where an earlier one ended.
+    What is finished is kept in OUT/parts: the same command continues where an earlier one ended.
     """
     from dataclasses import replace
 

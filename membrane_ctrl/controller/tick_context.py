@@ -81,7 +81,7 @@ class TickContext(TickContextState):
 
     config: Config
     loop_config: LoopConfig  # present settings, after `gains`
-    pump_config: PumpConfig  # likewise
+    pump_config: PumpConfig  # of the pump, as the loop uses it
     loop: inner_loop.InnerLoop
     observer: Observer
     levels: safe_levels.SafeLevels

@@ -68,7 +68,7 @@ class PageService:
         return ""
 
     def forget(self) -> None:
-        """Leave the service to itself: it goes on."""
+        """Leave the service to itself: it continues."""
         if self._process is not None and self._process.poll() is None:
             # it is not ours to wait for: without a code its end would be reported as a leak
             self._process.returncode = 0
@@ -101,7 +101,7 @@ def start_page_service(
     warn : callable
         Gets one line if there will be no page.
     ends_with_us : bool
-        Whether the service ends with this program; else it goes on, and ends an hour after its
+        Whether the service ends with this program; else it continues, and ends an hour after its
         last use.
 
     Returns

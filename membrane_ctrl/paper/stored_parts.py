@@ -1,4 +1,4 @@
-"""Finished parts on disk, so that a computation that was ended goes on where it was."""
+"""Finished parts on disk, so that a computation that was ended continues where it was."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -41,7 +41,7 @@ async def begin_restart(
     Returns
     -------
     Task of Outcome
-        It goes on without the viewer who asked. A failure is also in `starter.failure`, and so is
+        It continues without the viewer who asked. A failure is also in `starter.failure`, and so is
         that of the start, which continues after it.
 
     Raises

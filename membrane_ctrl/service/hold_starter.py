@@ -174,7 +174,7 @@ class HoldStarter:
         return self._thread.submit(start, chosen, options)
 
     def close(self) -> None:
-        """Forget a hold that was started; it goes on."""
+        """Forget a hold that was started; it continues."""
         self._thread.shutdown()
         with self._lock:
             if self._process is not None:

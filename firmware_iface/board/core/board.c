@@ -143,7 +143,7 @@ static bool gauge_lost(const struct state *state)
 
 /* Judged in every tick and after every write, so that no command drives the pump even for a tick.
  *
- * A lost gauge matters only to a pump that is to run. Its age goes on while the fault is latched and when it is cleared:
+ * A lost gauge matters only to a pump that is to run. Its age grows while the fault is latched and when it is cleared:
  * without a new value the pump does not run again. An open circuit latches always: that somebody pressed an emergency
  * stop must not be forgotten because the pump was off at that moment. */
 static void protect(struct state *state)

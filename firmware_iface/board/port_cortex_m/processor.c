@@ -1,4 +1,4 @@
-/* The part of hal.h that every Cortex-M does alike (ARMv7-M architecture reference manual, DDI 0403). */
+/* The part of hal.h that every Cortex-M has (ARMv7-M architecture reference manual, DDI 0403). */
 #include "cortex_m.h"
 #include "hal.h"
 

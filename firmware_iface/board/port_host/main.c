@@ -1,6 +1,6 @@
 /* The board as a program on a PC: Modbus RTU on a pseudo terminal, Modbus TCP on a port of localhost, and the wire to a
  * simulated film (bench_line.h) to a port that listens. Prints the line's name and the TCP port, then runs until it is
- * told to stop. */
+ * stopped. */
 #define _GNU_SOURCE
 
 #include <arpa/inet.h>

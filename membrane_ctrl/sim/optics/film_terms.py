@@ -45,7 +45,7 @@ def height_and_slopes(
     hx = 2.0 * X * sag_mm * bowl_u
     hy = 2.0 * Y * sag_mm * bowl_u
 
-    # The polynomial in x and y, likewise.
+    # The polynomial in x and y, too.
     degree = terms.poly_mm.shape[0] - 1
     value = 0.0
     value_x = 0.0
