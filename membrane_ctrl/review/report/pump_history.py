@@ -11,6 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control import pump_curve
 from membrane_ctrl.model import events
 from membrane_ctrl.model.run_status import RunStatus
@@ -46,9 +47,9 @@ def explain_pump_change(history: Sequence[PumpSeen], change_max: float) -> str:
     sigma = math.hypot(newest.sigma, first.sigma) / first.scale
     if abs(change) <= max(change_max, _CERTAIN_SIGMAS * sigma):
         return ""
+    side = "less" if change < 0 else "more"
     return (
-        f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than "
-        f"in {first.run} "
+        f"the pump gives {100 * abs(change):.0f} % {side} than in {first.run} "
         f"(+- {100 * sigma:.0f} %): check it, then `tune pump`"
     )
 
@@ -58,7 +59,8 @@ def pump_history(newest: Path) -> list[PumpSeen]:
 
     Runs that have learned nothing are omitted.
     """
-    devices, latest = run_config.read_config(newest, []).devices, None
+    devices = run_config.read_config(newest, []).devices
+    latest: PumpConfig | None = None
     found: list[PumpSeen] = []
     folders = [folder for folder in sorted(newest.parent.iterdir()) if folder.name <= newest.name]
     for folder in reversed(folders[-_LOOKED_BACK:]):
@@ -70,17 +72,37 @@ def pump_history(newest: Path) -> list[PumpSeen]:
             last = _last_learned(log)
             if last is None or config.devices != devices:
                 continue
-            learned, pump = last[0], config.with_gains(last[1]).pump
+            learned, gains = last
+            pump = config.with_gains(gains).pump
             latest = latest or pump
-            fraction = pump_curve.PumpCurve(latest).fraction(0.5 * latest.flow_full_um_per_s)
-            share = pump_curve.PumpCurve(pump).flow(fraction) / (0.5 * latest.flow_full_um_per_s)
-            leak = _to_finite((summary_file.read_summary(folder, []) or {}).get("leak_um_per_s"))
-            seen = (share * _to_finite(learned.scale), share * _to_finite(learned.sigma), leak)
-            if seen[0] > 0 and seen[1] > 0:
-                watched = {"probe_um", "change_max"}
-                same = pump.model_dump(exclude=watched) == latest.model_dump(exclude=watched)
-                found.append(PumpSeen(folder.name, origin_of(folder, log), *seen, same))
+            seen = _compare_pump(folder, log, learned, pump, latest)
+            if seen.scale > 0 and seen.sigma > 0:
+                found.append(seen)
     return found[::-1]
+
+
+def _compare_pump(
+    folder: Path,
+    log: Sequence[LoggedEvent],
+    learned: events.PumpLearned,
+    pump: PumpConfig,
+    latest: PumpConfig,
+) -> PumpSeen:
+    """What a run has learned, with its scale relative to the curve of the newest run."""
+    # The flow by the run's own curve at the command that gives half of the newest curve's flow
+    half_um_per_s = 0.5 * latest.flow_full_um_per_s
+    fraction = pump_curve.PumpCurve(latest).fraction(half_um_per_s)
+    share = pump_curve.PumpCurve(pump).flow(fraction) / half_um_per_s
+    summary = summary_file.read_summary(folder, []) or {}
+    watched = {"probe_um", "change_max"}
+    return PumpSeen(
+        run=folder.name,
+        started_utc=origin_of(folder, log),
+        scale=share * _to_finite(learned.scale),
+        sigma=share * _to_finite(learned.sigma),
+        leak_um_per_s=_to_finite(summary.get("leak_um_per_s")),
+        same_curve=pump.model_dump(exclude=watched) == latest.model_dump(exclude=watched),
+    )
 
 
 def _last_learned(log: Sequence[LoggedEvent]) -> tuple[events.PumpLearned, dict[str, Any]] | None:
