@@ -125,6 +125,7 @@ async def _nodes(
     mirror = await server.nodes.objects.add_object(
         ua.NodeId(name, space), ua.QualifiedName(name, space)
     )
+    # A variable for each published value, with its description and its unit
     found = {}
     for each in TABLE:
         node = await mirror.add_variable(
@@ -144,6 +145,7 @@ async def _nodes(
                 ua.NodeId(f"{name}.{each.name}.unit", space), "0:EngineeringUnits", unit
             )
         found[each.name] = node
+    # A method for each command
     for do, action in bridge.commands.items():
         given = [_argument(action)] if action.asks else []
         node_id = ua.NodeId(f"{name}.do.{do}", space)

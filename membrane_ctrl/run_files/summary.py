@@ -76,16 +76,21 @@ class Summary(StateNode):
         """Add (n, len(FIELDS)) telemetry rows, in order."""
         if not len(rows):
             return
+        # States entered
         time_s = telemetry.get_column(rows, "mono_s")
-        for row, code in telemetry.find_changes(telemetry.get_column(rows, "state"), self.state):
+        state = telemetry.get_column(rows, "state")
+        for row, code in telemetry.find_changes(state, self.state):
             self.transitions += 1
             if len(self.states) < _LISTED_MAX:
                 name = telemetry.State(code).name.lower()
                 self.states.append(EnteredState(name, float(time_s[row])))
-        settled = telemetry.get_columns(rows[self.held.add_rows(rows)])
-        self.state = float(telemetry.get_column(rows, "state")[-1])
+        self.state = float(state[-1])
+        # Errors of the rows in which the mirror is held
+        is_held = self.held.add_rows(rows)
+        settled = telemetry.get_columns(rows[is_held])
         self.true_um.add(telemetry.true_error_um(settled))
         self.reading_um.add(settled["setpoint_um"] - settled["displacement_um"])
+        # All rows
         self.lateness_ms.add(telemetry.get_column(rows, "lateness_ms"))
         self.rows += len(rows)
         self.missed_ticks = int(telemetry.get_column(rows, "missed_ticks")[-1])

@@ -50,11 +50,12 @@ class Lab:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._servers: dict[str, modbus_server.ModbusTcpServer] = {}
         self._tables: defaultdict[str, dict[int, modbus_pdu.RegisterTable]] = defaultdict(dict)
+        # Instruments on lines of their own, and registers of those on Modbus, by link and unit
         for role, section in devices.roles().items():
             if isinstance(section, settings.BronkhorstModbusConfig):
-                self._tables[section.link][section.unit_id] = pumps.BronkhorstRegisters(
-                    self._make_bronkhorst(role, section.serial)
-                )
+                instrument = self._make_bronkhorst(role, section.serial)
+                registers = pumps.BronkhorstRegisters(instrument)
+                self._tables[section.link][section.unit_id] = registers
             elif not isinstance(section, settings.ModbusMapConfig):
                 self.serial[section.port] = self._make_device(role, section)
         self._map_devices()
@@ -64,6 +65,7 @@ class Lab:
             self._tables[devices.board][devices.unit_id] = self._board.state
         self._modules: defaultdict[str, dict[int, input_module.InputModule]] = defaultdict(dict)
         self._add_modules()
+        # A Modbus RTU bus is a serial line with several units
         for url in self._modbus_urls:
             if url.startswith("rtu:"):
                 _, line = modbus_rtu.parse_rtu_url(url)

@@ -302,12 +302,14 @@ class Layer:
         """
         context = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, "", (24, 24, 24, 255))])
         self._stream.log(self._prefix + "/shape", context, static=True)
+        # The standard deviation over the part
         colours = {}
         if time_s.size > 1:
             deviation = shapes.deviation_map_um(parameters)
             span = rerun_shapes.colour_span(deviation, None)
             self._send_map("scatter", deviation, span)
             colours["scatter"] = f"0 to {span[1]:.2g} µm"
+        # Changes at some moments, each kind without its low terms and on one scale
         wanted = np.flatnonzero(_thin_evenly(time_s.size, MAPS_MOST))
         whole = [shapes.change_map_um(parameters[row]) for row in wanted]
         for kind, (terms, least_um) in rerun_shapes.CHANGES.items():
