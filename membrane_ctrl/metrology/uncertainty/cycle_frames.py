@@ -143,7 +143,7 @@ def _solve_amplitudes(table: FloatArray) -> FloatArray:
 
     `table` (frames, columns + 1, n) are the columns, and the frame itself.
     """
-    # Products of the columns with each other and with the residual (the last row), scaled to a unit
+    # Products of the columns with each other and with the frame (the last row), scaled to a unit
     # diagonal.
     gram = table @ table.transpose(0, 2, 1)
     scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), _TINY))
