@@ -48,10 +48,20 @@ def warm_up(
     position: FilmPosition,
     clock: exposures.CycleClock,
 ) -> None:
-    """Run a full cycle and two fringes-only cycles, with and without known motion, of a film at
-    rest.
+    """Run a full cycle and two fringes-only cycles, with and without known motion.
 
-    `reconstructor` is one for this call alone; it and `optics` are those of `coarse_optics`.
+    Parameters
+    ----------
+    reconstructor : Reconstructor
+        One for this call alone, of the bench `optics`.
+    optics : OpticsConfig
+        The bench of `coarse_optics`.
+    plan : CyclePlan
+        Patterns of the cycles.
+    position : FilmPosition
+        Sag and displacement of the film.
+    clock : CycleClock
+        Of the simulated exposures.
     """
     bench = TwinOptics(optics, TwinConfig(), lambda: position, clock)
     # Displacements that differ by more than noise trigger the kernels that correct the film's

@@ -22,7 +22,21 @@ _HEIGHT_STEPS = 4  # the rim's height hardly changes with the place: each gains 
 def on_rim(
     geometry: Geometry, edges: FloatArray, rim_z: HeightFunction
 ) -> tuple[FloatArray, FloatArray]:
-    """x and y (n,), mm, at which the rays of edges (2, n) meet the rim's height."""
+    """Where the rays of edges meet the rim's height.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        The bench.
+    edges : (2, n) array
+        Columns and rows.
+    rim_z : height function
+        Height of the rim in world at x and y, mm.
+
+    Returns
+    -------
+    x_mm, y_mm : (n,) arrays
+    """
     rays = geometry.rays(*edges)
     z_mm = np.zeros(edges.shape[1])
     x_mm = y_mm = z_mm
@@ -36,10 +50,21 @@ def on_rim(
 def find_edges(
     light: FloatArray, stated: Geometry, radius_mm: float, rim_z_mm: float
 ) -> FloatArray | None:
-    """Find the edges of the light (2, n), pixels, at the rim; None if half of it or more is not
-    visible.
+    """Find the edges of the light at the rim.
 
-    `light` (H, W) is white minus black.
+    Parameters
+    ----------
+    light : (H, W) array
+        White minus black.
+    stated : Geometry
+        The stated bench.
+    radius_mm, rim_z_mm : float
+        Radius of the rim, and the height of its plane in world.
+
+    Returns
+    -------
+    (2, n) array or None
+        Columns and rows of the edges; None if half of the rim or more is not visible.
     """
     outline = find_outline(light, stated, radius_mm, rim_z_mm)
     if outline is None:

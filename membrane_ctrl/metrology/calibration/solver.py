@@ -479,7 +479,21 @@ def fit_on(
 ) -> surface_fit.Fit:
     """Fit one set's surface on a bench without bow, as `measure` does.
 
-    Raises ValueError if its points determine no surface.
+    Parameters
+    ----------
+    bench : BenchGeometry
+        The bench.
+    phases : SetPhases
+        The set; points seen with a moved screen are left out.
+    radius_mm : float
+        Radius of the Zernike disc.
+    vertex_z_mm : float
+        Height of the vertex in world.
+
+    Raises
+    ------
+    ValueError
+        If its points determine no surface.
     """
     phases = phases.subset(phases.seen_with(0))
     tracer = ray_tracing.Tracer(bench.geometry, radius_mm, vertex_z_mm)

@@ -25,10 +25,31 @@ def absolute_phases_of_bins(
     anchor: Anchor | None,
     optics: OpticsConfig,
 ) -> FloatArray:
-    """Absolute phases of the bins, (2, rows, columns); NaN where not valid.
+    """Absolute phases of the bins of a set.
 
-    They follow from the Gray code or, with an `anchor`, from the phases of the set that it was made
-    of. Raises NoFigureError if the film moved too far from the anchor.
+    They follow from the Gray code or, with an anchor, from the phases of the set that it was made
+    of.
+
+    Parameters
+    ----------
+    stack, binned : FrameStack, Binned
+        The set, and its frames as means over bins.
+    view : BinView
+        What the usable frames show of each bin.
+    anchor : Anchor or None
+        Phases of the set that this one refers to; None: the set has its own Gray code.
+    optics : OpticsConfig
+        The bench.
+
+    Returns
+    -------
+    (2, rows, columns) array
+        NaN where not valid.
+
+    Raises
+    ------
+    NoFigureError
+        If the film moved too far from the anchor.
     """
     if anchor is not None:
         return _follow_anchor(view, anchor)
@@ -41,7 +62,20 @@ def absolute_phases(
     view: bin_view.BinView,
     pattern: PatternConfig,
 ) -> FloatArray:
-    """Absolute phases (2, rows, columns) of a set with Gray code; NaN where not valid (eq. 2)."""
+    """Absolute phases of a set with Gray code (eq. 2 of the paper).
+
+    Parameters
+    ----------
+    stack, binned, view
+        As in `absolute_phases_of_bins`.
+    pattern : PatternConfig
+        The pattern on the screen.
+
+    Returns
+    -------
+    (2, rows, columns) array
+        NaN where not valid.
+    """
     absolute_rad = np.empty_like(view.phase_rad)
     for k, axis in enumerate(AXES):
         # A bit is bright above half the light: the mean of the fringes, which no single frame can

@@ -90,7 +90,24 @@ def camera_rays(geometry: Geometry, phases: SetPhases) -> FloatArray:
 def place_rays(
     bench: BenchGeometry, phases: SetPhases, surface: Surface, vertex_z_mm: float
 ) -> Points:
-    """The set's rays, followed to the surface."""
+    """Follow the rays of a set to the surface.
+
+    Parameters
+    ----------
+    bench : BenchGeometry
+        The bench.
+    phases : SetPhases
+        The set, with n bins.
+    surface : Surface
+        The film, or the artefact.
+    vertex_z_mm : float
+        Height of its vertex in world.
+
+    Returns
+    -------
+    Points
+        n rays, with their lengths to the surface.
+    """
     points = Points.of(camera_rays(bench.geometry, phases), phases.screen_mm)
     tracer = Tracer(bench.geometry, surface.radius_mm, vertex_z_mm)
     tracer.start(points, make_parabola(surface.sag_mm, surface.radius_mm))

@@ -128,10 +128,25 @@ def right_side(sums: FloatArray, radius_mm: float) -> FloatArray:
 def residual_rms(
     sums: FloatArray, right: FloatArray, normal: NormalMatrix, delta: FloatArray
 ) -> tuple[float, float]:
-    """RMS of the x and of the y slopes' residual after the step `delta`, without another pass over
-    the points.
+    """RMS of the slopes' residual after a step, without another pass over the points.
 
     |r - D delta|^2 = |r|^2 - 2 delta D^T r + delta D^T D delta, each sum weighted.
+
+    Parameters
+    ----------
+    sums : (SUMS,) array
+        Moments of `kernels.residual_sums` before the step.
+    right : (2, parameters) array
+        `right_side` of them.
+    normal : NormalMatrix
+        D^T W D.
+    delta : (parameters,) array
+        The step, in mm.
+
+    Returns
+    -------
+    (float, float)
+        Of the x and of the y slopes; NaN without weight.
     """
     weight = sums[-1]
     if not weight > 0:

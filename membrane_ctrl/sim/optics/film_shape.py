@@ -27,10 +27,22 @@ _Form = Literal["hencky", "paraboloid", "sphere"]
 
 
 def bowl_series(bowl: _Form, sag_mm: float, radius_mm: float) -> FloatArray:
-    """Height of a bowl of unit sag above its vertex: element k multiplies rho^(2k).
+    """Height of a bowl of unit sag above its vertex.
 
     Hencky's has nu = 0.3; a concave sphere's depends on its sag: 1 - sqrt(1 - x rho^2), x = (radius
     / curvature's)^2.
+
+    Parameters
+    ----------
+    bowl : "hencky", "paraboloid" or "sphere"
+        Form of the bowl.
+    sag_mm, radius_mm : float
+        Depth and radius of the rim, for a sphere.
+
+    Returns
+    -------
+    (k,) array
+        Element k multiplies rho^(2k).
     """
     if bowl == "hencky":
         return hencky.solve_hencky().profile
@@ -216,6 +228,15 @@ def typical_film(
 
     0.3 mm of astigmatism, 0.1 mm of coma and 0.05 mm of trefoil, each in a direction drawn from the
     seed, and 10 µm RMS spread over the terms above.
+
+    Parameters
+    ----------
+    sag_mm, radius_mm : float
+        Depth of the bowl, and radius of its rim.
+    seed : int
+        Of the figure errors.
+    prestrain, poisson : float
+        The film's pre-strain and Poisson ratio.
     """
     rng = np.random.default_rng(seed)
     coeffs_um = np.zeros(_TYPICAL_TERMS)
