@@ -157,6 +157,7 @@ async def _page_pictures(folder: Path) -> dict[str, bytes]:
             await asyncio.to_thread(command, "ctl", "mark", text, *socket)
         await tab.show_as(1500, 1560)
         await asyncio.sleep(20.0)
+        await tab.until("!document.body.innerText.includes('no figure yet')")
         await tab.screenshot(target, whole=False)
         room = await asyncio.to_thread(target.read_bytes)
         configuration = await _configuration_picture(tab, target)
