@@ -594,10 +594,11 @@ class Controller:
             self._limit_gains(found, events)
 
     def _limit_gains(self, response: PumpResponse, events: list[Event]) -> None:
-        """Slow down a loop whose gains are those of its file, and too quick for the pump."""
-        stated = self._config.loop
-        limited = limit_gains(stated, response)
-        if self._gains.on_trial or self._gains.present.loop != stated or limited is stated:
+        """Slow down a loop that is too quick for the pump, unless a person has set its gains."""
+        stated, present = self._config.loop, self._gains.present.loop
+        limited = limit_gains(present, response)
+        set_by_person = present not in (stated, self._gains.memory.limited)
+        if self._gains.on_trial or set_by_person or limited is present:
             return
         self._gains.limit(limited)
         self._set_gains(limited)

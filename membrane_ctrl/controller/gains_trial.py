@@ -26,6 +26,7 @@ class GainsState(StateNode):
     until_s: float = math.nan  # end of the trial; NaN: there is none
     # part of the trial; NaN: the setpoint and the shape loop are not
     setpoint_step_um: float = math.nan
+    limited: LoopConfig | None = None  # what `limit` has set last
 
 
 class GainsTrial:
@@ -78,6 +79,7 @@ class GainsTrial:
     def limit(self, loop: LoopConfig) -> None:
         """Replace the loop's settings, which are not on trial, by others that stay."""
         self.memory.tried = replace(self.memory.tried, loop=loop)
+        self.memory.limited = loop
         self.keep()
 
     def is_overdue(self, now_s: float) -> bool:

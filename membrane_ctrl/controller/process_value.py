@@ -30,9 +30,15 @@ from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, Proc
 from membrane_ctrl.model.state_tree import Count, StateNode
 
 NOTICE = "estimate_worse"
-# Sensors that come and go must not exchange the loops again and again.
 _FIRST_S = 0.5
+# Sensors that come and go must not exchange the loops again and again: another choice, or another
+# reason, waits so long. The wait doubles with each loss of a sensor, and is short again after an
+# hour without one.
 _AGAIN_S = 10.0
+_AGAIN_MOST_S = 600.0
+_CALM_S = 3600.0
+# The estimate may be held by the laser alone for so long: a barometer's or a camera's short gap.
+_ALONE_S = 5.0
 # The laser contradicts the estimate beyond so many standard deviations (`control/centre.py`).
 _CONTRADICTS_SIGMAS = 5.0
 # The prediction starts from the estimate's steadier hold; so many integral times later it is the
@@ -50,6 +56,7 @@ _TRIAL_SPANS = 12
 _RETURNS_SIGMAS = 1.0
 _FALL_BACK_S = 600.0
 _FALL_BACK_MOST_S = 6 * 3600.0
+_DOUBLINGS_MOST = 10
 
 
 class ProcessValueReason(StrEnum):
@@ -120,6 +127,10 @@ class ProcessValueState(StateNode):
         Name of the reported reason; empty before the first.
     wanted_since_s : float
         Since when another loop is wanted.
+    again_s : float
+        How long another choice is wanted before it is taken, if sensors come and go.
+    sensor_lost_s : float
+        When a sensor's loss last changed the decision or its reason.
     compares_from_s : float
         When the prediction has become the PI's own.
     tries_pi : bool
@@ -136,6 +147,8 @@ class ProcessValueState(StateNode):
     follows_estimate: bool = False
     reason_name: str = ""
     wanted_since_s: float = math.nan
+    again_s: float = _AGAIN_S
+    sensor_lost_s: float = math.nan
     compares_from_s: float = math.nan
     tries_pi: bool = False
     fall_back_until_s: float = -math.inf
@@ -211,7 +224,7 @@ class ProcessValueChoice:
             return None, []
         events = self._judge_estimate(facts, estimate)
         wanted = self._find_reason(facts, estimate)
-        events += self._decide(wanted, facts.now_s)
+        events += self._decide(wanted, facts)
         overruled = facts.held_by_optics and not self._is_laser_usable(facts, estimate)
         return (estimate if memory.follows_estimate or overruled else None), events
 
@@ -233,28 +246,53 @@ class ProcessValueChoice:
             return ProcessValueReason.ESTIMATE_WORSE
         return ProcessValueReason.RESPONSE_KNOWN
 
-    def _decide(self, wanted: ProcessValueReason, now_s: float) -> list[Event]:
-        """Take another decision: at once for the laser, for the estimate after some time."""
-        memory = self.memory
+    def _decide(self, wanted: ProcessValueReason, facts: ProcessValueFacts) -> list[Event]:
+        """Take another decision, at once or after it has been wanted for some time."""
+        memory, now_s = self.memory, facts.now_s
         by_estimate = wanted in _BY_ESTIMATE
-        first = not memory.reason_name
         if wanted.name == memory.reason_name:
             memory.wanted_since_s = math.nan
             return []
         if math.isnan(memory.wanted_since_s):
             memory.wanted_since_s = now_s
-        waits_s = 0.0
-        if by_estimate and not memory.follows_estimate:
-            waits_s = _FIRST_S if first else _AGAIN_S
-        if now_s - memory.wanted_since_s < waits_s:
+        if now_s - memory.wanted_since_s < self._find_wait_s(wanted, facts):
             return []
         if by_estimate != memory.follows_estimate:
             self._stop_comparing()
+        if wanted in _BY_SENSORS:
+            self._lengthen_wait(now_s)
         memory.follows_estimate = by_estimate
         memory.reason_name = wanted.name
         memory.wanted_since_s = math.nan
         value = "estimate of the centre" if by_estimate else "laser"
         return [ProcessValueChosen(value, wanted.value, wanted.name.lower())]
+
+    def _find_wait_s(self, wanted: ProcessValueReason, facts: ProcessValueFacts) -> float:
+        """How long a choice must be wanted before it is taken."""
+        memory = self.memory
+        by_estimate = wanted in _BY_ESTIMATE
+        if not memory.reason_name:
+            return _FIRST_S if by_estimate else 0.0
+        laser_was_lost = memory.reason_name == ProcessValueReason.LASER_UNUSABLE.name
+        if by_estimate == memory.follows_estimate:
+            # Only the reason is another one
+            by_sensors = wanted in _BY_SENSORS or laser_was_lost
+            return memory.again_s if by_sensors else 0.0
+        if by_estimate:
+            return memory.again_s
+        if wanted is ProcessValueReason.LASER_ALONE:
+            return _ALONE_S
+        # A laser that has returned may go again; the optics hold the mirror
+        return _AGAIN_S if laser_was_lost and facts.held_by_optics else 0.0
+
+    def _lengthen_wait(self, now_s: float) -> None:
+        """A sensor is lost: double the wait if another one was within the last hour."""
+        memory = self.memory
+        if now_s - memory.sensor_lost_s < _CALM_S:
+            memory.again_s = min(2.0 * memory.again_s, _AGAIN_MOST_S)
+        else:
+            memory.again_s = _AGAIN_S
+        memory.sensor_lost_s = now_s
 
     def _is_laser_usable(self, facts: ProcessValueFacts, estimate: CentreEstimate) -> bool:
         """Whether the PI may follow this tick's reading."""
@@ -327,7 +365,8 @@ class ProcessValueChoice:
         if errors is None or estimate_error is None or self._comparison.spans < _TRIAL_SPANS:
             return []
         memory.tries_pi = False
-        until_s = facts.now_s + min(_FALL_BACK_S * 2.0**memory.trials, _FALL_BACK_MOST_S)
+        doublings = min(memory.trials, _DOUBLINGS_MOST)
+        until_s = facts.now_s + min(_FALL_BACK_S * 2.0**doublings, _FALL_BACK_MOST_S)
         memory.trials += 1
         sigma_um2 = math.hypot(errors.own.sigma_um2, estimate_error.sigma_um2)
         if errors.own.um2 - estimate_error.um2 > _RETURNS_SIGMAS * sigma_um2:
@@ -358,6 +397,8 @@ class ProcessValueChoice:
 
 
 _BY_ESTIMATE = (ProcessValueReason.RESPONSE_KNOWN, ProcessValueReason.LASER_UNUSABLE)
+# Reasons that a lost sensor gives
+_BY_SENSORS = (ProcessValueReason.LASER_ALONE, ProcessValueReason.LASER_UNUSABLE)
 
 
 def _root(mean_square_um2: float) -> float:

@@ -24,9 +24,10 @@ from membrane_ctrl.control.gain_limits import find_dead_time_s, limit_gains
 from membrane_ctrl.control.pump_response import PumpResponse
 from membrane_ctrl.controller.actuator_test import ActuatorTest, ActuatorTestState
 from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
-from membrane_ctrl.model.events import GainsLimited, PumpResponseFound
+from membrane_ctrl.model.events import Event, GainsLimited, PumpResponseFound
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.state_tree import decode_state, encode_state
 from membrane_ctrl.model.telemetry import State
@@ -380,3 +381,28 @@ def test_the_error_bar_of_a_quick_pump_holds_at_ten_ticks_a_second() -> None:
         scores.append((response.sum_s - 0.255) / response.sum_sigma_s)
     assert np.mean(np.abs(scores) < 2.0) >= 0.9
     assert np.sqrt(np.mean(np.square(scores))) > 0.7  # nor is it too wide
+
+
+def test_a_later_start_that_finds_a_slower_pump_slows_the_loop_further() -> None:
+    """Also after the first start has limited the gains; gains that a person has set stay."""
+    config = foreign_config(rate_hz=10.0)
+    for set_by_person in (False, True):
+        limited = find_limited_gains(config, set_by_person)
+        assert len(limited) == (1 if set_by_person else 2)
+        if not set_by_person:
+            assert limited[1].kp_per_s < 0.7 * limited[0].kp_per_s
+
+
+def find_limited_gains(config: Config, set_by_person: bool) -> list[GainsLimited]:
+    """What three starts limit, of which the last two find a slower pump."""
+    controller = Controller(leave_to_start(config), zernike_projection())
+    slow = PumpResponse(0.5, 0.5, 0.05, 0.05, 0.05)
+    slower = PumpResponse(1.0, 1.5, 0.1, 0.1, 0.1)
+    events: list[Event] = []
+    for response in (slow, slower, slow):
+        controller._context.found_response = response
+        controller._use_response(events)
+        if set_by_person:
+            command = Command("gains", "test", loop=config.loop)
+            controller._gains.begin(config.loop.model_copy(update={"ti_s": 9.0}), command, 0.0)
+    return [event for event in events if isinstance(event, GainsLimited)]

@@ -11,6 +11,7 @@ import pytest
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.config.schema import Config, ShapeConfig, StatesConfig, leave_to_start
 from membrane_ctrl.control.centre_estimate import CentreEstimate, Sensor, SensorView
+from membrane_ctrl.control.loop_comparison import MeanSquare
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.process_value import (
     NOTICE,
@@ -101,14 +102,54 @@ def test_the_laser_is_followed_without_camera_and_barometer() -> None:
     assert choice.codes == ["laser_alone"]
 
 
-def test_a_barometer_that_comes_and_goes_does_not_exchange_the_loops_again_and_again() -> None:
+@pytest.mark.parametrize(("gone_s", "back_s"), [(2.0, 6.0), (8.0, 11.0), (60.0, 60.0)])
+def test_a_barometer_that_comes_and_goes_does_not_exchange_the_loops_again_and_again(
+    gone_s: float, back_s: float
+) -> None:
+    choice = Choice()
+    unjudged = replace(FACTS, steady=False)
+    choice.run(20.0, unjudged)
+    alone = replace(unjudged, estimate=without(Sensor.BAROMETER))
+    while choice.now_s < 1800.0:
+        choice.run(gone_s, alone)
+        choice.run(back_s, unjudged)
+    assert 1 <= len(choice.codes) <= 10
+
+
+@pytest.mark.parametrize("response_known", [True, False])
+@pytest.mark.parametrize(("gone_s", "back_s"), [(0.7, 0.7), (11.0, 1.0), (11.0, 11.0)])
+def test_a_laser_that_comes_and_goes_before_the_camera_is_no_decision_again_and_again(
+    gone_s: float, back_s: float, response_known: bool
+) -> None:
+    choice = Choice()
+    both = replace(FACTS, held_by_optics=True, response_known=response_known, steady=False)
+    choice.run(20.0, both)
+    lost = replace(both, laser_um=math.nan, estimate=without(Sensor.LASER))
+    while choice.now_s < 1800.0:
+        assert all(choice.run(gone_s, lost))  # whatever is decided
+        choice.run(back_s, both)
+    assert 1 <= len(choice.codes) <= 10
+
+
+def test_a_laser_that_returns_as_the_camera_is_lost_is_followed_at_once() -> None:
+    choice = Choice()
+    both = replace(FACTS, held_by_optics=True, response_known=False)
+    choice.run(20.0, both)
+    choice.run(20.0, replace(both, laser_um=math.nan, estimate=without(Sensor.LASER)))
+    assert all(choice.run(5.0, both))
+    assert not any(choice.run(5.0, replace(both, held_by_optics=False)))
+
+
+def test_any_number_of_trials_keeps_the_longest_fall_back() -> None:
     choice = Choice()
     choice.run(20.0, FACTS)
-    alone = replace(FACTS, estimate=without(Sensor.BAROMETER))
-    for _ in range(20):
-        choice.run(2.0, alone)
-        choice.run(6.0, FACTS)
-    assert choice.codes == ["response_known", "laser_alone"]
+    memory = choice.choice.memory
+    memory.trials = 5000
+    memory.tries_pi = True
+    memory.estimate_error = MeanSquare(1.0, 0.1)
+    choice.run(120.0, FACTS)
+    assert choice.codes[-1] == "estimate_worse"
+    assert memory.fall_back_until_s < choice.now_s + 7 * 3600.0
 
 
 def test_gains_on_trial_act_on_the_mirror() -> None:
