@@ -295,13 +295,10 @@ class ActuatorTest:
         if speed is None:
             self._fail_late(part, "no reading while the vent is open")
             return
-        if self._lets_down(speed):
-            self._begin_part(memory.part + 1)
-            return
         # A jump of the laser spoils the line until it has left the window: a line from the jump on
-        jump = _find_step(self._choose_readings(from_s))
-        after_jump = None if jump is None else self._measure(jump)
-        if after_jump is not None and self._lets_down(after_jump):
+        jump_s = _find_step(self._choose_readings(from_s))
+        after_jump = None if jump_s is None else self._measure(jump_s)
+        if self._lets_down(speed) or (after_jump is not None and self._lets_down(after_jump)):
             self._begin_part(memory.part + 1)
             return
         sinks_um_per_s = memory.off_um_per_s - speed.um_per_s
@@ -314,9 +311,12 @@ class ActuatorTest:
 
     def _lets_down(self, speed: Speed) -> bool:
         """Whether the open vent lets the mirror down clearly."""
+        lets_down = False
         sinks_um_per_s = self.memory.off_um_per_s - speed.um_per_s
         least_um_per_s = max(_VENT_LEAST_UM_PER_S, _CLEAR_SIGMAS * self._sigma_of_change(speed))
-        return sinks_um_per_s >= least_um_per_s and self._is_straight(speed)
+        if sinks_um_per_s >= least_um_per_s and self._is_straight(speed):
+            lets_down = True
+        return lets_down
 
     def _judge_pump(self, part: Part, dt_s: float) -> None:
         memory = self.memory
