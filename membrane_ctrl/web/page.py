@@ -62,6 +62,9 @@ _CSS = (
     ".membrane-events { height: 100%; max-height: 24rem } }"
     ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"
     ".membrane-map canvas { touch-action: pan-y; display: block }"
+    # above an open dialog, which leaves room for it
+    ".membrane-stop { z-index: 7000 }"
+    ".q-dialog__inner > div { max-height: calc(100vh - 10rem) !important }"
     # legible on either ground
     ".body--dark .text-negative { color: #ff7b72 !important }"
     ".body--light .text-warning { color: #8a5a00 !important }" + MESSAGE_CSS
@@ -120,7 +123,8 @@ class WebPage:
         self._drawn: tuple[object, ...] = ()
         self._coloured = ""
         self._buttons: list[tuple[ui.button, ActionButton]] = []
-        self._asking = False
+        self._asking = False  # a dialog is open
+        self._stopping = False  # it is that of STOP
         self._clicked_s: float | None = None  # UTC of the last click on the chart
         # of this viewer, in records
         self._session = f"page {ui.context.client.id[:_SESSION_DIGITS]}"
@@ -147,7 +151,7 @@ class WebPage:
             fleet_panel(self._feeds)
         self._build_tabs()
         with ui.footer().classes(
-            "justify-center q-pa-xs !bg-white dark:!bg-[#121212]"
+            "membrane-stop justify-center q-pa-xs !bg-white dark:!bg-[#121212]"
         ):  # always on the screen
             stop = ui.button(
                 STOP.label, icon=STOP.icon, color="negative", on_click=lambda: self._confirm(STOP)
@@ -539,18 +543,21 @@ class WebPage:
             dialog.delete()
 
     async def _ask(self, action: ActionButton) -> Any:
-        """Show the dialog of a command, one at a time: a key may be pressed beside it."""
-        self._asking = True
+        """Show the dialog of a command, one at a time but for STOP: a key may be pressed beside
+        it.
+        """
+        before = self._asking
+        self._asking, self._stopping = True, action is STOP
         try:
             return await ask_for_confirmation(
                 action, self._feed.seen.status, self._views.config(self._hold)
             )
         finally:
-            self._asking = False
+            self._asking, self._stopping = before, False
 
     async def _confirm(self, action: ActionButton) -> None:
         """Ask for the input and for a confirmation, send, and show what became of it."""
-        if self._asking:
+        if self._stopping or (self._asking and action is not STOP):
             return
         given = await self._ask(action)
         if given is None:

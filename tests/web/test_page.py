@@ -258,6 +258,34 @@ async def test_a_phone_and_the_keyboard_alone(tmp_path: Path) -> None:
         assert [(each.kind, each.text) for each in run.asked] == [("mark", "shut"), ("stop", "")]
 
 
+@needs("chromium")
+@pytest.mark.real_time
+async def test_stop_is_within_reach_while_a_dialog_is_open(tmp_path: Path) -> None:
+    async with viewed(tmp_path) as (run, tab):
+        await tab.show_as(390, 700)
+        await tab.until("document.querySelector('[data-field=error_um]').innerText === '0.25'")
+        await asyncio.sleep(1.0)
+        await tab.press("p")
+        await tab.until("document.querySelectorAll('.q-dialog').length === 1")
+        await asyncio.sleep(1.0)
+        middle = f"(() => {{ const r = {STOP}.getBoundingClientRect(); return [r.left + r.width / 2, r.top + r.height / 2] }})()"  # noqa: E501
+        x, y = await tab.value(middle)
+        for kind in ("mousePressed", "mouseReleased"):
+            await tab.call(
+                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
+            )
+        await tab.until(
+            "[...document.querySelectorAll('.q-dialog')].some(d => d.innerText.startsWith('STOP'))"
+        )
+        await tab.screenshot(tmp_path / "stop.png", whole=False)
+        await tab.value(
+            "[...document.querySelectorAll('.q-dialog')].find(d => d.innerText.startsWith('STOP'))"
+            ".querySelector('button').click()"
+        )
+        await tab.until("document.body.innerText.includes('stop: done')")
+        assert [each.kind for each in run.asked] == ["stop"]
+
+
 CANDIDATES = """| candidate | K 1/s | std µm | Ms | against present |
 |---|---:|---:|---:|---:|
 | present | 0.300 | 0.210 +- 0.010 | 1.35 | in force |
