@@ -18,6 +18,7 @@ from enum import StrEnum
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.control.centre_estimate import CentreEstimate, Sensor
 from membrane_ctrl.control.error_correlation import ErrorCorrelation, ErrorCorrelationState
+from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.control.innovation_test import InnovationTest, InnovationTestState
 from membrane_ctrl.control.loop_comparison import (
     LoopComparison,
@@ -57,6 +58,8 @@ _RETURNS_SIGMAS = 1.0
 _FALL_BACK_S = 600.0
 _FALL_BACK_MOST_S = 6 * 3600.0
 _DOUBLINGS_MOST = 10
+# Memory of the mean that shows whether laser and camera move apart
+_APART_S = 60.0
 
 
 class ProcessValueReason(StrEnum):
@@ -142,6 +145,10 @@ class ProcessValueState(StateNode):
     trials : int
     estimate_error : MeanSquare or None
         Of the estimate's loop before the trial.
+    mount_mean : LowPass
+        Mean of the laser's mount in the last minute; NaN without a camera.
+    apart_um : float
+        How far the mount was from that mean when the trial began.
     """
 
     follows_estimate: bool = False
@@ -155,6 +162,8 @@ class ProcessValueState(StateNode):
     trusted_until_s: float = -math.inf
     trials: Count = 0
     estimate_error: MeanSquare | None = None
+    mount_mean: LowPass = field(default_factory=LowPass)
+    apart_um: float = math.nan
     noticed: bool = False
     prediction: PredictedPiState = field(default_factory=PredictedPiState)
     comparison: LoopComparisonState = field(default_factory=LoopComparisonState)
@@ -309,6 +318,7 @@ class ProcessValueChoice:
             self._stop_comparing()
             return []
         self._innovations.step(laser.innovation, facts.dt_s)
+        apart_um = self._compare_sensors(facts, estimate)
         self._compare_loops(facts)
         if memory.tries_pi:
             return self._end_trial(facts)
@@ -321,8 +331,17 @@ class ProcessValueChoice:
                 return []
             if self._may_be_worse(errors):
                 memory.estimate_error = errors.own
+                memory.apart_um = apart_um
                 memory.tries_pi = True
         return []
+
+    def _compare_sensors(self, facts: ProcessValueFacts, estimate: CentreEstimate) -> float:
+        """How far laser and camera moved apart in the last minute, µm; NaN without a camera."""
+        mean = self.memory.mount_mean
+        if not facts.held_by_optics:
+            mean.reset(math.nan)
+            return math.nan
+        return estimate.mount_um - mean.update(estimate.mount_um, facts.dt_s, _APART_S)
 
     def _may_be_worse(self, errors: LoopErrors) -> bool:
         """Whether the PI may hold the mirror better than the estimate."""
@@ -376,14 +395,21 @@ class ProcessValueChoice:
         memory.fall_back_until_s = until_s
         memory.noticed = True
         message = (
-            f"with the estimate the centre moved by {_root(estimate_error.um2):.2f} µm, with the "
-            f"PI on the laser by {_root(errors.own.um2):.2f} µm; {self._explain_worse()}. "
+            f"by the laser, the centre moved by {_root(estimate_error.um2):.2f} µm with the "
+            f"estimate and by {_root(errors.own.um2):.2f} µm with the PI; {self._explain_worse()}. "
             "The loop follows the laser"
         )
         return [Maintenance(NOTICE, message)]
 
     def _explain_worse(self) -> str:
-        """What errors and innovations show of the cause."""
+        """What errors, sensors and innovations show of the cause."""
+        memory = self.memory
+        error = memory.estimate_error
+        if error is not None and abs(memory.apart_um) > _root(error.um2):
+            return (
+                f"laser and camera moved apart by {abs(memory.apart_um):.1f} µm in the minute "
+                "before: either of them may creep"
+            )
         if self._correlation.largest > _CORRELATED:
             return (
                 "its errors swing: it looks like another dead time, lag or curve of the pump than "

@@ -140,6 +140,21 @@ def test_a_laser_that_returns_as_the_camera_is_lost_is_followed_at_once() -> Non
     assert not any(choice.run(5.0, replace(both, held_by_optics=False)))
 
 
+@pytest.mark.parametrize(
+    ("apart_um_per_s", "camera", "creeps"),
+    [(0.1, True, True), (-0.1, True, True), (0.0, True, False), (0.1, False, False)],
+)
+def test_the_notice_names_laser_and_camera_that_move_apart(
+    apart_um_per_s: float, camera: bool, creeps: bool
+) -> None:
+    choice = Choice()
+    while choice.now_s < 200.0:
+        moved = replace(ESTIMATE, mount_um=apart_um_per_s * choice.now_s)
+        choice.run(DT_S, replace(FACTS, estimate=moved, held_by_optics=camera))
+    (notice,) = (event for event in choice.events if isinstance(event, Maintenance))
+    assert ("either of them may creep" in notice.message) == creeps
+
+
 def test_any_number_of_trials_keeps_the_longest_fall_back() -> None:
     choice = Choice()
     choice.run(20.0, FACTS)
