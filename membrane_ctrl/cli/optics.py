@@ -268,6 +268,7 @@ def paper(
 
     What is finished is kept in OUT/parts: the same command continues where an earlier one ended.
     """
+    import shlex
     from dataclasses import replace
 
     from membrane_ctrl.model.errors import InputError
@@ -280,7 +281,9 @@ def paper(
     options = replace(options, seed=seed, scheduler=scheduler)
     arguments = " --quick" * quick + " --full-size" * full_size
     if sets is not None:
-        arguments += f" --sets {sets}"
+        arguments += f" --sets {shlex.quote(str(sets))}"
+    if seed != 1:
+        arguments += f" --seed {seed}"
     return paper_command(PaperCommand(out, options, sets, tuple(only or ()), json, arguments))
 
 

@@ -1,7 +1,9 @@
 """The paper's bench with one full capture set: simulated in memory, or recorded."""
 
+import hashlib
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -104,6 +106,11 @@ class MeasuredBench(ABC):
         """The 18 frames."""
 
     @property
+    @abstractmethod
+    def pixels_of_camera(self) -> int:
+        """Pixels of the bench's camera for each pixel of the frames."""
+
+    @property
     def geometry(self) -> PaperGeometry:
         """a, b and alpha for the paper's own equations. Raises InputError for another form."""
         stated = self.optics.geometry
@@ -113,6 +120,12 @@ class MeasuredBench(ABC):
                 "calibrated geometries have none"
             )
         return PaperGeometry(stated.a_mm, stated.b_mm, math.radians(stated.alpha_deg))
+
+    @property
+    def has_angle(self) -> bool:
+        """Whether the geometry is given as a, b and alpha."""
+        stated = self.optics.geometry
+        return None not in (stated.a_mm, stated.b_mm, stated.alpha_deg)
 
     @property
     def geometry_sigmas(self) -> tuple[float, float, float]:
@@ -159,6 +172,11 @@ class PaperBench(MeasuredBench):
         camera = camera.model_copy(update={"noise_adu": PIXEL_NOISE_ADU})
         optics = default.model_copy(update={"geometry": GEOMETRY, "camera": camera})
         super().__init__(options, optics)
+
+    @property
+    def pixels_of_camera(self) -> int:
+        """The paper's camera has more pixels than the frames of a smaller computation."""
+        return self.options.shrink**2
 
     @cached_property
     def film(self) -> FilmShape:
@@ -212,6 +230,27 @@ class RecordedBench(MeasuredBench):
     def stack(self) -> FrameStack:
         """The frames of the first set."""
         return self._stack
+
+    @property
+    def pixels_of_camera(self) -> int:
+        """The frames are the camera's own."""
+        return 1
+
+
+def fingerprint_sets(folders: Sequence[Path]) -> str:
+    """A digest of the names, sizes and times of the sets' files: another one means other sets.
+    Raises InputError.
+    """
+    digest = hashlib.sha256()
+    for folder in folders:
+        try:
+            for path in sorted(folder.iterdir()):
+                status = path.stat()
+                row = (folder.name, path.name, status.st_size, status.st_mtime_ns)
+                digest.update(repr(row).encode())
+        except OSError as error:
+            raise errors.InputError(f"{folder}: {errors.os_reason(error)}") from None
+    return digest.hexdigest()
 
 
 def find_sets(folder: Path) -> list[Path]:

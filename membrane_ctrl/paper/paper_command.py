@@ -9,7 +9,13 @@ from typing import Any
 
 from membrane_ctrl.measure.result_files import write_json
 from membrane_ctrl.model import errors, files, program
-from membrane_ctrl.paper.bench import MeasuredBench, PaperBench, PaperOptions, RecordedBench
+from membrane_ctrl.paper.bench import (
+    MeasuredBench,
+    PaperBench,
+    PaperOptions,
+    RecordedBench,
+    fingerprint_sets,
+)
 from membrane_ctrl.paper.comparison import PartResult, round_numbers
 from membrane_ctrl.paper.document import count_agreements, render_document
 from membrane_ctrl.paper.parts import PARTS, PaperPart
@@ -54,12 +60,21 @@ def paper_command(asked: PaperCommand) -> int:
     if unknown:
         raise errors.InputError(f"--only {unknown[0]}: one of {', '.join(known)}")
     bench: MeasuredBench = PaperBench(asked.options)
+    fingerprint = None
     if asked.sets is not None:
-        bench = RecordedBench(asked.options, asked.sets)
+        recorded = RecordedBench(asked.options, asked.sets)
+        fingerprint = fingerprint_sets(recorded.folders)
+        bench = recorded
     parts = [part for part in PARTS if asked.sets is None or not part.needs_truth]
+    if not bench.has_angle:
+        # a part that is asked for by name fails with the reason
+        left_out = [part for part in parts if part.needs_angle and part.name not in asked.only]
+        parts = [part for part in parts if part not in left_out]
+        names = ", ".join(part.name for part in left_out)
+        print(f"left out: {names} (they need a_mm, b_mm and alpha_deg)", file=sys.stderr)
 
     with errors.convert_write_errors(asked.out):
-        stored = PartFolder(files.make_folder(asked.out / "parts"), asked.options, asked.sets)
+        stored = PartFolder(files.make_folder(asked.out / "parts"), asked.options, fingerprint)
         results: dict[PaperPart, PartResult] = {}
         for part in parts:
             result = stored.read_part(part)

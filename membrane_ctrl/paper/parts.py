@@ -32,6 +32,8 @@ class PaperPart:
         Gets the bench and returns a PartResult.
     needs_truth : bool
         Whether only a simulated bench will do.
+    needs_angle : bool
+        Whether the geometry must be given as a, b and alpha.
     """
 
     name: str
@@ -39,6 +41,7 @@ class PaperPart:
     source: str
     compute: Callable[[Any], PartResult]
     needs_truth: bool = False
+    needs_angle: bool = False
 
 
 PARTS = (
@@ -65,14 +68,22 @@ PARTS = (
         "Convergence of the iteration",
         "section 2.4, equation 22",
         convergence_parts.compare_convergence,
+        needs_angle=True,
     ),
-    PaperPart("starts", "Starting shapes", "section 2.4", convergence_parts.compare_starts),
+    PaperPart(
+        "starts",
+        "Starting shapes",
+        "section 2.4",
+        convergence_parts.compare_starts,
+        needs_angle=True,
+    ),
     PaperPart("profile", "Surface and radial profile", "section 3.1", profile_part.compare_profile),
     PaperPart(
         "monte_carlo",
-        "Monte Carlo of the height",
-        "section 3.1",
+        "Monte Carlo of the height and of its change",
+        "sections 3.1 and 3.2",
         monte_carlo_part.compare_monte_carlo,
+        needs_angle=True,
     ),
     PaperPart("stability", "Stability and pairs", "section 3.2", stability_parts.compare_stability),
     PaperPart(

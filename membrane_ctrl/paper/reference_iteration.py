@@ -7,6 +7,7 @@ A point keeps its ray from the pinhole: where the ray meets the last surface is 
 paper does not say so; with `fixed_mm` a point keeps x_0 and y_0 instead.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -145,6 +146,7 @@ def reconstruct(
     *,
     reading: YReading = YReading.HEIGHT_OF_POINT,
     fixed_mm: FloatArray | None = None,
+    y_geometry: PaperGeometry | None = None,
     y_change: SlopeChange | None = None,
 ) -> ReferenceSolution:
     """Reconstruct the surface by the paper's equations.
@@ -164,6 +166,8 @@ def reconstruct(
         What the y equations mean.
     fixed_mm : (2, n) array, optional
         x_0 and y_0 that the points keep; without, each keeps its ray.
+    y_geometry : PaperGeometry, optional
+        That of the y equations, if it is not that of x.
     y_change : callable, optional
         Changes the y slopes (n,) of points (3, n): an error of the y equations.
 
@@ -181,7 +185,7 @@ def reconstruct(
     for _ in range(iterations):
         points_mm = _place_points(geometry, seen, shape, fixed_mm)
         rays = _reflect(geometry, points_mm, shape)
-        slopes = compute_slopes(geometry, points_mm, seen.screen_mm, rays, reading)
+        slopes = compute_slopes(geometry, points_mm, seen.screen_mm, rays, reading, y_geometry)
         if y_change is not None:
             slopes[1] += y_change(points_mm, slopes[1])
         shape = _fit_slopes(points_mm, slopes, radius_mm)
@@ -190,6 +194,23 @@ def reconstruct(
         last_mm = height_mm
     assert isinstance(shape, PolynomialSurface)
     return ReferenceSolution(shape, changes_mm)
+
+
+def predict_seen(
+    geometry: PaperGeometry, rays: FloatArray, surface: PolynomialSurface
+) -> SeenPoints:
+    """What a camera sees of a surface by its rays (3, n) from the pinhole: reflected by vectors,
+    without the paper's equations.
+    """
+    points_mm = _place_points(geometry, SeenPoints(rays, np.zeros((2, 0))), surface, None)
+    reflected = _reflect(geometry, points_mm, surface).reflected
+    cosine, sine = math.cos(geometry.alpha_rad), math.sin(geometry.alpha_rad)
+    face = np.array([-cosine, 0.0, sine])
+    centre_mm = np.asarray(geometry.b_mm)[..., None] * face
+    reach_mm = ((centre_mm - points_mm.T) @ face) / (reflected @ face)
+    on_screen_mm = points_mm.T + reach_mm[:, None] * reflected - centre_mm
+    along_x = np.array([-sine, 0.0, -cosine])
+    return SeenPoints(rays, np.stack([on_screen_mm @ along_x, on_screen_mm[:, 1]]))
 
 
 def _place_points(

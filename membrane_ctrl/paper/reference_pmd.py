@@ -205,10 +205,12 @@ def compute_slopes(
     screen_mm: FloatArray,
     rays: Reflection | None,
     reading: YReading = YReading.HEIGHT_OF_POINT,
+    y_geometry: PaperGeometry | None = None,
 ) -> FloatArray:
     """Slopes (2, n) in x and y of points (3, n) that see the screen at `screen_mm` (2, n).
 
-    Without `rays` the projection is not corrected.
+    Without `rays` the projection is not corrected. `y_geometry` is that of the y equations, if it
+    is not that of x: an error that acts in one axis only.
     """
     x_mm, y_mm, height_mm = points_mm
     screen_x_mm, screen_y_mm = screen_mm
@@ -218,7 +220,7 @@ def compute_slopes(
         correction_x_rad = compute_projection_correction(rays, 0)
         correction_y_rad = compute_projection_correction(rays, 1)
     slope_x = compute_slope(geometry, x_mm, height_mm, screen_x_mm, correction_x_rad)
-    upright = geometry.project_onto_yz(screen_x_mm, reading)
+    upright = (y_geometry or geometry).project_onto_yz(screen_x_mm, reading)
     # O'A of the equations grows towards negative x; the screen's y coordinate grows with y
     slope_y = compute_slope(upright, y_mm, height_mm, -screen_y_mm, correction_y_rad)
     return np.stack([slope_x, slope_y])

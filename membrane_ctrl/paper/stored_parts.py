@@ -40,13 +40,13 @@ class PartFolder:
         Existing folder.
     options : PaperOptions
         A part that was computed with others is computed again.
-    sets : Path, optional
-        The recorded sets; None: simulated.
+    sets : str, optional
+        Fingerprint of the recorded sets; None: simulated.
     """
 
-    def __init__(self, folder: Path, options: PaperOptions, sets: Path | None) -> None:
+    def __init__(self, folder: Path, options: PaperOptions, sets: str | None) -> None:
         self._folder = folder
-        self._made_from = {**asdict(options), "sets": None if sets is None else str(sets)}
+        self._made_from = {**asdict(options), "sets": sets}
         del self._made_from["scheduler"]  # the numbers are the same everywhere
 
     def read_part(self, part: PaperPart) -> PartResult | None:

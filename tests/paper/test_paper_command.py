@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -141,3 +142,27 @@ s_y = [0.0, 1.0, 0.0]
     out = tmp_path / "out"
     assert run(["paper", "--sets", str(sets), "--only", "convergence", "--out", str(out)]) == 2
     assert "need a_mm, b_mm and alpha_deg" in capsys.readouterr().err
+    only = ["--only", "gray", "--only", "stability"]
+    assert run(["paper", "--sets", str(sets), *only, "--out", str(out)]) == 0
+    assert "left out: convergence, starts, monte_carlo" in capsys.readouterr().err
+    # and one set has no SD
+    assert "1 of 1 sets gave a figure" in (out / "paper.html").read_text()
+
+
+def test_other_sets_in_the_same_folder_are_computed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sets = tmp_path / "sets of é"
+    assert run(["simulate", str(sets / "0000"), "--shrink", "12"]) == 0
+    command = ["paper", "--sets", str(sets), "--only", "gray", "--seed", "3"]
+    command += ["--out", str(tmp_path / "missing" / "out")]
+    assert run(command) == 0
+    page = html.unescape((tmp_path / "missing" / "out" / "paper.html").read_text())
+    assert "sets of é' --seed 3 --only gray" in page
+    capsys.readouterr()
+    assert run(command) == 0
+    assert "Gray-code table ..." not in capsys.readouterr().err
+    assert run(["simulate", str(sets / "0001"), "--shrink", "12"]) == 0
+    capsys.readouterr()
+    assert run(command) == 0
+    assert "Gray-code table ..." in capsys.readouterr().err

@@ -11,10 +11,12 @@ import pytest
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.paper.reference_iteration import (
     POWERS,
+    PolynomialSurface,
     SeenPoints,
     make_cone,
     make_parabola,
     make_v_fold,
+    predict_seen,
     reconstruct,
 )
 from membrane_ctrl.paper.reference_pmd import (
@@ -147,3 +149,12 @@ def test_no_iteration_is_no_solution() -> None:
     seen = SeenPoints(np.zeros((3, 1)), np.zeros((2, 1)))
     with pytest.raises(ValueError, match="at least 1"):
         reconstruct(GEOMETRIES["another"], seen, make_parabola(1.0, 500.0), 500.0, 475.0, 0)
+
+
+def test_what_a_camera_sees_is_predicted() -> None:
+    bench = GEOMETRIES["another"]
+    _, _, screen, rays = reflect(bench, round_bowl, *points_on_disc(100))
+    coeffs = np.zeros(len(POWERS))
+    coeffs[[POWERS.index((2, 0)), POWERS.index((0, 2))]] = 1.4e-4 * 500.0**2
+    found = predict_seen(bench, rays.incident.T, PolynomialSurface(coeffs, 500.0))
+    np.testing.assert_allclose(found.screen_mm, screen, atol=1e-9)

@@ -33,9 +33,13 @@ frames of the paper's bench; `--quick` in two minutes, `--sets RUN_OF_SETS` from
   height of each point of it; with that the equations are exact.
 - **Equation 14** takes both angles from arccosines, which have no sign. In y the angles need signs.
 - **x_0 and y_0** of a pixel depend on the height, which is unknown: here a pixel keeps its ray.
-- **The Monte Carlo** does not say whether a pixel keeps its ray or its x and y when alpha is wrong.
+- **The Monte Carlo** does not say whether a pixel keeps its ray or its x and y when alpha is wrong,
+  nor what alpha does in the y equations: by geometry it acts there with the opposite sign. No
+  reading gives 24.8 µm.
+- **4 to 5 µm of a pair** are the uncertainty of its change by Monte Carlo, not the change.
 - **Pitch of the screen**: eight periods of 49.82 mm do not fit on 768 pixels of 0.51 mm.
-- **1e-16 mm** between solutions is less than double precision resolves of a height of 34 mm.
+- **1e-16 mm** between solutions is less than double precision resolves at the edge, 31 mm
+  high.
 """
 
 
