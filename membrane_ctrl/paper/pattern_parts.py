@@ -121,28 +121,27 @@ def compare_phases(bench: PaperBench) -> PartResult:
 
 def compare_gray_table(bench: MeasuredBench) -> PartResult:
     """The Gray-code table: bits, K1 and K2 of each half period, and one bit changes at a time."""
+    gray = FullSlots(bench.optics.pattern.steps).gray[0]
+    bits = _displayed_bits(make_screen(bench), bench.patterns[gray])
+    k1, k2 = code_orders(bits)
+    changed = np.sum(bits[:, 1:] != bits[:, :-1], axis=0)
     half_periods = np.arange(2**GRAY_BITS)
     code = half_periods ^ (half_periods >> 1)
     place = np.arange(GRAY_BITS)[::-1, None]
-    bits = ((code >> place) & 1).astype(bool)
-    k1, k2 = code_orders(bits)
-    changed = np.sum(bits[:, 1:] != bits[:, :-1], axis=0)
-    gray = FullSlots(bench.optics.pattern.steps).gray[0]
-    displayed = _displayed_bits(make_screen(bench), bench.patterns[gray])
-    same = bool(np.array_equal(displayed, bits))
+    same = bool(np.array_equal(bits, ((code >> place) & 1).astype(bool)))
     comparisons = [
         PaperStatement(
             "bits that change between neighbouring half periods",
             "single-bit transitions",
             f"{changed.min()} to {changed.max()}",
             Agreement.REPRODUCED if np.all(changed == 1) else Agreement.DIFFERS,
+            "bits read from the middle of each displayed half period",
         ),
         PaperStatement(
-            "displayed patterns against the table",
+            "displayed patterns against the reflected binary code",
             "",
             "the same" if same else "not the same",
             Agreement.UNSTATED,
-            "bits read from the middle of each displayed half period",
         ),
         PaperStatement(
             "K1 (GC1 to GC3), K2 (GC1 to GC4)",

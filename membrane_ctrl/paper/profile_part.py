@@ -48,8 +48,9 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
             "about 3 (10 %), sign not given",
             f"{edge_mm:+.2f} ({100 * edge_mm / hencky_mm[-1]:+.0f} %) at {reach_mm:g} mm",
             Agreement.ASSUMED if simulated else judge_within(abs(edge_mm), 2.5, 3.5),
-            f"a pre-strain of {1e6 * prestrain:.0f} µm/m makes this film "
-            f"{EDGE_BELOW_HENCKY_MM:g} mm less deep at its ring; the simulated one has it",
+            f"a pre-strain of {1e6 * prestrain:.0f} µm/m makes the paper's film "
+            f"{EDGE_BELOW_HENCKY_MM:g} mm less deep at its ring"
+            + ("; the simulated one has it" if simulated else ""),
         ),
         PaperStatement(
             "of it, left by a film with this pre-strain, µm RMS",
