@@ -275,7 +275,7 @@ def _state_period(period_s: float) -> str:
 def compare_pairs(
     series: SetSeries, height_um: FloatArray, lag_s: float
 ) -> tuple[PaperStatement, dict[str, float]] | None:
-    """Change between all pairs of sets an interval apart; None without any."""
+    """Change from each set to the one nearest after an interval; None without any."""
     # the set that is nearest to an interval later, if it is near enough
     apart_s = series.time_s - series.time_s[:, None]
     later = np.argmin(np.abs(apart_s - lag_s), axis=1)
@@ -293,9 +293,10 @@ def compare_pairs(
     comparison = PaperStatement(
         f"RMS of the change over the mirror, {lag_s / 60:g} min apart, µm",
         "",
-        f"{np.mean(rms_um):.2f} (largest {np.max(rms_um):.2f}) of all {rms_um.size} pairs",
+        f"{np.mean(rms_um):.2f} (largest {np.max(rms_um):.2f}) of {rms_um.size} pairs",
         Agreement.UNSTATED,
-        "the paper's 4 to 5 µm of one pair are the uncertainty of its change: see the Monte Carlo",
+        "each set with the nearest one after this interval, to 5 %; the paper's 4 to 5 µm are the "
+        "uncertainty of a change: see the Monte Carlo",
     )
     return comparison, values
 
