@@ -75,16 +75,18 @@ def paper_command(asked: PaperCommand) -> int:
 
     with errors.convert_write_errors(asked.out):
         stored = PartFolder(files.make_folder(asked.out / "parts"), asked.options, fingerprint)
-        results: dict[PaperPart, PartResult] = {}
-        for part in parts:
-            result = stored.read_part(part)
-            if result is None and (not asked.only or part.name in asked.only):
-                print(f"{part.title} ...", file=sys.stderr)
-                result = part.compute(bench)
-                result = replace(result, numbers=round_numbers(result.numbers))
+    results: dict[PaperPart, PartResult] = {}
+    for part in parts:
+        result = stored.read_part(part)
+        if result is None and (not asked.only or part.name in asked.only):
+            print(f"{part.title} ...", file=sys.stderr)
+            result = part.compute(bench)
+            result = replace(result, numbers=round_numbers(result.numbers))
+            with errors.convert_write_errors(asked.out):
                 stored.write_part(part, result)
-            if result is not None:
-                results[part] = result
+        if result is not None:
+            results[part] = result
+    with errors.convert_write_errors(asked.out):
         _write_document(asked, bench, results)
     print(f"written to {asked.out}", file=sys.stderr)
     print(json.dumps(_make_table(asked, results)) if asked.as_json else _summarise(results))
