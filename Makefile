@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # A test starts hundreds of processes: without bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: hold test paper board board-fuzz board-hold rest lint types kernels fast real_time unit shake docs notebooks pictures bench campaign fuzz mutants generate clean
+.PHONY: hold test paper board board-fuzz board-hold rest lint types kernels fast real_time unit shake docs notebooks pictures bench benches campaign fuzz mutants generate clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml requirements.lock
@@ -65,6 +65,9 @@ pictures: $(STAMP)  ## takes the pictures of README and documentation; ONLY='run
 
 bench: $(STAMP)  ## measured figures, each against a reference of the same run
 	$(BIN)/python -m benchmarks
+
+benches: $(STAMP)  ## 500 random benches of the second world, resumable: docs/measurements/second-world.md; COUNT=50 for fewer
+	OPENBLAS_NUM_THREADS=1 nice -n 15 $(BIN)/python -m benchmarks.metrology.second_world $(or $(COUNT),500)
 
 campaign: $(STAMP)  ## all faults, in virtual time and with real processes; docs/measurements/fault-matrix.md, sensor-faults.md
 	$(BIN)/pytest -m campaign

@@ -27,7 +27,9 @@ sigma of the rows of the budget that should cover it, RMS height over the analys
 the error that the cause adds to the figure, likewise; random causes are planted several times. The
 goal is a ratio within a factor of {AGREES:g}; errors below {NEGLIGIBLE_UM:g} µm RMS count as
 agreeing. Causes without a row of their own are compared with the growth of all rows that the set
-measures itself.
+measures itself. Another film is compared by the change of the figure from the sound set to the
+planted one as these rows state it: the sound film does not follow the fit's law either. What no
+term of the fit represents of a film is no error of its terms; the zonal map shows it.
 """
 
 

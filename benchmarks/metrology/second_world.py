@@ -1,16 +1,19 @@
 """Verdicts and error bars of `measure` on random benches of the second optical world.
 
-`python -m benchmarks.metrology.second_world 500` measures up to 500 benches (two sets each) at a
-quarter of the resolution and writes docs/measurements/second-world.md from all answers that there
-are. The answers go to a file for each resolution, a line of JSON a bench: a stopped run continues
-where it was. `second_world 20 full` measures at full size, `second_world 500 eighth` at an eighth;
-`second_world page` writes the page from the answers that are there.
+`make benches` (`python -m benchmarks.metrology.second_world 500`) measures up to 500 benches (two
+sets each) at a quarter of the resolution, on all cores, and writes
+docs/measurements/second-world.md from all answers that there are. The answers go to a file for each
+resolution, a line of JSON a bench: a stopped run continues where it was. `second_world 20 full`
+measures at full size, `second_world 500 eighth` at an eighth; `second_world page` writes the page
+from the answers that are there.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +42,10 @@ def answers_file(resolution: str) -> Path:
 def measured_benches(count: int, resolution: str) -> list[dict[str, Any]]:
     """The first benches at a resolution; the missing ones are measured."""
     return answers(
-        answers_file(resolution), count, lambda seed: bench_answer(seed, RESOLUTIONS[resolution])
+        answers_file(resolution),
+        count,
+        partial(bench_answer, resolution=RESOLUTIONS[resolution]),
+        workers=os.cpu_count() or 1,
     )
 
 

@@ -163,13 +163,7 @@ def noise_seen_adu(measurement: Measurement) -> float:
     """Noise of a pixel, ADU, estimated from the phase steps; NaN for three steps, which always
     agree.
     """
-    if measurement.checked is None or measurement.full is None:
-        return float("nan")
-    freedom = sum(len(used) - 3 for used in measurement.checked.view.used)
-    if freedom == 0:
-        return float("nan")
-    squares = np.square(measurement.full.rest_adu)
-    return float(np.sqrt(np.median(squares) / freedom))
+    return math.nan if measurement.full is None else measurement.full.noise_adu
 
 
 @dataclass(frozen=True)

@@ -321,6 +321,17 @@ def test_a_change_counts_noise_that_has_its_own_row_once() -> None:
     assert grown == pytest.approx(0.04 * square, rel=0.2)
 
 
+def _cube(seed: int) -> dict[str, int]:
+    return {"seed": seed, "cube": seed**3}
+
+
+def test_a_benchmark_on_two_processes_gives_the_answers_of_one(tmp_path: Path) -> None:
+    one, two = tmp_path / "one.jsonl", tmp_path / "two.jsonl"
+    answers(two, 2, _cube)
+    assert answers(one, 5, _cube) == answers(two, 5, _cube, workers=2)
+    assert one.read_text(encoding="utf-8") == two.read_text(encoding="utf-8")
+
+
 def test_a_benchmark_that_was_killed_continues_where_it_was(tmp_path: Path) -> None:
     asked: list[int] = []
 

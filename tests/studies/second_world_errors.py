@@ -96,10 +96,11 @@ def true_values_um(mirror: Mirror, truth: Truth, points_mm: FloatArray) -> Float
 
 @dataclass(frozen=True)
 class MeasuredSurface:
-    """A figure: the parameters of the fit in mm, and the rows of its budget."""
+    """A figure: the parameters of the fit in mm, its budget, and the budget's rows."""
 
     verdict: str
     parameters_mm: FloatArray
+    budget: Budget
     rows: list[dict[str, Any]]
 
 
@@ -111,7 +112,7 @@ def measure_surface(folder: Path) -> MeasuredSurface:
     bars = results.error_bars(measurement, None, outline)
     assert bars is not None
     parameters_mm = measurement.full.surface.parameters
-    return MeasuredSurface(measurement.verdict, parameters_mm, bars.budget.rows())
+    return MeasuredSurface(measurement.verdict, parameters_mm, bars.budget, bars.budget.rows())
 
 
 def measured_errors(

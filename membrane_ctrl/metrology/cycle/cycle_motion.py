@@ -5,7 +5,6 @@ motions: by the ring's tilt, and by the phases that no surface explains, both si
 cycle.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +18,7 @@ from membrane_ctrl.metrology.uncertainty.motion_evidence import (
     MotionTest,
     SlopeEvidence,
     ring_tilt,
+    ring_tilt_urad,
 )
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
@@ -135,5 +135,4 @@ class CycleMotion:
 
     def tilt_urad(self, surface: Surface) -> float:
         """Tilt of the ring since the reference."""
-        moved_mm = surface.parameters - self.surface.parameters
-        return 1e6 * math.hypot(*(ring_tilt() @ moved_mm)) / surface.radius_mm
+        return ring_tilt_urad(self.surface, surface)

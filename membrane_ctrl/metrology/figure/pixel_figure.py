@@ -10,6 +10,7 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure.set_motion import FilmMotion, combine_axis_steps
 from membrane_ctrl.metrology.figure.set_quality import set_quality
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
+from membrane_ctrl.metrology.frame_checks import pixel_noise
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.phase import full_decoder, pattern_sequence, phase_steps, screen_scale
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
@@ -51,8 +52,8 @@ class FullResult:
         Weight in the fit.
     swing_adu : (n,) array
         The smaller of the two fringe amplitudes.
-    rest_adu : (n,) array
-        Residual of the frames after the sinusoids: noise, motion, the display's harmonics.
+    noise_adu : float
+        Standard deviation of a pixel in one frame, as the frames show it; NaN for three steps.
     grid : zonal_map.ResidualGrid
         Mean slope residuals in cells.
     fit_grid : zonal_map.ResidualGrid
@@ -69,7 +70,7 @@ class FullResult:
     index: IntArray
     weights: FloatArray
     swing_adu: Singles
-    rest_adu: Singles
+    noise_adu: float
     grid: zonal_map.ResidualGrid
     fit_grid: zonal_map.ResidualGrid
     residual_mm: FloatArray
@@ -132,8 +133,8 @@ class PixelPoints:
         Their rays and screen points.
     swing_adu : (n,) array
         The smaller of the two fringe amplitudes.
-    rest_adu : (n,) array
-        Residual of the frames after the sinusoids.
+    noise_adu : float
+        Standard deviation of a pixel in one frame, as the frames show it; NaN for three steps.
     moved : bool
         Whether the film's motion was corrected.
     """
@@ -141,7 +142,7 @@ class PixelPoints:
     index: IntArray
     points: ray_tracing.Points
     swing_adu: Singles
-    rest_adu: Singles
+    noise_adu: float
     moved: bool
 
 
@@ -201,13 +202,13 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     keep &= ~(x_phases.saturated | y_phases.saturated)
     swing_adu = np.minimum(x_phases.swing_adu, y_phases.swing_adu)
     keep &= swing_adu > full_decoder.FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
-    rest_adu = np.hypot(x_phases.rest_adu, y_phases.rest_adu)[keep]
     index = index[keep]
     swing_adu = swing_adu[keep]
+    noise_adu = pixel_noise.estimate_pixel_noise_adu(stack, checked.view.used, index)
 
     # The copies of the points take the most memory of a measurement: free what is not needed.
     del x_phases, y_phases, phase_rad, x_mm, y_mm, in_bin, sensitivity_rad_per_um
-    return PixelPoints(index, points.subset(keep), swing_adu, rest_adu, moved)
+    return PixelPoints(index, points.subset(keep), swing_adu, noise_adu, moved)
 
 
 def _trace_pixel_rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
@@ -341,7 +342,7 @@ def reconstruct_full(
         index=pixels.index,
         weights=points.weights,
         swing_adu=pixels.swing_adu,
-        rest_adu=pixels.rest_adu,
+        noise_adu=pixels.noise_adu,
         grid=grid,
         fit_grid=fit_grid,
         residual_mm=zonal_map.integrate_residual(grid),

@@ -1,4 +1,4 @@
-"""Phase, modulation and residual of every pixel: the pass over all frames of a measurement."""
+"""Phase and modulation of every pixel: the pass over all frames of a measurement."""
 
 import math
 from dataclasses import dataclass
@@ -23,15 +23,12 @@ class PixelPhases:
         Absolute phase, the period nearest to the reference.
     swing_adu : (n,) array
         Fringe amplitude.
-    rest_adu : (n,) array
-        Root of the sum of squares that the sinusoid leaves; 0 for three frames.
     saturated : (n,) bool array
         Whether a frame is clipped there, at white or at black.
     """
 
     phase_rad: FloatArray
     swing_adu: Singles
-    rest_adu: Singles
     saturated: BoolArray
 
 
@@ -58,7 +55,6 @@ def _compute_phases(  # type: ignore[no-untyped-def]
     index,
     fade,
     weights,
-    design,
     turn,
     mirror,
     slope,
@@ -69,8 +65,7 @@ def _compute_phases(  # type: ignore[no-untyped-def]
     start,
     stop,
 ):
-    """Rows of `out` (2, n): swing (negative where clipped) and rest; the phase in place of
-    `reference` (n,).
+    """The swing into `out` (n,), negative where clipped; the phase in place of `reference` (n,).
 
     `fade` (N, height) is 1 / gain of the rows; other arguments are those of `pixel_phases`.
     """
@@ -79,9 +74,8 @@ def _compute_phases(  # type: ignore[no-untyped-def]
         place = index[p]
         row = place // (frames.shape[1] // height)
 
-        # Mean and phasor c + i s by least squares (section 1 of the derivation; eq. 1 of the paper
-        # for four steps); and the extreme values, which may be clipped.
-        mean = 0.0
+        # Phasor c + i s by least squares (section 1 of the derivation; eq. 1 of the paper for four
+        # steps); and the extreme values, which may be clipped.
         c = 0.0
         s = 0.0
         top = 0.0
@@ -91,16 +85,8 @@ def _compute_phases(  # type: ignore[no-untyped-def]
             top = max(top, value)
             bottom = min(bottom, value)
             light = _correct_light(frames, previous, rise, fall, k, place, fade[k, row])
-            mean += weights[0, k] * light
             c += weights[1, k] * light
             s += weights[2, k] * light
-
-        # What they leave: sum of squares over the steps.
-        rest = 0.0
-        for k in range(steps):
-            light = _correct_light(frames, previous, rise, fall, k, place, fade[k, row])
-            left = light - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
-            rest += left * left
 
         # The phase without the film's motion, in the period nearest to the reference.
         c, s = remove_phasor_motion(c, s, slope[p], turn, mirror)
@@ -108,12 +94,11 @@ def _compute_phases(  # type: ignore[no-untyped-def]
         period = math.floor((reference[p] - wrapped) / (2 * math.pi) + 0.5)
         reference[p] = wrapped + 2 * math.pi * period
 
-        # The swing, with a negative sign where a frame is clipped, and the rest.
+        # The swing, with a negative sign where a frame is clipped.
         swing = math.sqrt(c * c + s * s)
         if top >= white or bottom <= black:
             swing = -swing
-        out[0, p] = swing
-        out[1, p] = math.sqrt(rest)
+        out[p] = swing
 
 
 def pixel_phases(
@@ -159,7 +144,7 @@ def pixel_phases(
     """
     flat = frames.reshape(len(frames), -1)
     phase = reference_rad.copy()
-    out = np.empty((2, index.size), np.float32)
+    out = np.empty(index.size, np.float32)
 
     # Without bands the gain is 1; without image lag a frame is its own predecessor.
     fade = np.ones(frames.shape[:2])
@@ -169,7 +154,7 @@ def pixel_phases(
     if previous is not None:
         before = previous.reshape(flat.shape)
     rise, fall = (share / (1 - share) for share in lag_shares)
-    fixed = (fade, np.linalg.pinv(design), design, combined.turn, combined.mirror)
+    fixed = (fade, np.linalg.pinv(design), combined.turn, combined.mirror)
 
     def run(start: int, stop: int) -> None:
         _compute_phases(
@@ -189,4 +174,4 @@ def pixel_phases(
         )
 
     split_over_threads(run, index.size)
-    return PixelPhases(phase, np.abs(out[0]), out[1], np.signbit(out[0]))
+    return PixelPhases(phase, np.abs(out), np.signbit(out))

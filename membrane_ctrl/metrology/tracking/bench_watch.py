@@ -26,6 +26,7 @@ from membrane_ctrl.metrology.uncertainty.motion_evidence import (
     SlopeEvidence,
     ring_saddle,
     ring_tilt,
+    ring_tilt_urad,
 )
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
@@ -233,5 +234,4 @@ class BenchWatch:
 
     def tilt_urad(self, shape: Surface) -> float:
         """Tilt of the ring since the reference."""
-        moved_mm = shape.parameters - self._reference.surface.parameters
-        return 1e6 * math.hypot(*(ring_tilt() @ moved_mm)) / shape.radius_mm
+        return ring_tilt_urad(self._reference.surface, shape)

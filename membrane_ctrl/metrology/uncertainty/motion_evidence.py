@@ -43,6 +43,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.rays import rim_harmonics
 from membrane_ctrl.metrology.rays.bench_motions import GROUPS, group_columns
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_DEGREE
 
@@ -83,6 +84,12 @@ def ring_tilt() -> FloatArray:
 def ring_saddle() -> FloatArray:
     """Matrix (2, parameters): cosine and sine of the rim's height around twice the azimuth."""
     return _ring_harmonic(2)
+
+
+def ring_tilt_urad(earlier: Surface, later: Surface) -> float:
+    """Angle by which the ring has tilted from one surface to another."""
+    tilt_mm = ring_tilt() @ (later.parameters - earlier.parameters)
+    return 1e6 * math.hypot(*tilt_mm) / later.radius_mm
 
 
 @cache

@@ -192,7 +192,6 @@ def test_pixels_are_measured_without_the_bands() -> None:
         pixel_phases(stack.frames[4:], *fixed, gain[4:]),
         pixel_phases(stack.frames[4:], *fixed),
     )
-    assert np.median(seen.rest_adu) < 0.25 * np.median(bare.rest_adu)
     assert np.std(seen.phase_rad - phase[INSIDE]) < 0.5 * np.std(bare.phase_rad - phase[INSIDE])
 
 

@@ -96,5 +96,8 @@ def test_every_spot_of_dust_is_left_out(grid: BinGrid) -> None:
     # White noise of 1 mrad is 1 nm of figure; the bias of the bins is added after the fit.
     without, _ = selected(grid, 0.0)
     assert found.surface.parameters == pytest.approx(without.surface.parameters, abs=3e-5)
+    bias_mm = grid.averaging_bias_mm(TRACER, without.points, without.surface, without.index)
+    centre_mm = screen_scale.screen_mm(np.zeros(1), OPTICS.pattern)
+    assert without.offset_mm == pytest.approx(bias_mm - centre_mm, abs=1e-5)
     clean = without.index[~np.isin(without.index, dust)]
     assert np.isin(clean, found.index).mean() > 0.999

@@ -1,0 +1,135 @@
+"""Rows and signatures of a bench against formulas that are written here."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
+from membrane_ctrl.metrology.rays import bench_motions
+from membrane_ctrl.metrology.rays.bench_motions import group_columns
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
+from membrane_ctrl.metrology.uncertainty.image_blur import blur_source, estimate_blur_px
+from membrane_ctrl.metrology.uncertainty.motion_evidence import ring_tilt_urad
+from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
+from membrane_ctrl.metrology.uncertainty.slope_misfit import measure_curl_urad
+from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, predicted_mm
+from tests.support.metrology_truth import RADIUS_MM
+
+Array = NDArray[np.float64]
+CAMERA = CameraConfig(width_px=306, height_px=256, pixel_um=3.45 * 8)
+OPTICS = OpticsConfig(camera=CAMERA)
+PARAMETERS = Surface.hencky_bowl(37.1, RADIUS_MM).parameters.copy()
+PARAMETERS[[4, 7, 20]] += (0.8, -0.5, 0.05)
+FILM = Surface.from_parameters(PARAMETERS, RADIUS_MM)
+
+
+@pytest.fixture(scope="module")
+def bench() -> TrialBench:
+    geometry = Geometry.from_config(OPTICS)
+    tracer = Tracer(geometry, RADIUS_MM)
+    column, row = np.meshgrid(np.arange(0, 306, 4.0), np.arange(0, 256, 4.0))
+    places_px = np.stack([column.ravel(), row.ravel()])
+    rays = geometry.rays(*places_px)
+    on_plane_mm = geometry.pinhole_mm[:, None] - geometry.pinhole_mm[2] / rays[2] * rays
+    near = np.hypot(*on_plane_mm[:2]) < 440.0
+    points = Points.of(rays[:, near], np.zeros((2, int(near.sum()))))
+    tracer.start(points, FILM.height)
+    tracer.intersect(points, FILM, newton=3)
+    points.screen_mm[:] = tracer.predict_screen(points, FILM)
+    exact = np.zeros(points.screen_mm.shape)
+    return TrialBench.of_points(OPTICS, tracer, FILM, points, places_px[:, near], exact, 10_000)
+
+
+def test_the_row_of_the_blur_is_the_error_of_blurred_phases(bench: TrialBench) -> None:
+    """The mean over a Gaussian by quadrature with 7 x 7 nodes."""
+    sigma_px = 1.5
+    nodes, weights = np.polynomial.hermite_e.hermegauss(7)
+    weights = weights / weights.sum()
+    nominal = bench.geometry()
+    mean_mm = np.zeros_like(bench.screen_mm)
+    for right, of_right in zip(nodes, weights, strict=True):
+        for down, of_down in zip(nodes, weights, strict=True):
+            moved = TrialBench(
+                **vars(bench)
+                | {
+                    "column_px": bench.column_px + sigma_px * right,
+                    "row_px": bench.row_px + sigma_px * down,
+                }
+            )
+            mean_mm += of_right * of_down * predicted_mm(moved, nominal, FILM)
+    expected = bench.solve(nominal, mean_mm - bench.screen_mm) - FILM.parameters
+    found = blur_source(bench, sigma_px).effects_mm[:, 0]
+    assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
+    assert np.linalg.norm(expected) > 1e-4
+
+
+@pytest.mark.parametrize("sigma_px", [0.0, 0.8, 2.0])
+def test_a_blur_is_found_by_the_swings_of_its_fringes(sigma_px: float) -> None:
+    rows, columns = 60, 80
+    row, column = np.mgrid[:rows, :columns].astype(float)
+    bin_px = 4
+    # Fringes that are finer on one side: rad per pixel is a quarter of that per bin.
+    phases = np.stack([0.01 * column**2, 0.3 * row + 0.004 * row * column])
+    squares = [np.sum(np.square(np.gradient(phase)), axis=0) / bin_px**2 for phase in phases]
+    variance = sigma_px**2 + (bin_px**2 - 1) / 12
+    swings = np.stack([90.0 * np.exp(-variance * square / 2).ravel() for square in squares])
+    index = np.arange(rows * columns)
+    found = estimate_blur_px(phases.reshape(2, -1), swings, index, (rows, columns), bin_px)
+    assert found == pytest.approx(sigma_px, abs=1e-3)
+
+
+def test_signatures_of_a_pair_are_the_changes_of_the_fitted_surface(bench: TrialBench) -> None:
+    """A motion of 10 µm or µrad, and the fit to the screen points after it."""
+    signatures = PairMotion.of(bench).effects.figure_mm
+    geometry = bench.geometry().geometry
+    rays = geometry.rays(bench.column_px, bench.row_px)
+    changes = bench_motions.screen_changes(geometry, rays, bench.t_mm, FILM, 0.0)
+    for columns in group_columns():
+        for k in range(columns.start, columns.stop):
+            after = bench.solve(bench.geometry(), 10.0 * changes[k])
+            moved_mm = (after - FILM.parameters) / 10.0
+            size = np.linalg.norm(moved_mm)
+            assert np.linalg.norm(signatures[:, k] - moved_mm) < 0.02 * size + 1e-12
+
+
+def test_the_tilt_of_the_ring_is_that_of_a_plane() -> None:
+    plane = PARAMETERS.copy()
+    plane[:2] += np.array([3e-3, -4e-3])  # mm RMS of Z2 and Z3, which are 2 r cos and 2 r sin
+    later = Surface.from_parameters(plane, RADIUS_MM)
+    rim_mm = np.array([later.height(RADIUS_MM, 0.0) - FILM.height(RADIUS_MM, 0.0)])
+    beside_mm = np.array([later.height(0.0, RADIUS_MM) - FILM.height(0.0, RADIUS_MM)])
+    expected_urad = 1e6 * float(np.hypot(rim_mm, beside_mm)[0]) / RADIUS_MM
+    assert ring_tilt_urad(FILM, later) == pytest.approx(expected_urad, rel=1e-9)
+    assert expected_urad == pytest.approx(20.0, rel=0.01)
+    assert ring_tilt_urad(later, later) == 0.0
+
+
+def grid_of(slope_x: Array, slope_y: Array, axis_mm: Array) -> ResidualGrid:
+    return ResidualGrid(axis_mm, slope_x, slope_y, np.ones_like(slope_x))
+
+
+def test_slopes_of_a_height_have_no_curl_and_those_of_a_whirl_have_their_size() -> None:
+    axis_mm = np.linspace(-450, 450, 241)
+    x, y = np.meshgrid(axis_mm, axis_mm)
+    height_mm = 1e-7 * x**2 - 2e-7 * x * y
+    of_height = grid_of(2e-7 * x - 2e-7 * y, -2e-7 * x, axis_mm)
+    assert measure_curl_urad(of_height, height_mm) < 1e-6
+    turn = 2e-8  # rad per mm
+    whirl = grid_of(-turn * y, turn * x, axis_mm)
+    expected_urad = 1e6 * turn * 900 / np.sqrt(12)
+    assert measure_curl_urad(whirl, np.zeros_like(x)) == pytest.approx(expected_urad, rel=0.02)
+
+
+def test_noise_of_cells_is_averaged_over_patches() -> None:
+    """40 patches along a side of 240 cells: 36 cells each."""
+    rng = np.random.default_rng(1)
+    axis_mm = np.linspace(-450, 450, 241)
+    shape = (241, 241)
+    noise = grid_of(1e-6 * rng.standard_normal(shape), 1e-6 * rng.standard_normal(shape), axis_mm)
+    # A slope between two cells is their mean; that of a patch counts its cells once.
+    assert measure_curl_urad(noise, np.zeros(shape)) == pytest.approx(1 / 6, rel=0.1)
