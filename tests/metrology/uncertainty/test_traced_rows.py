@@ -16,6 +16,7 @@ from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
 from membrane_ctrl.metrology.uncertainty.image_blur import blur_source, estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.motion_evidence import ring_tilt_urad
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
+from membrane_ctrl.metrology.uncertainty.residual_patches import Patches
 from membrane_ctrl.metrology.uncertainty.slope_misfit import measure_curl_urad
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, predicted_mm
 from tests.support.metrology_truth import RADIUS_MM
@@ -107,6 +108,21 @@ def test_the_tilt_of_the_ring_is_that_of_a_plane() -> None:
     assert ring_tilt_urad(FILM, later) == pytest.approx(expected_urad, rel=1e-9)
     assert expected_urad == pytest.approx(20.0, rel=0.01)
     assert ring_tilt_urad(later, later) == 0.0
+
+
+def test_points_are_averaged_in_patches_of_a_fortieth_of_the_square() -> None:
+    """Reach 400 mm: patches of 20 mm, counted row by row from the corner."""
+    places_mm = np.array([[-395.0, -385.0, 5.0, 5.0], [-395.0, -395.0, 25.0, 35.0]])
+    count = np.array([1.0, 3.0, 2.0, 2.0])
+    slopes = np.array([[4.0, 8.0, 1.0, 3.0], [0.0, 4.0, -1.0, -1.0]])
+    found = Patches.of(places_mm, count, slopes, 400.0)
+    corner, middle = 0, 21 * 40 + 20
+    assert np.flatnonzero(found.count).tolist() == [corner, middle]
+    assert found.count[[corner, middle]].tolist() == [4.0, 4.0]
+    assert found.slopes[:, corner].tolist() == [7.0, 3.0]
+    assert found.slopes[:, middle].tolist() == [2.0, -1.0]
+    assert found.places_mm[:, corner].tolist() == [-387.5, -395.0]
+    assert found.places_mm[:, middle].tolist() == [5.0, 30.0]
 
 
 def grid_of(slope_x: Array, slope_y: Array, axis_mm: Array) -> ResidualGrid:
