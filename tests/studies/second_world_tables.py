@@ -295,8 +295,8 @@ orthotropic film of finite strains on an uneven ring, its own ray tracer, lens, 
 air, panel and camera. Every input of the geometry is off at random; half of the benches have the
 sigmas of a hand measurement, half those of a hundredth. About three effects come on top; the table
 by cause lists them. Two sets a bench, 120 s apart. `make benches` measures up to 500 of them at a
-quarter of the resolution, 6 s of a core each: half an hour on 2 cores. It can be stopped at any time
-and continues where it was; the numbers below state how many were measured.
+quarter of the resolution, 6 s of a core each: half an hour on 2 cores. A run can be stopped and
+continues where it was; the numbers below state how many were measured.
 
 Tables give the share of the 95 % intervals that contain the truth (goal 93 to 97 %), and bar over
 scatter (1 is sharp), of sets that are `ok` or `degraded`.

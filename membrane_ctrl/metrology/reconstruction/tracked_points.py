@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.reconstruction.film_motion import sensitivity_mm_pe
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _START_SAG_MM = 40.0  # the paper's starting parabola; any other leads to the same result
-_FIRST_POINTS = 8000  # of the first surface, which only finds outliers and starts the fit of all
+_FIRST_POINTS = 8000  # of the first surface, which only starts the fit of all
 _PLACING_STEPS = 3  # towards a parabola near it; Newton steps do the rest
 _OUTLIER_SIGMAS = 8.0  # of the slopes' robust scatter: dust and glints, never noise
 _RAYLEIGH_MEDIAN = 1.177  # median of a Rayleigh distribution, in sigmas
@@ -113,18 +113,23 @@ def select_points(
     if index.size < _MIN_POINTS:
         raise ValueError(f"only {index.size} bins see the pattern in the mirror")
     points = ray_tracing.Points.of(grid.rays[:, index], screen_scale.screen_mm(phase_rad, pattern))
-    first = _fit_some(tracer, points, analysis_radius_mm)
-    near = ray_tracing.make_parabola(first.sag_mm, tracer.radius_mm)
+    surface = _fit_some(tracer, points)
+    near = ray_tracing.make_parabola(surface.sag_mm, tracer.radius_mm)
     tracer.start(points, near, steps=_PLACING_STEPS)
-    tracer.intersect(points, first, newton=3)
+    tracer.intersect(points, surface, newton=3)
 
-    # Without bins outside the analysed radius, and without outliers: the surface of all others.
-    inside = _inside_radius(tracer, points, analysis_radius_mm)
-    keep = np.flatnonzero(inside & _without_outliers(tracer, points, first, inside))
-    _check_count(keep.size)
-    points, index, phase_rad = points.subset(keep), index[keep], phase_rad[:, keep]
-    fit = surface_fit.fit_surface(tracer, points, first)
-    tracer.intersect(points, fit.surface)
+    # Without bins outside the analysed radius, then without outliers of the surface through all:
+    # one through some would be bent by wrinkles that it happens to meet.
+    for select in (_inside_radius, _without_outliers):
+        keep = np.flatnonzero(select(tracer, points, surface, analysis_radius_mm))
+        points = points.subset(keep)
+        index = index[keep]
+        phase_rad = phase_rad[:, keep]
+        if index.size < _MIN_POINTS:
+            raise ValueError(f"only {index.size} bins see the pattern inside the analysis radius")
+        fit = surface_fit.fit_surface(tracer, points, surface)
+        surface = fit.surface
+    tracer.intersect(points, surface)
 
     # From phase to place on the screen; the effect of the film's displacement; the bins' areas.
     mm_per_rad = screen_scale.mm_per_rad(pattern)
@@ -160,29 +165,16 @@ def select_points(
     )
 
 
-def _fit_some(tracer: ray_tracing.Tracer, points: ray_tracing.Points, radius_mm: float) -> Surface:
-    """Surface through some of the points, inside a radius and without outliers."""
+def _fit_some(tracer: ray_tracing.Tracer, points: ray_tracing.Points) -> Surface:
+    """Surface through some of the points."""
     count = min(_FIRST_POINTS, points.t_mm.size)
     some = points.subset(np.linspace(0, points.t_mm.size - 1, count).astype(int))
     start = ray_tracing.make_parabola(_START_SAG_MM, tracer.radius_mm)
-    surface = surface_fit.fit_surface(tracer, some, start).surface
-    some = some.subset(_inside_radius(tracer, some, radius_mm))
-    _check_count(some.t_mm.size)
-    surface = surface_fit.fit_surface(tracer, some, surface).surface
-    everywhere = np.ones(some.t_mm.size, bool)
-    some = some.subset(_without_outliers(tracer, some, surface, everywhere))
-    _check_count(some.t_mm.size)
-    return surface_fit.fit_surface(tracer, some, surface).surface
-
-
-def _check_count(count: int) -> None:
-    """Raise ValueError if there are too few bins for a surface."""
-    if count < _MIN_POINTS:
-        raise ValueError(f"only {count} bins see the pattern inside the analysis radius")
+    return surface_fit.fit_surface(tracer, some, start).surface
 
 
 def _inside_radius(
-    tracer: ray_tracing.Tracer, points: ray_tracing.Points, radius_mm: float
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, _surface: Surface, radius_mm: float
 ) -> BoolArray:
     """Points within a radius."""
     x, y = tracer.position_mm(points)
@@ -190,16 +182,12 @@ def _inside_radius(
 
 
 def _without_outliers(
-    tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface, inside: BoolArray
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface, _radius_mm: float
 ) -> BoolArray:
-    """Points whose slopes are within some robust sigmas of the fit, in both directions.
-
-    The sigma is that of the points `inside` (n,).
-    """
+    """Slopes within some robust sigmas of the fit, in both directions."""
     field = tracer.slope_field(points, surface)
     residual = np.hypot(field[2] - field[4], field[3] - field[5])
-    median = float(np.median(residual[inside]))
-    sigma = max(median / _RAYLEIGH_MEDIAN, _LEAST_SLOPE)
+    sigma = max(float(np.median(residual)) / _RAYLEIGH_MEDIAN, _LEAST_SLOPE)
     return np.asarray(residual <= _OUTLIER_SIGMAS * sigma)
 
 

@@ -89,10 +89,10 @@ def selected(grid: BinGrid, dust_rad: float) -> tuple[TrackedPoints, NDArray[np.
 
 
 def test_every_spot_of_dust_is_left_out(grid: BinGrid) -> None:
-    """The first surface goes through a fourth of the bins; the others are judged by it."""
+    """The first surface goes through a fourth of the bins."""
     found, dust = selected(grid, 0.1)
     assert not np.isin(dust, found.index).any()
-    assert np.hypot(*TRACER.position_mm(found.points)).max() <= ANALYSIS_MM
+    assert np.hypot(*TRACER.position_mm(found.points)).max() <= ANALYSIS_MM + 1e-3
     # White noise of 1 mrad is 1 nm of figure; the bias of the bins is added after the fit.
     without, _ = selected(grid, 0.0)
     assert found.surface.parameters == pytest.approx(without.surface.parameters, abs=3e-5)
