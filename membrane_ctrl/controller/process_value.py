@@ -395,8 +395,8 @@ class ProcessValueChoice:
         memory.fall_back_until_s = until_s
         memory.noticed = True
         message = (
-            f"by the laser, the centre moved by {_root(estimate_error.um2):.2f} µm with the "
-            f"estimate and by {_root(errors.own.um2):.2f} µm with the PI; {self._explain_worse()}. "
+            f"by the laser, the centre moved by {_describe_root(estimate_error)} with the estimate "
+            f"and by {_describe_root(errors.own)} with the PI; {self._explain_worse()}. "
             "The loop follows the laser"
         )
         return [Maintenance(NOTICE, message)]
@@ -429,3 +429,11 @@ _BY_SENSORS = (ProcessValueReason.LASER_ALONE, ProcessValueReason.LASER_UNUSABLE
 
 def _root(mean_square_um2: float) -> float:
     return math.sqrt(max(0.0, mean_square_um2))
+
+
+def _describe_root(mean_square: MeanSquare) -> str:
+    """A root mean square in µm; its upper limit if the laser's noise hides it."""
+    margin_um2 = 2.0 * mean_square.sigma_um2
+    if mean_square.um2 > margin_um2:
+        return f"{_root(mean_square.um2):.2f} µm"
+    return f"less than {_root(max(0.0, mean_square.um2) + margin_um2):.2f} µm"

@@ -155,6 +155,17 @@ def test_the_notice_names_laser_and_camera_that_move_apart(
     assert ("either of them may creep" in notice.message) == creeps
 
 
+def test_the_notice_gives_a_limit_where_the_noise_hides_the_error() -> None:
+    choice = Choice()
+    choice.run(20.0, FACTS)
+    memory = choice.choice.memory
+    memory.tries_pi = True
+    memory.estimate_error = MeanSquare(0.01, 0.02)
+    choice.run(120.0, FACTS)
+    (notice,) = (event for event in choice.events if isinstance(event, Maintenance))
+    assert "moved by less than 0.22 µm with the estimate" in notice.message
+
+
 def test_any_number_of_trials_keeps_the_longest_fall_back() -> None:
     choice = Choice()
     choice.run(20.0, FACTS)
