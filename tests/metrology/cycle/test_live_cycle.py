@@ -351,7 +351,7 @@ def test_wrong_number_of_frames(kind: str) -> None:
     live = LiveReconstructor(OPTICS, 1)
     frames, times, where = _render(kind)
     with pytest.raises(ValueError, match=f"{kind} cycle has {len(frames)} frames"):
-        getattr(live, kind)(frames[:-1], times, where)
+        getattr(live, f"measure_{kind}")(frames[:-1], times, where)
 
 
 def test_wrong_size_of_frame() -> None:
