@@ -468,7 +468,7 @@ def test_bands_of_a_pulsed_backlight_are_removed_from_full_and_fringes_cycles(
     still, live = _live(), LiveReconstructor(OPTICS, 1)
     steady = still.measure_fringes(*_render("fringes"))
     for kind in ("full", "fringes", "fringes"):
-        found = getattr(live, kind)(*banded(kind))
+        found = getattr(live, f"measure_{kind}")(*banded(kind))
         assert np.linalg.norm((found.coeffs_um - steady.coeffs_um)[3:]) < most_um
         assert found.verdict == ("ok" if share < 0.05 else "degraded")
         assert ("bands of 1" in found.reason) == (share > 0.05)
