@@ -226,7 +226,7 @@ def test_a_stuck_pump_is_reported(
     monkeypatch.setattr(ForeignHold, "stuck_fraction", 0.31)
     assert tuned(tmp_path, monkeypatch, "pump") == Exit.REJECTED
     said = capsys.readouterr().err
-    assert "alike at every command" in said
+    assert "moves the same at every command" in said
     assert "Traceback" not in said
     link = ForeignHold.last
     assert link.rows[-1].state == State.HOLD
