@@ -132,6 +132,7 @@ class Bench:
                     rings=rings,
                     children=children,
                     twin=None,
+                    figure_mode=None,
                     board=BoardAtStart(),
                     make_port=port,
                     make_latch=latched,

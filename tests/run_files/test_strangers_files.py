@@ -212,6 +212,7 @@ _OWN = {
     # into memory, and from there by `model.files`
     "measure/result_files.py",
     "measure/report_pdf.py",
+    "paper/pictures.py",
     "measure/export_formats.py",
     "review/report/figures.py",
 }
