@@ -14,8 +14,8 @@ Three places of the paper need a reading, and a ray trace decides between them:
   O'A does. `compute_slope` returns +dh/dx.
 - The y axis "follows the same principle". Its projection, parallel to the yz plane, contains the
   camera at the height a sin(alpha), so that its angle is 90 degrees and a is a sin(alpha). The
-  screen is inclined to that plane: each of its points stands at a height of its own, which the x
-  phase tells, and b is that height. With these two the equations are exact
+  screen is inclined to that plane: each of its points stands at a height of its own, which
+  follows from the x phase, and b is that height. With these two the equations are exact
   (`YReading.HEIGHT_OF_POINT`); the other readings are approximations.
 - Equation 14 takes delta theta from two arccosines, which are never negative. The camera is on
   the same side of all normals in x, but not in y: the angles need signs, here those of

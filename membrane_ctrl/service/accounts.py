@@ -162,13 +162,13 @@ class Accounts:
         return f"{DEVICE_COOKIE}={_new_device(known)}; {self.attributes}; Max-Age={_DEVICE_S}"
 
 
-# A device that has logged in before has its own budget of password guesses (`login_throttle`). Its
-# cookie is a random number with a signature. The key of the signature is the account's hash: it
-# needs no storage, survives a restart, and ends with the password.
-
-
 def _new_device(known: KnownUser) -> str:
-    """The cookie of a new device of an account."""
+    """The cookie of a new device of an account.
+
+    A device that has logged in before has its own budget of password guesses (`login_throttle`).
+    Its cookie is a random number with a signature. The key of the signature is the account's hash:
+    it needs no storage, survives a restart, and ends with the password.
+    """
     number = secrets.token_hex(16)
     return f"{number}.{_sign(known.hash, f'device {known.name}', number)}"
 

@@ -125,7 +125,7 @@ async def test_a_key_is_edited_and_the_hold_restarts_with_it(
             assert begun.status_code == 202, begun.text
             first = await until(reader, lambda state: holds_with(state, GAIN))
 
-            # a program: what is refused, in one line, while the first run goes on
+            # a program gets one line for each refusal, and the first run continues
             found = (await tuner.get("api/configurations/lab")).json()
             bad = {"text": configuration(-1.0), "digest": found["digest"]}
             refused = await tuner.put("api/configurations/lab", json=bad)

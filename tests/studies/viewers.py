@@ -266,7 +266,7 @@ def measure_viewers(
         at_most(
             "viewers lost", sum(bool(failed) for _, failed in gaps), "", 0, "viewers", len(gaps)
         ),
-        # One viewer of each cycle is stalled; whoever else was hung up on had read
+        # One viewer of each cycle is stalled; all others that lost their connection were reading
         at_most(
             "stalled viewers not hung up on", max(0, cycles - hung_up), "", 0, "stalled", cycles
         ),
