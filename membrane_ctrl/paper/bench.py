@@ -13,7 +13,7 @@ import numpy as np
 from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.optics import GeometryConfig
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.measure.capture_set import read_set
+from membrane_ctrl.measure.capture_set import read_head, read_set
 from membrane_ctrl.measure.measurement import stack_of
 from membrane_ctrl.measure.simulate import shrink_camera
 from membrane_ctrl.metrology.figure.pixel_figure import (
@@ -212,7 +212,8 @@ class PaperBench(MeasuredBench):
 class RecordedBench(MeasuredBench):
     """A bench whose sets were recorded: a folder with one folder for each set.
 
-    The first set in the order of their names is full. Raises InputError.
+    The first set in the order of their names is full. Raises InputError, also for a set of another
+    mirror.
     """
 
     def __init__(self, options: PaperOptions, folder: Path) -> None:
@@ -225,6 +226,12 @@ class RecordedBench(MeasuredBench):
         except RejectedSetError as error:
             raise errors.RejectedError(f"{self.folders[0]}: rejected: {error}") from None
         super().__init__(options, capture.head.optics)
+        # found here, because computing the sets takes long
+        for other in self.folders[1:]:
+            if read_head(other).optics.mirror != self.optics.mirror:
+                raise errors.InputError(
+                    f"{other / 'capture.toml'}: [mirror] is not that of the first set"
+                )
 
     @property
     def stack(self) -> FrameStack:

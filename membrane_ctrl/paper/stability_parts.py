@@ -111,9 +111,7 @@ def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> SetSeries:
 
 
 def read_series(bench: RecordedBench) -> SetSeries:
-    """The recorded sets of a bench, each computed from its frames. Raises InputError for a set of
-    another mirror.
-    """
+    """The recorded sets of a bench, each computed from its frames."""
     figures = Figures()
     parameters_mm, middle_s, moved_um = [], [], []
     rejected = 0
@@ -123,8 +121,6 @@ def read_series(bench: RecordedBench) -> SetSeries:
         except errors.RejectedError:
             rejected += 1
             continue
-        if measured.head.optics.mirror != bench.optics.mirror:
-            raise errors.InputError(f"{folder}: [mirror] is not that of the first set")
         parameters_mm.append(measured.figure.fit.surface.parameters)
         middle_s.append(measured.time_s)
         moved_um.append(measured.displacement_um)

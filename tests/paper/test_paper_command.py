@@ -166,3 +166,35 @@ def test_other_sets_in_the_same_folder_are_computed(
     capsys.readouterr()
     assert run(command) == 0
     assert "Gray-code table ..." in capsys.readouterr().err
+
+
+def test_a_set_that_cannot_be_read_is_named_before_anything_is_computed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sets = tmp_path / "sets"
+    assert run(["simulate", str(sets), "--shrink", "12", "--sets", "3"]) == 0
+    broken = sets / "0002" / "capture.toml"
+    kept = broken.read_text()
+    command = ["paper", "--sets", str(sets), "--only", "gray", "--out", str(tmp_path / "out")]
+    for content, line in (
+        ("[[[", f"{broken}: not valid TOML"),
+        (kept.replace("radius_mm = 500.0", "radius_mm = 510.0", 1), "not that of the first set"),
+    ):
+        broken.write_text(content)
+        capsys.readouterr()
+        assert run(command) == 2
+        shown = capsys.readouterr().err
+        assert line in shown
+        assert "..." not in shown
+
+
+def test_a_set_with_a_broken_picture_is_counted_as_rejected(tmp_path: Path) -> None:
+    sets = tmp_path / "sets"
+    assert run(["simulate", str(sets), "--shrink", "12", "--sets", "4"]) == 0
+    picture = sets / "0002" / "x_sin_2.png"
+    picture.write_bytes(picture.read_bytes()[:100])
+    out = tmp_path / "out"
+    assert run(["paper", "--sets", str(sets), "--only", "stability", "--out", str(out)]) == 0
+    stability = read_table(out)["numbers"]["stability"]
+    assert stability["sets"] == 4
+    assert stability["rejected"] == 1
