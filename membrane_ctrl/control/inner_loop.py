@@ -27,6 +27,8 @@ from membrane_ctrl.control.feedforward import FeedForward, FeedForwardState
 from membrane_ctrl.model.state_tree import StateNode
 
 _AT_TARGET_UM = 0.1  # of the ramp: the pump is probed only then
+# Memory with which the error that the laser's loop left is removed after the hand-over
+_HAND_OVER_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +90,9 @@ class InnerLoopState(StateNode):
     # Of the last automatic tick, and since when it is kept; None after any other tick
     kept_output: LoopOutput | None = None
     kept_s: float = 0.0
+    follows_estimate: bool = False  # the last automatic tick did
+    # Where the loop on the estimate aims, less the setpoint: not 0 just after a hand-over
+    aim_offset_um: float = 0.0
 
 
 class InnerLoop:
@@ -227,6 +232,7 @@ class InnerLoop:
         )
         self.memory.kept_output = output
         self.memory.kept_s = 0.0
+        self.memory.follows_estimate = given.estimate is not None
         return output
 
     def keep_output(self, given: LoopInput, dt_s: float) -> LoopOutput:
@@ -245,6 +251,7 @@ class InnerLoop:
     def _forget_output(self) -> None:
         self.memory.kept_output = None
         self.memory.kept_s = 0.0
+        self.memory.aim_offset_um = 0.0
 
     def _step_on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
         """PI(D) on the filtered reading: its terms, and the ramp's own speed."""
@@ -276,8 +283,25 @@ class InnerLoop:
             self._error_gain_per_s * (shaped_um - estimate.ahead_um)
             + self._due_gain * estimate.due_um_per_s
         )
+        known_um_per_s = estimate.drift_um_per_s + ramp_um_per_s
+        p_um_per_s += self._smooth_hand_over(p_um_per_s + known_um_per_s, dt_s)
         terms = pid.PidTerms(p_um_per_s, self._pid.integral_um_per_s, 0.0)
         return terms, ramp_um_per_s
+
+    def _smooth_hand_over(self, wanted_um_per_s: float, dt_s: float) -> float:
+        """The flow to add so that a hand-over from the laser's loop does not step the flow.
+
+        The loop on the estimate would remove the error that the laser's loop left within a tenth of
+        a second. It aims first at the centre to which the present flow leads, and from there moves
+        to the setpoint.
+        """
+        memory = self.memory
+        if memory.kept_output is not None and not memory.follows_estimate:
+            step_um_per_s = wanted_um_per_s - self._limiter.flow_um_per_s
+            memory.aim_offset_um = -step_um_per_s / self._error_gain_per_s
+        else:
+            memory.aim_offset_um *= 1.0 - filters.lag_step_fraction(dt_s, _HAND_OVER_S)
+        return self._error_gain_per_s * memory.aim_offset_um
 
     def step_without_reading(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """One tick without control: the integrator is frozen and put out, for it is the mean flow.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.control.centre_estimate import CentreEstimate, Sensor, SensorView
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
 
 DT_S = 0.02
@@ -147,6 +149,63 @@ def test_gain_change_is_bumpless_off_the_setpoint() -> None:
     )
     after = inner.step(given_at(0.3, 0.0), DT_S)
     assert after.flow_wanted_um_per_s == pytest.approx(before.flow_wanted_um_per_s, abs=0.05)
+
+
+def estimate_at(ahead_um: float, leak_um_per_s: float = 1.24) -> CentreEstimate:
+    sensors = tuple(SensorView(True, 0.0, 0.25) for _ in Sensor)
+    return CentreEstimate(
+        um=ahead_um,
+        sigma_um=0.05,
+        mount_um=0.0,
+        ahead_um=ahead_um,
+        due_um_per_s=0.0,
+        leak_um_per_s=leak_um_per_s,
+        drift_um_per_s=leak_um_per_s,
+        sensors=sensors,
+    )
+
+
+def step_on_estimate(inner: InnerLoop, estimate: CentreEstimate) -> LoopOutput:
+    given = LoopInput(0.0, 0.0, 0.0, math.nan, math.nan, estimate)
+    return inner.step(given, DT_S)
+
+
+@pytest.mark.parametrize("ahead_um", [-0.05, 0.0, 0.04])
+@pytest.mark.parametrize("leak_um_per_s", [1.0, 1.4])
+def test_the_hand_over_to_the_estimate_is_bumpless(ahead_um: float, leak_um_per_s: float) -> None:
+    """The error that the PI left is removed within two seconds, not in the first tick."""
+    inner, before = settled()
+    estimate = estimate_at(ahead_um, leak_um_per_s)
+    flows = [step_on_estimate(inner, estimate).flow_wanted_um_per_s for _ in range(100)]
+    assert flows[0] == pytest.approx(before.flow_um_per_s, abs=1e-9)
+    assert max(abs(late - early) for early, late in itertools.pairwise(flows)) < 0.1
+    settled_at = InnerLoop(LOOP, PUMP)
+    settled_at.start(0.0, 1.24)
+    assert flows[-1] == pytest.approx(
+        step_on_estimate(settled_at, estimate).flow_wanted_um_per_s, abs=0.05
+    )
+
+
+def test_a_large_error_at_the_hand_over_is_removed_at_once() -> None:
+    inner, _ = settled()
+    flows = [step_on_estimate(inner, estimate_at(5.0)).flow_um_per_s for _ in range(6)]
+    assert flows[-1] == 0.0
+
+
+def test_no_second_hand_over_begins_while_the_estimate_is_followed() -> None:
+    inner, _ = settled()
+    for _ in range(200):
+        step_on_estimate(inner, estimate_at(0.0))
+    quick = step_on_estimate(inner, estimate_at(0.1)).flow_wanted_um_per_s
+    assert quick < 0.0
+
+
+def test_the_laser_takes_over_from_the_estimate_at_the_mean_flow() -> None:
+    inner, _ = settled()
+    for _ in range(50):
+        step_on_estimate(inner, estimate_at(0.02, 1.1))
+    out = inner.step(given_at(0.02), DT_S)
+    assert out.flow_wanted_um_per_s == pytest.approx(1.1, abs=0.05)
 
 
 def test_new_limits_apply_at_once() -> None:
