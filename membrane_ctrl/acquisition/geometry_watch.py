@@ -1,8 +1,13 @@
 """Reports how well the geometry of a run is known, and when it does not fit its cycles."""
 
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 
-from membrane_ctrl.geometry.run_geometry import RunGeometry
+from membrane_ctrl.geometry.change import describe_change
+from membrane_ctrl.geometry.run_geometry import RunGeometry, read_run_geometry
 from membrane_ctrl.metrology.cycle.geometry_monitors import DriftMonitor, RingMonitor, noise_urad
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.rays.bench_motions import describe_hidden_allowance
@@ -13,15 +18,42 @@ from membrane_ctrl.metrology.uncertainty.geometry_statement import (
     GeometryState,
     GeometryStatement,
 )
-from membrane_ctrl.model import acquisition_events, events, shape_estimate
+from membrane_ctrl.model import acquisition_events, errors, events, shape_estimate
+from membrane_ctrl.run_files.run_config import read_config
+from membrane_ctrl.run_files.run_folder import is_run
 
 
-def geometry_event(geometry: RunGeometry) -> acquisition_events.GeometryInUse:
-    """The event that records the geometry."""
+def make_geometry_event(
+    geometry: RunGeometry, run_dir: Path | None
+) -> acquisition_events.GeometryInUse:
+    """The event that records the geometry, and what has changed in it since the run before.
+
+    Parameters
+    ----------
+    geometry : RunGeometry
+    run_dir : Path or None
+        Folder of the run; the run before is beside it.
+    """
     origin = geometry.origin
-    return acquisition_events.GeometryInUse(
+    event = acquisition_events.GeometryInUse(
         origin.hash, origin.file or None, origin.calibrated_utc or None, geometry.note
     )
+    with suppress(OSError, errors.CommandError):  # a damaged run: nothing is stated about it
+        before = None if run_dir is None else _find_run_before(run_dir)
+        if before is not None:
+            former = read_run_geometry(before, read_config(before, []))
+            changed = describe_change(former.optics, geometry.optics)
+            return replace(event, run_before=before.name, changed=changed or None)
+    return event
+
+
+def _find_run_before(run_dir: Path) -> Path | None:
+    """The newest run beside a run that is older; None if it is the first."""
+    older = [path for path in run_dir.parent.iterdir() if path.name < run_dir.name]
+    runs = (
+        path for path in sorted(older, reverse=True) if path.name[:1].isdigit() and is_run(path)
+    )
+    return next(runs, None)
 
 
 class StatementWatch:

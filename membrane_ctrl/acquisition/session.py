@@ -53,7 +53,7 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
     config = spec.config
     clock = WaitingClock(spec.clock)
     geometry = run_geometry.read_run_geometry(spec.run_dir, config)
-    remote.send_event(geometry_watch.geometry_event(geometry))
+    remote.send_event(geometry_watch.make_geometry_event(geometry, spec.run_dir))
     plan = _cycle_plan(config, geometry.optics)
     with ExitStack() as stack:
         # Camera and screen, open, and compiled kernels.

@@ -165,17 +165,21 @@ def read_geometry(path: str | Path) -> GeometryFile:
     return GeometryFile(path, geometry, lens, pitch, calibration, origin, text)
 
 
-def stated_origin(optics: OpticsConfig) -> GeometryOrigin:
-    """Origin of a bench's own stated geometry."""
+def list_numbers(optics: OpticsConfig) -> dict[str, dict[str, Any]]:
+    """The numbers of a geometry, by their tables."""
     lens = {key: getattr(optics.camera, key) for key in ("focal_mm", "distortion")}
-    tables = {
+    return {
         "geometry": optics.geometry.model_dump(
             exclude_none=True, exclude={"reference_displacement_um"}
         ),
         "camera": {**lens, "principal_px": optics.camera.principal},
         "pattern": {"period_mm": optics.pattern.period_mm},
     }
-    return GeometryOrigin(geometry_hash.hash_content(tables))
+
+
+def stated_origin(optics: OpticsConfig) -> GeometryOrigin:
+    """Origin of a bench's own stated geometry."""
+    return GeometryOrigin(geometry_hash.hash_content(list_numbers(optics)))
 
 
 def _optional_table(

@@ -29,15 +29,32 @@ class AcquisitionState(Event, kind="acquisition", sentence="Acquisition {state}[
 class GeometryInUse(
     Event,
     kind="geometry",
-    sentence="Geometry {hash}[ from {file}][, calibrated {calibrated_utc}][; {message}]",
+    sentence="The figures use the geometry of {source}[, calibrated {calibrated_utc}]"
+    "[; {changes}][; {message}]",
     notable=True,
 ):
-    """The geometry that the cycles use."""
+    """The geometry that the cycles use, and what has changed in it since the run before."""
 
     hash: str
     file: str | None
     calibrated_utc: str | None
     message: str
+    run_before: str | None = None
+    changed: str | None = None
+
+    @property
+    def source(self) -> str:
+        """Where it is stated."""
+        return self.file or "the configuration"
+
+    @property
+    def changes(self) -> str:
+        """What has changed; empty without a run before."""
+        if self.run_before is None:
+            return ""
+        if self.changed is None:
+            return f"as in {self.run_before}"
+        return f"changed since {self.run_before}: {self.changed}"
 
 
 class GeometryKnown(

@@ -1,6 +1,8 @@
 """Reads the events of a run; unreadable lines are counted and skipped."""
 
 import errno
+import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from membrane_ctrl.run_files.annotations import ANNOTATIONS_FILE
 
 # Enough for a fault campaign of months; a line is about 150 bytes.
 EVENTS_BYTES_MAX = 64_000_000
+_NEWEST_BYTES = 262_144  # at the end of the file: some thousand events
 _RUN_MAX_S = 1e9  # thirty years
 
 
@@ -45,6 +48,21 @@ def read_events(folder: Path, notes: list[str]) -> tuple[LoggedEvent, ...]:
         notes.append("events.jsonl: missing; states are taken from the telemetry")
     later = _json_lines(folder / ANNOTATIONS_FILE, notes)
     return tuple(sorted(map(parse_logged_line, logged + later), key=lambda each: each.mono_s))
+
+
+def read_newest_lines(folder: Path) -> list[events.EventLine]:
+    """The last lines of a run's events, oldest first; none if they cannot be read.
+
+    At most the last 256 kB are read, so the time does not grow with the run.
+    """
+    with suppress(OSError), files.open_plain(folder / "events.jsonl") as file:
+        skipped = max(0, os.fstat(file.fileno()).st_size - _NEWEST_BYTES)
+        file.seek(skipped)
+        lines = file.read(_NEWEST_BYTES).decode("utf-8", "replace").splitlines()
+        if skipped:  # the first line is a part of one
+            del lines[:1]
+        return [event for event in map(event_of, lines) if event is not None]
+    return []
 
 
 def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:

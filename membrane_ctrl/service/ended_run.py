@@ -18,9 +18,9 @@ from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.event_log import LoggedEvent
 from membrane_ctrl.run_files.run import Run, open_run
 from membrane_ctrl.run_files.table_store.reader import TableReader
+from membrane_ctrl.service.event_lines import SHOWN_MOST, format_event
 
 REPORT_NAME = "report/report.html"  # in a run's folder, as `report` writes it
-_EVENTS_MOST = 200
 _LAST_TICKS_S = 1.0
 _STOP_BEFORE_END_S = 120.0  # a stop that is older ended nothing: the run went on
 _READ_BACK = ("pump_readback_fraction", "vent_readback_fraction", "state")
@@ -196,8 +196,7 @@ def read_ended_run(folder: Path) -> EndedRun:
         vent_fraction=vent,
         read_utc=run.utc(read_s) if math.isfinite(read_s) else None,
         events=tuple(
-            f"{run.utc(each.mono_s):%H:%M:%S} UTC  {each.event.sentence}"
-            for each in run.log[-_EVENTS_MOST:]
+            format_event(run.utc(each.mono_s), each.event) for each in run.log[-SHOWN_MOST:]
         ),
     )
 

@@ -1,4 +1,15 @@
-"""Which lines of a log a viewer has not seen."""
+"""The events of a run as lines for people, and which of them a viewer has not seen."""
+
+from datetime import datetime
+
+from membrane_ctrl.model.event_base import Event
+
+SHOWN_MOST = 200
+
+
+def format_event(utc: datetime, event: Event) -> str:
+    """The line of an event: a run may last for weeks, so it has the date."""
+    return f"{utc:%m-%d %H:%M:%S} UTC  {event.sentence}"
 
 
 def find_new_lines(old: tuple[str, ...], new: tuple[str, ...]) -> tuple[str, ...]:

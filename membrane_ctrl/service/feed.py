@@ -24,20 +24,23 @@ from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.columns import PUBLISHED
+from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.processes import published_rings, ring
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.run_files.event_log import parse_logged_line
+from membrane_ctrl.run_files.event_log import parse_logged_line, read_newest_lines
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.service.ended_run import EndedRun, EndKind, find_newest_run, read_ended_run
+from membrane_ctrl.service.event_lines import SHOWN_MOST, format_event
 from membrane_ctrl.service.hold_command import NO_LIMITS, SendLimits, ask_hold
 from membrane_ctrl.service.hold_seen import HoldSeen, Message
 from membrane_ctrl.service.published_signals import Value, signal_values
+from membrane_ctrl.service.run_events_reader import RunEventsReader
 
 PERIOD_S = 0.5  # as fast as people read changing figures
 SIGNALS = tuple(each.name for each in PUBLISHED)
 _KEPT_S = 3600  # of seconds for the chart; the run's tables have the rest
-_EVENTS_KEPT = 200
+_MARKS_KEPT = 200
 _AGAIN_S = 2.0
 _NO_HOLD = "no hold runs"
 _RECORDING_S = 30.0  # a recorder that lives has written within this time
@@ -91,10 +94,11 @@ class HoldFeed:
         self.seen = HoldSeen("")
         self.seconds = Seconds()
         self.marks: deque[tuple[float, str]] = deque(
-            maxlen=_EVENTS_KEPT
+            maxlen=_MARKS_KEPT
         )  # UTC seconds and text, since `met_s`
         self.met_s = math.inf  # UTC of the present contact's begin
-        self._events: deque[str] = deque(maxlen=_EVENTS_KEPT)
+        self._events: deque[str] = deque(maxlen=SHOWN_MOST)
+        self._log: RunEventsReader | None = None  # of the run's files; None: they are elsewhere
         self._files_read: tuple[Path, int, bool] | None = None  # of the ended run
         self._ending = threading.Event()
         self._client: PortClient | None = None
@@ -213,6 +217,7 @@ class HoldFeed:
         self.marks.clear()  # those made without contact are in the runs' logs only
         self.met_s = time.time()
         rings = self._rings()
+        self._log = self._open_log(rings.get("events"))
         client.patience(10 * PERIOD_S)
         answer = client.ask(do="watch", period_s=PERIOD_S)
         if not answer.get("ok"):
@@ -233,16 +238,24 @@ class HoldFeed:
         if folder is None:
             return {}
         with suppress(OSError, ValueError):
-            return published_rings.attach_rings(folder)
+            return published_rings.attach_rings(folder, whole=("events",))
         return {}
 
+    def _open_log(self, reader: ring.RingReader | None) -> RunEventsReader | None:
+        """The run's events from its beginning, or from as long ago as the viewers see; None without
+        a ring: then the port sends those from now on.
+        """
+        if reader is None or self.folder is None:
+            return None
+        self._events.clear()
+        return RunEventsReader(read_newest_lines(self.folder), reader)
+
     def _take(self, message: Message, greeting: Message, rings: dict[str, ring.RingReader]) -> None:
-        if "event" in message:
-            utc = datetime.now(UTC)
-            event = parse_logged_line(message["event"]).event
-            self._events.append(f"{utc:%H:%M:%S} UTC  {event.sentence}")
-            if isinstance(event, Mark):
-                self.marks.append((utc.timestamp(), event.text))
+        if self._log is not None:
+            for line in self._log.read_new():
+                self._note_event(line)
+        elif "event" in message:
+            self._note_event(message["event"])
         if "status" in message:
             self.seen = replace(
                 self.seen,
@@ -254,6 +267,18 @@ class HoldFeed:
             self._take_ticks(message["status"].get("row") or {}, rings.get("telemetry"))
             self._take_figures(rings.get("shapes"))
         self.seen = replace(self.seen, events=tuple(self._events))
+
+    def _note_event(self, line: EventLine) -> None:
+        """Keep an event for the viewers; one that comes from the port is of this moment."""
+        event = parse_logged_line(line).event
+        try:
+            utc = datetime.fromisoformat(str(line.get("time_utc"))).astimezone(UTC)
+        except (ValueError, OverflowError):
+            utc = datetime.now(UTC)
+        self._events.append(format_event(utc, event))
+        # those before are in the run's files
+        if isinstance(event, Mark) and utc.timestamp() >= self.met_s:
+            self.marks.append((utc.timestamp(), event.text))
 
     def _take_ticks(self, newest: Message, reader: ring.RingReader | None) -> None:
         """Add the ticks since the last status; without a ring, the status's own."""

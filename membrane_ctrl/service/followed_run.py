@@ -23,6 +23,7 @@ from membrane_ctrl.model.run_events import ENDS_WITHOUT_CONTROL, Ended
 from membrane_ctrl.processes import published_rings, ring
 from membrane_ctrl.run_files.event_log import read_events
 from membrane_ctrl.run_files.run_config import read_config
+from membrane_ctrl.service.run_events_reader import RunEventsReader
 
 _LOOKS_WITHOUT_CONTROL = 2  # see `is_control_alive`
 _NEWS_AGE_MAX_S = 86_400.0  # an older end is no news
@@ -58,8 +59,8 @@ class FollowedRun:
         self._rings: dict[str, ring.RingReader] = {}
         with suppress(OSError, ValueError):
             self._rings = published_rings.attach_rings(folder, whole=("events",))
-        self._past = [_without_control(each.line) for each in read_events(folder, [])]
-        self._known = {_identity(line) for line in self._past}
+        recorded = [_without_control(each.line) for each in read_events(folder, [])]
+        self._events = RunEventsReader(recorded, self._rings.get("events"))
 
     @property
     def is_done(self) -> bool:
@@ -69,13 +70,7 @@ class FollowedRun:
     def step(self) -> None:
         """Take what is new, and send what is due."""
         self._look_for_control()  # before the rings: it has written its last message first
-        events = [json.dumps(line).encode() for line in self._past]
-        self._past = []
-        events += [
-            message
-            for message in _drain(self._rings.get("events"))
-            if _identity(event_lines.parse_event(message)) not in self._known
-        ]
+        events = [json.dumps(line).encode() for line in self._events.read_new()]
         rows = _drain(self._rings.get("telemetry"))
         if rows:
             self._seconds.note_tick(telemetry.TelemetryRow.unpack(rows[-1]).mono_s)
@@ -163,11 +158,6 @@ def _without_control(line: EventLine) -> EventLine:
     event = event_lines.from_dict(line)
     is_end = isinstance(event, Ended) and event.exit in ENDS_WITHOUT_CONTROL
     return {} if is_end else line
-
-
-def _identity(line: EventLine) -> tuple[object, ...]:
-    """Return what an event has in the file and in the ring."""
-    return tuple(sorted((key, repr(value)) for key, value in line.items()))
 
 
 def _drain(reader: ring.RingReader | None) -> list[bytes]:

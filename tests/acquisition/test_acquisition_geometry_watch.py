@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.geometry_watch import GeometryWatch, geometry_event
-from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.acquisition.geometry_watch import GeometryWatch, make_geometry_event
+from membrane_ctrl.config.schema import Config, OpticsConfig
 from membrane_ctrl.geometry.file import CalibrationTable, stated_origin
-from membrane_ctrl.geometry.run_geometry import RunGeometry
+from membrane_ctrl.geometry.run_geometry import RunGeometry, read_run_geometry
 from membrane_ctrl.metrology.cycle.geometry_monitors import CYCLES, ring_um
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+from membrane_ctrl.run_files.run_folder import create_run_folder
 
 OPTICS = OpticsConfig()
 CYCLE = ShapeEstimate(
@@ -98,7 +101,7 @@ def test_rejected_cycles_and_stated_geometries_say_nothing() -> None:
 
 
 def test_the_record_names_the_geometry() -> None:
-    event = geometry_event(in_force())
+    event = make_geometry_event(in_force(), None)
     assert event.to_dict() == {
         "kind": "geometry",
         "hash": stated_origin(OPTICS).hash,
@@ -106,3 +109,44 @@ def test_the_record_names_the_geometry() -> None:
         "calibrated_utc": None,
         "message": "",
     }
+
+
+def _make_run(logs: Path, minute: int, optics: OpticsConfig) -> Path:
+    began_utc = datetime(2026, 1, 2, 3, minute, tzinfo=UTC)
+    folder = create_run_folder(logs, "lab", began_utc, Config(optics=optics))
+    (folder / "events.jsonl").write_text("")
+    return folder
+
+
+def test_the_event_states_what_has_changed_since_the_run_before(tmp_path: Path) -> None:
+    moved = OPTICS.geometry.model_copy(update={"a_mm": 2675.5, "a_sigma_mm": 2.0})
+    lens = OPTICS.camera.model_copy(update={"principal_px": (1200.0, 1000.0)})
+    benches = (
+        OPTICS,
+        OPTICS,
+        OPTICS.model_copy(update={"geometry": moved, "camera": lens}),
+        OPTICS,
+    )
+    said = []
+    for minute, optics in enumerate(benches):
+        folder = _make_run(tmp_path, minute, optics)
+        (tmp_path / ".remains").mkdir(exist_ok=True)
+        geometry = read_run_geometry(folder, Config(optics=optics))
+        said.append(make_geometry_event(geometry, folder).sentence)
+    place = "The figures use the geometry of the configuration"
+    assert said[0] == place, "there is no run before"
+    assert said[1] == f"{place}; as in 20260102T030000Z-lab"
+    assert said[2] == (
+        f"{place}; changed since 20260102T030100Z-lab: geometry.a_mm from 2672 to 2675.5, "
+        "geometry.a_sigma_mm from none to 2, camera.principal_px from (1223.5, 1023.5) to "
+        "(1200, 1000)"
+    )
+    assert "from 2675.5 to 2672" in said[3]
+
+
+def test_a_damaged_run_before_is_no_error(tmp_path: Path) -> None:
+    before = _make_run(tmp_path, 0, OPTICS)
+    (before / "geometry.toml").write_text("not a geometry")
+    folder = _make_run(tmp_path, 1, OPTICS)
+    event = make_geometry_event(in_force(), folder)
+    assert (event.run_before, event.changed) == (None, None)

@@ -6,7 +6,10 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import json
 from collections.abc import Callable
+from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -16,7 +19,10 @@ from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.protocol import encode, parse
 from membrane_ctrl.control_port.status_lines import alarm_lines
 from membrane_ctrl.controller.commands import TABLE
+from membrane_ctrl.model.event_base import Event
 from membrane_ctrl.model.run_events import Mark
+from membrane_ctrl.processes.published_rings import publish_rings
+from membrane_ctrl.processes.ring import RingWriter, open_ring
 from membrane_ctrl.service.access import (
     ACTIONS,
     STOP,
@@ -69,6 +75,54 @@ async def test_a_hold_is_followed_asked_and_found_again(tmp_path: Path) -> None:
     finally:
         await asyncio.to_thread(feed.close)
     assert not feed._thread.is_alive()
+
+
+def _line_of(at_s: int, event: Event) -> dict[str, object]:
+    moment = datetime(2026, 1, 2, tzinfo=UTC) + timedelta(seconds=at_s)
+    return {"time_utc": moment.isoformat(), "mono_s": float(at_s), **event.to_dict()}
+
+
+async def test_a_service_that_starts_during_a_run_shows_its_events_each_once(
+    tmp_path: Path,
+) -> None:
+    """The file is longer than what is read of it, and its end is in the ring, too."""
+    folder = tmp_path / "the-run"
+    folder.mkdir()
+    past = [_line_of(at_s, Mark(f"mark {at_s} {'x' * 200}", "anna")) for at_s in range(2000)]
+    in_file, in_ring = past[:-2], past[-6:]
+    (folder / "events.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in in_file))
+    feed = HoldFeed(Where(logs=tmp_path))
+    with ExitStack() as stack:
+        address = stack.enter_context(open_ring(64, 4096))
+        publish_rings(folder, {"events": address}, stack)
+        writer = RingWriter(address)
+        stack.callback(writer.close)
+        for line in in_ring:
+            writer.put(json.dumps(line).encode())
+        async with port_run(tmp_path) as run:
+            feed.open()
+            try:
+                await until(lambda: not feed.seen.silent)
+                lines = feed.seen.events
+                assert [int(line.split("mark ")[1].split()[0]) for line in lines] == [
+                    *range(1800, 2000)
+                ]
+                assert lines[-1].startswith("01-02 00:33:19 UTC  "), "of the event, not of now"
+                assert not feed.marks, "marks before the contact are read from the runs"
+                # a hold sends each event to the ring and to the port
+                new = Mark("door opened", "anna")
+                moment = {"time_utc": datetime.now(UTC).isoformat(), "mono_s": 2000.0}
+                writer.put(json.dumps(moment | new.to_dict()).encode())
+                run.port.note_report(new)
+                await until(lambda: "door opened" in feed.seen.events[-1])
+                run.port.note_report(Mark("on the port alone", "anna"))
+                run.tick()
+                status = feed.seen.status
+                await until(lambda: feed.seen.status is not status)
+                assert sum("door opened" in line for line in feed.seen.events) == 1
+                assert [text for _, text in feed.marks] == ["door opened"]
+            finally:
+                await asyncio.to_thread(feed.close)
 
 
 async def test_a_command_for_the_last_run_does_not_reach_the_next(tmp_path: Path) -> None:
