@@ -43,6 +43,17 @@ _MEDIAN_STEP = 0.954  # median of the difference of two readings, in units of th
 # All changes of speed are measured from that with everything off. With 1 µm of noise it has
 # 0.4 µm/s after the part's measuring time; a noisier laser takes longer.
 _OFF_SIGMA_MOST_UM_PER_S = 0.6
+# A speed is measured over all readings after a part's waiting time, but at most over so many
+# seconds: noise averages out, and the beginning of a slow response is left behind.
+_VENT_WINDOW_MOST_S = 2.0
+_PUMP_WINDOW_MOST_S = 2.5
+_SWITCH_SHARE = 0.5
+_SWITCH_RANGE_S = (1.0, 2.0)
+# Readings count from here on: until then the vent may still be closing.
+_VENT_CLOSED_S = 1.0
+# Dead time and lag together are known well enough at this standard deviation, or share of them.
+_RESPONSE_SIGMA_S = 0.08
+_RESPONSE_SIGMA_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,20 +89,9 @@ PARTS = (
     Part("vent", 0.0, 0.08, 0.35, 0.5, 3.0),
     Part("pump", 0.8, 0.0, 0.5, 1.0, 5.0),
 )
-# A speed is measured over all readings after a part's waiting time, but at most over so many
-# seconds: noise averages out, and the beginning of a slow response is left behind.
-_VENT_WINDOW_MOST_S = 2.0
-_PUMP_WINDOW_MOST_S = 2.5
 
 # Identification: the pump is off, then on for a share of the time after which it had responded
 RESPONSE = Part("response", 0.8, 0.0, 0.0, 0.0, 0.0)
-_SWITCH_SHARE = 0.5
-_SWITCH_RANGE_S = (1.0, 2.0)
-# Readings count from here on: until then the vent may still be closing.
-_VENT_CLOSED_S = 1.0
-# Dead time and lag together are known well enough at this standard deviation, or share of them.
-_RESPONSE_SIGMA_S = 0.08
-_RESPONSE_SIGMA_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)

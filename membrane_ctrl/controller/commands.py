@@ -59,6 +59,8 @@ _HOLD, _PARKED, _FLOW = (
     {State.STANDBY, State.MANUAL, State.TUNE},
     {State.SETTLE, State.HOLD, State.MANUAL},
 )
+# Allowed in a run that only observes
+_OBSERVING: frozenset[Kind] = frozenset({"mark", "stop", "latch", "unlock"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,10 +143,6 @@ TABLE: dict[Kind, CommandRule] = {
         "operate", ANY, "Remove your lock, or another person's by typing its word.", takes=("text",)
     ),
 }
-
-
-# Allowed in a run that only observes
-_OBSERVING: frozenset[Kind] = frozenset({"mark", "stop", "latch", "unlock"})
 
 
 def sort_commands(commands: Iterable[Command]) -> list[Command]:

@@ -44,6 +44,19 @@ _MARKS_KEPT = 200
 _AGAIN_S = 2.0
 _NO_HOLD = "no hold runs"
 _RECORDING_S = 30.0  # a recorder that lives has written within this time
+SPANS_S = {
+    ("1 min"): 60.0,
+    ("10 min"): 600.0,
+    ("1 h"): 3600.0,
+    ("8 h"): 28_800.0,
+    ("1 day"): 86_400.0,
+    ("1 week"): 604_800.0,
+    "1 month": 2_678_400.0,
+}
+_LIVE_S = 3600.0  # the feed remembers this much; a longer span is read from the tables
+_POINTS_MAX = 1200  # as many as a wide screen shows
+_LISTED_S = 10.0  # the runs of a folder are listed again so often
+_GAP = 3.0  # windows without data interrupt the line
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,21 +325,6 @@ def _is_over(run: EndedRun) -> bool:
 
 def _number(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
-
-
-SPANS_S = {
-    ("1 min"): 60.0,
-    ("10 min"): 600.0,
-    ("1 h"): 3600.0,
-    ("8 h"): 28_800.0,
-    ("1 day"): 86_400.0,
-    ("1 week"): 604_800.0,
-    "1 month": 2_678_400.0,
-}
-_LIVE_S = 3600.0  # the feed remembers this much; a longer span is read from the tables
-_POINTS_MAX = 1200  # as many as a wide screen shows
-_LISTED_S = 10.0  # the runs of a folder are listed again so often
-_GAP = 3.0  # windows without data interrupt the line
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from membrane_ctrl.model.notices import Topic
 from membrane_ctrl.service.hold_seen import HoldSeen
 
 Value = float | str | None  # None: not known
+_TERMS = range(4, 12)  # Noll: defocus to the first spherical term
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,6 @@ class Published:
 
 
 _TICK = tuple(Published(each.name, each.description) for each in PUBLISHED)
-_TERMS = range(4, 12)  # Noll: defocus to the first spherical term
 _FIGURE = (
     Published("sag_um", "sag of the newest figure"),
     Published("sag_change_sigma_um", "standard deviation of its changes"),

@@ -16,6 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+_SAFETY = frozenset({"stop", "vent", "lower", "latch"})
 
 
 class PoolFullError(RuntimeError):
@@ -85,8 +86,6 @@ GAINS = WorkPool("curves of gains", workers=2, waiting_max=20, niceness=5)
 CONFIGURATIONS = WorkPool("configurations", workers=1, waiting_max=8, niceness=5)
 COMMANDS = WorkPool("commands", workers=4, waiting_max=32)
 SAFETY_COMMANDS = WorkPool("safety commands", workers=8, waiting_max=32)
-
-_SAFETY = frozenset({"stop", "vent", "lower", "latch"})
 
 
 def pool_of_command(do: str) -> WorkPool:

@@ -29,6 +29,12 @@ _FILES = frozenset(
         "ca_file",
     }
 )
+token_app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Tokens for programs, which send them as `Authorization: Bearer TOKEN`.",
+)
+app.add_typer(token_app, name="token")
 
 
 @app.callback()
@@ -169,14 +175,6 @@ def add_user(
         files.write_text_atomic(file, "".join(f"{each.line()}\n" for each in found.values()))
         file.chmod(0o600)
     print(f"{file}: {len(found)} users", file=sys.stderr)
-
-
-token_app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    help="Tokens for programs, which send them as `Authorization: Bearer TOKEN`.",
-)
-app.add_typer(token_app, name="token")
 
 
 @token_app.command("add")

@@ -14,6 +14,11 @@ from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.review.formatting import format_span
 from membrane_ctrl.service.access import ActionButton
 
+_MOVES_GAS = frozenset(
+    {"hold", "pause", "resume", "setpoint", "manual", "shape_on", "shape_off", "ack", "unlock"}
+)
+_COSTS_HOURS = frozenset({"lower", "vent", "latch", "stop"})
+
 
 class Consequence(Enum):
     """What a command does to the mirror; the value is the heading of its buttons."""
@@ -21,12 +26,6 @@ class Consequence(Enum):
     NOTHING = "leaves the mirror as it is"
     MOVES_GAS = "moves gas"
     COSTS_HOURS = "costs hours: the mirror goes down"
-
-
-_MOVES_GAS = frozenset(
-    {"hold", "pause", "resume", "setpoint", "manual", "shape_on", "shape_off", "ack", "unlock"}
-)
-_COSTS_HOURS = frozenset({"lower", "vent", "latch", "stop"})
 
 
 def find_consequence(action: ActionButton) -> Consequence:

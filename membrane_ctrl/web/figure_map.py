@@ -35,6 +35,7 @@ REMOVABLE = {
 _STEPS = 1000  # of the colour scale: finer than a screen shows
 _COLOURS = 64
 _LEAST_SCALE_UM = 1e-6
+_BESIDE = {"nameLocation": "middle", "nameGap": 40}  # of the name of an axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,9 +119,6 @@ def _list_colours() -> list[str]:
     from matplotlib.colors import to_hex
 
     return [to_hex(colormaps[DIVERGING_MAP](share)) for share in np.linspace(0.0, 1.0, _COLOURS)]
-
-
-_BESIDE = {"nameLocation": "middle", "nameGap": 40}  # of the name of an axis
 
 
 def make_terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[str, Any]:
