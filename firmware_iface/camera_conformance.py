@@ -19,6 +19,7 @@ from firmware_iface.requirement import overrides, require, require_error, requir
 
 _STEP_S = 1e-4  # that a reading of the clock takes: no two moments are the same
 _REPEATS = 3
+Check = Callable[["CameraBench"], None]
 
 
 class VirtualTime:
@@ -96,12 +97,23 @@ class CameraBench:
         return self.scene
 
 
-Check = Callable[[CameraBench], None]
-
-
 def list_checks(bench: type[CameraBench]) -> list[Check]:
     """List the checks for which a bench can bring about the faults."""
-    return [check for check, faults in _CHECKS.items() if overrides(bench, CameraBench, faults)]
+    faults_of: dict[Check, tuple[str, ...]] = {
+        check_identity: (),
+        check_pictures: (),
+        check_given_array_is_not_kept: (),
+        check_time_stamps: (),
+        check_screen_may_change_after_exposure: (),
+        check_abandoned_exposure: (),
+        check_lost_frame: ("lose_frame",),
+        check_late_frame: ("delay_frame",),
+        check_frozen_camera: ("freeze",),
+        check_unplugged: ("unplug", "plug_in"),
+        check_other_sensor: (),
+        check_closing: (),
+    }
+    return [check for check, faults in faults_of.items() if overrides(bench, CameraBench, faults)]
 
 
 def check_identity(bench: CameraBench) -> None:
@@ -262,22 +274,6 @@ def check_closing(bench: CameraBench) -> None:
             scene = bench.change_scene()
             _require_picture(camera.grab(), scene, "a frame after the camera was closed and opened")
             camera.close()
-
-
-_CHECKS: dict[Check, tuple[str, ...]] = {
-    check_identity: (),
-    check_pictures: (),
-    check_given_array_is_not_kept: (),
-    check_time_stamps: (),
-    check_screen_may_change_after_exposure: (),
-    check_abandoned_exposure: (),
-    check_lost_frame: ("lose_frame",),
-    check_late_frame: ("delay_frame",),
-    check_frozen_camera: ("freeze",),
-    check_unplugged: ("unplug", "plug_in"),
-    check_other_sensor: (),
-    check_closing: (),
-}
 
 
 @contextmanager

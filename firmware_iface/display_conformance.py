@@ -16,6 +16,7 @@ from firmware_iface.requirement import overrides, require, require_error, requir
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 
 _REPEATS = 3
+Check = Callable[["DisplayBench"], None]
 
 
 class DisplayBench:
@@ -57,12 +58,17 @@ class DisplayBench:
         return self._random.integers(0, 256, (self.height_px, self.width_px)).astype(np.uint8)
 
 
-Check = Callable[[DisplayBench], None]
-
-
 def list_checks(bench: type[DisplayBench]) -> list[Check]:
     """List the checks for which a bench can bring about the faults."""
-    return [check for check, faults in _CHECKS.items() if overrides(bench, DisplayBench, faults)]
+    faults_of: dict[Check, tuple[str, ...]] = {
+        check_identity: (),
+        check_pictures: (),
+        check_prepared_pictures: (),
+        check_unplugged: ("unplug", "plug_in"),
+        check_other_size: (),
+        check_closing: (),
+    }
+    return [check for check, faults in faults_of.items() if overrides(bench, DisplayBench, faults)]
 
 
 def check_identity(bench: DisplayBench) -> None:
@@ -139,16 +145,6 @@ def check_closing(bench: DisplayBench) -> None:
             _require_lit(bench, picture, "a picture after the display was closed and opened")
             display.close()
             display.close()
-
-
-_CHECKS: dict[Check, tuple[str, ...]] = {
-    check_identity: (),
-    check_pictures: (),
-    check_prepared_pictures: (),
-    check_unplugged: ("unplug", "plug_in"),
-    check_other_size: (),
-    check_closing: (),
-}
 
 
 @contextmanager

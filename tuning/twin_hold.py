@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.virtual_run import ShapeSource, TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import shape_estimate, telemetry

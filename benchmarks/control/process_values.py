@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.tuning.benches import drawn
 from membrane_ctrl.config.schema import Config, EstimatorConfig, ShapeConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import ProcessValueChosen

@@ -17,7 +17,7 @@ from contextlib import ExitStack
 import numpy as np
 
 from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, TwinConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick_codec import SNAPSHOT_MESSAGE_BYTES, pack_snapshot

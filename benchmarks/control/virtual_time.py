@@ -41,7 +41,7 @@ def _hold(shape: bool) -> None:
         for _ in run_virtual(config, plant, VIRTUAL_S, zernike_projection()):
             pass
         return
-    from membrane_ctrl.controller.commands import Command
+    from membrane_ctrl.controller.command import Command
 
     bench = VirtualBench(plant)
     run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, 1))

@@ -7,23 +7,12 @@ Only an installed package is ever executed, and only when a configuration names 
 configuration, run folder or working folder can name a file.
 """
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+from firmware_iface.driver_kind import DriverKind
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
-
-
-@dataclass(frozen=True, slots=True)
-class DriverKind:
-    """A kind of driver: its name for people, its entry point groups, and the drivers of this
-    package in the first.
-    """
-
-    name: str
-    group: str
-    emulators: str
-    built_in: dict[str, str]  # name and object of an entry point
 
 
 INSTRUMENTS = DriverKind(

@@ -7,9 +7,10 @@ parameters), 9.17.023 (meaning of parameters).
 
 import contextlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
+from firmware_iface.drivers.bronkhorst_parameter import InstrumentParameter
 from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
 FULL_SCALE = 32_000  # of measure and setpoint: 100 %
@@ -31,19 +32,6 @@ _GAUGE_UNITS_PA = {
     "Pa(g)": 1.0,
     "Pa(d)": 1.0,
 }
-
-
-@dataclass(frozen=True, slots=True)
-class InstrumentParameter:
-    """One value of an instrument; `kind` is "u8", "u16", "f32" or "text", `chars` the length of a
-    text.
-    """
-
-    name: str
-    process: int
-    number: int
-    kind: str
-    chars: int = 0
 
 
 MEASURE = InstrumentParameter("measure", 1, 0, "u16")

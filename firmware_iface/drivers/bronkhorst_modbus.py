@@ -2,7 +2,7 @@
 
 import struct
 
-from firmware_iface.drivers.bronkhorst import InstrumentParameter
+from firmware_iface.drivers.bronkhorst_parameter import InstrumentParameter
 from firmware_iface.links.modbus_link import ModbusLink
 from firmware_iface.roles import DeviceRefusedError
 

@@ -12,7 +12,8 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from firmware_iface.drivers.bronkhorst import MEASURE, InstrumentParameter
+from firmware_iface.drivers.bronkhorst import MEASURE
+from firmware_iface.drivers.bronkhorst_parameter import InstrumentParameter
 from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceRefusedError, LinkError
 

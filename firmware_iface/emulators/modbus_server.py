@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of what follows, unit
 _LENGTH_MAX = 254  # unit + the longest PDU of 253 bytes
+Handler = Callable[[int, bytes], "Answer"]
+"""Unit and request PDU to answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +25,6 @@ class Answer:
     delay_s: float = 0.0
     hang_up: bool = False  # the connection is dropped instead
     transaction_offset: int = 0  # added to the transaction id; other than 0 it is a wrong answer
-
-
-Handler = Callable[[int, bytes], Answer]
-"""Unit and request PDU to answer."""
 
 
 class ModbusTcpServer:

@@ -9,7 +9,12 @@ import re
 import struct
 from collections.abc import Callable, Sequence
 
-from firmware_iface.drivers import bronkhorst, bronkhorst_modbus, bronkhorst_propar
+from firmware_iface.drivers import (
+    bronkhorst,
+    bronkhorst_modbus,
+    bronkhorst_parameter,
+    bronkhorst_propar,
+)
 from firmware_iface.emulators import modbus_pdu, serial_device
 from firmware_iface.emulators.serial_device import Drive, LineDevice, Transmit
 from firmware_iface.links.serial_port import SerialSettings
@@ -168,13 +173,13 @@ class Instrument:
         if self._actuate is not None:
             self._actuate(self.fraction)
 
-    def raw(self, parameter: bronkhorst.InstrumentParameter) -> bytes:
+    def raw(self, parameter: bronkhorst_parameter.InstrumentParameter) -> bytes:
         """A parameter as bytes, big end first; a text has its full length."""
         if parameter.kind == "text":
             return self._texts[parameter].encode().ljust(parameter.chars, b"\0")[: parameter.chars]
         return struct.pack(_FORMATS[parameter.kind], self._read_parameter(parameter))
 
-    def _read_parameter(self, parameter: bronkhorst.InstrumentParameter) -> float:
+    def _read_parameter(self, parameter: bronkhorst_parameter.InstrumentParameter) -> float:
         if parameter in self._settings:
             return self._settings[parameter]
         if self._measured is None:
@@ -192,7 +197,7 @@ class Instrument:
             bronkhorst.TEMPERATURE: 20.0,
         }[parameter]
 
-    def write(self, parameter: bronkhorst.InstrumentParameter, raw: bytes) -> bool:
+    def write(self, parameter: bronkhorst_parameter.InstrumentParameter, raw: bytes) -> bool:
         """Take a setting; False when the value is impossible."""
         if parameter == bronkhorst.FSETPOINT:
             parameter = bronkhorst.SETPOINT

@@ -11,6 +11,7 @@ protocol 1.1b3.
 
 import struct
 from collections.abc import Sequence
+from functools import cache
 from urllib.parse import parse_qsl, urlsplit
 
 from firmware_iface.links import exchange, modbus_link, modbus_tcp, serial_port
@@ -30,22 +31,26 @@ def compute_crc16(data: bytes) -> int:
     """The CRC of Modbus: polynomial 0xA001 (reflected 0x8005), start 0xFFFF;
     sent low byte first.
     """
+    table = _make_crc_table()
     crc = 0xFFFF
     for byte in data:
-        crc = (crc >> 8) ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
+        crc = (crc >> 8) ^ table[(crc ^ byte) & 0xFF]
     return crc
 
 
-def _table_entry(index: int) -> int:
+@cache
+def _make_crc_table() -> tuple[int, ...]:
+    """Return the CRC of each byte alone, so that a frame needs one step a byte."""
+    return tuple(_make_crc_entry(index) for index in range(256))
+
+
+def _make_crc_entry(index: int) -> int:
     for _ in range(8):
         lowest_bit = index & 1
         index >>= 1
         if lowest_bit:
             index ^= 0xA001
     return index
-
-
-_CRC_TABLE = tuple(_table_entry(index) for index in range(256))
 
 
 def rtu_frame(unit_id: int, pdu: bytes) -> bytes:

@@ -12,18 +12,14 @@ from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.protocol import TEXT_BYTES
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.sender import role_includes
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model.numbers import parse_number
-from membrane_ctrl.service.access import (
-    ACTIONS,
-    STOP,
-    ActionButton,
-    WebUser,
-    is_action_allowed,
-    request,
-)
+from membrane_ctrl.service.access import ACTIONS, STOP, is_action_allowed, request
+from membrane_ctrl.service.action_button import ActionButton
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.service.published_signals import SIGNAL_TABLE, Published, Value
+from membrane_ctrl.service.published_signal import Published
+from membrane_ctrl.service.published_signals import SIGNAL_TABLE, Value
+from membrane_ctrl.service.web_user import WebUser
 
 # Who removes a lock must be known; the clients of a bridge are not.
 _NEVER = frozenset({"unlock"})

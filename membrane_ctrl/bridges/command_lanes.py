@@ -25,7 +25,8 @@ from typing import Any
 from membrane_ctrl.control_port.fair_queue import FairQueue
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import is_safety_command
-from membrane_ctrl.service.hold_command import NO_LIMITS, SendLimits
+from membrane_ctrl.service.hold_command import NO_LIMITS
+from membrane_ctrl.service.send_limits import SendLimits
 
 ORDINARY_MOST = 8  # commands that wait
 SAFETY_MOST_EACH = 4  # different safety commands of one kind that wait

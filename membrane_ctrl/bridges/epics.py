@@ -19,8 +19,9 @@ from membrane_ctrl.bridges.epics_search import require_unserved
 from membrane_ctrl.config.bridges import EpicsConfig
 from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.service.access import ActionButton
-from membrane_ctrl.service.published_signals import Published, Value
+from membrane_ctrl.service.action_button import ActionButton
+from membrane_ctrl.service.published_signal import Published
+from membrane_ctrl.service.published_signals import Value
 
 # Clients may write the value of a command (level 0) only. EPICS by itself lets them write
 # everything, and the other fields (FLNK, SCAN, ASG) would send commands in chains, again and again,

@@ -35,7 +35,7 @@ from membrane_ctrl.config.bridges import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY, is_safety_command
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.columns import QUANTITY_OF_UNIT
-from membrane_ctrl.service.published_signals import Published
+from membrane_ctrl.service.published_signal import Published
 
 _LEAVES_S = 2.0
 _ANSWER_S = 5.0  # of the broker to each message

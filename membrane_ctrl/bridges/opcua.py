@@ -19,8 +19,8 @@ from membrane_ctrl.bridges.bridge import TABLE, Bridge
 from membrane_ctrl.bridges.opcua_server import AnonymousClients, BridgeServer, NamedClients, caller
 from membrane_ctrl.config.bridges import OpcuaConfig
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.service.access import ActionButton
 from membrane_ctrl.service.accounts import KnownUser, known_users
+from membrane_ctrl.service.action_button import ActionButton
 from membrane_ctrl.service.published_signals import Value
 
 _UNITS = "http://www.opcfoundation.org/UA/units/un/cefact"

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from membrane_ctrl.calibration.setpoints import SETTLE_S, HeldMirror
 from membrane_ctrl.config.schema import LimitsConfig
-from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.controller.command import Command, Kind
 from membrane_ctrl.model import acquisition_events, errors, events, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
 

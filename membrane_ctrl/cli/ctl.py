@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
-from membrane_ctrl.cli.options import JsonOption
+from membrane_ctrl.cli.action_first import ActionFirst
+from membrane_ctrl.cli.options import JsonOption, parse_number_argument
 from membrane_ctrl.model import durations
-from membrane_ctrl.model.numbers import parse_number
 
 WhyOption = Annotated[str, typer.Option(help="Reason, recorded with the command.")]
 TakeOverOption = Annotated[
@@ -64,40 +63,13 @@ TrialOption = Annotated[
 EveryOption = Annotated[str, typer.Option(help="Interval between lines, e.g. 0.5s.")]
 
 
-def _parse_number(text: str) -> float:
-    try:
-        return parse_number(text)
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
-
-
 SetpointArgument = Annotated[
-    float, typer.Argument(metavar="UM", help="Setpoint, µm.", parser=_parse_number)
+    float, typer.Argument(metavar="UM", help="Setpoint, µm.", parser=parse_number_argument)
 ]
 FlowArgument = Annotated[
-    float, typer.Argument(metavar="FLOW", help="Flow, µm/s of the centre.", parser=_parse_number)
+    float,
+    typer.Argument(metavar="FLOW", help="Flow, µm/s of the centre.", parser=parse_number_argument),
 ]
-
-
-def _has_value_next(word: str) -> bool:
-    return word.startswith("--") and "=" not in word and word not in ("--json", "--take-over")
-
-
-class ActionFirst(TyperGroup):
-    """Accept options before the action, too."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Move the action to the front; an option's value does not count as one."""
-        words = zip(["", *args], args, strict=False)
-        at = next(
-            (
-                n
-                for n, (last, word) in enumerate(words)
-                if word in self.commands and not _has_value_next(last)
-            ),
-            0,
-        )
-        return super().parse_args(ctx, [*args[at : at + 1], *args[:at], *args[at + 1 :]])
 
 
 ctl_app = typer.Typer(
@@ -203,17 +175,6 @@ def _watch(every: EveryOption = "1s") -> dict[str, Any]:
     return {"period_s": durations.parse_duration_s(every)}
 
 
-_OWN: dict[str, Callable[..., dict[str, Any]]] = {
-    "setpoint": _setpoint,
-    "manual": _manual,
-    "gains": _gains,
-    "capture": _capture,
-    "mark": _mark,
-    "latch": _latch,
-    "unlock": _unlock,
-}
-
-
 def _fleet(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="TOML file with a table [[holds]] for each.")
@@ -232,15 +193,24 @@ def add_actions() -> None:
 
     if ctl_app.registered_commands:
         return
+    own_arguments: dict[str, Callable[..., dict[str, Any]]] = {
+        "setpoint": _setpoint,
+        "manual": _manual,
+        "gains": _gains,
+        "capture": _capture,
+        "mark": _mark,
+        "latch": _latch,
+        "unlock": _unlock,
+    }
     _add_command("status", "Show the status once.", _plain)
     ctl_app.command("fleet")(_fleet)
     _add_command("watch", "Print a status line repeatedly until the run ends.", _watch)
     for kind, rule in TABLE.items():
         # `tune` is a separate command
-        if kind in _OWN or not (rule.needs or kind.startswith("shape_")):
-            _add_command(kind, rule.does, _OWN.get(kind, _plain))
+        if kind in own_arguments or not (rule.needs or kind.startswith("shape_")):
+            _add_command(kind, rule.does, own_arguments.get(kind, _plain))
     for name, kind in SAME_AS.items():
-        _add_command(name, TABLE[kind].does, _OWN.get(kind, _plain))
+        _add_command(name, TABLE[kind].does, own_arguments.get(kind, _plain))
     _add_command("shape", "Switch the shape loop on or off.", _shape)
     _add_command("quiet", "Acknowledge the alarms: no reminders, no escalation.", _plain)
     _add_command("release", "Release command, so that someone else may take it.", _plain)

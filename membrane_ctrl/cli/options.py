@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from membrane_ctrl.cli.completion import complete_run
+from membrane_ctrl.model.numbers import parse_number
 
 if TYPE_CHECKING:  # loading the configuration's tables takes longer than all commands' help
     from membrane_ctrl.config.schema import Config
@@ -52,3 +53,11 @@ def load_configuration(path: Path | None) -> "Config":
     from membrane_ctrl.config.configuration_file import load_configuration
 
     return load_configuration(path)
+
+
+def parse_number_argument(text: str) -> float:
+    """Return the number of an argument; typer reports what is wrong with it."""
+    try:
+        return parse_number(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.locks import decide_unlock
 from membrane_ctrl.instruments import device_claim, lock_store
 from membrane_ctrl.model import files

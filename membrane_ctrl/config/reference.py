@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
-from firmware_iface import drivers
+from firmware_iface import driver_kind, drivers
 from firmware_iface.roles import ROLES
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import suggest_word
@@ -241,7 +241,7 @@ def _of_other_packages(word: str) -> list[TableHelp]:
     return found
 
 
-def _places_of_driver(driver: Any, kind: drivers.DriverKind) -> list[str]:
+def _places_of_driver(driver: Any, kind: driver_kind.DriverKind) -> list[str]:
     """Return the tables in which a driver may be named."""
     if kind is drivers.CAMERAS:
         return ["devices.camera"]

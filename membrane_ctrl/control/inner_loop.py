@@ -64,9 +64,6 @@ class LoopOutput(StateNode):
     too_tight: bool = False  # the mirror loses too little gas to be held within the band
 
 
-NO_OUTPUT = LoopOutput()  # for a tick in which the loop did not run
-
-
 @dataclass(slots=True)
 class InnerLoopState(StateNode):
     """What the loop remembers from tick to tick."""

@@ -28,13 +28,12 @@ MEASURED = slice(1, None)  # all but piston, which is set by the surface being 0
 
 @dataclass(frozen=True, slots=True)
 class SagChange(StateNode):
-    """Change of sag in µm, positive when the bowl deepens, and its standard deviation."""
+    """Change of sag in µm, positive when the bowl deepens, and its standard deviation; NaN without
+    one.
+    """
 
-    change_um: float
-    sigma_um: float
-
-
-NO_CHANGE = SagChange(math.nan, math.nan)
+    change_um: float = math.nan
+    sigma_um: float = math.nan
 
 
 def compute_sag_change(

@@ -14,40 +14,18 @@ that could become unstable: there is only a tracker to tune.
 
 import math
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 import numpy as np
 
 from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.drift_tracker import DriftTracker
-from membrane_ctrl.control.sag_change import NO_CHANGE, SagChange, compute_sag_change
+from membrane_ctrl.control.sag_change import SagChange, compute_sag_change
+from membrane_ctrl.control.shape_code import ShapeCode
 from membrane_ctrl.control.shape_reference import ReferenceMean
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.reason import NO_REASON, Reason, make_reason
 from membrane_ctrl.model.state_tree import StateNode
-
-
-class ShapeCode(StrEnum):
-    """Why the shape loop does not track, or what limits it."""
-
-    SWITCHED_OFF = "switched_off"
-    WAITING = "waiting"
-    REFERENCE = "reference"
-    NOT_SETTLED = "not_settled"
-    NO_SHAPE = "no_shape"
-    REJECTED = "rejected"
-    MOVED_MEANWHILE = "moved_meanwhile"
-    NOT_NEWER = "not_newer"
-    NOT_FINITE = "not_finite"
-    NO_LASER = "no_laser"
-    LASER_MOVED = "laser_moved"
-    DISAGREE = "disagree"
-    CAMERA_REPEATS = "camera_repeats"
-    CAMERA_WRONG = "camera_wrong"
-    NO_MOUNT = "no_mount"
-    TRIM_LIMIT = "trim_limit"
-
 
 _SWITCHED_OFF = make_reason(ShapeCode.SWITCHED_OFF, "switched off")
 
@@ -75,7 +53,7 @@ class ShapeLoopMemory(StateNode):
     base_um: float = 0.0  # the trim at lock
     reference: ReferenceMean = field(default_factory=ReferenceMean)
     drift: DriftTracker = field(default_factory=DriftTracker)
-    change: SagChange = NO_CHANGE  # as last admitted
+    change: SagChange = field(default_factory=SagChange)  # as last admitted
     admitted_s: float = math.nan
     seen_s: float = math.nan
     settled_since_s: float = math.inf
@@ -115,7 +93,7 @@ class ShapeLoop:
         memory.state = telemetry.ShapeState.WAITING
         memory.reason = make_reason(ShapeCode.WAITING, "waiting for the first shape")
         memory.reference = ReferenceMean()
-        memory.change = NO_CHANGE
+        memory.change = SagChange()
         memory.admitted_s = math.nan
         memory.seen_s = now_s
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from membrane_ctrl.control_port.message_syntax import QUOTED_MAX, AnswerError, Message
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model import terminal
 
 Kind = Literal["answer", "notice", "streamed", "unknown"]
@@ -165,17 +165,15 @@ def kind_of(message: Message) -> Kind:
     return "unknown"
 
 
-_MODELS: dict[Kind, type[_Part]] = {
-    "answer": AnswerPart,
-    "notice": NoticePart,
-    "streamed": StreamedPart,
-    "unknown": _Part,
-}
-
-
 def check_message(message: Message) -> Message:
     """Return a message as it was sent, checked. Raises AnswerError."""
-    return check(message, _MODELS[kind_of(message)])
+    models: dict[Kind, type[_Part]] = {
+        "answer": AnswerPart,
+        "notice": NoticePart,
+        "streamed": StreamedPart,
+        "unknown": _Part,
+    }
+    return check(message, models[kind_of(message)])
 
 
 def check_greeting(message: Message) -> Message:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from membrane_ctrl.control_port.protocol import TEXT_BYTES, WHY_BYTES, RequestName
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 
 _Line = Annotated[str, Field(max_length=2000)]
 _Lines = Annotated[list[_Line], Field(max_length=500)]

@@ -14,7 +14,8 @@ from pydantic import AfterValidator, Field, ValidationError, field_validator, mo
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file
-from membrane_ctrl.controller.commands import SAME_AS, TABLE, Kind, Role
+from membrane_ctrl.controller.command import Kind, Role
+from membrane_ctrl.controller.commands import SAME_AS, TABLE
 
 VERSION = 1
 

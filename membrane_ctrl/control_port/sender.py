@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 from membrane_ctrl.control_port.protocol import OnBehalf, RequestName
 from membrane_ctrl.control_port.safety_commands import SAFETY
-from membrane_ctrl.controller.commands import TABLE, Role
+from membrane_ctrl.controller.command import Role
+from membrane_ctrl.controller.commands import TABLE
 
 _RANK: dict[str, int] = {"read": 0, "operate": 1, "tune": 2}
 # The least role of a request that is no command

@@ -29,6 +29,7 @@ from membrane_ctrl.control_port.sender import FREE, Peer, Sender, explain_missin
 from membrane_ctrl.control_port.session import PortSession
 from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.controller import commands, cross_check_plant, tick
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.instruments.lock_store import draw_word
 from membrane_ctrl.model import errors, events, port_events
 from membrane_ctrl.model.lock import Lock
@@ -46,7 +47,7 @@ _OVER = "the run is over"
 class RunHooks:
     """What the port needs from the run."""
 
-    queue_command: Callable[[commands.Command], None]  # for the next tick
+    queue_command: Callable[[Command], None]  # for the next tick
     record_event: Callable[[events.Event], None]
     now: Callable[[], float]  # the run's clock
     loop: Callable[[], schema.LoopConfig]  # present loop settings
@@ -226,7 +227,7 @@ class Port:
             answer |= await self._lock_answer(command)
         return answer
 
-    async def _lock_answer(self, command: commands.Command) -> dict[str, Any]:
+    async def _lock_answer(self, command: Command) -> dict[str, Any]:
         """The part of the answer that confirms a lock or its removal: only what is synced to the
         disk is stored.
         """
@@ -316,7 +317,7 @@ class Port:
         former = who if in_command is None else in_command.describe()
         self._record_event(port_events.CommanderChanged(None, former, why))
 
-    def _command(self, sender: Sender, request: protocol.Request) -> commands.Command:
+    def _command(self, sender: Sender, request: protocol.Request) -> Command:
         """The command of a request. Raises InputError for invalid
         gains or an invalid experiment.
         """
@@ -334,7 +335,7 @@ class Port:
         account = ""
         if kind == "unlock":
             account = sender.account
-        return commands.Command(
+        return Command(
             kind,
             sender.who,
             request.why,
@@ -370,7 +371,7 @@ class Port:
             raise errors.InputError(f"gains: kp_per_s = {loop.kp_per_s:g}: {weak[1]}")
         return loop
 
-    async def _obeyed(self, command: commands.Command) -> str:
+    async def _obeyed(self, command: Command) -> str:
         """Why the tick refused the command; empty if it executed it."""
         if self._over:
             return _OVER

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.control_port import endpoint, sender
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model.errors import DeviceError, InputError, os_reason
 
 _MODE = 0o660

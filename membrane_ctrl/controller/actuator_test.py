@@ -18,6 +18,7 @@ import numpy as np
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control import pump_curve
 from membrane_ctrl.control.pump_response import PumpResponse, Switch, identify_pump_response
+from membrane_ctrl.controller.actuator_test_part import Part
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
@@ -54,31 +55,6 @@ _VENT_CLOSED_S = 1.0
 # Dead time and lag together are known well enough at this standard deviation, or share of them.
 _RESPONSE_SIGMA_S = 0.08
 _RESPONSE_SIGMA_SHARE = 0.2
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """A part of the actuator test.
-
-    Attributes
-    ----------
-    name : str
-    pump_fraction, vent_fraction : float
-        Commands.
-    wait_s : float
-        What a quick actuator needs to respond: lag 0.15 s, transport 0.1 s.
-    measure_s : float
-        Time over which a speed is measured.
-    longest_s : float
-        After which the test fails without a response.
-    """
-
-    name: str
-    pump_fraction: float
-    vent_fraction: float
-    wait_s: float
-    measure_s: float
-    longest_s: float
 
 
 # The vent costs 7 µm of height, which the pump must restore. The pump comes last, at 0.8: its gas

@@ -18,7 +18,7 @@ from membrane_ctrl.control.plausibility import (
     REFERENCE_S,
     SLOW_REFERENCE_S,
 )
-from membrane_ctrl.controller import safety
+from membrane_ctrl.controller import state_sets
 from membrane_ctrl.controller.mount_drift import MountDrift, MountDriftState
 from membrane_ctrl.controller.sensor_consistency import SensorConsistency
 from membrane_ctrl.controller.tick import TickInputs
@@ -129,10 +129,10 @@ class CentreEstimation:
         """One tick, after the sensors were judged; returns what is news."""
         flow_um_per_s, seen_um = last.flow_um_per_s, context.observer.displacement_um
         figures = context.observer.figures
-        is_moved = state in safety.ESTIMATED or context.config.states.observe
+        is_moved = state in state_sets.ESTIMATED or context.config.states.observe
         if not self._wanted or not is_moved or not math.isfinite(flow_um_per_s):
             self._stop_estimate()
-            if self._by_optics and state not in safety.MOVING:
+            if self._by_optics and state not in state_sets.MOVING:
                 self._mount_drift.start(0.0)  # a resumed hold judges the optics by itself
             return []
         laser_um = math.nan if consistency.laser_fault_text else context.observer.moving_laser_um

@@ -14,7 +14,7 @@ from numpy.linalg import LinAlgError
 
 from firmware_iface.roles import ALL_FAULTS, BenchCommand
 from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, PumpConfig
-from membrane_ctrl.control import inner_loop, shape_loop
+from membrane_ctrl.control import inner_loop, shape_code, shape_loop
 from membrane_ctrl.control.experiments import trial
 from membrane_ctrl.control.experiments.experiment import ExperimentEnd, Finished
 from membrane_ctrl.control.gain_limits import limit_gains
@@ -30,10 +30,14 @@ from membrane_ctrl.controller import (
     resume_rule,
     safe_levels,
     safety,
+    safety_rule,
     sensor_consistency,
     standstill,
-    states,
+    state_handlers,
+    state_sets,
 )
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.sample_rate import SampleRate
 from membrane_ctrl.controller.state import ControllerState, ReportedShape, make_first_state
@@ -65,7 +69,7 @@ _DT_RANGE = (0.2, 5.0)
 _RAMP_ENDS_UM = 0.1
 _WHY_STANDS_S = 1.0  # shorter-lived reasons (a pump that touches its limit) are not reported
 _WITHOUT_LASER = make_reason(
-    shape_loop.ShapeCode.NO_MOUNT,
+    shape_code.ShapeCode.NO_MOUNT,
     "there is no laser whose mount could drift: the optics themselves are held",
 )
 _LOCKS_SHOWN = 3  # in the fault's text; the status has all of them
@@ -126,12 +130,12 @@ class Controller:
         return self.memory.state
 
     @property
-    def fault(self) -> safety.Rule | None:
+    def fault(self) -> safety_rule.Rule | None:
         """The standing fault."""
         return None if self.memory.fault is None else safety.RULES[self.memory.fault]
 
     @fault.setter
-    def fault(self, rule: safety.Rule | None) -> None:
+    def fault(self, rule: safety_rule.Rule | None) -> None:
         self.memory.fault = None if rule is None else rule.code
 
     @property
@@ -161,9 +165,9 @@ class Controller:
         context = self._context
         events: list[Event] = []
         self._begin_tick(inputs, events)
-        last = context.output or inner_loop.NO_OUTPUT
+        last = context.output or inner_loop.LoopOutput()
         # nothing follows a setpoint in a pause
-        judged = self.state in safety.MOVING and not context.paused
+        judged = self.state in state_sets.MOVING and not context.paused
         error_um = last.error_um if judged else math.nan
         context.observer.observe_inputs(inputs, self._may_follow_optics())
         consistency = self._consistency
@@ -346,7 +350,7 @@ class Controller:
         context.loop.may_probe = not self._gains.on_trial
 
     def _handle_command(
-        self, command: commands.Command, obeyed: Collection[str], events: list[Event]
+        self, command: Command, obeyed: Collection[str], events: list[Event]
     ) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""
         refused = (
@@ -362,7 +366,7 @@ class Controller:
             self._execute_command(command, events)
         return not refused
 
-    def _execute_command(self, command: commands.Command, events: list[Event]) -> None:
+    def _execute_command(self, command: Command, events: list[Event]) -> None:
         context = self._context
         match command.kind:
             case "setpoint" if math.isfinite(self.memory.setpoint_back_um):  # it stays
@@ -387,13 +391,13 @@ class Controller:
                 self._remove_lock(command, events)
         apply_command(context, command, self.state)
 
-    def _set_lock(self, command: commands.Command, events: list[Event]) -> None:
+    def _set_lock(self, command: Command, events: list[Event]) -> None:
         lock = locks.make_lock(command, self._context.locks)
         if lock is not None:
             self._context.locks = (*self._context.locks, lock)
             events.append(LockSet(**asdict(lock), number=command.number))
 
-    def _remove_lock(self, command: commands.Command, events: list[Event]) -> None:
+    def _remove_lock(self, command: Command, events: list[Event]) -> None:
         context = self._context
         unlocking = locks.decide_unlock(command, context.locks)
         lock = unlocking.lock
@@ -410,7 +414,7 @@ class Controller:
         )
         events.append(event)
 
-    def _refuse_by_condition(self, command: commands.Command) -> str:
+    def _refuse_by_condition(self, command: Command) -> str:
         """Why a fault, an interlock, a safe level or a limit forbids a command that its state
         allows; empty if none does.
         """
@@ -434,7 +438,7 @@ class Controller:
             return commands.explain_refusal(stepped, self.state, self._present_config)
         return ""
 
-    def _begin_experiment(self, command: commands.Command) -> str:
+    def _begin_experiment(self, command: Command) -> str:
         """Begin the experiment of a `tune`; returns why it cannot begin, or an empty text."""
         context, spec = self._context, command.experiment
         if command.kind != "tune" or spec is None:
@@ -483,7 +487,7 @@ class Controller:
         self._set_gains(self._gains.present.loop)
         events.append(GainsReverted(why))
 
-    def _consider_resuming(self, observation: safety.Observation) -> None:
+    def _consider_resuming(self, observation: Observation) -> None:
         """Decide whether a latched fault may clear automatically (`resume`)."""
         context, resume = self._context, self._resume
         if self.state != State.FAULT or self.fault is None:
@@ -531,7 +535,7 @@ class Controller:
         except (ValueError, ArithmeticError, LinAlgError) as error:
             self.memory.tick_error = f"shape loop: {type(error).__name__}: {error}"
             shape = self._shape.output(inputs.now_s)
-        context.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
+        context.trim_um = shape.trim_um if self.state in state_sets.MOVING else 0.0
         reported = ReportedShape(shape.state, shape.reason.code)
         if reported != self.memory.reported_shape:
             self.memory.reported_shape = reported
@@ -547,7 +551,7 @@ class Controller:
         context.pump_fraction = 0.0
         context.vent_fraction = 0.0
         try:
-            wanted = states.run_state(self.state, context)
+            wanted = state_handlers.run_state(self.state, context)
         except Exception as error:
             self.memory.tick_error = f"{type(error).__name__}: {error}"
             # an error must not close an open vent

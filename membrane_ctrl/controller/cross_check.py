@@ -48,7 +48,23 @@ def cross_check(
     findings = cross_check_plant.ConfigFindings(config)
     _check_finite(config, findings)
     if not findings.found:  # the others compute with the values
-        for judge in _RULES:
+        for judge in (
+            _check_resume,
+            _check_watchdog,
+            _check_stale,
+            _check_states,
+            _check_limits,
+            cross_check_plant.judge_gauge,
+            cross_check_plant.judge_film,
+            cross_check_plant.judge_alarms,
+            cross_check_plant.judge_pump,
+            cross_check_plant.judge_vent,
+            cross_check_interlocks.judge_interlocks,
+            cross_check_plant.judge_loop,
+            cross_check_plant.judge_shape,
+            cross_check_plant.judge_optics,
+            cross_check_bridges.judge_bridges,
+        ):
             judge(config, findings)
         for judge_board in (
             cross_check_plant.judge_ranges,
@@ -360,22 +376,3 @@ def _board_guards(
     findings.warn(
         cut, "states.ramp_down_s", why, "shorten it, or lengthen gauge_timeout_s in the board"
     )
-
-
-_RULES = (
-    _check_resume,
-    _check_watchdog,
-    _check_stale,
-    _check_states,
-    _check_limits,
-    cross_check_plant.judge_gauge,
-    cross_check_plant.judge_film,
-    cross_check_plant.judge_alarms,
-    cross_check_plant.judge_pump,
-    cross_check_plant.judge_vent,
-    cross_check_interlocks.judge_interlocks,
-    cross_check_plant.judge_loop,
-    cross_check_plant.judge_shape,
-    cross_check_plant.judge_optics,
-    cross_check_bridges.judge_bridges,
-)

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model.state_tree import StateNode
 
 

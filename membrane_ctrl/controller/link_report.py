@@ -35,6 +35,3 @@ class LinkReport:
             return ""
         device = self.devices.slowest or "the device"
         return f"{self.wait_ms:.0f} ms of waiting for {device}"
-
-
-NO_LINK_TROUBLE = LinkReport()

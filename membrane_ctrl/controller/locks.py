@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from membrane_ctrl.controller.commands import AT_START, Command
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import AT_START
 from membrane_ctrl.model.lock import LOCKS_MOST, Lock, describe_locks
 from membrane_ctrl.model.lock_words import distinct_word
 

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 from firmware_iface.roles import NO_ANSWER, NO_READING, BenchCommand, BenchReading
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller import safety, tick
+from membrane_ctrl.controller import tick
 from membrane_ctrl.controller.figure_gate import FigureGate, FigureGateState
 from membrane_ctrl.controller.jumps import JumpGate
-from membrane_ctrl.controller.link_report import NO_LINK_TROUBLE
+from membrane_ctrl.controller.link_report import LinkReport
+from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode, make_reason
 from membrane_ctrl.model.state_tree import StateNode
 
@@ -94,7 +95,7 @@ class Observer:
         self.optics_guard_um = math.nan
         self.repeats_sample = False
         self.optics_replace_laser = False
-        self.link = NO_LINK_TROUBLE
+        self.link = LinkReport()
 
     def note_command(self, command: BenchCommand) -> None:
         """Note the tick's command for comparison with the next read-backs."""
@@ -183,13 +184,13 @@ class Observer:
         """
         return self.figures.waited_s if self._by_optics else 0.0
 
-    def make_observation(self, inputs: tick.TickInputs, error_um: float) -> safety.Observation:
+    def make_observation(self, inputs: tick.TickInputs, error_um: float) -> Observation:
         """Return what the inputs show, after `observe_inputs`; the control code fills in what it
         knows itself.
         """
         reading, now_s = self.reading, inputs.now_s
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
-        return safety.Observation(
+        return Observation(
             link_up=inputs.link_up,
             reading_age_s=now_s - self.memory.last_read_s,
             advance_age_s=now_s - self.memory.last_advance_s,

@@ -13,7 +13,6 @@ replace the laser, it holds the mirror at once.
 
 import math
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.control.centre_estimate import CentreEstimate, Sensor
@@ -27,6 +26,7 @@ from membrane_ctrl.control.loop_comparison import (
     MeanSquare,
 )
 from membrane_ctrl.control.predicted_pi import PredictedPi, PredictedPiState
+from membrane_ctrl.controller.process_value_reason import ProcessValueReason
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, ProcessValueChosen
 from membrane_ctrl.model.state_tree import Count, StateNode
 
@@ -60,18 +60,9 @@ _FALL_BACK_MOST_S = 6 * 3600.0
 _DOUBLINGS_MOST = 10
 # Memory of the mean that shows whether laser and camera move apart
 _APART_S = 60.0
-
-
-class ProcessValueReason(StrEnum):
-    """Why the loop follows what it follows; the value is a phrase for people."""
-
-    RESPONSE_KNOWN = "dead time and lag of the pump are known"
-    RESPONSE_UNKNOWN = "dead time and lag of the pump are not known"
-    LASER_ALONE = "neither camera nor barometer shows the centre or its weather"
-    GAINS_ON_TRIAL = "gains of the PI are on trial"
-    PI_TRIED = "the PI is tried, as the estimate may be worse"
-    ESTIMATE_WORSE = "the estimate held the mirror no better"
-    LASER_UNUSABLE = "the laser is missing or wrong"
+_BY_ESTIMATE = (ProcessValueReason.RESPONSE_KNOWN, ProcessValueReason.LASER_UNUSABLE)
+# Reasons that a lost sensor gives
+_BY_SENSORS = (ProcessValueReason.LASER_ALONE, ProcessValueReason.LASER_UNUSABLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,11 +411,6 @@ class ProcessValueChoice:
     def _end_notice(self, why: str) -> list[Event]:
         self.memory.noticed = False
         return [MaintenanceOver(NOTICE, why)]
-
-
-_BY_ESTIMATE = (ProcessValueReason.RESPONSE_KNOWN, ProcessValueReason.LASER_UNUSABLE)
-# Reasons that a lost sensor gives
-_BY_SENSORS = (ProcessValueReason.LASER_ALONE, ProcessValueReason.LASER_UNUSABLE)
 
 
 def _root(mean_square_um2: float) -> float:

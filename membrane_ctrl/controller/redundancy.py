@@ -5,7 +5,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.protection import Failure, FilmSensor, ProcessValue, find_bound
+from membrane_ctrl.controller.duties import FilmSensor, ProcessValue
+from membrane_ctrl.controller.protection import Failure, find_bound
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
 from membrane_ctrl.model.state_tree import StateNode
 

@@ -5,8 +5,9 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from membrane_ctrl.config.schema import LimitsConfig, ResumeConfig
+from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.controller.safe_levels import DAY_S, VENTED_FRACTION, WATCHDOG_MASK, SafeLevels
-from membrane_ctrl.controller.safety import Observation, Rule
+from membrane_ctrl.controller.safety_rule import Rule
 from membrane_ctrl.model.state_tree import StateNode
 from membrane_ctrl.model.telemetry import SafeLevel
 

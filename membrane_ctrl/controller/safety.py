@@ -8,23 +8,24 @@ fault.
 """
 
 import math
-from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
-from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD, NO_READING, BenchReading
+from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config.schema import LimitsConfig
-from membrane_ctrl.controller.link_report import NO_LINK_TROUBLE, LinkReport
-from membrane_ctrl.model.events import Fault
+from membrane_ctrl.controller.observation import Observation
+from membrane_ctrl.controller.safety_rule import Rule, join_seen
+from membrane_ctrl.controller.state_sets import (
+    ALWAYS,
+    CONNECTED,
+    ESTIMATED,
+    GAS_MOVES,
+    HOLDING,
+    MOVING,
+    NOT_YET_FAULT,
+)
 from membrane_ctrl.model.state_tree import Count, StateNode
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
-MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
-HOLDING = frozenset({State.HOLD})
-ESTIMATED = MOVING - {State.INFLATE}  # laser, optics and gauge are compared
-CONNECTED = MOVING | {State.CHECK}
-GAS_MOVES = CONNECTED | {State.LOWER}
-ALWAYS = frozenset(State)
-NOT_YET_FAULT = ALWAYS - {State.FAULT}
 _FOREIGN = {
     FOREIGN_CLAIM: "another claim is active",
     FOREIGN_PERIOD: "another watchdog period is active",
@@ -36,161 +37,6 @@ _TWICE = (2, 3)
 # difference in some ticks
 _FOLLOWED = (40, 50)
 _A_FEW = (3, 3)  # one repeated sample of a busy device is not a fault
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """What one tick shows of the bench and of the program; NaN and None mean "not seen", never
-    "fine".
-    """
-
-    link_up: bool  # the device link is connected
-    reading_age_s: float  # since the last answer of the device
-    advance_age_s: (
-        float  # since its sample counter and time last advanced; a repeated answer does not count
-    )
-    displacement_um: (
-        float  # raw laser reading, or by figures on a bench without a laser; NaN if bad or absent
-    )
-    displacement_valid: (
-        bool  # known as well as the state needs it: new, of good quality, not a jump
-    )
-    jumps: int  # consecutive readings refused as jumps
-    error_um: float  # setpoint minus reading; NaN outside the loop, and in a pause
-    gauge_pressure_pa: float
-    pump_mismatch: float  # |command - read-back|, the smaller of the last two commands'
-    watchdog_tripped: bool
-    board_faults: int
-    lateness_ms: float
-    dead_tasks: tuple[str, ...] = ()  # supervised tasks of the control process that ended
-    tick_error: str = ""  # exception of a handler, if any
-    overdue: str = ""  # what the present state has waited for too long, if anything
-    unfit: str = ""  # what the actuator test found, if anything
-    same_s: float = 0.0  # how long the valid readings have been bit-identical
-    laser_fault_text: str = ""  # readings of laser, gauge and camera, if the laser is wrong
-    runs_on: str = ""  # the read-back of a pump that should have stopped
-    inflow: str = ""  # how the mirror rises although the pump is commanded off
-    locked: str = ""  # the locks that people have set, in words
-    foreign: int = 0  # changes by another program: claim, watchdog (`roles.FOREIGN_...`)
-    gauge_same_s: float = 0.0  # how long a taut film's gauge readings have been bit-identical
-    gauge_jumps: int = 0  # consecutive readings that no film can cause
-    # readings of laser (or optics) and gauge, if they contradict each other
-    laser_gauge_apart: str = ""
-    held_by_optics: bool = False  # the optics show the centre, or must: the laser may be missing
-    unseen_film: str = ""  # on a bench held without a laser: why the film is not seen, if so
-    # the displacement by the optics, with or without a laser, where the loop may follow them
-    optics_guard_um: float = math.nan
-    # excess gas the film takes, unless an independent sensor shows it standing still
-    gas_excess: str = ""
-    open_interlocks: int = 0  # bit i: interlock i of the configuration is open, or its signal lost
-    interlock_level: SafeLevel = SafeLevel.NONE  # the deepest level of the open ones
-    interlock_words: str = ""  # the open ones with their texts
-    # all sensors as they answered in this tick, for properties without memory
-    reading: BenchReading = NO_READING
-    answered: bool = True  # the device that shows the displacement gave a valid answer
-    link: LinkReport = NO_LINK_TROUBLE
-
-    @property
-    def vent_fraction(self) -> float:
-        """The vent's read-back; NaN without one."""
-        return self.reading.vent_fraction
-
-    @property
-    def is_unanswered(self) -> bool:
-        """There is no displacement, because its device gave no valid answer."""
-        return not self.displacement_valid and not self.answered
-
-    def is_late_by_link(self, lateness_max_ms: float) -> bool:
-        """The tick is late, and without the last one's waiting for the devices it would not be."""
-        late_by_itself_ms = self.lateness_ms - self.link.wait_ms
-        return self.lateness_ms > lateness_max_ms >= late_by_itself_ms
-
-    @property
-    def deepest_um(self) -> float:
-        """The largest displacement that a sensor shows, µm; NaN without one.
-
-        A laser that fails may repeat an old value with noise, which no check of the laser alone
-        recognises. Each limit therefore judges the sensor that is nearest to it.
-        """
-        return max(self._shown_um, default=math.nan)
-
-    @property
-    def shallowest_um(self) -> float:
-        """The smallest displacement that a sensor shows, µm; NaN without one."""
-        return min(self._shown_um, default=math.nan)
-
-    @property
-    def _shown_um(self) -> list[float]:
-        """Displacements by laser and optics, without those that are missing."""
-        shown_um = (self.displacement_um, self.optics_guard_um)
-        return [um for um in shown_um if not math.isnan(um)]
-
-
-@dataclass(frozen=True, slots=True)
-class Rule:
-    """One row of the table. `limit` and `remedy` are for people; `broken` decides.
-
-    The window skips ticks in which `unseen` is true: ticks without an answer must not excuse a
-    sensor that exceeds its limit whenever it answers. `deepens` gives a level deeper than
-    `safe_level` where what is observed demands it, and `enters` describes the level to people who
-    read the table.
-    """
-
-    code: int
-    name: str
-    cause: str
-    limit: str
-    safe_level: SafeLevel
-    remedy: str
-    broken: Callable[[Observation, LimitsConfig], bool]
-    seen: Callable[[Observation], str] = lambda o: ""  # the observed value, for the operator
-    seen_in: tuple[int, int] = (1, 1)  # (m, n): m of n ticks must show the cause
-    states: Collection[State] = MOVING
-    # `resume.faults` may name it: a lost message or sensor whose return is visible. All others need
-    # a person.
-    may_resume: bool = False
-    unseen: Callable[[Observation], bool] = lambda o: False
-    deepens: Callable[[Observation], SafeLevel] = lambda o: SafeLevel.NONE
-    enters: str = ""  # empty: always `safe_level`
-
-    def find_safe_level(self, observation: Observation) -> SafeLevel:
-        """The safe level that the rule enters if it trips on this observation."""
-        return max(self.safe_level, self.deepens(observation))
-
-    @property
-    def needed_ticks(self) -> int:
-        """Ticks of the window that must show the cause."""
-        return self.seen_in[0]
-
-    @property
-    def window(self) -> int:
-        """Length of the window in ticks."""
-        return self.seen_in[1]
-
-    @property
-    def latching(self) -> bool:
-        """Whether the fault stays until acknowledged."""
-        return self.safe_level > SafeLevel.HOLD_FLOW
-
-    def fault(self, seen: str, safe_level: SafeLevel) -> Fault:
-        """The event of a tripped rule, with the observed value in words and the level that it
-        enters.
-        """
-        return Fault(
-            code=self.code,
-            name=self.name,
-            cause=self.cause,
-            seen=seen,
-            limit=self.limit,
-            safe_level=safe_level.name.lower(),
-            latching=self.latching,
-            remedy=self.remedy,
-        )
-
-
-def _join_seen(*parts: str) -> str:
-    """What was seen, in words; empty parts are left out."""
-    return "; ".join(part for part in parts if part)
 
 
 TABLE: tuple[Rule, ...] = (
@@ -312,7 +158,7 @@ TABLE: tuple[Rule, ...] = (
         states=CONNECTED,
         may_resume=True,
         remedy="mend the link as its message states; a board's watchdog stops its pump",
-        seen=lambda o: _join_seen(f"{o.reading_age_s:.2f} s", o.link.message),
+        seen=lambda o: join_seen(f"{o.reading_age_s:.2f} s", o.link.message),
         broken=lambda o, c: o.reading_age_s > c.stale_s,
     ),
     Rule(
@@ -336,7 +182,7 @@ TABLE: tuple[Rule, ...] = (
         states=CONNECTED,
         may_resume=True,
         remedy="find why the device or the network answers late; this machine is not the cause",
-        seen=lambda o: _join_seen(o.link.explain_wait(), o.link.message),
+        seen=lambda o: join_seen(o.link.explain_wait(), o.link.message),
         broken=lambda o, c: (
             o.watchdog_tripped and (o.link.wait_ms > c.lateness_max_ms or bool(o.link.message))
         ),
@@ -571,7 +417,7 @@ TABLE: tuple[Rule, ...] = (
         seen_in=(5, 10),
         may_resume=True,
         remedy="find why the device or the network answers late; this machine is not the cause",
-        seen=lambda o: _join_seen(o.link.explain_wait(), o.link.message),
+        seen=lambda o: join_seen(o.link.explain_wait(), o.link.message),
         broken=lambda o, c: o.is_late_by_link(c.lateness_max_ms),
     ),
     Rule(
@@ -583,7 +429,7 @@ TABLE: tuple[Rule, ...] = (
         seen_in=(5, 10),
         may_resume=True,
         remedy="move other work off this machine",
-        seen=lambda o: _join_seen(f"{o.lateness_ms:.0f} ms", o.link.explain_wait()),
+        seen=lambda o: join_seen(f"{o.lateness_ms:.0f} ms", o.link.explain_wait()),
         broken=lambda o, c: o.lateness_ms > c.lateness_max_ms,
     ),
 )

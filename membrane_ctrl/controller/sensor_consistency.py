@@ -18,10 +18,10 @@ from membrane_ctrl.control.plausibility import (
     PlausibilityCheck,
     PlausibilityState,
 )
-from membrane_ctrl.control.shape_loop import ShapeCode
-from membrane_ctrl.controller import safety
+from membrane_ctrl.control.shape_code import ShapeCode
+from membrane_ctrl.controller import state_sets
+from membrane_ctrl.controller.duties import FilmSensor
 from membrane_ctrl.controller.hold_status import HoldStatus
-from membrane_ctrl.controller.protection import FilmSensor
 from membrane_ctrl.controller.recent_count import RecentCount
 from membrane_ctrl.controller.redundancy import RedundancyState, RedundancyWatch
 from membrane_ctrl.controller.tick import TickInputs
@@ -181,7 +181,7 @@ class SensorConsistency:
         self._compare_with_gauge(state, dt_s, held)
         events = self._report_doubtful_sag(state) + self._notice_drift(state)
         events += self._watch_redundancy(inputs.now_s, state, held)
-        if state not in safety.ESTIMATED:
+        if state not in state_sets.ESTIMATED:
             return events + self._reset_comparisons()
         moves = state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um
         if moves:
@@ -270,7 +270,7 @@ class SensorConsistency:
         Both comparisons run all the time, so that the optics have a reference when the laser is
         lost.
         """
-        if state not in safety.CONNECTED:
+        if state not in state_sets.CONNECTED:
             self._laser_film.reset()
             self._optics_film.reset()
             self.memory.laser_gauge_apart = ""
@@ -289,7 +289,7 @@ class SensorConsistency:
         sensor's drift in.
         """
         monitor = self._film_in_use
-        noticed = state in safety.CONNECTED and monitor.drifting
+        noticed = state in state_sets.CONNECTED and monitor.drifting
         if noticed == self.memory.drift_noticed:
             return []
         self.memory.drift_noticed = noticed
@@ -312,14 +312,14 @@ class SensorConsistency:
             or (held.optics_usable and math.isfinite(held.sag_um)),
             FilmSensor.GAUGE: math.isfinite(held.gauge_pressure_pa),
         }
-        return self._redundancy.step(now_s, state in safety.MOVING, present)
+        return self._redundancy.step(now_s, state in state_sets.MOVING, present)
 
     def _report_doubtful_sag(self, state: State) -> list[Event]:
         """Report once that optics without a laser may have missed a jump of the film, until the
         next start.
         """
         doubted_now = self._optics_alone and self._optics_film.doubted
-        doubted = state in safety.CONNECTED and (self.memory.doubted or doubted_now)
+        doubted = state in state_sets.CONNECTED and (self.memory.doubted or doubted_now)
         if doubted == self.memory.doubted:
             return []
         self.memory.doubted = doubted

@@ -5,7 +5,6 @@ They decide only what to do when all is well. Safety is judged around them on ev
 """
 
 import math
-from collections.abc import Callable
 
 from membrane_ctrl.control import inner_loop
 from membrane_ctrl.control.centre_estimate import Sensor
@@ -88,7 +87,7 @@ def inflate(context: TickContext) -> State:
     """
     states = context.config.states
     lag = abs(context.loop.lag_um) / states.inflate_pause_um
-    output = _drive_pump(context, context.loop.ramp_um if lag > 1.0 else context.setpoint_um)
+    output = drive_pump(context, context.loop.ramp_um if lag > 1.0 else context.setpoint_um)
     to_go_um = context.setpoint_um - output.filtered_um
     unseen = NO_REASON if math.isfinite(to_go_um) else context.observer.missing_reason
     to_go = f"{to_go_um:.1f} µm to go" if math.isfinite(to_go_um) else unseen.text or "no reading"
@@ -118,7 +117,7 @@ def inflate(context: TickContext) -> State:
 
 def settle(context: TickContext) -> State:
     """Stay within the band for a while before `hold` begins."""
-    output = _drive_pump(context, context.setpoint_um)
+    output = drive_pump(context, context.setpoint_um)
     band_um = context.config.limits.band_um
     # a lost reading is no error
     settled_s = context.measure_good_time_s(not abs(output.error_um) >= band_um)
@@ -152,7 +151,7 @@ def hold(context: TickContext) -> State:
             context.paused = False
         return State.HOLD
     context.good_since_s = math.nan
-    _explain_hold(context, _drive_pump(context, context.setpoint_um))
+    _explain_hold(context, drive_pump(context, context.setpoint_um))
     return State.HOLD
 
 
@@ -231,7 +230,7 @@ def lower(context: TickContext) -> State:
     context.hold_wanted = False
     context.vent_fraction = float(context.venting)
     stand = context.standstill
-    _explain_way_down(context, ": pump off")
+    explain_way_down(context, ": pump off")
     if context.way_down == "stop":
         if stand.silent_s > context.config.states.lower_timeout_s:
             context.finished = Exit.DEVICE_FAILED  # the pump's state is unknown
@@ -311,19 +310,6 @@ def _is_lowered(context: TickContext, safe_level: SafeLevel) -> bool:
     return vented_s > (_STOP_GIVES_UP_S if empty or context.way_down == "stop" else _VENTED_S)
 
 
-HANDLERS: dict[State, Callable[[TickContext], State]] = {
-    State.STANDBY: standby,
-    State.CHECK: check,
-    State.INFLATE: inflate,
-    State.SETTLE: settle,
-    State.HOLD: hold,
-    State.MANUAL: manual,
-    State.TUNE: tune,
-    State.LOWER: lower,
-    State.FAULT: fault,
-}
-
-
 def observe(context: TickContext) -> State:
     """Follow a pump that others drive, by its read-back; command nothing."""
     reading = context.observer.reading
@@ -338,24 +324,8 @@ def observe(context: TickContext) -> State:
     return State.STANDBY
 
 
-def run_state(state: State, context: TickContext) -> State:
-    """Run the state's handler and return the next state; a request for another state takes
-    precedence.
-    """
-    if context.config.states.observe:
-        return observe(context)
-    if context.way_down is not None and state not in (State.LOWER, State.FAULT):
-        _explain_way_down(context)
-        return State.LOWER
-    if (
-        state in (State.INFLATE, State.SETTLE, State.HOLD)
-        and (elsewhere := _find_requested_state(context)) is not None
-    ):
-        return elsewhere
-    return HANDLERS[state](context)
-
-
-def _explain_way_down(context: TickContext, more: str = "") -> None:
+def explain_way_down(context: TickContext, more: str = "") -> None:
+    """State why the mirror goes down, and at whose request; `more` follows in the sentence."""
     way = "vent" if context.venting and context.way_down == "lower" else str(context.way_down)
     who = (
         "the duration is over"
@@ -375,23 +345,6 @@ def _explain_manual_end(context: TickContext) -> str:
     if context.now_s - context.manual_since_s > states.manual_max_s:
         return f"no flow was set for {states.manual_max_s:g} s"
     return ""
-
-
-def _find_requested_state(context: TickContext) -> State | None:
-    """The requested state, if it is not a hold."""
-    if context.trial is not None:
-        # the loop runs this tick: otherwise the pump would be off for 20 ms
-        _drive_pump(context, context.setpoint_um)
-        requested = f"{context.asked_by} requested the experiment {context.trial.spec.kind}"
-        context.explain(WhyCode.EXPERIMENT_REQUESTED, requested)
-        return State.TUNE
-    if context.manual_wanted:
-        context.hold_wanted = False
-        context.explain(WhyCode.MANUAL_REQUESTED, f"{context.asked_by} took over the pump")
-        context.mean_flow_um_per_s = context.loop.mean_flow_um_per_s
-        context.keep_flowing()
-        return State.MANUAL
-    return None
 
 
 def _test_actuators(context: TickContext) -> State:
@@ -444,7 +397,7 @@ def _begin_loop(context: TickContext, leak_um_per_s: float) -> State:
     return State.INFLATE
 
 
-def _drive_pump(context: TickContext, target_um: float) -> inner_loop.LoopOutput:
+def drive_pump(context: TickContext, target_um: float) -> inner_loop.LoopOutput:
     """Let the loop drive the pump: automatic with a new reading, the last output with one that
     repeats, held mean flow without one.
     """

@@ -6,10 +6,10 @@ from firmware_iface.roles import NO_READING
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.controller import (
     interlocks,
-    safety,
     tick,
     tick_codec,
 )
+from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.model import telemetry
 
@@ -20,12 +20,12 @@ def make_telemetry_row(
     fault: int,
     number: int,
     inputs: tick.TickInputs,
-    observation: safety.Observation,
+    observation: Observation,
     shape: shape_loop.ShapeOutput,
 ) -> telemetry.TelemetryRow:
     """The row of tick `number`; `fault` is the standing fault's code, 0 for none."""
     reading = inputs.reading or NO_READING
-    out = context.output or inner_loop.NO_OUTPUT
+    out = context.output or inner_loop.LoopOutput()
     seen = context.estimate.telemetry() if context.estimate else {}
     return telemetry.TelemetryRow(
         mono_s=inputs.now_s,

@@ -5,11 +5,11 @@ virtual-time runs and a replay call the same code.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from firmware_iface.roles import BenchCommand, BenchReading
-from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.controller.link_report import NO_LINK_TROUBLE, LinkReport
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.link_report import LinkReport
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.events import Event
 
@@ -28,7 +28,7 @@ class TickInputs:
     estimate: shape_estimate.ShapeEstimate | None = None
     commands: tuple[Command, ...] = ()  # since the last tick
     dead_tasks: tuple[str, ...] = ()  # supervised tasks that ended
-    link: LinkReport = NO_LINK_TROUBLE
+    link: LinkReport = field(default_factory=LinkReport)
     # the twin's truth, for the record only; NaN on a real bench
     truth_displacement_um: float = math.nan
     truth_laser_bias_um: float = math.nan

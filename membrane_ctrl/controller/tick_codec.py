@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from firmware_iface.roles import SENSORS, BenchReading
-from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.controller.link_report import NO_LINK_TROUBLE, LinkReport
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.link_report import LinkReport
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_checksum import output_crc
 from membrane_ctrl.model import shape_estimate, telemetry
@@ -137,7 +137,7 @@ def _split_message(kind: bytes, data: bytes) -> list[bytes]:
 
 
 def _pack_tail(inputs: TickInputs) -> bytes:
-    is_common = not inputs.commands and not inputs.dead_tasks and inputs.link == NO_LINK_TROUBLE
+    is_common = not inputs.commands and not inputs.dead_tasks and inputs.link == LinkReport()
     if is_common:
         return b""
     rare = {

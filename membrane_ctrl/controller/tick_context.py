@@ -19,6 +19,7 @@ from membrane_ctrl.controller import (
     safe_levels,
     standstill,
 )
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.model.lock import Lock
@@ -149,7 +150,7 @@ def collect_state_fields(memory: TickContextState) -> dict[str, Any]:
     return {field.name: getattr(memory, field.name) for field in fields(TickContextState)}
 
 
-def apply_command(context: TickContext, command: commands.Command, state: telemetry.State) -> None:
+def apply_command(context: TickContext, command: Command, state: telemetry.State) -> None:
     """Take an accepted command's request into the context; the controller does the rest."""
     match command.kind:
         case "hold":

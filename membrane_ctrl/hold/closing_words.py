@@ -114,11 +114,8 @@ class PageAtEnd:
     problem: str = ""
 
 
-NO_PAGE = PageAtEnd()
-
-
 def print_closing_report(
-    run_dir: Path, as_json: bool, closing: RunEnd | None = None, page: PageAtEnd = NO_PAGE
+    run_dir: Path, as_json: bool, closing: RunEnd | None = None, page: PageAtEnd | None = None
 ) -> None:
     """Print how the run ended, a fault first, then its result, its folder and the page's link."""
     if closing is not None:
@@ -151,6 +148,8 @@ def print_closing_report(
             f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}",
             file=sys.stderr,
         )
+    if page is None:
+        return
     if page.problem:
         print(f"no page:    its service has ended: {page.problem}", file=sys.stderr)
     elif page.link:

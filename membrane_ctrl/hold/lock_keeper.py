@@ -16,7 +16,8 @@ from functools import partial
 from pathlib import Path
 
 from membrane_ctrl.controller import tick
-from membrane_ctrl.controller.commands import AT_START, Command
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import AT_START
 from membrane_ctrl.instruments.lock_store import LockStore, StoredLock
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.errors import os_reason

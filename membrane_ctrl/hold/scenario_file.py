@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
-from membrane_ctrl.controller.commands import Kind
+from membrane_ctrl.controller.command import Kind
 from membrane_ctrl.sim import virtual_bench, virtual_interlocks
 
 SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(virtual_bench.Wrong)}
@@ -37,6 +37,7 @@ Happening = Literal[
     "pressure_weather",
     "power_cycle",
 ]
+S = TypeVar("S", bound="Scenario")
 
 
 class ScenarioStep(Section):
@@ -116,9 +117,6 @@ class Scenario(Section):
                     f"at.{number}: every_s = {at.every_s:g} repeats more than {_REPEATS_MAX} times"
                 )
         return self
-
-
-S = TypeVar("S", bound=Scenario)
 
 
 def load_scenario(path: Path, model: type[S]) -> S:

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.closing_words import RunEnd
 from membrane_ctrl.hold.scenario_file import INTERLOCK_SWITCHES, SWITCHES, Scenario, ScenarioStep
 from membrane_ctrl.hold.virtual_run import Rings, TruthShape, VirtualRun, VirtualTick

@@ -21,7 +21,8 @@ from firmware_iface.roles import (
     LinkState,
     LinkWaitsError,
 )
-from membrane_ctrl.controller.commands import AT_END, Command
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import AT_END
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.link_report import LinkReport
 from membrane_ctrl.controller.snapshot import take_snapshot

@@ -13,6 +13,7 @@ from firmware_iface.roles import Bench, LinkError
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port import server
 from membrane_ctrl.controller import commands, tick
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.hold import child_processes
 from membrane_ctrl.hold.closing_words import RunEnd
@@ -49,9 +50,7 @@ class HoldResources:
     figure_mode: run_events.FigureModeChosen | None  # None: the mode was stated
     make_port: Callable[[server.RunHooks], server.Port]
     make_latch: Callable[[Callable[[events.Event], None]], FaultLatch]
-    make_keeper: Callable[
-        [Callable[[events.Event], None], Callable[[commands.Command], None]], LockKeeper
-    ]
+    make_keeper: Callable[[Callable[[events.Event], None], Callable[[Command], None]], LockKeeper]
 
 
 async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
@@ -174,15 +173,13 @@ def _send_first_commands(
     earlier runs.
     """
     for lock in locks:
-        supervisor.queue_command(
-            commands.Command("latch", commands.AT_START, text=lock.text, lock=lock)
-        )
+        supervisor.queue_command(Command("latch", commands.AT_START, text=lock.text, lock=lock))
     if not standby:
-        supervisor.queue_command(commands.Command("hold", commands.AT_START))
+        supervisor.queue_command(Command("hold", commands.AT_START))
     elif latched := "; ".join(part for part in (latch.latched_line, board.latched) if part):
-        supervisor.queue_command(commands.Command("latched", commands.AT_START, text=latched))
+        supervisor.queue_command(Command("latched", commands.AT_START, text=latched))
     for age_s in latch.resumes_s:
-        supervisor.queue_command(commands.Command("resumed", commands.AT_START, value=age_s))
+        supervisor.queue_command(Command("resumed", commands.AT_START, value=age_s))
 
 
 def _forward_captures(
@@ -210,9 +207,7 @@ def _stop_on_signals(supervisor: Supervisor) -> Iterator[None]:
         numbers.append(signal.SIGHUP)
     before = {number: signal.getsignal(number) for number in [*numbers, signal.SIGTSTP]}
     for number in numbers:
-        loop.add_signal_handler(
-            number, supervisor.queue_command, commands.Command("stop", number.name)
-        )
+        loop.add_signal_handler(number, supervisor.queue_command, Command("stop", number.name))
     # Ctrl-Z: without ticks the board's watchdog stops the pump
     signal.signal(signal.SIGTSTP, signal.SIG_IGN)
     try:

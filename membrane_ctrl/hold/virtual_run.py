@@ -15,7 +15,8 @@ import numpy as np
 
 from firmware_iface import roles
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller import commands, controller, tick
+from membrane_ctrl.controller import controller, tick
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import arrays, clock, errors, events, run_events, shape_estimate, telemetry
@@ -117,7 +118,7 @@ class VirtualRun:
         )
         bench.open()
 
-    def run_tick(self, commands: tuple[commands.Command, ...] = ()) -> VirtualTick | None:
+    def run_tick(self, commands: tuple[Command, ...] = ()) -> VirtualTick | None:
         """Advance one period and run a tick; None if the control process does not run."""
         self._steps += 1
         self.now_s = self._steps * self._period_s  # no sum, which would drift

@@ -7,7 +7,7 @@ Only what opens or emulates devices imports this: reading a configuration loads 
 
 from typing import Any
 
-from firmware_iface import drivers, settings
+from firmware_iface import driver_kind, drivers, settings
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.model.errors import InputError
 
@@ -17,7 +17,7 @@ def name_of(section: Any) -> str:
     return str(section.name if isinstance(section, settings.ExternalSection) else section.driver)
 
 
-def check_settings(section: Any, where: str, kind: drivers.DriverKind) -> settings.Section:
+def check_settings(section: Any, where: str, kind: driver_kind.DriverKind) -> settings.Section:
     """Return the settings that a driver gets; a package's own class checks the table of its driver.
 
     Raises InputError (no such driver, one without settings, or a key that its class refuses).
@@ -34,7 +34,7 @@ def check_settings(section: Any, where: str, kind: drivers.DriverKind) -> settin
     return toml_file.parse_tables(section.keys, expected, where)
 
 
-def make_driver(section: Any, where: str, kind: drivers.DriverKind, *more: Any) -> Any:
+def make_driver(section: Any, where: str, kind: driver_kind.DriverKind, *more: Any) -> Any:
     """Make the driver of a table, not yet connected.
 
     Raises InputError for a driver that is not installed, does not load or cannot be made, and for a
@@ -55,7 +55,7 @@ def make_driver(section: Any, where: str, kind: drivers.DriverKind, *more: Any) 
 
 
 def make_emulator(
-    section: settings.ExternalSection, where: str, kind: drivers.DriverKind, *more: Any
+    section: settings.ExternalSection, where: str, kind: driver_kind.DriverKind, *more: Any
 ) -> Any:
     """Make the emulator of a table's device. Raises InputError as `make_driver`."""
     try:
@@ -65,7 +65,7 @@ def make_emulator(
     return _construct_driver(make, check_settings(section, where, kind), where, more)
 
 
-def _load_driver(section: Any, where: str, kind: drivers.DriverKind) -> Any:
+def _load_driver(section: Any, where: str, kind: driver_kind.DriverKind) -> Any:
     if not isinstance(section, settings.ExternalSection):
         return drivers.load_built_in(section.driver, kind)
     try:

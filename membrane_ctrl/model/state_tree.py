@@ -29,6 +29,7 @@ T = TypeVar("T", bound="StateNode")
 
 Count = Annotated[int, Field(ge=0, lt=2**53)]  # a number of events, a mask of bits
 _SHOWN_NUMBERS = 8  # of an array
+_ADAPTERS: "dict[type[StateNode], TypeAdapter[Any]]" = {}
 
 
 class StateError(ValueError):
@@ -101,9 +102,6 @@ class ArrayShape:
         if len(shape) != len(self.shape):
             return False
         return all(length in (given, -1) for given, length in zip(shape, self.shape, strict=True))
-
-
-_ADAPTERS: dict[type[StateNode], TypeAdapter[Any]] = {}
 
 
 def _make_adapter(kind: type[StateNode]) -> TypeAdapter[Any]:

@@ -101,6 +101,11 @@ class TelemetryRow(ColumnValues):
         return cls(*_STRUCT.unpack(message))
 
 
+def name_codes(codes: type[IntEnum]) -> dict[int, str]:
+    """Return the name of each code, in lower case."""
+    return {int(code): code.name.lower() for code in codes}
+
+
 def unpack_rows(messages: Sequence[bytes]) -> Rows:
     """Packed `TelemetryRow`s as a table (n, len(FIELDS))."""
     return np.frombuffer(b"".join(messages), dtype="<f8").reshape(-1, len(FIELDS))

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from membrane_ctrl.measure.report_pdf import pdf_pages
 from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult
-from membrane_ctrl.paper.parts import PaperPart
+from membrane_ctrl.paper.paper_part import PaperPart
 from membrane_ctrl.report_pages.blocks import (
     PageBlock,
     PageLines,

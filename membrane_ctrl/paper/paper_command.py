@@ -18,7 +18,8 @@ from membrane_ctrl.paper.bench import (
 )
 from membrane_ctrl.paper.comparison import PartResult, round_numbers
 from membrane_ctrl.paper.document import count_agreements, render_document
-from membrane_ctrl.paper.parts import PARTS, PaperPart
+from membrane_ctrl.paper.paper_part import PaperPart
+from membrane_ctrl.paper.parts import PARTS
 from membrane_ctrl.paper.stored_parts import PartFolder
 
 # `--quick`: a sixth of the pixels along a side, and as many sets as pairs 10 minutes apart need.

@@ -1,9 +1,5 @@
 """The parts of the document, in the order of the paper."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
-
 from membrane_ctrl.paper import (
     convergence_parts,
     gradient_parts,
@@ -13,36 +9,7 @@ from membrane_ctrl.paper import (
     stability_parts,
     timing_parts,
 )
-from membrane_ctrl.paper.comparison import PartResult
-
-
-@dataclass(frozen=True, slots=True)
-class PaperPart:
-    """A figure, table or statement of the paper.
-
-    Attributes
-    ----------
-    name : str
-        For `--only` and the files.
-    title : str
-        Heading.
-    source : str
-        Where it stands in the paper.
-    compute : callable
-        Gets the bench and returns a PartResult.
-    needs_truth : bool
-        Whether only a simulated bench will do.
-    needs_angle : bool
-        Whether the geometry must be given as a, b and alpha.
-    """
-
-    name: str
-    title: str
-    source: str
-    compute: Callable[[Any], PartResult]
-    needs_truth: bool = False
-    needs_angle: bool = False
-
+from membrane_ctrl.paper.paper_part import PaperPart
 
 PARTS = (
     PaperPart(

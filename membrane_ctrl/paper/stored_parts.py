@@ -10,7 +10,7 @@ from membrane_ctrl.measure.result_files import write_json
 from membrane_ctrl.model import files, program
 from membrane_ctrl.paper.bench import PaperOptions
 from membrane_ctrl.paper.comparison import PaperStatement, PartResult
-from membrane_ctrl.paper.parts import PaperPart
+from membrane_ctrl.paper.paper_part import PaperPart
 
 _FORMAT = "membrane-paper-part/1"
 _BYTES_MAX = 10_000_000  # of one picture or table
@@ -26,9 +26,6 @@ class _StoredPart:
     numbers: dict[str, Any]
     timing_s: dict[str, float]
     pictures: list[str]
-
-
-_STORED = TypeAdapter(_StoredPart)
 
 
 class PartFolder:
@@ -53,7 +50,7 @@ class PartFolder:
         """A finished part; None if there is none of this program and these options."""
         try:
             content = files.read_bytes(self._table(part), _BYTES_MAX)
-            stored = _STORED.validate_json(content)
+            stored = TypeAdapter(_StoredPart).validate_json(content)
             if stored.origin != program.file_origin(_FORMAT) or stored.made_from != self._made_from:
                 return None
             pictures = {

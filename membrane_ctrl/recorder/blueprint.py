@@ -10,6 +10,7 @@ from membrane_ctrl.model.columns import Group, Plot, plot_title, plots_of
 from membrane_ctrl.model.figure_columns import figure_plot_title
 from membrane_ctrl.recorder.summary_page import SUMMARY_PATH
 from membrane_ctrl.run_files import plot_marks, shapes, streams
+from membrane_ctrl.run_files.stream import mean_path
 
 _NO_TIME = TimelineColumn("utc", visible=False)  # too narrow to read: the lines begin with it
 _TICKS = "every tick around events, else one a second"
@@ -75,7 +76,7 @@ def _figure_plot(plot: Plot) -> rrb.TimeSeriesView:
 def _make_means_plot(plot: Plot) -> rrb.TimeSeriesView:
     """Plot the mean of each second."""
     return _make_plot(
-        plot_title(plot, "mean of each second"), *map(streams.mean_path, streams.entities_of(plot))
+        plot_title(plot, "mean of each second"), *map(mean_path, streams.entities_of(plot))
     )
 
 

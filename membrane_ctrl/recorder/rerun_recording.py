@@ -29,6 +29,7 @@ from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.recorder.blueprint import run_blueprint
 from membrane_ctrl.recorder.state_lanes import LANES
 from membrane_ctrl.run_files import plot_marks, shapes, streams
+from membrane_ctrl.run_files.stream import Stream
 
 APPLICATION = "membrane_ctrl"
 RUN_TIME = "run_time"
@@ -255,7 +256,7 @@ def _panics_are_errors() -> Iterator[None]:
 
 
 def _style_lines(
-    archetype: Callable[..., rr.AsComponents], stream: streams.Stream, **more: object
+    archetype: Callable[..., rr.AsComponents], stream: Stream, **more: object
 ) -> rr.AsComponents:
     """Names, colours and widths of a stream's lines."""
     names, colours, widths = zip(

@@ -12,6 +12,7 @@ from membrane_ctrl.model.figure_columns import LOW_ORDER_COLUMNS
 from membrane_ctrl.model.prose import for_people
 from membrane_ctrl.recorder import rerun_recording, state_lanes
 from membrane_ctrl.run_files import shapes, streams
+from membrane_ctrl.run_files.stream import Stream
 
 # Three maps of the change a minute are 60 MB a day. Nothing is lost, as any map can be rebuilt from
 # the coefficients of its cycle. In the first minutes somebody is watching.
@@ -216,7 +217,7 @@ def _make_legend(
 
 def _make_quality_scalars(
     estimate: shape_estimate.ShapeEstimate,
-) -> dict[streams.Stream, list[float]]:
+) -> dict[Stream, list[float]]:
     return {
         streams.RESIDUAL: [estimate.slope_residual_urad],
         streams.QUALITY: [estimate.valid_fraction, estimate.saturated_fraction],
@@ -227,7 +228,7 @@ def _make_quality_scalars(
 
 def _make_change_scalars(
     estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate
-) -> dict[streams.Stream, tuple[list[float], list[float]]]:
+) -> dict[Stream, tuple[list[float], list[float]]]:
     """Values and variances; these are this cycle's own,
     as those of the reference shift all equally.
     """

@@ -1,7 +1,6 @@
 """State lanes: the words of a lane, their colours, and the meaning of a row's codes."""
 
-from dataclasses import dataclass
-
+from membrane_ctrl.recorder.lane import Lane
 from membrane_ctrl.run_files import named_tables
 
 _CALM = 0x5A5A5AFF
@@ -10,32 +9,6 @@ _GOOD = 0x009E73FF
 _WARN = 0xE69F00FF
 _BAD = 0xD55E00FF
 _FAULTS = named_tables.WORDS["fault"]
-
-
-@dataclass(frozen=True, slots=True)
-class Lane:
-    """One row of the state timeline.
-
-    Attributes
-    ----------
-    path : str
-        Rerun entity.
-    field : str
-        Telemetry field that holds the code; empty if the lane does not come from telemetry.
-    words : dict
-        Code to word.
-    colours : dict
-        Word to 0xRRGGBBAA; a word without one gets the viewer's choice.
-    """
-
-    path: str
-    field: str
-    words: dict[int, str]
-    colours: dict[str, int]
-
-    def name_code(self, code: int) -> str:
-        """The word for a code; an unknown code is shown as a number."""
-        return self.words.get(code, f"code {code}")
 
 
 STATE = Lane(

@@ -39,7 +39,7 @@ from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.state_tree import describe_tree, to_plain
 from membrane_ctrl.replay import replay as replays
 from membrane_ctrl.replay.numbers import NUMBERS_WITHIN, RecordedRows
-from membrane_ctrl.run_files import event_log, inputs_file, run_config, table_specs
+from membrane_ctrl.run_files import event_log, inputs_file, run_config, table_fields
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_tables import RunTables, as_recorded
 
@@ -380,7 +380,7 @@ def write_incident(
 def _make_input_rows(records: Records) -> telemetry.Rows:
     """Telemetry rows holding only the fields that repeat the ticks' inputs, NaN elsewhere."""
     rows = np.full((len(records), len(telemetry.FIELDS)), np.nan)
-    for name, column in table_specs.ROW_COLUMNS.items():
+    for name, column in table_fields.ROW_COLUMNS.items():
         rows[:, telemetry.COLUMN[column]] = records[name]
     return rows
 

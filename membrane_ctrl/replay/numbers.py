@@ -13,12 +13,12 @@ import numpy as np
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.model.columns import COLUMNS, Kind
-from membrane_ctrl.run_files import table_specs
+from membrane_ctrl.run_files import table_fields
 
 NUMBERS_WITHIN = 1e-9  # of a number's size, at least of 1 unit
 _SINGLE = 2.0**-24  # share of a number by which single precision may miss it
 _CODES = np.array([column.kind is not Kind.QUANTITY for column in COLUMNS.values()])
-_EXACT = np.array([table_specs.is_exact(name) for name in COLUMNS])
+_EXACT = np.array([table_fields.is_exact(name) for name in COLUMNS])
 
 
 class RecordedRows:

@@ -15,7 +15,7 @@ from membrane_ctrl.controller.tick_codec import RECORD, SAME, Records
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.model.program import stated_program
-from membrane_ctrl.run_files import shapes, table_specs
+from membrane_ctrl.run_files import shapes, table_fields, table_specs
 from membrane_ctrl.run_files.table_store.reader import TableReader
 from membrane_ctrl.run_files.table_store.spec import TableSpec
 
@@ -131,7 +131,7 @@ class InputsReader:
             )
             records = np.zeros(here.size, dtype=RECORD)
             records["tick"] = numbers[here]
-            for name in table_specs.INPUT_FIELDS:
+            for name in table_fields.INPUT_FIELDS:
                 records[name] = _record_column(inputs, "time_s" if name == "now_s" else name)[here]
             for name, column in _ROW_COLUMNS.items():
                 records[name] = _record_column(same, column)[there]

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from datetime import datetime
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -22,15 +21,11 @@ _COUNTS = ("rows", *(each.name for each in COLUMNS.values() if each.kind is Kind
 _TIME_MAX_S = 1e9  # thirty years: a damaged file may hold any time
 
 
-def _code_words(codes: type[IntEnum]) -> dict[int, str]:
-    return {int(code): code.name.lower() for code in codes}
-
-
 # By column: the name of each code.
 WORDS: dict[str, dict[int, str]] = {
-    "state": _code_words(telemetry.State),
-    "shape_state": _code_words(telemetry.ShapeState),
-    "safe_level": _code_words(telemetry.SafeLevel),
+    "state": telemetry.name_codes(telemetry.State),
+    "shape_state": telemetry.name_codes(telemetry.ShapeState),
+    "safe_level": telemetry.name_codes(telemetry.SafeLevel),
     "fault": {0: "none"} | {rule.code: rule.name for rule in safety.TABLE},
 }
 

@@ -17,7 +17,7 @@ from membrane_ctrl.model.colours import (
     YELLOW,
 )
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.run_files.streams import Line, Stream
+from membrane_ctrl.run_files.stream import Line, Stream
 
 # Vertical lines across plots of a fixed height, interrupted by NaN; an entity each, as a legend
 # lists only those with data.

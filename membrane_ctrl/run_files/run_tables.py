@@ -16,7 +16,7 @@ from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.columns import COLUMNS, Kind
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.run_files import event_log, levels, table_specs
+from membrane_ctrl.run_files import event_log, levels, table_fields, table_specs
 from membrane_ctrl.run_files.figure_minutes import FigureMinute
 from membrane_ctrl.run_files.table_store.spec import TableSpec
 from membrane_ctrl.run_files.table_store.writer import TableWriter
@@ -226,7 +226,7 @@ def _tick_rows(row: Mapping[str, Column]) -> pa.RecordBatch:
         values = np.ascontiguousarray(row[field.name], dtype=np.float64)
         if COLUMNS[field.name].kind is not Kind.QUANTITY:
             arrays.append(_whole_numbers(values))
-        elif table_specs.is_exact(field.name):
+        elif table_fields.is_exact(field.name):
             # a reading that is another NaN than the missing value keeps its bits, for replays
             arrays.append(
                 pa.array(values, mask=values.view(np.uint64) == _MISSING_BITS, from_pandas=False)
@@ -247,7 +247,7 @@ def as_recorded(row: telemetry.TelemetryRow) -> telemetry.TelemetryRow:
 
 def _input_rows(batch: TickBatch) -> pa.RecordBatch:
     """A tick's other inputs, bit by bit."""
-    values = [batch.records["tick"], *(batch.records[name] for name in table_specs.INPUT_FIELDS)]
+    values = [batch.records["tick"], *(batch.records[name] for name in table_fields.INPUT_FIELDS)]
     arrays = [pa.array(np.ascontiguousarray(column), from_pandas=False) for column in values]
     return pa.record_batch(arrays, schema=table_specs.INPUTS.schema)
 

@@ -4,7 +4,7 @@ The signals of one plot share one entity: m scalars of one entity cost the write
 less than m entities of one. `SeriesLines` sets the names of the lines once.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,20 +14,26 @@ from membrane_ctrl.model.colours import (
     BLUE,
     GREEN,
     GREY,
-    Colour,
 )
 from membrane_ctrl.model.columns import (
-    BY_GROUP,
     COLUMNS,
     POSITION,
     TRUE_ERROR_COLUMN,
     Group,
     Plot,
-    TelemetryColumn,
     columns_of,
     plots_of,
 )
 from membrane_ctrl.model.telemetry import Rows, get_column
+from membrane_ctrl.run_files.stream import (
+    Line,
+    Stream,
+    make_figure_stream,
+    make_line,
+    make_second_line,
+    make_telemetry_streams,
+    mean_path,
+)
 
 _ERROR = COLUMNS["error_um"]
 # A point per second all over the run: the others have every tick around events and one per second
@@ -36,66 +42,16 @@ _MEAN_PLOTS = (POSITION, *plots_of(Group.PUMP, Group.ENVIRONMENT))
 _MEANS = frozenset(each.entity for plot in _MEAN_PLOTS for each in columns_of(plot))
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
-    """One signal of a stream: the telemetry field, its name in the legend, its colour and width in
-    points.
-    """
-
-    field: str
-    name: str
-    colour: Colour
-    width: float = 1.5
-
-
-@dataclass(frozen=True, slots=True)
-class Stream:
-    """One Rerun entity of several signals."""
-
-    path: str
-    lines: tuple[Line, ...]
-
-    def select_values(self, rows: Rows) -> FloatArray:
-        """(n, lines) block of the stream."""
-        return np.stack([get_column(rows, line.field) for line in self.lines], axis=1)
-
-
-def _make_line(each: TelemetryColumn) -> Line:
-    return Line(each.name, each.legend, each.colour, each.width)
-
-
-def _telemetry_streams() -> tuple[Stream, ...]:
-    by_entity: dict[str, list[Line]] = {}
-    for each in BY_GROUP:
-        if each.entity:
-            by_entity.setdefault(each.entity, []).append(_make_line(each))
-    return tuple(Stream(path, tuple(lines)) for path, lines in by_entity.items())
-
-
-def mean_path(entity: str) -> str:
-    """Return the entity of the means of each second of an entity."""
-    return f"/overview{entity}"
-
-
-def _line_of_second(what: str, colour: Colour, width: float) -> Line:
-    return Line("", f"{_ERROR.label}, {what} of a second {_ERROR.unit}", colour, width)
-
-
-def _figure_stream(plot: Plot) -> Stream:
-    shown = figure_columns.figure_columns_of(plot)
-    return Stream(shown[0].entity, tuple(map(_make_line, shown)))
-
-
 # Every column except `mono_s`, the time axis, is in exactly one stream.
-STREAMS: tuple[Stream, ...] = _telemetry_streams()
+STREAMS: tuple[Stream, ...] = make_telemetry_streams()
 # Computed here from the rows, so that plots need no arithmetic.
-TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (_make_line(TRUE_ERROR_COLUMN),))
+TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (make_line(TRUE_ERROR_COLUMN),))
 OVERVIEW = Stream(
     mean_path("/loop/error"),
     (
-        _line_of_second("least", GREY, 1.0),
-        _line_of_second("mean", BLUE, 2.0),
-        _line_of_second("greatest", GREY, 1.0),
+        make_second_line("least", GREY, 1.0),
+        make_second_line("mean", BLUE, 2.0),
+        make_second_line("greatest", GREY, 1.0),
     ),
 )
 MEANS = tuple(
@@ -103,15 +59,15 @@ MEANS = tuple(
 )
 TRUE_MEAN = replace(TRUE_ERROR, path=mean_path(TRUE_ERROR.path))
 DERIVED: tuple[Stream, ...] = (TRUE_ERROR, OVERVIEW, *MEANS, TRUE_MEAN)
-ZERNIKE = _figure_stream(figure_columns.TERMS)
-CHANGE = _figure_stream(figure_columns.LOW_ORDERS)
-PUMP = _figure_stream(figure_columns.PUMP_CURVE)
-VIBRATIONS = _figure_stream(figure_columns.VIBRATIONS)
-SAG = _figure_stream(figure_columns.SAG_CHANGE)
-RESIDUAL = _figure_stream(figure_columns.SLOPE_RESIDUAL)
-QUALITY = _figure_stream(figure_columns.FRINGE_QUALITY)
-MODULATION = _figure_stream(figure_columns.MODULATION)
-LATENCY = _figure_stream(figure_columns.LATENCY)
+ZERNIKE = make_figure_stream(figure_columns.TERMS)
+CHANGE = make_figure_stream(figure_columns.LOW_ORDERS)
+PUMP = make_figure_stream(figure_columns.PUMP_CURVE)
+VIBRATIONS = make_figure_stream(figure_columns.VIBRATIONS)
+SAG = make_figure_stream(figure_columns.SAG_CHANGE)
+RESIDUAL = make_figure_stream(figure_columns.SLOPE_RESIDUAL)
+QUALITY = make_figure_stream(figure_columns.FRINGE_QUALITY)
+MODULATION = make_figure_stream(figure_columns.MODULATION)
+LATENCY = make_figure_stream(figure_columns.LATENCY)
 SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, RESIDUAL, QUALITY, MODULATION, LATENCY)
 
 

@@ -2,64 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cache
-from typing import Any, Literal, cast
+from typing import Any
 
 from membrane_ctrl.control_port.sender import role_includes
-from membrane_ctrl.controller.commands import ANY, TABLE, Kind, Role
 from membrane_ctrl.model.columns import unit_of
 from membrane_ctrl.model.numbers import parse_number
-
-
-@dataclass(frozen=True, slots=True)
-class WebUser:
-    """A viewer or a program: name and role."""
-
-    name: str
-    role: Role
-    # with a password or a token; a link proves no name
-    has_login: bool = field(default=False, compare=False)
-    via: Literal["page", "token"] = "page"
-
-
-@dataclass(frozen=True, slots=True)
-class ActionButton:
-    """A button: a command of `ctl` that takes at most one number or one text.
-
-    `asks` is what the viewer types: a number in the given unit, a text, or nothing but yes.
-    """
-
-    do: Kind | Literal["quiet"]
-    label: str
-    icon: str  # a Material icon's name
-    asks: Literal["", "number", "text"] = ""
-    unit: str = ""
-
-    @property
-    def role(self) -> Role:
-        """The role that it needs."""
-        return "operate" if self.do == "quiet" else TABLE[self.do].role
-
-    @property
-    def does(self) -> str:
-        """What it does, in a sentence."""
-        return (
-            "Acknowledge the alarms: no reminders." if self.do == "quiet" else TABLE[self.do].does
-        )
-
-    @property
-    def states(self) -> frozenset[str]:
-        """States in which the hold obeys, in lower case; all for `quiet`."""
-        return _states(self.do)
-
-
-@cache  # asked for each button of each viewer
-def _states(do: str) -> frozenset[str]:
-    return frozenset(
-        state.name.lower() for state in (ANY if do == "quiet" else TABLE[cast(Kind, do)].states)
-    )
-
+from membrane_ctrl.service.action_button import ActionButton
+from membrane_ctrl.service.web_user import WebUser
 
 STOP = ActionButton("stop", "STOP", "stop_circle")
 UNLOCK = ActionButton(

@@ -18,10 +18,10 @@ from typing import Any, cast, get_args
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model import errors
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.login_throttle import Admission, Guess, LoginThrottle
+from membrane_ctrl.service.web_user import WebUser
 
 SESSION_COOKIE = "membrane_ctrl"
 SESSION_S = 12 * 3600  # a shift; then log in again

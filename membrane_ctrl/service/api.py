@@ -39,29 +39,29 @@ from membrane_ctrl.control_port.api_models import (
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.sender import Peer, explain_missing_role, role_includes
 from membrane_ctrl.control_port.status_lines import alarm_lines, lock_lines
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.model.program import program_identity
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.service.access import WebUser, on_behalf
+from membrane_ctrl.service.access import on_behalf
 from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.ended_run import REPORT_NAME, EndedRun
 from membrane_ctrl.service.event_lines import find_new_lines
 from membrane_ctrl.service.feed import SIGNALS, HoldFeed, history
-from membrane_ctrl.service.hold_command import SendLimits
 from membrane_ctrl.service.hold_restart import begin_restart
 from membrane_ctrl.service.hold_seen import HoldSeen
 from membrane_ctrl.service.hold_starter import HoldStarter, StartOptions
 from membrane_ctrl.service.metrics import METRICS_TYPE, render_metrics
 from membrane_ctrl.service.published_signals import SIGNAL_TABLE
+from membrane_ctrl.service.send_limits import SendLimits
+from membrane_ctrl.service.web_user import WebUser
+from membrane_ctrl.service.work_pool import PoolFullError, WorkPool
 from membrane_ctrl.service.work_pools import (
     CONFIGURATIONS,
     LONG_CHARTS,
     RUN_LISTS,
     SAFETY_COMMANDS,
-    PoolFullError,
-    WorkPool,
     pool_of_command,
 )
 

@@ -32,10 +32,11 @@ from membrane_ctrl.run_files.event_log import parse_logged_line, read_newest_lin
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.service.ended_run import EndedRun, EndKind, find_newest_run, read_ended_run
 from membrane_ctrl.service.event_lines import SHOWN_MOST, format_event
-from membrane_ctrl.service.hold_command import NO_LIMITS, SendLimits, ask_hold
+from membrane_ctrl.service.hold_command import NO_LIMITS, ask_hold
 from membrane_ctrl.service.hold_seen import HoldSeen, Message
 from membrane_ctrl.service.published_signals import Value, signal_values
 from membrane_ctrl.service.run_events_reader import RunEventsReader
+from membrane_ctrl.service.send_limits import SendLimits
 
 PERIOD_S = 0.5  # as fast as people read changing figures
 SIGNALS = tuple(each.name for each in PUBLISHED)

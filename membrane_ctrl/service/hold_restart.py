@@ -11,7 +11,8 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter, StartOptions
-from membrane_ctrl.service.work_pools import RUN_LISTS, PoolFullError, pool_of_command
+from membrane_ctrl.service.work_pool import PoolFullError
+from membrane_ctrl.service.work_pools import RUN_LISTS, pool_of_command
 
 # A pump that does not obey takes 15 s, and the recording closes within 30 s
 _ENDS_S = 120.0

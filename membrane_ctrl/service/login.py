@@ -25,12 +25,13 @@ from urllib.parse import parse_qs, urlencode
 from starlette.middleware.sessions import SessionMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.accounts import DEVICE_COOKIE, SESSION_COOKIE, SESSION_S, Accounts
 from membrane_ctrl.service.connections import ConnectionGuard
 from membrane_ctrl.service.public_address import PublicAddress, host_name
 from membrane_ctrl.service.tokens import TokenBook
-from membrane_ctrl.service.work_pools import KNOWN_PASSWORDS, STRANGERS_PASSWORDS, PoolFullError
+from membrane_ctrl.service.web_user import WebUser
+from membrane_ctrl.service.work_pool import PoolFullError
+from membrane_ctrl.service.work_pools import KNOWN_PASSWORDS, STRANGERS_PASSWORDS
 
 LOGIN_PATH = "/login"
 _FORM_BYTES_MAX = 4096

@@ -7,35 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from membrane_ctrl.control_port.status_lines import fault_line, lock_lines, notice_lines
-from membrane_ctrl.model.columns import COLUMNS, PUBLISHED, unit_of
+from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.model.notices import Topic
 from membrane_ctrl.service.hold_seen import HoldSeen
+from membrane_ctrl.service.published_signal import Published
 
 Value = float | str | None  # None: not known
 _TERMS = range(4, 12)  # Noll: defocus to the first spherical term
-
-
-@dataclass(frozen=True, slots=True)
-class Published:
-    """A published value: a text, or a number with its unit (empty for counts and fractions)."""
-
-    name: str
-    description: str
-    is_text: bool = False
-
-    @property
-    def unit(self) -> str:
-        """Unit for people, from the name."""
-        return unit_of(self.name)
-
-    @property
-    def title(self) -> str:
-        """Name for people."""
-        column = COLUMNS.get(self.name)
-        return self.name if column is None else column.title
 
 
 _TICK = tuple(Published(each.name, each.description) for each in PUBLISHED)

@@ -10,11 +10,12 @@ from membrane_ctrl.control_port.api_models import StateAnswer
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.service_client import ServiceAddress, ServiceClient
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.service.hold_command import NO_LIMITS, SendLimits
+from membrane_ctrl.service.hold_command import NO_LIMITS
 from membrane_ctrl.service.hold_seen import HoldSeen, Message
 from membrane_ctrl.service.published_signals import Value
+from membrane_ctrl.service.send_limits import SendLimits
 
 _PERIOD_S = 1.0
 _ANSWER_S = 5.0

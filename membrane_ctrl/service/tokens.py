@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import cast, get_args
 
 from membrane_ctrl.control_port.service_link import service_folder
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.accounts import require_name
+from membrane_ctrl.service.web_user import WebUser
 
 _FILE_NAME = "tokens"
 _TOKEN_BYTES = 32  # too many to guess, so a fast hash is enough

@@ -28,6 +28,7 @@ FILES: dict[str, tuple[str, ...]] = {
 }
 _BYTES_MAX = 16_000_000  # a picture is some 100 kB
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+H = TypeVar("H", bound="Head")
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,9 +145,6 @@ class Head(Protocol):
     def created_utc(self) -> str:
         """ISO 8601."""
         ...
-
-
-H = TypeVar("H", bound=Head)
 
 
 def begin_session(

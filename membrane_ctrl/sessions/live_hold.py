@@ -19,7 +19,7 @@ from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where, socket_path
 from membrane_ctrl.control_port.message_syntax import Message
 from membrane_ctrl.control_port.status_lines import lock_lines
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model import errors, event_lines, shape_estimate, telemetry
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes.published_rings import attach_rings

@@ -11,7 +11,8 @@ from nicegui import ui
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.status_lines import lock_lines
 from membrane_ctrl.model.numbers import parse_number
-from membrane_ctrl.service.access import STOP, UNLOCK, ActionButton
+from membrane_ctrl.service.access import STOP, UNLOCK
+from membrane_ctrl.service.action_button import ActionButton
 from membrane_ctrl.web.consequences import (
     AllowedRange,
     Consequence,

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 
 from nicegui import ui
 
-from membrane_ctrl.service.work_pools import PoolFullError
+from membrane_ctrl.service.work_pool import PoolFullError
 from membrane_ctrl.web.alarm_history import PastAlarm
 from membrane_ctrl.web.messages import show_message
 

@@ -13,9 +13,9 @@ from nicegui import ui
 
 from membrane_ctrl.config.reference import Key, TableHelp, list_tables
 from membrane_ctrl.control_port.sender import role_includes
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model import errors
-from membrane_ctrl.service.access import STOP, WebUser, request
+from membrane_ctrl.service.access import STOP, request
 from membrane_ctrl.service.configuration_editor import (
     CheckedText,
     ConfigurationEditor,
@@ -24,7 +24,9 @@ from membrane_ctrl.service.configuration_editor import (
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_restart import begin_restart
 from membrane_ctrl.service.hold_starter import HoldStarter, find_name_of_run
-from membrane_ctrl.service.work_pools import CONFIGURATIONS, RUN_LISTS, PoolFullError
+from membrane_ctrl.service.web_user import WebUser
+from membrane_ctrl.service.work_pool import PoolFullError
+from membrane_ctrl.service.work_pools import CONFIGURATIONS, RUN_LISTS
 from membrane_ctrl.web.confirmation import confirm
 from membrane_ctrl.web.messages import show_message
 

@@ -12,7 +12,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control.filling_time import find_fall_s, find_filling_s
 from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.review.formatting import format_span
-from membrane_ctrl.service.access import ActionButton
+from membrane_ctrl.service.action_button import ActionButton
 
 _MOVES_GAS = frozenset(
     {"hold", "pause", "resume", "setpoint", "manual", "shape_on", "shape_off", "ack", "unlock"}

@@ -11,12 +11,13 @@ from urllib.parse import urlencode
 from nicegui import ui
 
 from membrane_ctrl.control_port.sender import role_includes
-from membrane_ctrl.controller.commands import TABLE, Role
+from membrane_ctrl.controller.command import Role
+from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.run_status import gains_words
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.service.work_pools import PoolFullError
+from membrane_ctrl.service.web_user import WebUser
+from membrane_ctrl.service.work_pool import PoolFullError
 from membrane_ctrl.web.confirmation import confirm
 from membrane_ctrl.web.gains_charts import CHARTS
 from membrane_ctrl.web.gains_views import ExploredGains, GainsSource, GainsViews, Setting

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Hashable
 from typing import Any, Generic, TypeVar
 
-from membrane_ctrl.service.work_pools import WorkPool
+from membrane_ctrl.service.work_pool import WorkPool
 
 T = TypeVar("T")
 

@@ -6,7 +6,6 @@ from nicegui import ui
 
 from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.model import errors
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_starter import (
     Configuration,
@@ -14,6 +13,7 @@ from membrane_ctrl.service.hold_starter import (
     StartOptions,
     find_name_of_run,
 )
+from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.service.work_pools import RUN_LISTS
 from membrane_ctrl.web.confirmation import confirm
 from membrane_ctrl.web.messages import show_message

@@ -19,17 +19,18 @@ from membrane_ctrl.service.access import (
     ACTIONS,
     STOP,
     UNLOCK,
-    ActionButton,
-    WebUser,
     is_action_allowed,
     on_behalf,
     request,
 )
+from membrane_ctrl.service.action_button import ActionButton
 from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.event_lines import find_new_lines
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
-from membrane_ctrl.service.work_pools import COMMANDS, PoolFullError
+from membrane_ctrl.service.web_user import WebUser
+from membrane_ctrl.service.work_pool import PoolFullError
+from membrane_ctrl.service.work_pools import COMMANDS
 from membrane_ctrl.web import figure_map, history_chart
 from membrane_ctrl.web.action_dialog import ask_for_confirmation
 from membrane_ctrl.web.alarms_panel import alarms_panel

@@ -13,13 +13,14 @@ from urllib.parse import quote
 from nicegui import ui
 
 from membrane_ctrl.control_port.sender import role_includes
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.run_files.run import open_run
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.ended_run import REPORT_NAME
-from membrane_ctrl.service.work_pools import REPORTS, RUN_LISTS, PoolFullError
+from membrane_ctrl.service.web_user import WebUser
+from membrane_ctrl.service.work_pool import PoolFullError
+from membrane_ctrl.service.work_pools import REPORTS, RUN_LISTS
 from membrane_ctrl.web.messages import show_message
 
 WRITES: Role = "operate"  # reports

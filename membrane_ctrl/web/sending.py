@@ -6,7 +6,8 @@ from typing import Any
 
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.service.work_pools import PoolFullError, pool_of_command
+from membrane_ctrl.service.work_pool import PoolFullError
+from membrane_ctrl.service.work_pools import pool_of_command
 from membrane_ctrl.web.messages import show_message
 
 

@@ -21,7 +21,6 @@ from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.link_code import draw_link_code
 from membrane_ctrl.control_port.service_link import link_key, publish_address, read_or_make_secret
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.accounts import Accounts
 from membrane_ctrl.service.alarm_child import AlarmChild
 from membrane_ctrl.service.api import make_api
@@ -38,7 +37,9 @@ from membrane_ctrl.service.public_address import public_address
 from membrane_ctrl.service.service_check import read_users, require_usable_files
 from membrane_ctrl.service.service_feed import make_feed
 from membrane_ctrl.service.tokens import TokenBook, tokens_file
-from membrane_ctrl.service.work_pools import REPORT_FILES, SESSIONS, PoolFullError
+from membrane_ctrl.service.web_user import WebUser
+from membrane_ctrl.service.work_pool import PoolFullError
+from membrane_ctrl.service.work_pools import REPORT_FILES, SESSIONS
 from membrane_ctrl.web.gains_views import parse_setting
 from membrane_ctrl.web.page import WebPage
 from membrane_ctrl.web.runs_panel import run_folder

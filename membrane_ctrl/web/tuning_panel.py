@@ -13,10 +13,10 @@ from urllib.parse import urlencode
 from nicegui import ui
 
 from membrane_ctrl.control_port.outcome import Outcome
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model import errors
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.event_lines import find_new_lines
+from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.service.work_pools import ANSWERS
 from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, write_answer

@@ -16,7 +16,7 @@ from membrane_ctrl.bridges import command_lanes
 from membrane_ctrl.bridges.command_lanes import ORDINARY_MOST, SAFETY_MOST_EACH, CommandLanes
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import SAFETY
-from membrane_ctrl.service.hold_command import SendLimits
+from membrane_ctrl.service.send_limits import SendLimits
 
 SAFETY_KINDS = sorted(SAFETY)
 

@@ -21,7 +21,7 @@ from membrane_ctrl.config.schema import (
     ShapeConfig,
     TwinConfig,
 )
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model.acquisition_events import Capture
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.sessions.live_hold import News

@@ -31,7 +31,8 @@ from campaign_run import Result, run_case
 from campaign_times import RATE_HZ
 from process_run import ProcessResult, process_table
 
-from membrane_ctrl.controller.safety import TABLE, Observation, SafetyTable, Verdict
+from membrane_ctrl.controller.observation import Observation
+from membrane_ctrl.controller.safety import TABLE, SafetyTable, Verdict
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 SEEDS = range(1, 5)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from campaign_times import GAUGE_STUCK_S, HOLD_FLOW_S, STALE_S, TICK_S
 
-from membrane_ctrl.controller.commands import Kind
+from membrane_ctrl.controller.command import Kind
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})

@@ -15,7 +15,7 @@ from campaign_world import World
 
 from firmware_iface.settings import BoardInputConfig, InterlockDriver, ModbusInputConfig
 from membrane_ctrl.config.schema import DevicesConfig
-from membrane_ctrl.controller.commands import Kind
+from membrane_ctrl.controller.command import Kind
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks

@@ -41,8 +41,8 @@ from membrane_ctrl.config.schema import (
     StatesConfig,
 )
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
-from membrane_ctrl.controller import states
-from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.controller import state_handlers
+from membrane_ctrl.controller.command import Command, Kind
 from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
@@ -276,7 +276,7 @@ def _raising(case: Case, injection: Injection) -> Iterator[None]:
     if not case.raises:
         yield
         return
-    before = dict(states.HANDLERS)
+    before = dict(state_handlers.HANDLERS)
 
     def breaking(state: State) -> None:
         def handler(context: TickContext) -> State:
@@ -284,11 +284,11 @@ def _raising(case: Case, injection: Injection) -> Iterator[None]:
                 raise ZeroDivisionError("injected")
             return before[state](context)
 
-        states.HANDLERS[state] = handler
+        state_handlers.HANDLERS[state] = handler
 
     try:
         for state in before:
             breaking(state)
         yield
     finally:
-        states.HANDLERS.update(before)
+        state_handlers.HANDLERS.update(before)

@@ -13,7 +13,7 @@ from campaign_world import WatchedPlant, World
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.controller.command import Command, Kind
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.shape_estimate import ShapeEstimate

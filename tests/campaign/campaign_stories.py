@@ -13,8 +13,8 @@ from campaign_stage import Stage
 from campaign_times import DISPLACEMENT_MAX_UM, TICK_S
 from campaign_world import World
 
-from membrane_ctrl.controller import states
-from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.controller import state_handlers
+from membrane_ctrl.controller.command import Command, Kind
 from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.model.telemetry import State
 
@@ -267,7 +267,7 @@ def resumes_of_a_day() -> list[str]:
 def a_handler_that_gives_nonsense() -> list[str]:
     """A state's code computes NaN, 2 or -1 for the pump: 0 is written."""
     violations = []
-    before = states.HANDLERS[State.HOLD]
+    before = state_handlers.HANDLERS[State.HOLD]
     for nonsense in (math.nan, 2.0, -1.0, math.inf):
         stage = Stage().held()
 
@@ -275,7 +275,7 @@ def a_handler_that_gives_nonsense() -> list[str]:
             context.pump_fraction = value
             return State.HOLD
 
-        states.HANDLERS[State.HOLD] = wrong
+        state_handlers.HANDLERS[State.HOLD] = wrong
         try:
             stage.tick()
             stage.must(not stage.still(), f"{nonsense} for the pump, and it is driven")
@@ -283,7 +283,7 @@ def a_handler_that_gives_nonsense() -> list[str]:
         except Exception as error:
             stage.must(False, f"{nonsense} for the pump: {error!r}")
         finally:
-            states.HANDLERS[State.HOLD] = before
+            state_handlers.HANDLERS[State.HOLD] = before
         violations += stage.violations
     return violations
 

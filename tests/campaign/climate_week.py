@@ -24,8 +24,8 @@ from membrane_ctrl.config.schema import (
     ShapeConfig,
     TwinConfig,
 )
-from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.controller.protection import ProcessValue
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.duties import ProcessValue
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault, Maintenance

@@ -26,7 +26,7 @@ from firmware_iface.roles import (
     LinkState,
 )
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring

@@ -26,7 +26,7 @@ from climate_week import Climate, Week, run_week
 from protection_cells import BY_WORDS, FAILURES, Outcome, SensorFailure, Undertaking, run_cell
 from protection_page import write_page
 
-from membrane_ctrl.controller.protection import Activity, FilmSensor, ProcessValue
+from membrane_ctrl.controller.duties import Activity, FilmSensor, ProcessValue
 
 RESULTS = Path(__file__).parents[2] / "build" / "protection.jsonl"
 WEEKS = Path(__file__).parents[2] / "build" / "climate.json"

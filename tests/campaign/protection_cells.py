@@ -27,8 +27,9 @@ from membrane_ctrl.config.schema import (
     TwinConfig,
 )
 from membrane_ctrl.control.experiments.spec import ExperimentKind, ExperimentSpec, PumpStep
-from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.controller.protection import Activity, Failure, FilmSensor, ProcessValue
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.duties import Activity, FilmSensor, ProcessValue
+from membrane_ctrl.controller.protection import Failure
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault, Maintenance, Plausibility

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from protection_cells import BY_WORDS, WARM_S, Outcome, Undertaking
 
 from membrane_ctrl.config.schema import Config, StatesConfig
-from membrane_ctrl.controller.protection import Failure, ProcessValue, find_bound
+from membrane_ctrl.controller.duties import ProcessValue
+from membrane_ctrl.controller.protection import Failure, find_bound
 
 if TYPE_CHECKING:
     from climate_week import Week

@@ -16,8 +16,8 @@ import numpy as np
 from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.control.shape_loop import ShapeCode
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.control.shape_code import ShapeCode
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection

@@ -9,7 +9,7 @@ import numpy as np
 from sensor_faults import Lying, LyingPlant
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault

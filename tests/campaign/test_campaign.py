@@ -10,8 +10,9 @@ from campaign_cases import CASES, SITUATIONS, Case, Situation
 from campaign_holds import HOLDS
 from campaign_run import run_case
 
+from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.controller.safe_levels import SafeLevels
-from membrane_ctrl.controller.safety import TABLE, Observation, SafetyTable, Verdict
+from membrane_ctrl.controller.safety import TABLE, SafetyTable, Verdict
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 

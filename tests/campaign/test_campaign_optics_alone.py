@@ -18,7 +18,7 @@ from membrane_ctrl.config.schema import (
     ShapeConfig,
     TwinConfig,
 )
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection

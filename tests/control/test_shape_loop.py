@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import ShapeConfig
-from membrane_ctrl.control.shape_loop import ShapeCode, ShapeLoop, ShapeOutput
+from membrane_ctrl.control.shape_code import ShapeCode
+from membrane_ctrl.control.shape_loop import ShapeLoop, ShapeOutput
 from membrane_ctrl.control.shape_reference import SHAPES, TRACKED_EVERY_S, TRACKED_SHAPES
 from membrane_ctrl.model.reason import NO_REASON, Reason
 from membrane_ctrl.model.shape_estimate import ShapeEstimate

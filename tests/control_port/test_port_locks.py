@@ -20,7 +20,7 @@ from membrane_ctrl.control_port.protocol import OnBehalf, parse
 from membrane_ctrl.control_port.sender import Peer, sender_of
 from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.control_port.status_lines import lock_lines
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model.events import LockRemoved, LockSet
 from membrane_ctrl.model.run_events import LockNotStored, LockStored
 from membrane_ctrl.model.run_status import RunStatus

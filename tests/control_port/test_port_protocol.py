@@ -20,7 +20,8 @@ from membrane_ctrl.control_port.protocol import (
     parse,
 )
 from membrane_ctrl.control_port.sender import Peer, explain_missing_role
-from membrane_ctrl.controller.commands import TABLE, Kind
+from membrane_ctrl.controller.command import Kind
+from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.hold.child_processes import EVENT_BYTES
 from membrane_ctrl.model.events import CommandTaken
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.protocol import MESSAGE_BYTES
 from membrane_ctrl.control_port.sender import Peer
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.telemetry import State

@@ -23,7 +23,7 @@ from membrane_ctrl.config.schema import (
 from membrane_ctrl.control.gain_limits import find_dead_time_s, limit_gains
 from membrane_ctrl.control.pump_response import PumpResponse
 from membrane_ctrl.controller.actuator_test import ActuatorTest, ActuatorTestState
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection

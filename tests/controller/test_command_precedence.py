@@ -14,9 +14,10 @@ import pytest
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
-from membrane_ctrl.controller.commands import DOWN, TABLE, Command, Kind, sort_commands
+from membrane_ctrl.controller.command import Command, Kind
+from membrane_ctrl.controller.commands import DOWN, TABLE, sort_commands
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.safety import MOVING
+from membrane_ctrl.controller.state_sets import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import CommandTaken

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from membrane_ctrl.config.schema import Config, ShapeConfig
-from membrane_ctrl.controller.commands import TABLE, Command, explain_refusal
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import TABLE, explain_refusal
 from membrane_ctrl.model.telemetry import State
 
 WITHOUT_SHAPE = Config(shape=ShapeConfig(enabled=False))

@@ -12,7 +12,8 @@ import pytest
 
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, StatesConfig, TwinConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.errors import Exit
@@ -217,12 +218,12 @@ def test_missing_sensors_never_start_the_pump() -> None:
 
 
 def test_an_error_in_the_control_code_stops_the_pump(monkeypatch: pytest.MonkeyPatch) -> None:
-    from membrane_ctrl.controller import states
+    from membrane_ctrl.controller import state_handlers
 
-    def broken(context: states.TickContext) -> State:
+    def broken(context: TickContext) -> State:
         raise ZeroDivisionError("x / 0")
 
-    monkeypatch.setitem(states.HANDLERS, State.HOLD, broken)
+    monkeypatch.setitem(state_handlers.HANDLERS, State.HOLD, broken)
     run = Run()
     assert run.finished == Exit.SAFETY_TRIP
     assert [(f["name"], f["seen"]) for f in run.of("fault")] == [
@@ -275,26 +276,26 @@ def test_the_same_seed_gives_the_same_run() -> None:
 def test_an_invalid_bench_command_counts_as_an_error_of_the_control_code(
     monkeypatch: pytest.MonkeyPatch, field: str, value: float
 ) -> None:
-    from membrane_ctrl.controller import states
+    from membrane_ctrl.controller import state_handlers
 
-    def broken(context: states.TickContext) -> State:
+    def broken(context: TickContext) -> State:
         context.pump_fraction = 0.5
         setattr(context, field, value)
         return State.STANDBY
 
-    monkeypatch.setitem(states.HANDLERS, State.STANDBY, broken)
+    monkeypatch.setitem(state_handlers.HANDLERS, State.STANDBY, broken)
     run = Run(CALM, 5.0)
     assert [f["name"] for f in run.of("fault")] == ["tick_error"]
     assert all(tick.outputs.command == BenchCommand(0.0, 0.0) for tick in run.ticks)
 
 
 def test_an_error_in_a_vented_fault_leaves_the_vent_open(monkeypatch: pytest.MonkeyPatch) -> None:
-    from membrane_ctrl.controller import states
+    from membrane_ctrl.controller import state_handlers
 
-    def broken(context: states.TickContext) -> State:
+    def broken(context: TickContext) -> State:
         raise ZeroDivisionError("x / 0")
 
-    monkeypatch.setitem(states.HANDLERS, State.FAULT, broken)
+    monkeypatch.setitem(state_handlers.HANDLERS, State.FAULT, broken)
     run = Run(CALM, 60.0, after(25.0, math.inf, lambda r: replace(r, gauge_pressure_pa=900.0)))
     assert run.finished == Exit.SAFETY_TRIP
     assert run.ticks[-1].outputs.command == BenchCommand(0.0, 1.0)

@@ -16,7 +16,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import parse_tables
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection

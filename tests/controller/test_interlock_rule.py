@@ -11,7 +11,7 @@ import pytest
 from firmware_iface.roles import BenchReading
 from firmware_iface.settings import BoardInputConfig, ModbusInputConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig, ResumeConfig, StatesConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick_assembler import TickAssembler

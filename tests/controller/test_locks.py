@@ -10,7 +10,8 @@ import pytest
 from test_command_precedence import CONFIG, Mirror, in_state
 
 from membrane_ctrl.controller import locks
-from membrane_ctrl.controller.commands import AT_START, TABLE, Command, Kind
+from membrane_ctrl.controller.command import Command, Kind
+from membrane_ctrl.controller.commands import AT_START, TABLE
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_assembler import TickAssembler

@@ -9,8 +9,8 @@ import pytest
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, EstimatorConfig, ShapeConfig
+from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.controller.observer import Observer
-from membrane_ctrl.controller.safety import Observation
 from membrane_ctrl.controller.tick import TickInputs
 from tests.worlds.sound_figure import SOUND_FIGURE
 

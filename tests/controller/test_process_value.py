@@ -12,7 +12,7 @@ from membrane_ctrl.config.control import EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.config.schema import Config, ShapeConfig, StatesConfig, leave_to_start
 from membrane_ctrl.control.centre_estimate import CentreEstimate, Sensor, SensorView
 from membrane_ctrl.control.loop_comparison import MeanSquare
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.process_value import (
     NOTICE,
     ProcessValueChoice,

@@ -9,17 +9,10 @@ from itertools import product
 import pytest
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.protection import (
-    Activity,
-    Duty,
-    Failure,
-    FilmSensor,
-    Guard,
-    ProcessValue,
-    find_bound,
-    find_protections,
-)
-from membrane_ctrl.controller.safety import MOVING, TABLE
+from membrane_ctrl.controller.duties import Activity, Duty, FilmSensor, Guard, ProcessValue
+from membrane_ctrl.controller.protection import Failure, find_bound, find_protections
+from membrane_ctrl.controller.safety import TABLE
+from membrane_ctrl.controller.state_sets import MOVING
 
 RULES = {rule.name: rule for rule in TABLE}
 CELLS = list(product(ProcessValue, Activity, Duty))

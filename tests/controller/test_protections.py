@@ -19,7 +19,7 @@ from membrane_ctrl.config.schema import (
     TwinConfig,
 )
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import (

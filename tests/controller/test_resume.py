@@ -18,10 +18,12 @@ from membrane_ctrl.config.schema import (
     ShapeConfig,
     StatesConfig,
 )
-from membrane_ctrl.controller.commands import AT_START, Command
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import AT_START
+from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.controller.resume_rule import ResumeRule
 from membrane_ctrl.controller.safe_levels import SafeLevels
-from membrane_ctrl.controller.safety import TABLE, Observation
+from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.hold.scenario_file import ScenarioStep
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection

@@ -10,7 +10,8 @@ import pytest
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.link_report import LinkReport
-from membrane_ctrl.controller.safety import TABLE, Rule, SafetyTable
+from membrane_ctrl.controller.safety import TABLE, SafetyTable
+from membrane_ctrl.controller.safety_rule import Rule
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from tests.worlds.quiet_observation import GOOD
 

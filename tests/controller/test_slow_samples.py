@@ -14,7 +14,7 @@ import pytest
 from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.sample_rate import NOTICE, SampleRate, SampleRateState
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.virtual_run import VirtualRun

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, DevicesConfig, LoopConfig, ShapeConfig, StatesConfig
-from membrane_ctrl.controller.commands import TABLE, Command
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.safety import MOVING
+from membrane_ctrl.controller.state_sets import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import SafeLevel, State

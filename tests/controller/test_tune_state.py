@@ -16,7 +16,8 @@ from pydantic import ValidationError
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control.pump_drift import PumpScale
-from membrane_ctrl.controller.commands import Command, explain_refusal
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import explain_refusal
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick import TickInputs

@@ -14,7 +14,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.controller import figure_gate, observer
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import CommandTaken

@@ -23,7 +23,7 @@ from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.role_bench import RoleBench, RoleDevices
 from firmware_iface.settings import KeyenceDlRs1aConfig
 from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection

@@ -15,7 +15,8 @@ from typing import Any, cast
 import pytest
 
 from membrane_ctrl.config.schema import Config, DevicesConfig, StatesConfig
-from membrane_ctrl.controller.commands import AT_START, Command
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import AT_START
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold import lock_keeper
 from membrane_ctrl.hold.hold_options import HoldOptions

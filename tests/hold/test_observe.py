@@ -14,7 +14,7 @@ from firmware_iface.emulators.pump_board import BoardSample, PumpBoardEmulator
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.cli import run as run_command_line
 from membrane_ctrl.config.schema import Config, DevicesConfig, EstimatorConfig, StatesConfig
-from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.controller.command import Command, Kind
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.start_checks import identify_board
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick

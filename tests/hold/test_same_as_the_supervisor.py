@@ -12,7 +12,7 @@ from typing import cast
 import pytest
 
 from membrane_ctrl.config.schema import Config, LoopConfig, TwinConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from firmware_iface import roles
 from firmware_iface.drivers.pump_board import PumpBoard
 from membrane_ctrl.config.schema import Config, LoopConfig, ResumeConfig, ShapeConfig, StatesConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault

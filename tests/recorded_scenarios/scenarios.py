@@ -20,7 +20,8 @@ from membrane_ctrl.config.schema import (
     StatesConfig,
     TwinConfig,
 )
-from membrane_ctrl.controller.commands import AT_START, Command
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import AT_START
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.sim.bench_events import (
     AirTemperatureChange,

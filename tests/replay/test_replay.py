@@ -17,7 +17,7 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_assembler import TickAssembler

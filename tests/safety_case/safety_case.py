@@ -24,8 +24,9 @@ for folder in (ROOT / "tests" / "mutants", ROOT):
 from mutants import Verdict, current_verdicts, load, removes  # noqa: E402
 
 from firmware_iface.register_map import load_default_map  # noqa: E402
-from membrane_ctrl.controller.protection import Guard  # noqa: E402
-from membrane_ctrl.controller.safety import TABLE, Rule  # noqa: E402
+from membrane_ctrl.controller.duties import Guard  # noqa: E402
+from membrane_ctrl.controller.safety import TABLE  # noqa: E402
+from membrane_ctrl.controller.safety_rule import Rule  # noqa: E402
 
 SOURCE = Path(__file__).with_name("safety_case.toml")
 DOCUMENT = ROOT / "docs" / "reference" / "safety-case.md"

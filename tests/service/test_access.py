@@ -12,11 +12,12 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.service.access import WebUser, on_behalf
+from membrane_ctrl.service.access import on_behalf
 from membrane_ctrl.service.accounts import SESSION_S, Accounts, known_user, known_users
 from membrane_ctrl.service.login import with_login
 from membrane_ctrl.service.public_address import PublicAddress
 from membrane_ctrl.service.tokens import TokenBook, add_token, revoke_token
+from membrane_ctrl.service.web_user import WebUser
 from tests.worlds.password_guesses import guess_password
 
 ADDRESS = PublicAddress(frozenset({"127.0.0.1", "localhost"}))

@@ -19,12 +19,12 @@ from membrane_ctrl.control_port.api_models import StateAnswer
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
 from membrane_ctrl.model.run_events import Ended, Mark
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.api import make_api
 from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.published_signals import SIGNAL_TABLE
+from membrane_ctrl.service.web_user import WebUser
 from tests.service.test_ended_run import FAULT, write_run
 from tests.worlds.port_run import PortRun, port_run
 

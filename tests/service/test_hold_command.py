@@ -17,7 +17,7 @@ from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.service.hold_command import SendLimits
+from membrane_ctrl.service.send_limits import SendLimits
 from tests.bridges.test_bridges import bridge_with, seen_hold
 from tests.worlds.port_run import port_run
 

@@ -27,12 +27,12 @@ from membrane_ctrl.service.access import (
     ACTIONS,
     STOP,
     UNLOCK,
-    WebUser,
     is_action_allowed,
     on_behalf,
     request,
 )
 from membrane_ctrl.service.feed import HoldFeed
+from membrane_ctrl.service.web_user import WebUser
 from tests.worlds.port_run import ROW, port_run
 
 _LOOK_S = 0.02

@@ -23,10 +23,11 @@ from membrane_ctrl.control_port.service_client import (
     read_token,
 )
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
-from membrane_ctrl.service.access import WebUser, on_behalf
-from membrane_ctrl.service.hold_command import SendLimits
+from membrane_ctrl.service.access import on_behalf
+from membrane_ctrl.service.send_limits import SendLimits
 from membrane_ctrl.service.service_feed import ServiceFeed, make_feed
 from membrane_ctrl.service.tokens import add_token, revoke_token, tokens_file
+from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.web.fleet_panel import fleet_rows
 from tests.web.test_page import served
 from tests.worlds.port_run import ROW, PortRun, keep_ticking, port_run

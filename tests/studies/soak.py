@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.config.schema import Config, LoopConfig, ResumeConfig, StatesConfig, TwinConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import State

@@ -9,17 +9,11 @@ from pathlib import Path
 
 from firmware_iface.register_map import load_default_map
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.protection import (
-    Activity,
-    Duty,
-    Failure,
-    FilmSensor,
-    Guard,
-    ProcessValue,
-    find_bound,
-    find_protections,
-)
-from membrane_ctrl.controller.safety import (
+from membrane_ctrl.controller.duties import Activity, Duty, FilmSensor, Guard, ProcessValue
+from membrane_ctrl.controller.protection import Failure, find_bound, find_protections
+from membrane_ctrl.controller.safety import TABLE
+from membrane_ctrl.controller.safety_rule import Rule
+from membrane_ctrl.controller.state_sets import (
     ALWAYS,
     CONNECTED,
     ESTIMATED,
@@ -27,8 +21,6 @@ from membrane_ctrl.controller.safety import (
     HOLDING,
     MOVING,
     NOT_YET_FAULT,
-    TABLE,
-    Rule,
 )
 from membrane_ctrl.model.telemetry import SafeLevel, State
 

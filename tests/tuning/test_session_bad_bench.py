@@ -13,7 +13,7 @@ import pytest
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model.errors import Exit, RejectedError
 from membrane_ctrl.model.telemetry import ShapeState, State
 from membrane_ctrl.sessions.folder import create_session

@@ -9,7 +9,7 @@ import pytest
 
 from membrane_ctrl.control.experiments.experiment import ExperimentEnd
 from membrane_ctrl.control.experiments.spec import ExperimentSpec, PumpStep
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.live_hold import HoldError, News
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config

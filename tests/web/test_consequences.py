@@ -7,7 +7,8 @@ import math
 import pytest
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.service.access import ACTIONS, STOP, UNLOCK, ActionButton
+from membrane_ctrl.service.access import ACTIONS, STOP, UNLOCK
+from membrane_ctrl.service.action_button import ActionButton
 from membrane_ctrl.web.action_dialog import explain_input
 from membrane_ctrl.web.consequences import (
     Consequence,

@@ -20,8 +20,8 @@ from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.events import LockSet
 from membrane_ctrl.model.run_events import Mark
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.ended_run import REPORT_NAME
+from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_log import LiveLog
 from membrane_ctrl.sessions.progress import Progress

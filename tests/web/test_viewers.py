@@ -11,8 +11,8 @@ import pytest
 
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.service import event_lines
-from membrane_ctrl.service.access import WebUser
-from membrane_ctrl.service.work_pools import WorkPool
+from membrane_ctrl.service.web_user import WebUser
+from membrane_ctrl.service.work_pool import WorkPool
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_log import ANSWER, LiveLog, PageAnswer
 from membrane_ctrl.web import server, tuning_panel

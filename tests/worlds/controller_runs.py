@@ -21,7 +21,7 @@ from membrane_ctrl.config.schema import (
     TwinConfig,
 )
 from membrane_ctrl.control.experiments.spec import ExperimentSpec, PumpStep
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.state import ControllerState
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs

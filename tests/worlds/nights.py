@@ -26,7 +26,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import COLUMN, FIELDS, Rows, ShapeState, State
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.run_files.run_tables import RunTables
-from membrane_ctrl.run_files.table_specs import ROW_COLUMNS
+from membrane_ctrl.run_files.table_fields import ROW_COLUMNS
 
 RATE_HZ = 10.0
 CONFIG = Config(loop=LoopConfig(rate_hz=RATE_HZ))

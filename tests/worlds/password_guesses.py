@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.accounts import Accounts
+from membrane_ctrl.service.web_user import WebUser
 
 
 def guess_password(

@@ -18,7 +18,8 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control_port.sender import Peer
 from membrane_ctrl.control_port.server import Port, RunHooks
 from membrane_ctrl.control_port.sockets import Listeners, UnixListener
-from membrane_ctrl.controller.commands import Command, explain_refusal
+from membrane_ctrl.controller.command import Command
+from membrane_ctrl.controller.commands import explain_refusal
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.telemetry import FIELDS, State, TelemetryRow

@@ -1,6 +1,6 @@
 """What a tick shows while the mirror is held and nothing is wrong."""
 
-from membrane_ctrl.controller.safety import Observation
+from membrane_ctrl.controller.observation import Observation
 
 GOOD = Observation(
     link_up=True,

@@ -29,7 +29,7 @@ from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.server import Port, RunHooks
 from membrane_ctrl.control_port.sockets import listeners_for
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring

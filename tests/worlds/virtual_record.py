@@ -11,7 +11,7 @@ import numpy as np
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, TwinConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import take_snapshot
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs

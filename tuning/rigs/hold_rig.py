@@ -16,7 +16,7 @@ import numpy as np
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import experiment, operating_point
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model import events, shape_estimate, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
 from tuning.identification.record import Record, Series

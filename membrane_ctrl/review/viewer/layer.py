@@ -5,6 +5,7 @@ much to draw; the figure with maps; states; events, marks and detected events.
 """
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from membrane_ctrl.review.report.figures import broken_at_gaps
 from membrane_ctrl.review.run_times import end_s
 from membrane_ctrl.run_files import hold_parts, plot_marks, shapes, streams
 from membrane_ctrl.run_files.run import Block, Run
+from membrane_ctrl.run_files.stream import Line, Stream, mean_path
 
 APPLICATION = "membrane_review"
 # The viewer draws about this many rows of a dozen signals without stutter in software.
@@ -55,7 +57,7 @@ _FOUND_COLOURS = {
 ALL = (-np.inf, np.inf)
 
 
-def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
+def overview_streams(plot: Plot) -> tuple[Stream, ...]:
     """Return the streams of a plot of an overview level; the field of a line is a column of the
     level.
 
@@ -64,19 +66,22 @@ def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
     """
     kept = aggregated_of(plot)
     alone = sum(not each.twin_only for each in kept) == 1
-    by_entity: dict[str, list[streams.Line]] = {}
+    by_entity: dict[str, list[Line]] = {}
     for each in kept:
-        lines = by_entity.setdefault(streams.mean_path(each.entity), [])
+        lines = by_entity.setdefault(mean_path(each.entity), [])
         if alone and not each.twin_only:
             for kind, name in _EXTREMES.items():
                 label = f"{each.label}, {name} {each.unit}"
-                lines.append(streams.Line(f"{kind}_{each.name}", label, GREY, 1.0))
+                lines.append(Line(f"{kind}_{each.name}", label, GREY, 1.0))
         label = f"{each.label}, mean {each.unit}"
-        lines.append(streams.Line(f"mean_{each.name}", label, each.colour, each.width))
-    return tuple(streams.Stream(path, tuple(lines)) for path, lines in by_entity.items())
+        lines.append(Line(f"mean_{each.name}", label, each.colour, each.width))
+    return tuple(Stream(path, tuple(lines)) for path, lines in by_entity.items())
 
 
-OVERVIEWS = tuple(stream for plot in plots_of(*DRAWN) for stream in overview_streams(plot))
+@cache
+def _list_overviews() -> tuple[Stream, ...]:
+    """Return the streams of a level of all plots."""
+    return tuple(stream for plot in plots_of(*DRAWN) for stream in overview_streams(plot))
 
 
 class Layer:
@@ -147,7 +152,7 @@ class Layer:
             self._send_thumbnails(run, part_s)
 
     def _send_overviews(self, level: Block, band_um: float) -> None:
-        for stream in OVERVIEWS:
+        for stream in _list_overviews():
             values = np.column_stack([level[line.field] for line in stream.lines])
             if np.isfinite(values).any():
                 self._send_style(stream.path, _names_and_colours(stream))
@@ -412,7 +417,7 @@ class Layer:
         self._stream.send_columns(self._prefix + path, indexes=indexes, columns=columns)
 
 
-def _names_and_colours(stream: streams.Stream) -> list[tuple[str, Colour]]:
+def _names_and_colours(stream: Stream) -> list[tuple[str, Colour]]:
     return [(line.name, line.colour) for line in stream.lines]
 
 

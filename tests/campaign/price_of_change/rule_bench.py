@@ -23,7 +23,7 @@ import mutants  # noqa: E402
 
 from firmware_iface.roles import BenchReading  # noqa: E402
 from membrane_ctrl.config.schema import Config  # noqa: E402
-from membrane_ctrl.controller.commands import Command  # noqa: E402
+from membrane_ctrl.controller.command import Command  # noqa: E402
 from membrane_ctrl.hold.virtual_run import VirtualRun  # noqa: E402
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection  # noqa: E402
 from membrane_ctrl.model.events import Fault, StateEntered  # noqa: E402
