@@ -85,7 +85,7 @@ class Mutant:
     find: str
     replace: str
     lives: str = ""
-    guard: str = ""  # name of the `controller.protection.Guard` that it removes, if it removes one
+    guard: str = ""  # name of the `controller.duties.Guard` that it removes, if it removes one
     # name of the rule of the safety table that it removes, if it was made from the table
     rule: str = ""
 
