@@ -56,7 +56,7 @@ def open_on_hold(
 def _restore_gains(rig: HoldRig, progress: Progress) -> None:
     progress.interrupted = False
     try:
-        rig.go_back()
+        rig.restore_good_gains()
     except HoldError as error:
         progress.print_line(
             f"could not restore the last good gains ({error}); gains on trial revert automatically"

@@ -37,7 +37,7 @@ class PlantSection(Section):
     delay_sigma_s: Annotated[float, Field(ge=0)]
 
     @classmethod
-    def of(cls, identified: plant_fit.Identified) -> "PlantSection":
+    def from_fit(cls, identified: plant_fit.Identified) -> "PlantSection":
         """The section for a fit."""
         sigma = identified.sigma
         return cls(**asdict(identified.model), gain_sigma=sigma.gain, delay_sigma_s=sigma.delay_s)
@@ -83,7 +83,9 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     its tick rate differs from that of the hold (`running`); `where` names the file.
     """
     dt_s = 1 / gains.loop.rate_hz
-    found = margins.compute_margins(closed_loop.Gains.of(gains.loop), gains.plant.model, dt_s)
+    found = margins.compute_margins(
+        closed_loop.Gains.from_config(gains.loop), gains.plant.model, dt_s
+    )
     if not found.stable:
         raise errors.InputError(
             f"{where}: loop: unstable on this file's plant; was the file edited by hand?"

@@ -131,7 +131,7 @@ def _plain(problem: Problem) -> Problem:
         left = np.std(
             residual_mm(BenchGeometry(problem.stated), phases, state.surface, state.vertex_z_mm)
         )
-        few = phases.thinned(5000)
+        few = phases.thin_to(5000)
         sets.append(
             SetPhases(
                 few.name,
@@ -273,7 +273,7 @@ def _covariance() -> list[Figure]:
         solution = solve_calibration(_problem(_traced(values, seed)))
         ratios.append((solution.values - values)[free] / solution.sigmas[free])
     rms = np.sqrt(np.mean(np.square(ratios), axis=0))
-    names = solution.free
+    names = solution.free_names
     return [
         at_least(f"error / sigma, least ({names[int(rms.argmin())]})", float(rms.min()), "", 0.8),
         at_most(f"error / sigma, largest ({names[int(rms.argmax())]})", float(rms.max()), "", 1.3),

@@ -306,7 +306,7 @@ def bench(seed: int) -> dict[str, Any]:
         return answer | {"refused": str(error)}
     if fatal := [finding.description for finding in findings if finding.fatal]:
         return answer | {"refused": fatal[0]}
-    middle = solution.problem.middle
+    middle = solution.problem.middle_film_set
     phases = _still(solution, middle)
     surface = fit_on(solution.bench, phases, 500.0, -1e-3 * phases.displacement_um).surface
     claim = figure_uncertainty.propagate_to_figure(solution, middle, 475.0)
@@ -326,7 +326,7 @@ def _still(solution: Solution, index: int) -> SetPhases:
     """
     phases, state = solution.problem.sets[index], solution.states[index]
     phases, turns = (
-        phases.subset(phases.seen_with(0)),
+        phases.subset(phases.select_screen(0)),
         pose_derivatives(solution.problem.stated, solution.values),
     )
     parts = linearise_points(solution.bench, turns, phases, state.surface, state.vertex_z_mm)

@@ -28,7 +28,7 @@ from tests.support.figures import Figure, at_most
 OPTICS = OpticsConfig()
 MEASURED, PAPERS_SETS, TRIALS = 5, 451, 100  # sets measured here, sets and trials of the paper
 SLOW_UM_PER_S = 0.3  # the film's drift: 1.2 µm from set to set
-GRID = HeightMap.over(OPTICS.mirror.analysis_radius_mm, OPTICS.mirror.radius_mm)
+GRID = HeightMap.over_disc(OPTICS.mirror.analysis_radius_mm, OPTICS.mirror.radius_mm)
 
 
 def run() -> list[Figure]:

@@ -23,10 +23,10 @@ def write_geometry(
     findings: Sequence[verdict.CalibrationFinding],
 ) -> str:
     """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
-    films = [(solution.states[k], problem.sets[k]) for k in problem.films]
+    films = [(solution.states[k], problem.sets[k]) for k in problem.film_sets]
 
     # Residual of the slopes, and what the noise of the screen points makes of it.
-    slopes = [_slope_residual(solution, problem.sets[k], k) for k in problem.films]
+    slopes = [_slope_residual(solution, problem.sets[k], k) for k in problem.film_sets]
     noises = [
         geometry_monitors.noise_urad(
             solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2)))
@@ -45,7 +45,7 @@ def write_geometry(
         condition=weak_combinations.condition_number(solution),
         notes=tuple(finding.description for finding in findings),
     )
-    tables = geometry_tables.tables_of(solution, optics, origin)
+    tables = geometry_tables.make_geometry_tables(solution, optics, origin)
     with errors.convert_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(resolve_user_path(path), tomli_w.dumps(tables))  # never half a geometry

@@ -47,7 +47,7 @@ def calibration_report(
         return table
 
     # What the calibration claims, and what to measure next, for the middle set.
-    middle = solution.problem.middle
+    middle = solution.problem.middle_film_set
     claim = figure_uncertainty.propagate_to_figure(solution, middle, analysis_radius_mm)
     scale = model_tests.laser_scale(solution)
     number = advice.advise_number(solution, middle)
@@ -55,7 +55,7 @@ def calibration_report(
     return table | {
         "iterations": len(solution.changes),
         "condition": weak_combinations.condition_number(solution),
-        "parameters": [_parameter_row(solution, name) for name in solution.free],
+        "parameters": [_parameter_row(solution, name) for name in solution.free_names],
         "not_determined": [
             {
                 "sigma_left": each.left,

@@ -47,7 +47,7 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> set_phases.S
     """
     # The motion from x to y is left to the solution: the stated lens would correct 2 % too much or
     # too little of it.
-    film = FilmMotion.of(checked)
+    film = FilmMotion.from_set(checked)
     x_um, y_um = film.motion_um
     within_axes = replace(film, motion_um=(x_um - x_um.mean(), y_um - y_um.mean()))
     figure = bin_figure(optics, checked, within_axes)
@@ -109,7 +109,7 @@ def phases_of_screen(capture: CaptureSet) -> set_phases.SetPhases:
         sigma_mm=sigma_mm,
         displacement_um=math.nan,
         artefact=screen,
-        moved_screens=(MovedScreen.anywhere(),),
+        moved_screens=(MovedScreen.unknown_place(),),
         period_mm=pattern.period_mm,
     )
 

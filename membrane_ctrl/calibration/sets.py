@@ -206,7 +206,7 @@ def join_moved_screen(
         phases.motion_um,
         phases.motion_sigma_um,
     )
-    sets[nearest] = base.beside(phases, known)
+    sets[nearest] = base.add_screen_place(phases, known)
 
 
 def with_priors(bundle: Bundle, priors: Sequence[prior_file.Prior]) -> Bundle:

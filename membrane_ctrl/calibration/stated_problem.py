@@ -67,5 +67,5 @@ def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions
     films = [phases for phases in bundle.sets if phases.artefact is None]
     if sum(math.isfinite(phases.displacement_um) for phases in films) < 2:
         known[LASER.name] = 0.0  # one reading shows no scale
-    rim = Rim.of(bundle.edges_px, radius_mm, options.radius_sigma_mm)
+    rim = Rim.from_edges(bundle.edges_px, radius_mm, options.radius_sigma_mm)
     return Problem(geometry, bundle.sets, prior_sigmas(known), references, radius_mm, rim)

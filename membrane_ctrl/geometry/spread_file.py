@@ -63,9 +63,9 @@ def geometry_spread(optics: schema.OpticsConfig, file: Path | None) -> tuple[Geo
         except ValueError as error:
             raise InputError(f"{file}: covariance.names: {error}") from None
         optional = {name: sigma for name, sigma in others.items() if name in OPTIONAL_NAMES}
-        return given.with_others(optional), f"covariance in {file}"
+        return given.add_independent(optional), f"covariance in {file}"
     stated = stated_spread(geometry)
-    return (PAPER_SPREAD if stated is None else stated).with_others(others), _sigma_sources(
+    return (PAPER_SPREAD if stated is None else stated).add_independent(others), _sigma_sources(
         geometry, stated is not None
     )
 

@@ -159,7 +159,7 @@ def _read_figures(
         # The law's terms are those of a fit over the whole disc.
         hidden_mm = _HIDDEN_MM * (1 - one.figure.quality.valid_fraction)
         noise_mm2 = noise_mm2 + hidden_mm**2 * np.eye(len(noise_mm2))
-        geometry_mm = linear_covariance.geometry_jacobian(bench, spread) @ spread.root()
+        geometry_mm = linear_covariance.geometry_jacobian(bench, spread) @ spread.covariance_root()
         figure = film_figure.FilmFigure(
             one.head.folder.name,
             surface.parameters,
@@ -185,7 +185,7 @@ def _compute_departure(
     for figure, left in zip(figures, fit.left_mm, strict=True):
         # Hencky's bowl of the same pressure, or of the same sag if no gauge was read.
         if np.isfinite(figure.pressure_pa):
-            hencky = paper.under(figure.pressure_pa)
+            hencky = paper.under_pressure(figure.pressure_pa)
         else:
             hencky = paper.with_sag(figure.sag_mm)
         measured_mm = _profile_mm(figure.parameters_mm, disc_mm, radius_mm)
@@ -325,8 +325,12 @@ def _make_fit_table(
 def _paper_prestrain(poisson: float, stiffness: FloatArray | float) -> float:
     """The pre-strain that makes this film 3 mm less deep than the paper's Hencky film at 600 Pa."""
     strains = np.linspace(-2e-4, 5e-3, 200)
-    hencky = FilmLaw(0.0, _POISSON, _STIFFNESS_N_PER_M, 500.0).under(_PRESSURE_PA)
-    sags = FilmLaw(strains[:, None], poisson, stiffness, 500.0).under(_PRESSURE_PA).sag_mm.ravel()
+    hencky = FilmLaw(0.0, _POISSON, _STIFFNESS_N_PER_M, 500.0).under_pressure(_PRESSURE_PA)
+    sags = (
+        FilmLaw(strains[:, None], poisson, stiffness, 500.0)
+        .under_pressure(_PRESSURE_PA)
+        .sag_mm.ravel()
+    )
     return float(np.interp(_PAPER_EDGE_MM, float(hencky.sag_mm) - sags, strains))
 
 

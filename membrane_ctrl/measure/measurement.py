@@ -199,7 +199,7 @@ class SetFigure:
 
     def make_trial_bench(self) -> TrialBench:
         """The set's bench for Monte Carlo trials."""
-        return TrialBench.of(self.head.optics, self.checked, self.figure)
+        return TrialBench.from_set(self.head.optics, self.checked, self.figure)
 
 
 class Figures:

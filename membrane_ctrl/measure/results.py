@@ -122,7 +122,7 @@ def error_bars(
         raise errors.InputError(
             f"{source}: too wide: the figure does not follow from such a geometry"
         ) from None
-    grid = height_map.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
+    grid = height_map.HeightMap.over_disc(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
 
     # Noise of the zonal map: that of a pixel's slope, averaged over the pixels of a cell.
     shifts_rad = [checked.stack.shifts_rad(used) for used in checked.view.used]
@@ -130,7 +130,9 @@ def error_bars(
     pixels_in_cell = float(np.median(full.grid.count[full.grid.count > 0]))
     cell_slope = math.sqrt(float(variance.mean()) / pixels_in_cell)
     zonal_um = 1e3 * full.grid.noise_mm(cell_slope)
-    statement = GeometryStatement.of(find_known_by(optics, geometry), source, seen.rim, seen.slopes)
+    statement = GeometryStatement.from_evidence(
+        find_known_by(optics, geometry), source, seen.rim, seen.slopes
+    )
     return ErrorBars(seen.budget, statement, seen.doubts, grid, cell_slope, zonal_um)
 
 

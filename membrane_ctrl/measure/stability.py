@@ -261,7 +261,7 @@ class StabilityRun:
         # Change and RMSE of the first pair of each lag.
         maps = {}
         for lag_s, pair in self._shown.items():
-            change_um = grid.picture(1e3 * grid.matrix @ pair.change)
+            change_um = grid.picture(1e3 * grid.matrix @ pair.change_mm)
             rmse_um = grid.picture(1e3 * grid.sigma(pair.covariance))
             maps[lag_s] = (change_um, rmse_um)
         pairs = self._out / "pairs.png"
@@ -291,7 +291,7 @@ class StabilityRun:
         """The points of the map, those of the first set."""
         if self._grid is None:
             mirror = one.head.optics.mirror
-            self._grid = height_map.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
+            self._grid = height_map.HeightMap.over_disc(mirror.analysis_radius_mm, mirror.radius_mm)
             x, y = np.array(list(self._points_mm.values())).T
             self._point_matrix = height_map.height_matrix(x, y, mirror.radius_mm)
         return self._grid
@@ -314,7 +314,7 @@ class StabilityRun:
     def _add_pair(self, grid: height_map.HeightMap, pair: figure_pairs.FigurePair) -> None:
         """Count a pair, and write its row."""
         rmse_um = 1e3 * grid.sigma(pair.covariance)
-        change_um = float(1e3 * np.sqrt(np.mean(np.square(grid.matrix @ pair.change))))
+        change_um = float(1e3 * np.sqrt(np.mean(np.square(grid.matrix @ pair.change_mm))))
         changes, rmses = self._pairs[pair.lag_s]
         changes.add(change_um)
         rmses.add(float(rmse_um.mean()))

@@ -146,7 +146,7 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
 
     # The map, the table and the picture.
     mirror = sets[0].head.optics.mirror
-    grid = height_map.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
+    grid = height_map.HeightMap.over_disc(mirror.analysis_radius_mm, mirror.radius_mm)
     table = _make_comparison_table(options, sets, stated, spread, source, result, grid)
     table["timing_s"] = {"trials": seconds}
     out = options.out.resolve() if options.out else options.folder / "uncertainty"
@@ -211,7 +211,7 @@ def _make_comparison_table(
     moved = ""
     if result.motion is not None:
         motion_um = summarise(result.motion.covariance_mm2)
-        if result.motion.is_sure:
+        if result.motion.is_proven:
             moved = result.motion.describe()
     sag = sag_gradient()
     to_coeffs = parameter_to_coeffs()

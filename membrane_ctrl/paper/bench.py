@@ -80,8 +80,10 @@ class PaperOptions:
 
 def find_prestrain() -> float:
     """The pre-strain that makes the film 3 mm less deep than Hencky's at the paper's pressure."""
-    ideal = FilmLaw(0.0, POISSON, STIFFNESS_N_PER_M, 500.0).under(PRESSURE_PA)
-    strained = FilmLaw(_STRAINS[:, None], POISSON, STIFFNESS_N_PER_M, 500.0).under(PRESSURE_PA)
+    ideal = FilmLaw(0.0, POISSON, STIFFNESS_N_PER_M, 500.0).under_pressure(PRESSURE_PA)
+    strained = FilmLaw(_STRAINS[:, None], POISSON, STIFFNESS_N_PER_M, 500.0).under_pressure(
+        PRESSURE_PA
+    )
     missing_mm = float(ideal.sag_mm) - strained.sag_mm.ravel()
     return float(np.interp(EDGE_BELOW_HENCKY_MM, missing_mm, _STRAINS))
 
@@ -184,7 +186,7 @@ class PaperBench(MeasuredBench):
         prestrain = find_prestrain()
         radius_mm = self.optics.mirror.radius_mm
         law = FilmLaw(prestrain, POISSON, STIFFNESS_N_PER_M, radius_mm)
-        sag_mm = float(law.under(PRESSURE_PA).sag_mm)
+        sag_mm = float(law.under_pressure(PRESSURE_PA).sag_mm)
         return typical_film(sag_mm, radius_mm, self.options.seed, prestrain, POISSON)
 
     @cached_property

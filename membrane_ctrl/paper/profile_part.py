@@ -34,11 +34,13 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
     spread_mm = height_mm.std(axis=0)
 
     rho = radius_mm / mirror.radius_mm
-    hencky = FilmLaw(0.0, POISSON, STIFFNESS_N_PER_M, mirror.radius_mm).under(PRESSURE_PA)
+    hencky = FilmLaw(0.0, POISSON, STIFFNESS_N_PER_M, mirror.radius_mm).under_pressure(PRESSURE_PA)
     hencky_mm = hencky.height_mm(rho).ravel()
     edge_mm = float(profile_mm[-1] - hencky_mm[-1])
     prestrain = find_prestrain()
-    strained = FilmLaw(prestrain, POISSON, STIFFNESS_N_PER_M, mirror.radius_mm).under(PRESSURE_PA)
+    strained = FilmLaw(prestrain, POISSON, STIFFNESS_N_PER_M, mirror.radius_mm).under_pressure(
+        PRESSURE_PA
+    )
     left_um = 1e3 * (profile_mm - strained.height_mm(rho).ravel())
 
     simulated = isinstance(bench, PaperBench)

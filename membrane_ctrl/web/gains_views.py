@@ -228,7 +228,7 @@ class GainsViews:
             gains = named[start]
         else:
             gains = Sliders(*setting).within_reach(of.model, dt_s).make_gains(of.model, dt_s)
-        gains = gains.rounded()
+        gains = gains.round_to_four_digits()
         shown = {each: named[each] for each in dict.fromkeys((PRESENT, start))}
         duration_s = max(find_duration_s(each, of.model) for each in shown.values())
         found = {each: loaded.compute_named(each, duration_s) for each in shown}

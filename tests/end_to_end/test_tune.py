@@ -89,7 +89,7 @@ def test_an_experiment_and_gains_on_a_live_hold(logs: Path) -> None:
     )  # a machine that pauses twice skips ticks; they are counted, not hidden
     curve = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 5.3), flow_full_um_per_s=5.3)
     rig.set_gains(rig.loop.model_copy(update={"kp_per_s": 0.4}), "test", 60.0, pump=curve)
-    rig.keep()
+    rig.keep_gains()
     link.close()
     again = connected(logs)
     assert again.config.loop.kp_per_s == 0.4  # a later session starts from what runs

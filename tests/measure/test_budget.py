@@ -251,7 +251,7 @@ def test_what_bends_the_rays_or_moves_the_bench(name: str) -> None:
         seen = renderer.trace_pixels(0.0)
         inside = np.flatnonzero(seen.x_mm**2 + seen.y_mm**2 < 475**2)[::7]
         rows, columns = np.divmod(inside, CAMERA.width_px)
-        points = Points.of(
+        points = Points.from_rays(
             exact.geometry.rays(columns, rows), np.stack([seen.s_x_mm, seen.s_y_mm])[:, inside]
         )
         surfaces.append(fit_surface(exact, points, make_parabola(37.0, 500.0)).surface.parameters)
@@ -366,4 +366,4 @@ def test_a_good_set_raises_no_doubt() -> None:
     found = measured(STATED, seed=5)
     assert found.examined.doubts == ()
     own = found.examined.budget.covariance(common=False)
-    assert found.height_um < 2 * found.examined.budget.sizes(own)["height_rms_um"]
+    assert found.height_um < 2 * found.examined.budget.compute_sigmas_um(own)["height_rms_um"]

@@ -135,7 +135,7 @@ def test_harmonics_of_the_panel_are_no_motion_of_the_reference(tmp_path: Path) -
     CrossedWorld(seed=1, **CLEAN | FEW_FRINGES | disturbed).write_reference(tmp_path / "full")  # type: ignore[arg-type]
     checked = Figures().measure_folder(tmp_path / "full").checked
     assert checked.film_um.std() < 0.15
-    assert FilmMotion.of(checked).moved_um < 0.05
+    assert FilmMotion.from_set(checked).moved_um < 0.05
 
 
 def test_weak_bands_are_known_before_light_is_taken_from_the_first_frames(tmp_path: Path) -> None:
@@ -313,9 +313,9 @@ def test_bands_of_a_rolling_shutter_are_no_shape(still: Still, bands: float, siz
         fit = fitter.fit(
             seen, (0.0, 0.0), still.start, reach if len(known.waves) else still.everything
         )
-        while known.search(fitter.rows()):
+        while known.add_wave_of_frame(fitter.sum_over_rows()):
             fit = fitter.fit(seen, (0.0, 0.0), still.start, still.everything)
-        known.refine(fitter.rows(), fit.bands)
+        known.refine_frequencies(fitter.sum_over_rows(), fit.bands)
         assert fit.converged
         off_um.append([still.sag_off_um(blind), still.sag_off_um(fit)])
         sigma_um.append(
@@ -341,8 +341,8 @@ def test_waves_stay_where_they_are_while_there_are_no_bands(still: Still) -> Non
         seen = still.light_adu() * (1 + pulses) + random.normal(0.0, 0.05, turns.size)
         for _ in range(2):
             fit = fitter.fit(seen.astype(np.float32), (0.0, 0.0), still.start, still.everything)
-            known.search(fitter.rows())
-        known.refine(fitter.rows(), fit.bands)
+            known.add_wave_of_frame(fitter.sum_over_rows())
+        known.refine_frequencies(fitter.sum_over_rows(), fit.bands)
         off_um.append(still.sag_off_um(fit))
     assert len(known.waves) == 2
     assert rms(np.array(off_um[-4:])) < 0.006
@@ -360,10 +360,10 @@ def test_bands_that_are_none_move_no_figure(still: Still) -> None:
         fitter.fit(
             still.light_adu().astype(np.float32) + noise, (0.0, 0.0), still.start, still.everything
         )
-        assert not known.search(fitter.rows())
+        assert not known.add_wave_of_frame(fitter.sum_over_rows())
         seen = (still.light_adu() * (1 + still.wandering(seed)) + noise).astype(np.float32)
         without = fit = fitter.fit(seen, (0.0, 0.0), still.start, still.everything)
-        while known.search(fitter.rows()):
+        while known.add_wave_of_frame(fitter.sum_over_rows()):
             fit = fitter.fit(seen, (0.0, 0.0), still.start, still.everything)
         assert len(known.waves) <= 4
         assert abs(still.sag_off_um(fit) - still.sag_off_um(without)) < 0.001

@@ -356,7 +356,7 @@ def _stated_change_um2(
     for source in found.budget.sources:
         if source.name not in rows:
             continue
-        for effects_mm in source.change(before.get(source.name)):
-            sizes = found.budget.sizes(effects_mm @ effects_mm.T)
+        for effects_mm in source.list_change_effects(before.get(source.name)):
+            sizes = found.budget.compute_sigmas_um(effects_mm @ effects_mm.T)
             squares_um2 += sizes["height_rms_um"] ** 2
     return squares_um2

@@ -182,7 +182,7 @@ class SofastResult:
             screen_origin_mm=self.r_cam_optic @ (self.v_cam_screen_mm - self.v_cam_optic_mm),
             screen_s_x=r_screen_optic[:, 0],
             screen_s_y=r_screen_optic[:, 1],
-            face=Face.of(None),
+            face=Face.from_config(None),
         )
 
 

@@ -104,7 +104,9 @@ def test_a_session_gives_plant_weather_and_proposal(template: Path, tmp_path: Pa
     opened = copy_of(template, tmp_path)
     found = load_workpiece(opened.path, tmp_path)
     assert found.model.gain == pytest.approx(PLANT.gain, rel=0.05)
-    assert found.proposed == Gains.of(gains_file.load_gains(opened.file_path("gains.toml")).loop)
+    assert found.proposed == Gains.from_config(
+        gains_file.load_gains(opened.file_path("gains.toml")).loop
+    )
     opened.begin_step("design")
     assert load_workpiece(opened.path, tmp_path).proposed is None
 
@@ -210,7 +212,7 @@ def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) 
     opened = copy_of(template, tmp_path)
     session_json.write_session_file(opened.file_path("preview.json"), preview.Previewed((), ()))
     assert "tune apply" in save_gains(load_workpiece(opened.path, tmp_path), GAINS[0], "ada")
-    assert Gains.of(apply.load_checked_gains(opened)) == GAINS[0]
+    assert Gains.from_config(apply.load_checked_gains(opened)) == GAINS[0]
     assert gains_file.load_gains(opened.file_path("gains.toml")).author == "ada"
     assert not opened.is_done("preview")  # it was of other gains
 

@@ -258,15 +258,15 @@ def test_a_pump_that_starts_with_several_leaks_is_distinguished_from_one_of_unkn
         "µm/s: throttle"
     )
     with pytest.raises(ValueError, match=said):
-        survey_of([0.25, 0.35], [0.1, 17.0], 1.8).result()
+        survey_of([0.25, 0.35], [0.1, 17.0], 1.8).make_map()
     with pytest.raises(
         ValueError, match=r"beyond a command of 0\.25 is not known"
     ):  # what is between may hold it
-        survey_of([0.25, 0.55], [0.1, 17.0], 1.8).result()
+        survey_of([0.25, 0.55], [0.1, 17.0], 1.8).make_map()
     with pytest.raises(
         ValueError, match=r"beyond a command of 0\.25 is not known"
     ):  # a hold at 4.5 is possible
-        survey_of([0.25, 0.35], [0.1, 17.0], 4.5).result()
+        survey_of([0.25, 0.35], [0.1, 17.0], 4.5).make_map()
 
 
 @pytest.mark.parametrize(
@@ -463,7 +463,7 @@ def test_slow_gains_begin_at_the_mean_flow_of_a_loop_that_swings(tmp_path: Path)
         rows = rig.ticks(20.0)
         assert rig.loop.kp_per_s == map_pump._CAUTIOUS["kp_per_s"]
         assert max(abs(row.truth_displacement_um) for row in rows) < 10.0
-        rig.go_back()
+        rig.restore_good_gains()
 
 
 @pytest.mark.parametrize(("last", "up"), [(1.0, 0.55), (3.5, 0.4)])
@@ -603,7 +603,7 @@ def test_a_mirror_that_does_not_return_is_reported(
     fractions: list[float], flows: list[float], said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):
-        survey_of(fractions, flows, 1.0).result(held=False)
+        survey_of(fractions, flows, 1.0).make_map(held=False)
 
 
 @pytest.mark.parametrize(
@@ -625,7 +625,7 @@ def test_a_larger_limit_is_requested_only_where_it_helps(
     survey._branches[True].sigmas[1:] = [0.01, worse * 0.02 * survey.full_um_per_s]
     survey.runs = [PumpRun(DT_S, *np.zeros((3, round(seconds / DT_S))))]
     with pytest.raises(ValueError, match=f"not known to 2% .*{said}"):
-        survey.result()
+        survey.make_map()
 
 
 def flat_map(pump: PumpConfig) -> PumpMap:
@@ -672,8 +672,8 @@ def test_gains_too_fast_for_the_measured_actuator_become_slower() -> None:
     assert map_pump._make_safe_gains(loop, quick) == loop
     safe = map_pump._make_safe_gains(loop, late)
     model = PlantModel(1.0, 1.2, 0.3, 1.24)
-    assert compute_margins(Gains.of(safe), model, 0.02).ms < 1.75
-    assert not compute_margins(Gains.of(loop), model, 0.02).ms < 1.75
+    assert compute_margins(Gains.from_config(safe), model, 0.02).ms < 1.75
+    assert not compute_margins(Gains.from_config(loop), model, 0.02).ms < 1.75
 
 
 @pytest.mark.parametrize(

@@ -639,7 +639,7 @@ def test_edited_gains_are_a_candidate_of_their_own(done: SessionFolder) -> None:
 
 def test_margins_of_what_is_kept(done: SessionFolder) -> None:
     gains = load_gains(done.file_path("gains.toml"))
-    found = compute_margins(Gains.of(gains.loop), gains.plant.model, 0.02)
+    found = compute_margins(Gains.from_config(gains.loop), gains.plant.model, 0.02)
     assert found.stable
     assert found.ms < 1.45
 

@@ -164,7 +164,10 @@ def test_the_gains_before_are_judged_in_the_very_weather_of_the_new_ones() -> No
     stage = judge_stage(record, np.zeros(len(record)), trial, 1.1)
     assert stage.std_um == pytest.approx(after_um, rel=0.05)
     assert stage.before_um == pytest.approx(before_um, rel=0.05)
-    assert predict_loop(Gains.of(before), STORM_MODEL, weather, before).std_um < 0.5 * before_um
+    assert (
+        predict_loop(Gains.from_config(before), STORM_MODEL, weather, before).std_um
+        < 0.5 * before_um
+    )
 
 
 @pytest.mark.parametrize(

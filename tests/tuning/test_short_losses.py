@@ -78,7 +78,7 @@ def settled(losses_s: list[tuple[float, float]]) -> tuple[LossyHold, HoldRig]:
 def test_80_ms_without_the_laser_end_no_experiment(kind: str) -> None:
     _, rig = settled([(2.0, 2.08), (4.0, 4.08), (6.5, 6.58)])
     steps = STEPS if kind == "pump_map" else ()
-    rows, finished = rig.performed(make_spec(kind, 9.0 if kind != "pump_map" else 60.0, steps))
+    rows, finished = rig.perform_ticks(make_spec(kind, 9.0 if kind != "pump_map" else 60.0, steps))
     assert finished.completed, finished
     assert rig.repeated == 0
     tune = [row for row in rows if row.state == State.TUNE]
@@ -92,7 +92,7 @@ def test_80_ms_without_the_laser_end_no_experiment(kind: str) -> None:
 def test_an_experiment_whose_reading_was_lost_is_repeated_without_a_gap() -> None:
     link, rig = settled([(3.0, 4.5)])
     first = len(link.rows)
-    rows, finished = rig.performed(make_spec("steps", 8.0))
+    rows, finished = rig.perform_ticks(make_spec("steps", 8.0))
     assert finished.completed
     assert rig.repeated == 1
     assert [row.tick for row in rows] == [row.tick for row in link.rows[first:]][: len(rows)]
@@ -106,7 +106,7 @@ def test_an_experiment_whose_reading_was_lost_is_repeated_without_a_gap() -> Non
 
 def test_a_laser_that_is_lost_again_and_again_is_repeated_three_times() -> None:
     _, rig = settled([(8.0 * number, 8.0 * number + 0.6) for number in range(30)])
-    _, finished = rig.performed(make_spec("relay", 30.0))
+    _, finished = rig.perform_ticks(make_spec("relay", 30.0))
     assert finished.end is ExperimentEnd.READING_LOST
     assert rig.repeated == 3
     assert "check the laser" in finished.reason
@@ -116,14 +116,14 @@ def test_an_experiment_that_is_refused_during_a_loss_begins_after_it() -> None:
     link, rig = settled([(0.0, 1.2)])
     rig.ticks(0.6)  # in steps of half a second
     assert link.rows[-1].safe_level > 0
-    _, finished = rig.performed(make_spec("steps", 5.0))
+    _, finished = rig.perform_ticks(make_spec("steps", 5.0))
     assert finished.completed
 
 
 def test_a_refusal_for_another_reason_stays_one() -> None:
     _, rig = settled([])
     with pytest.raises(HoldError, match="limit"):
-        rig.performed(make_spec("steps", 5.0).model_copy(update={"limit_um": 0.5}))
+        rig.perform_ticks(make_spec("steps", 5.0).model_copy(update={"limit_um": 0.5}))
 
 
 class ComputingHold(LossyHold):
@@ -141,7 +141,7 @@ def test_ticks_that_queued_before_the_request_do_not_count_as_waiting() -> None:
     rig = HoldRig(link, "tester")
     rig.hold(20.0)
     first = rig.ticks(0.02)[0].tick + 1
-    rows, finished = rig.performed(make_spec("steps", 5.0))
+    rows, finished = rig.perform_ticks(make_spec("steps", 5.0))
     assert finished.completed
     assert rows[0].tick == first
     ticks = np.array([row.tick for row in rows])
@@ -160,7 +160,7 @@ def test_an_experiment_that_does_not_begin_is_reported() -> None:
     rig = HoldRig(DeafHold([]), "tester")
     rig.hold(2.0)
     with pytest.raises(HoldError, match="did not begin"):
-        rig.performed(make_spec("steps", 5.0))
+        rig.perform_ticks(make_spec("steps", 5.0))
 
 
 def test_a_record_without_a_gap_names_no_sensor() -> None:

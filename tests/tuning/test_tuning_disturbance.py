@@ -160,4 +160,4 @@ def test_without_sensors_everything_is_left_as_rest() -> None:
     ids=["known well: taken", "known badly, agrees: configured", "known badly, contradicts: taken"],
 )
 def test_which_gain_is_used(gain: float, sigma: float, expected: float) -> None:
-    assert WeatherGain(gain, sigma, 0.1, 0.05, 0.0).agreed(-0.358) == expected
+    assert WeatherGain(gain, sigma, 0.1, 0.05, 0.0).choose_gain(-0.358) == expected

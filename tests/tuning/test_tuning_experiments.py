@@ -64,7 +64,7 @@ def run(rig: Rig, experiment: Experiment, around: OperatingPoint) -> tuple[Recor
 def relay_after_hold(bench: TwinBench, case: Case) -> tuple[Rig, Record, Finished, float]:
     """Hold for 60 s, then the relay; with the largest true excursion in it."""
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
+    around = rig.around(rig.hold(60.0).cut(20.0, 60.0))
     start = len(bench.true_um)
     record, end = run(rig, Relay(around, 0.0), around)
     return rig, record, end, max(abs(x) for x in bench.true_um[start:])
@@ -185,7 +185,7 @@ def test_a_limit_within_the_noise_is_refused() -> None:
 def test_for_a_mirror_that_is_too_tight_the_advice_is_to_open_the_bleed() -> None:
     case = Case("calm", laser_noise_um=0.3, leak=0.2)
     rig = Rig(TwinBench(case, 1), case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
+    around = rig.around(rig.hold(60.0).cut(20.0, 60.0))
     with pytest.raises(ValueError, match="open the bleed"):
         make_doublets(around, 1.0)
 
@@ -209,7 +209,7 @@ def test_patterns_run_on_the_twin_within_the_limit(make: object) -> None:
     case = Case()
     bench = TwinBench(case, 3)
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
+    around = rig.around(rig.hold(60.0).cut(20.0, 60.0))
     start = len(bench.true_um)
     record, end = run(rig, Patterned(around, make(around, 1.0), 40.0, 0.0), around)
     assert end.completed, end.reason
@@ -230,7 +230,7 @@ def test_handing_over_between_loop_and_experiment_is_bumpless() -> None:
     case = Case("calm", laser_noise_um=0.0)
     bench = TwinBench(case, 1)
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    around = rig.around(rig.hold(60.0).part(20.0, 60.0))
+    around = rig.around(rig.hold(60.0).cut(20.0, 60.0))
     run(rig, Patterned(around, lambda time_s: 0.0, 5.0, 0.0), around)
     after = rig.hold(5.0)
     assert np.abs(after.flow_um_per_s - around.holding_flow_um_per_s).max() < 0.05

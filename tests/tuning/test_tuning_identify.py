@@ -55,15 +55,15 @@ def test_whiteness_and_independence_see_what_they_are_for() -> None:
 def test_a_short_or_silent_record_is_refused() -> None:
     whole = record(TRUTH)
     with pytest.raises(ValueError, match="too short"):
-        identify_plant(whole.part(0.0, 1.0))
+        identify_plant(whole.cut(0.0, 1.0))
     with pytest.raises(ValueError, match="tune characterise"):
         identify_plant(replace(whole, flow_um_per_s=np.ones(len(whole))))
 
 
 def test_good_data_are_ok_and_hold_on_fresh_data() -> None:
     whole = record(TRUTH, samples=5000)
-    fitted = identify_plant(whole.part(0.0, 70.0))
-    checked = validate_fit(fitted, whole.part(70.0, 100.0))
+    fitted = identify_plant(whole.cut(0.0, 70.0))
+    checked = validate_fit(fitted, whole.cut(70.0, 100.0))
     assert checked.innovation_ratio == pytest.approx(1.0, abs=0.1)
     assert judge_fit(whole, fitted, checked).verdict == "ok"
 

@@ -115,10 +115,12 @@ def test_a_load_step_with_delay_and_filter_is_that_of_the_loop_tick_by_tick() ->
     loop = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
     calm = DisturbanceModel(Noise(1e-3, 0.0, 0.0, 12.0, 0.02), None, None)
     held = preview_loop(loop, PumpConfig(), PUMP, calm, duration_s=1.0)
-    found = simulate_load_step(Gains.of(loop), PUMP, 0.6, 0.02)
+    found = simulate_load_step(Gains.from_config(loop), PUMP, 0.6, 0.02)
     assert found.peak_um == pytest.approx(held.load_peak_um, rel=0.02)
     assert found.recovery_s == pytest.approx(held.recovery_s, abs=0.2)
-    assert found.peak_um < bound_load_peak_um(Gains.of(loop), PUMP, 0.6) < 1.5 * found.peak_um
+    assert (
+        found.peak_um < bound_load_peak_um(Gains.from_config(loop), PUMP, 0.6) < 1.5 * found.peak_um
+    )
 
 
 def test_load_recovery_of_a_double_root_and_of_a_loop_that_never_comes_back() -> None:
@@ -138,13 +140,14 @@ def test_the_same_answer_to_a_load_is_to_be_had_with_less_noise() -> None:
     loop = LoopConfig()
     named = compute_designs(PUMP, typical(loop), loop, Demands())
     present, kept = (
-        simulate_load_step(gains, PUMP, 0.6, 0.02) for gains in (Gains.of(loop), named["same-load"])
+        simulate_load_step(gains, PUMP, 0.6, 0.02)
+        for gains in (Gains.from_config(loop), named["same-load"])
     )
     assert kept.peak_um <= 1.01 * present.peak_um
     assert kept.recovery_s <= present.recovery_s + 0.1
     stds = [
         predict_loop(gains, PUMP, typical(loop), loop).std_um
-        for gains in (Gains.of(loop), named["same-load"])
+        for gains in (Gains.from_config(loop), named["same-load"])
     ]
     assert stds[1] < stds[0]
     assert "same-load" not in compute_designs(
@@ -191,12 +194,12 @@ def test_the_bound_is_that_of_the_twin(feedforward: bool, agreement: float) -> N
 
 def test_weather_over_a_delay_of_many_of_its_lags_is_that_of_single_steps() -> None:
     noise = Noise(0.1, 1e-3, 1e-4, 12.0, 0.01, ((0.01, 1e-6), (0.02, 1e-6), (5.0, 0.1)))
-    walks = Walks.of(DisturbanceModel(noise, None, None))
-    step, kicks = walks.over(0.01)
+    walks = Walks.from_disturbance(DisturbanceModel(noise, None, None))
+    step, kicks = walks.discretise(0.01)
     transition, covariance = np.eye(len(step)), np.zeros_like(kicks)
     for _ in range(150):
         transition, covariance = step @ transition, step @ covariance @ step.T + kicks
-    found = walks.over(1.5)
+    found = walks.discretise(1.5)
     np.testing.assert_allclose(found[0], transition, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(found[1], covariance, rtol=1e-6, atol=1e-15)
 
@@ -210,7 +213,7 @@ def test_nothing_predicted_is_below_the_bound_and_the_search_comes_near_it() -> 
     assert least_um < found_um < 1.15 * least_um
     assert compute_margins(best, PUMP, 1 / loop.rate_hz).ms <= 1.42
     for other in (
-        Gains.of(loop),
+        Gains.from_config(loop),
         make_simc_gains(PUMP, 0.02, 0.2),
         make_amigo_gains(PUMP, 0.02, 0.2),
     ):

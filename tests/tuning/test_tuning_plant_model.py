@@ -57,9 +57,9 @@ def test_parts_join_again_and_hash_the_same() -> None:
     whole = Record.from_samples(
         0.02, [1.0, 2.0, 3.0, 4.0], [BenchSample(float(i), 1.0, 2.0) for i in range(4)]
     )
-    joined = whole.part(0.0, 0.04).followed_by(whole.part(0.04, 0.08))
+    joined = whole.cut(0.0, 0.04).followed_by(whole.cut(0.04, 0.08))
     assert joined.sha256() == whole.sha256()
-    assert joined.sha256() != whole.part(0.0, 0.06).sha256()
+    assert joined.sha256() != whole.cut(0.0, 0.06).sha256()
 
 
 def test_records_of_different_rates_do_not_join() -> None:

@@ -113,7 +113,7 @@ def test_a_leak_beyond_the_pump_is_refused(designed) -> None:  # type: ignore[no
 def test_hand_made_gains_that_are_unstable_are_seen_in_preview_and_robustness(designed) -> None:  # type: ignore[no-untyped-def]
     found, weather, loop = designed
     wild = LoopConfig.model_validate(loop.model_dump() | {"kp_per_s": 12.0, "ti_s": 0.5})
-    assert evaluate_robustness(Gains.of(wild), found, weather, wild).stable_fraction == 0.0
+    assert evaluate_robustness(Gains.from_config(wild), found, weather, wild).stable_fraction == 0.0
     assert preview_loop(wild, PumpConfig(), found.model, weather, duration_s=30.0).std_um > 0.5
 
 

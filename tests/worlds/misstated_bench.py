@@ -146,7 +146,7 @@ def true_bench(
     wrong.
     """
     spread, _ = geometry_spread(stated, None)
-    off = dict(zip(spread.names, spread.draw(rng), strict=True))
+    off = dict(zip(spread.names, spread.draw_change(rng), strict=True))
     grown = 1 + STEEL_PER_K * stated_sigmas(stated).temperature_k * rng.standard_normal()
     return bench_off_by(stated, off, grown), off
 

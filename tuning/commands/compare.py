@@ -73,7 +73,12 @@ def _tabulate_crossed(
                 gains.loop.model_dump() | {key: getattr(own, key) for key in _WEATHER_KEYS}
             )
             row = candidate.evaluate_candidate(
-                name, Gains.of(loop), found.identified.model, weather, loop, gain_search.Demands()
+                name,
+                Gains.from_config(loop),
+                found.identified.model,
+                weather,
+                loop,
+                gain_search.Demands(),
             )
             std = (
                 f"{row.predicted.std_um:.3f} | {row.ratio:.2f}"

@@ -40,7 +40,7 @@ class Workpiece:
     @property
     def named_gains(self) -> dict[str, closed_loop.Gains]:
         """What the sliders may start from: the present gains, those proposed, and the others."""
-        found = {PRESENT: closed_loop.Gains.of(self.loop)}
+        found = {PRESENT: closed_loop.Gains.from_config(self.loop)}
         if self.proposed is not None:
             found[PROPOSED] = self.proposed
         others = {
@@ -72,7 +72,9 @@ def load_from_session(opened: folder.SessionFolder) -> Workpiece:
     candidates: dict[str, closed_loop.Gains] = {}
     if opened.is_done("design"):
         candidates = {row.name: row.gains for row in design.load_design(opened).candidates}
-        proposed = closed_loop.Gains.of(gains_file.load_gains(opened.file_path("gains.toml")).loop)
+        proposed = closed_loop.Gains.from_config(
+            gains_file.load_gains(opened.file_path("gains.toml")).loop
+        )
     source = f"Plant and weather of the session {opened.path.name}."
     return Workpiece(source, model, weather, opened.head.before, proposed, opened, candidates)
 

@@ -31,11 +31,11 @@ class Gains:
     filter_s: float = 0.0
 
     @classmethod
-    def of(cls, loop: LoopConfig) -> Gains:
+    def from_config(cls, loop: LoopConfig) -> Gains:
         """Gains of a configured loop."""
         return cls(loop.kp_per_s, loop.ti_s, loop.td_s, loop.measurement_filter_s)
 
-    def rounded(self) -> Gains:
+    def round_to_four_digits(self) -> Gains:
         """To four digits: more mean nothing, and people copy them."""
         return Gains(
             *(

@@ -166,8 +166,8 @@ def fit_experiments(done: Experiments) -> Characterised:
     start_s, stop_s = done.pulses_s
     checked = None
     if stop_s - start_s > _VALIDATE_LEAST_S:
-        relays = done.record.part(0.0, done.relays_s)
-        checked = validate_fit(identify_plant(relays), done.record.part(start_s, stop_s))
+        relays = done.record.cut(0.0, done.relays_s)
+        checked = validate_fit(identify_plant(relays), done.record.cut(start_s, stop_s))
     return Characterised(done, found, judge_fit(done.record, found, checked))
 
 

@@ -102,7 +102,7 @@ class _Flows:
     values: FloatArray
     covariance: FloatArray
 
-    def near(self, white: float, leak_changes_um_per_s: float) -> bool:
+    def differs_by_at_most_one(self, white: float, leak_changes_um_per_s: float) -> bool:
         """Whether at most one of the two differs."""
         return white == self.white or leak_changes_um_per_s == self.leak_changes_um_per_s
 
@@ -117,20 +117,22 @@ def fit_pump(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:
     model = _Mirror([_blocks(run, levels) for run in runs], len(levels))
     starts = product(_DELAYS_S, _LAGS_S, _WHITES[1:2], _LEAK_CHANGES_UM_PER_S[-1:])
     best = min(
-        (model.solved(*start) for start in (starts if near is None else (near.likeliest,))),
+        (model.solve_flows(*start) for start in (starts if near is None else (near.likeliest,))),
         key=_cost,
     )
     for _ in range(_TURNS):
         noises = product(_WHITES, _LEAK_CHANGES_UM_PER_S)
         tried = (
-            model.solved(best.delay_s, best.lag_s, *noise) for noise in noises if best.near(*noise)
+            model.solve_flows(best.delay_s, best.lag_s, *noise)
+            for noise in noises
+            if best.differs_by_at_most_one(*noise)
         )
-        better = min((model.improved(best), *tried), key=_cost)
+        better = min((model.improve_delay_and_lag(best), *tried), key=_cost)
         enough = best.cost - better.cost < _ENOUGH
         best = better
         if enough:
             break
-    return model.fitted(best, levels)
+    return model.make_fit(best, levels)
 
 
 class _Mirror:
@@ -148,7 +150,7 @@ class _Mirror:
         self._noise_um = float(np.median(np.abs(bends))) / 0.6745 / math.sqrt(6)
         self._rows = sum(block.displacement_um.size for block in blocks)
 
-    def solved(
+    def solve_flows(
         self,
         delay_s: float,
         lag_s: float,
@@ -168,23 +170,23 @@ class _Mirror:
             _, values, covariance = _least_squares(gram, self._rows)
         return _Flows(delay_s, lag_s, white, changes, cost, values, covariance)
 
-    def improved(self, best: _Flows) -> _Flows:
+    def improve_delay_and_lag(self, best: _Flows) -> _Flows:
         """With a better delay and lag, if there are any."""
         kept = best.white, best.leak_changes_um_per_s
-        off = self.solved(best.delay_s, best.lag_s, *kept, best.values).values[-2:]
+        off = self.solve_flows(best.delay_s, best.lag_s, *kept, best.values).values[-2:]
         for share in (1.0, 0.4, 0.1):
             delay_s, lag_s = np.clip(
                 (best.delay_s, best.lag_s) + share * off, _LEAST_S, _MOST_S
             ).tolist()
-            found = self.solved(delay_s, lag_s, *kept)
+            found = self.solve_flows(delay_s, lag_s, *kept)
             if found.cost < best.cost:
                 return found
         return best
 
-    def fitted(self, best: _Flows, levels: Sequence[Level]) -> PumpFit:
+    def make_fit(self, best: _Flows, levels: Sequence[Level]) -> PumpFit:
         """The flows of the levels, with the share of delay and lag in their errors."""
         kept = best.white, best.leak_changes_um_per_s
-        found = self.solved(best.delay_s, best.lag_s, *kept, best.values)
+        found = self.solve_flows(best.delay_s, best.lag_s, *kept, best.values)
         count = len(levels)
         covariance = found.covariance[:count, :count]
         columns = found.values[:count].tolist(), np.sqrt(np.diag(covariance)).tolist()

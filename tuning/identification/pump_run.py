@@ -27,7 +27,7 @@ class PumpRun:
     ambient_pressure_pa: FloatArray
 
     @property
-    def sank(self) -> bool:
+    def has_sunk(self) -> bool:
         """Whether the mirror was below where it began at the end."""
         read_um = self.displacement_um[np.isfinite(self.displacement_um)]
         return bool(read_um.size and read_um[-1] < read_um[0])

@@ -98,14 +98,14 @@ class PumpSurvey:
         far.
         """
         self._rounds += 1
-        if not self._scarce:
+        if not self._lacks_flows:
             self._share = float(
                 np.clip(self._share * (1.2 if completed else 0.8), _SHARE_LEAST, 1.0)
             )
         elif (
             not completed
         ):  # a weak pump sinks between short pulses; a strong one rises too far in long ones
-            self._longer *= 2.0 if run.sank else 0.5
+            self._longer *= 2.0 if run.has_sunk else 0.5
         if run.fraction.size * run.dt_s > _LEAST_S:
             self.runs.append(run)
         is_short = run.fraction.size * run.dt_s < _DARK_S
@@ -121,7 +121,7 @@ class PumpSurvey:
         """The next round; empty when the curve is known, or cannot be known better in the time."""
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
-        if self._scarce:
+        if self._lacks_flows:
             hopeless = is_stuck(self.fit, self._branches.get(True, NO_BRANCH))
             if self._rounds >= (1 if hopeless else 3) * _FIRST_ROUNDS:
                 return ()
@@ -167,11 +167,11 @@ class PumpSurvey:
         between = flows.size > 0 and flows[0] <= leak < flows[-1]
         return float(np.interp(leak, flows, fractions)) if between else self.holding_fraction
 
-    def known(self, level: Level) -> bool:
+    def is_known(self, level: Level) -> bool:
         """Whether its flow is known well enough."""
-        return self.sigma(level) <= _KNOWN_SHARE * self.full_um_per_s
+        return self.flow_sigma(level) <= _KNOWN_SHARE * self.full_um_per_s
 
-    def sigma(self, level: Level) -> float:
+    def flow_sigma(self, level: Level) -> float:
         """Standard error of its flow in µm/s, with what its neighbours tell; infinite for one not
         visited.
         """
@@ -199,7 +199,7 @@ class PumpSurvey:
         sigmas = np.sqrt(np.maximum(np.diag(noise), 0.0))
         return Branch(fractions, np.asarray(isotonic_regression(np.maximum(flows, 0.0)).x), sigmas)
 
-    def start(self) -> tuple[float, float] | None:
+    def find_start(self) -> tuple[float, float] | None:
         """The command at which a standing pump starts with a flow at once, and the one below it, if
         it does.
         """
@@ -207,7 +207,7 @@ class PumpSurvey:
 
     def hysteretic(self) -> bool:
         """A level gives more when it is reached from above, beyond doubt."""
-        start = self.start()
+        start = self.find_start()
         for level, above in self.fit.levels.items():
             below = self.fit.levels.get(Level(level.fraction))
             if level.rising or below is None or (start is not None and level.fraction < start[1]):
@@ -237,9 +237,9 @@ class PumpSurvey:
             self._wanted |= {Level(f, False) for f in self._from_above()}
 
     @property
-    def done(self) -> bool:
+    def is_complete(self) -> bool:
         """Every level wanted so far is known."""
-        return all(self.known(level) for level in self._wanted if self._is_reachable(level))
+        return all(self.is_known(level) for level in self._wanted if self._is_reachable(level))
 
     def _list_finer_fractions(self, rising: bool) -> list[float]:
         """Commands between those of a branch, where it bends or jumps."""
@@ -281,7 +281,7 @@ class PumpSurvey:
             float(reached[np.argmin(np.abs(flows[: reached.size] - s * self.full_um_per_s))])
             for s in (0.3, 0.6)
         ]
-        start = self.start()
+        start = self.find_start()
         if start is not None:
             found += [_round_fraction(start[1] / 2), start[1]]
         if self.hysteretic():
@@ -299,9 +299,9 @@ class PumpSurvey:
         fresh = [level for level in wanted if level not in self.fit.levels]
         wide = max(_KNOWN_SHARE * self.full_um_per_s, 1e-3)
         worst = sorted(
-            (level for level in wanted if level not in fresh), key=self.sigma, reverse=True
+            (level for level in wanted if level not in fresh), key=self.flow_sigma, reverse=True
         )
-        visits = [3 * (self.sigma(level) / wide) ** 2 for level in worst]
+        visits = [3 * (self.flow_sigma(level) / wide) ** 2 for level in worst]
         again = [
             level
             for turn in range(_MOST_VISITS)
@@ -311,7 +311,7 @@ class PumpSurvey:
         return fresh + again
 
     @property
-    def _scarce(self) -> bool:
+    def _lacks_flows(self) -> bool:
         """No flow is known, or, in the rounds of the first pulses, none that lifts the mirror."""
         flows = self._list_known_flows()[1]
         return not flows.any() or (
@@ -416,7 +416,7 @@ class PumpSurvey:
         """A larger command, from which a level is reached: beyond any hysteresis."""
         return min(1.0, level.fraction + _ABOVE)
 
-    def result(self, held: bool = True) -> PumpMap:
+    def make_map(self, held: bool = True) -> PumpMap:
         """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with.
 
         `held`: the hold brought the mirror back after the last round.
@@ -428,7 +428,7 @@ class PumpSurvey:
             self.full_um_per_s,
             bool(self._branches) and self.hysteretic(),
             self.duration_s,
-            self.done,
+            self.is_complete,
             self.limit_um,
             held,
         ).map()

@@ -72,7 +72,7 @@ class Record:
         edges = np.flatnonzero(np.diff(is_lost.astype(int)))
         return [float(samples) * self.dt_s for samples in edges[1::2] - edges[::2]]
 
-    def part(self, start_s: float, stop_s: float) -> Record:
+    def cut(self, start_s: float, stop_s: float) -> Record:
         """The samples from `start_s` up to, but excluding, `stop_s`."""
         cut = slice(round(start_s / self.dt_s), round(stop_s / self.dt_s))
         return Record(self.dt_s, *(column[cut] for column in self._list_columns()))

@@ -76,7 +76,7 @@ def try_time_constant(
     if reason:
         rig.set_gains(rig.loop, f"{why}: {reason}"[:250], _BACK_S)
     else:
-        rig.keep()
+        rig.keep_gains()
     return OuterTrial(before_s, after_s, error_before_um, error_um, tracking, reason)
 
 

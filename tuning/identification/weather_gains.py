@@ -44,7 +44,7 @@ class WeatherGain:
         """Two-sided spectrum of the quantity, unit^2 s."""
         return self.walk / w_rad_per_s**2 + compute_coloured_psd(self.coloured, w_rad_per_s)
 
-    def agreed(self, configured: float) -> float:
+    def choose_gain(self, configured: float) -> float:
         """Gain to use: the fitted one if known to 10 %, else the configured one if they agree.
 
         Steady weather reveals nothing about its gain; the bench's physics is then the better

@@ -43,15 +43,15 @@ class RefusedError(Exception):
 
 def choose_feedforward(loop: LoopConfig, disturbance: DisturbanceModel) -> LoopConfig:
     """The loop with the fitted weather gains where the data determine
-    them (`WeatherGain.agreed`).
+    them (`WeatherGain.choose_gain`).
     """
     changed: dict[str, float] = {}
     if disturbance.barometer is not None:
-        changed["barometer_gain_um_per_pa"] = disturbance.barometer.agreed(
+        changed["barometer_gain_um_per_pa"] = disturbance.barometer.choose_gain(
             loop.barometer_gain_um_per_pa
         )
     if disturbance.air is not None:
-        changed["temperature_gain_um_per_k"] = disturbance.air.agreed(
+        changed["temperature_gain_um_per_k"] = disturbance.air.choose_gain(
             loop.temperature_gain_um_per_k
         )
     rounded = {name: float(f"{value:.4g}") for name, value in changed.items()}
@@ -76,7 +76,7 @@ def compute_designs(
     dt_s, filter_s = disturbance.rest.dt_s, _RULE_FILTER_S
     delay_s = tuning_rules.compute_effective_delay_s(model, dt_s, filter_s)
     found = {"least-variance": gain_search.search_least_variance(model, disturbance, loop, demands)}
-    step_um_per_s, present = demands.load_step_um_per_s, closed_loop.Gains.of(loop)
+    step_um_per_s, present = demands.load_step_um_per_s, closed_loop.Gains.from_config(loop)
     if math.isfinite(margins.find_sensitivity_peak(present, model, dt_s)):
         answer = load_step.simulate_load_step(present, model, step_um_per_s, dt_s)
         if (
@@ -97,7 +97,7 @@ def compute_designs(
             *compute_relay_ultimate(model, dt_s)
         ),
     }
-    return {name: gains.rounded() for name, gains in found.items()}
+    return {name: gains.round_to_four_digits() for name, gains in found.items()}
 
 
 def propose_gains(
@@ -148,7 +148,7 @@ def propose_gains(
     return Proposal(
         loop=proposed,
         chosen=chosen,
-        candidates=(chosen, row(PRESENT, closed_loop.Gains.of(loop), loop), *designed[1:]),
+        candidates=(chosen, row(PRESENT, closed_loop.Gains.from_config(loop), loop), *designed[1:]),
         least_std_um=lower_bound.compute_least_std_um(model, disturbance, settled),
         preview=preview_loop(proposed, pump, model, disturbance),
         robustness=evaluate_robustness(chosen.gains, identified, disturbance, settled),

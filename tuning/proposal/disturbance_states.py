@@ -31,7 +31,7 @@ class Walks:
     centre: FloatArray
 
     @classmethod
-    def of(cls, disturbance: DisturbanceModel) -> "Walks":
+    def from_disturbance(cls, disturbance: DisturbanceModel) -> "Walks":
         """States: barometer, air, gas, fast rest, slow rest, what it reaches; two more for each
         colour.
         """
@@ -63,7 +63,7 @@ class Walks:
         centre[2] = air.gain if air else 0.0
         return cls(drift, diffusion, sums[0], sums[1], centre)
 
-    def over(self, step_s: float) -> tuple[Matrix, Matrix]:
+    def discretise(self, step_s: float) -> tuple[Matrix, Matrix]:
         """Transition and noise covariance over a step (Van Loan 1978), doubled from one shorter
         than every lag.
         """

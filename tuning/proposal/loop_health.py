@@ -53,7 +53,9 @@ def judge_health(record: Record, setpoint_um: Series, loop: LoopConfig, made: Ga
         off_um, VerificationTrial(model, weather, loop, loop), weather, loop
     )
     least_um = compute_least_std_um(model, weather, loop)
-    designed = predict_loop(closed_loop.Gains.of(loop), model, weather, loop).std_um / least_um
+    designed = (
+        predict_loop(closed_loop.Gains.from_config(loop), model, weather, loop).std_um / least_um
+    )
     gain, gain_sigma = _compute_natural_gain(record, loop)
     leak_um_per_s = model.gain * float(record.flow_um_per_s.mean())
     found: list[str] = []

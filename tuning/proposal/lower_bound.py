@@ -26,7 +26,7 @@ def compute_least_std_um(
     `write_s` is the time from a reading to its command, if the model's dead time does not include
     it.
     """
-    moving = Walks.of(disturbance)
+    moving = Walks.from_disturbance(disturbance)
     centre = moving.centre
     readings, noises = [centre], [disturbance.rest.white**2]
     for reading, weather, used in (
@@ -37,8 +37,8 @@ def compute_least_std_um(
             readings.append(reading)
             noises.append(weather.noise**2)
     c, r = np.array(readings), np.diag(noises)
-    transition, kicks = moving.over(disturbance.rest.dt_s)
+    transition, kicks = moving.discretise(disturbance.rest.dt_s)
     before = solve_discrete_are(transition.T, c.T, kicks, r)
     after = before - before @ c.T @ np.linalg.solve(c @ before @ c.T + r, c @ before)
-    transition, kicks = moving.over(model.dead_time_s + write_s + disturbance.rest.dt_s / 2)
+    transition, kicks = moving.discretise(model.dead_time_s + write_s + disturbance.rest.dt_s / 2)
     return float(np.sqrt(centre @ (transition @ after @ transition.T + kicks) @ centre))

@@ -41,8 +41,8 @@ class ModelBench:
         self._dt_s = disturbance.rest.dt_s
         self._driven = DrivenCentre(model, pump, model.holding_flow_um_per_s, self._dt_s)
         self._leaked_um = 0.0
-        self._walks = Walks.of(disturbance)
-        self._transition, kicks = self._walks.over(self._dt_s)
+        self._walks = Walks.from_disturbance(disturbance)
+        self._transition, kicks = self._walks.discretise(self._dt_s)
         sizes, ways = np.linalg.eigh(kicks)
         self._kicks = ways * np.sqrt(np.maximum(sizes, 0.0))
         self._weather = np.zeros(len(kicks))

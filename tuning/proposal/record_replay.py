@@ -24,7 +24,7 @@ class _ReplayBench:
         model: plant_model.PlantModel,
         pump: PumpConfig,
     ) -> None:
-        self.flow_um_per_s = float(record.part(0.0, _START_S).flow_um_per_s.mean())
+        self.flow_um_per_s = float(record.cut(0.0, _START_S).flow_um_per_s.mean())
         flows = np.append(self.flow_um_per_s, record.flow_um_per_s)
         own_um = (
             model.gain

@@ -60,7 +60,7 @@ class Stage:
     reason: str  # why it fails; empty if it passes
 
     @property
-    def close(self) -> bool:
+    def is_close(self) -> bool:
         """Whether it fails by less than the standard deviation of ten minutes scatters."""
         return self.growth_max < self.growth < _CLOSE * self.growth_max
 
@@ -106,7 +106,7 @@ def estimate_centre_std_um(
     off = off_um - off_um.mean()
     lags = np.arange(1, round(_LAGS_S / dt_s) + 1)
     seen = np.array([off[lag:] @ off[:-lag] / (off.size - lag) for lag in lags])
-    gains = closed_loop.Gains.of(loop)
+    gains = closed_loop.Gains.from_config(loop)
     w = closed_loop.make_frequencies(dt_s, _POINTS)
     model, moving = linearise_limits(gains, trial.model, weather, loop, w)
     sensitivity = np.abs(1 / (1 + closed_loop.compute_loop_response(gains, model, w, dt_s))) ** 2
@@ -126,7 +126,7 @@ def estimate_sensitivity(
     weather does not
     matter: only the shape is compared, each band with the median band.
     """
-    gains, dt_s = closed_loop.Gains.of(trial.after), weather.rest.dt_s
+    gains, dt_s = closed_loop.Gains.from_config(trial.after), weather.rest.dt_s
     frequency_hz, power = welch(
         off_um, 1 / dt_s, nperseg=round(_SEGMENT_S / dt_s), detrend="constant"
     )
@@ -156,7 +156,7 @@ def judge_stage(
         weather = disturbance.observe_disturbance(record, trial.model, trial.after)
     std_um = estimate_centre_std_um(off_um, trial, weather, trial.after)
     before_um, after_um = (
-        predict_loop(closed_loop.Gains.of(loop), trial.model, weather, loop).std_um
+        predict_loop(closed_loop.Gains.from_config(loop), trial.model, weather, loop).std_um
         for loop in (trial.before, trial.after)
     )
     predicted_growth = after_um / before_um

@@ -87,10 +87,10 @@ class HoldRig:
 
         Raises HoldError if the experiment is refused or ends in a state other than hold.
         """
-        rows, finished = self.performed(spec)
+        rows, finished = self.perform_ticks(spec)
         return self.record(rows), finished
 
-    def performed(
+    def perform_ticks(
         self, spec: ExperimentSpec
     ) -> tuple[list[telemetry.TelemetryRow], experiment.Finished]:
         """As `perform`, with the ticks instead of a record.
@@ -175,11 +175,11 @@ class HoldRig:
         self.loop = loop
         self.pump = pump or self.pump
 
-    def keep(self) -> None:
+    def keep_gains(self) -> None:
         """Keep the gains that are on trial."""
         self._link.send_command(Command("keep", self._who, "verified"))
 
-    def go_back(self) -> None:
+    def restore_good_gains(self) -> None:
         """End any running experiment and set the last good gains and curve."""
         self.end_experiment()
         if self.good != (self.loop, self.pump):

@@ -66,7 +66,7 @@ def run_design(session: folder.SessionFolder, reason: str = "tuning session") ->
         data_sha256=found.data_sha256,
         predicted_std_um=made.chosen.predicted.std_um,
         least_std_um=made.least_std_um,
-        plant=PlantSection.of(found.identified),
+        plant=PlantSection.from_fit(found.identified),
         loop=made.loop,
     )
     files.write_text_atomic(
@@ -91,7 +91,7 @@ def load_candidates(
     hand.
     """
     rows, loop = load_design(session).candidates, load_gains(session.file_path("gains.toml")).loop
-    gains = closed_loop.Gains.of(loop)
+    gains = closed_loop.Gains.from_config(loop)
     for row in rows:
         if row.gains == gains:
             return rows, row

@@ -91,9 +91,9 @@ def map_pump(
         rig.set_gains(loop, "the measured curve of the pump", _MAP_S, pump=found.pump)
         gain, sigma = _measure_gain(rig, found.delay_s + found.lag_s)
     except (experiments.ExperimentError, ValueError) as error:
-        rig.go_back()
+        rig.restore_good_gains()
         raise errors.RejectedError(f"pump map: {error}") from None
-    rig.keep()
+    rig.keep_gains()
     rig.good = loop, found.pump
     session = folder.restart_session(session, loop, found.pump)
     done = MappedPump(found, before, gain, sigma)
@@ -113,7 +113,7 @@ def _calm_hold(rig: HoldRig, limit_um: float) -> None:
     mean = PumpStep(
         fraction=PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s), duration_s=0.1
     )
-    rig.performed(
+    rig.perform_ticks(
         experiments.make_spec("pump_map", around, 600.0).model_copy(update={"steps": (mean,)})
     )
 
@@ -130,13 +130,13 @@ def _survey_pump(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
             around = replace(around, holding_flow_um_per_s=flow_um_per_s)
         around = replace(around, late_s=max(around.late_s, survey.fit.delay_s + survey.fit.lag_s))
         spec = experiments.make_spec("pump_map", around, 600.0).model_copy(update={"steps": steps})
-        rows, finished = rig.performed(spec)
+        rows, finished = rig.perform_ticks(spec)
         run = make_pump_run(rows, rig.dt_s)
         survey.add_run(run, finished.completed)
         if survey.dark >= _DARK_MOST:
             raise ValueError(finished.reason)
         with contextlib.suppress(ValueError):  # none yet
-            found = survey.result()
+            found = survey.make_map()
             if _reaches_leak(found):
                 loop = _free_flow_limit(*rig.good, found.pump).model_copy(update=_CAUTIOUS)
                 rig.set_gains(
@@ -144,7 +144,7 @@ def _survey_pump(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
                 )
         # a hold that swings may do; one that stays away ends every round at once
         held = _brought_back(rig) or run.fraction.size * rig.dt_s > _AT_ONCE_S
-    return survey.result(held)
+    return survey.make_map(held)
 
 
 def _reaches_leak(found: pump_map.PumpMap) -> bool:
@@ -171,7 +171,7 @@ def _make_safe_gains(loop: schema.LoopConfig, found: pump_map.PumpMap) -> schema
     actuator.
     """
     model = plant_model.PlantModel(1.0, found.delay_s, found.lag_s, found.leak_um_per_s)
-    margins = compute_margins(closed_loop.Gains.of(loop), model, 1 / loop.rate_hz)
+    margins = compute_margins(closed_loop.Gains.from_config(loop), model, 1 / loop.rate_hz)
     if margins.stable and margins.ms <= MS_MAX:
         return loop
     return _slow_gains(loop, found, _SLOW)

@@ -74,7 +74,7 @@ def run_verify(
             looks.append(verification.judge_stage(record, setpoint_um, trial, growth_max))
             report_stage(looks[-1])
             reason = looks[-1].reason
-            if until_s == stages[-1][0] and looks[-1].close:
+            if until_s == stages[-1][0] and looks[-1].is_close:
                 continue  # as likely the weather as the gains: as long again decides
             if reason or until_s == stages[-1][0]:
                 break
@@ -86,7 +86,7 @@ def run_verify(
         except live_hold.HoldError:  # the hold has ended; with it the gains on trial
             raise live_hold.HoldError(reason) from None
     else:
-        rig.keep()
+        rig.keep_gains()
     done = Verified(not reason, reason, tuple(looks), before, after)
     if record is not None:
         record_file.save_record(session.file_path("verify.npz"), record)
@@ -168,7 +168,7 @@ def _draw_verification(
             nperseg=min(readings.size, round(SPECTRUM_SEGMENT_S / dt_s)),
         )
         response = closed_loop.compute_loop_response(
-            closed_loop.Gains.of(loop), model, closed_loop.make_frequencies(dt_s), dt_s
+            closed_loop.Gains.from_config(loop), model, closed_loop.make_frequencies(dt_s), dt_s
         )
         ms = float(np.max(np.abs(1 / (1 + response))))
         left.loglog(f[1:], power[1:], linewidth=0.8, label=f"{name}, Ms {ms:.2f}")

@@ -42,13 +42,13 @@ def advise_number(solution: Solution, index: int) -> Advice | None:
         Number of the set whose sag is considered.
     """
     # The sag's sigma with each free parameter known better.
-    sums = np.sum([each.reduced() for each in solution.equations], axis=0)
+    sums = np.sum([each.eliminate_surface() for each in solution.equations], axis=0)
     sigmas = solution.problem.sigmas
     advice = []
     for k in np.flatnonzero(sigmas > 0):
         better = sigmas.copy()
         better[k] /= _BETTER
-        step = solve_step(sums + solution.known(better), better)
+        step = solve_step(sums + solution.prior_sums(better), better)
         improved = replace(solution, covariance=step.covariance)
         sag_then_um = sag_um(surface_covariance(improved, index))
         advice.append(Advice(bench_parameters.NAMES[k], float(better[k]), sag_then_um))

@@ -70,7 +70,7 @@ def advise_sphere(solution: Solution, index: int) -> ArtefactAdvice | None:
     if solution.problem.with_artefact:
         return None
     phases = solution.problem.sets[index]
-    phases = replace(phases.subset(phases.seen_with(0)), moved_screens=())
+    phases = replace(phases.subset(phases.select_screen(0)), moved_screens=())
     surface = solution.states[index].surface
 
     # As deep as the film, so that the fringes fall on the same places of the screen.

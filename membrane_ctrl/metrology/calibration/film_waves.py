@@ -152,13 +152,13 @@ def _waves_explain_most(uneven: Solution) -> bool:
 
 
 def _count_freedom(solution: Solution) -> int:
-    return len(terms_beyond_fit.WAVES) * len(solution.problem.films)
+    return len(terms_beyond_fit.WAVES) * len(solution.problem.film_sets)
 
 
 def _note_on_waves(solution: Solution) -> verdict.CalibrationFinding:
     """Size of the waves in the middle set, and what has such waves."""
     waves_mm = np.array(
-        solution.states[solution.problem.middle].surface.beyond_mm[terms_beyond_fit.WAVE]
+        solution.states[solution.problem.middle_film_set].surface.beyond_mm[terms_beyond_fit.WAVE]
     )
     orders = np.array([abs(wave.azimuthal_order) for wave in terms_beyond_fit.WAVES])
     most = int(orders[np.argmax(np.abs(waves_mm))])

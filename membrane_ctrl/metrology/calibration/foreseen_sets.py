@@ -44,9 +44,12 @@ def foreseen_equations(
 
 
 def with_equations(solution: Solution, linear: tuple[normal_equations.Equations, ...]) -> Solution:
-    sums, sigmas = np.sum([each.reduced() for each in linear], axis=0), solution.problem.sigmas
+    sums, sigmas = (
+        np.sum([each.eliminate_surface() for each in linear], axis=0),
+        solution.problem.sigmas,
+    )
     return replace(
         solution,
         equations=linear,
-        covariance=solve_step(sums + solution.known(sigmas), sigmas).covariance,
+        covariance=solve_step(sums + solution.prior_sums(sigmas), sigmas).covariance,
     )

@@ -82,7 +82,7 @@ def _fit_waves_mm(
     if phases.screen is not None:
         places = len(phases.moved_screens) + 1
     for place in range(places):
-        some = phases.seen_with(place)
+        some = phases.select_screen(place)
         if not some.any():
             continue
         column = phases.column_px[some] / across_px(phases)

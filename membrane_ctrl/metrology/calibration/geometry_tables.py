@@ -51,14 +51,16 @@ class Origin:
     notes: tuple[str, ...] = ()  # findings of the calibration
 
 
-def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:
+def make_geometry_tables(
+    solution: Solution, optics: OpticsConfig, origin: Origin
+) -> dict[str, Any]:
     """The content of `geometry.toml`; `optics` is the stated bench."""
-    free = [bench_parameters.NAMES.index(name) for name in solution.free]
+    free = [bench_parameters.NAMES.index(name) for name in solution.free_names]
 
     # Geometry, its covariance in the general form, and the parameters as solved.
     tables: dict[str, Any] = {
         **file_origin(SCHEMA),
-        "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
+        "geometry": calibrated_geometry(solution, optics).model_dump(exclude_none=True),
         "covariance": {
             "names": [*GENERAL_NAMES, *_list_free_options(solution)],
             "matrix": general_covariance(solution).tolist(),
@@ -73,7 +75,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
 
     # Lens and period, if they were free.
     bench = solution.bench
-    if set(solution.free) & set(_LENS):
+    if set(solution.free_names) & set(_LENS):
         of_camera = {
             key: getattr(optics.camera, key) for key in ("width_px", "height_px", "pixel_um")
         }
@@ -82,7 +84,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
             "principal_px": list(bench.geometry.principal_px),
             "distortion": list(bench.geometry.distortion),
         }
-    if "pitch_relative" in solution.free:
+    if "pitch_relative" in solution.free_names:
         tables["pattern"] = {"period_mm": optics.pattern.period_mm * bench.pitch}
 
     # Where the numbers come from, and the hash of all tables before.
@@ -100,7 +102,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
     return tables
 
 
-def geometry_of(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
+def calibrated_geometry(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
     """The calibrated geometry in the general form; the screen's
     height map is the stated bench's.
     """
@@ -157,7 +159,9 @@ def general_covariance(solution: Solution) -> FloatArray:
 
 def _list_free_options(solution: Solution) -> list[str]:
     return [
-        parameter.name for parameter in bench_parameters.OPTIONAL if parameter.name in solution.free
+        parameter.name
+        for parameter in bench_parameters.OPTIONAL
+        if parameter.name in solution.free_names
     ]
 
 

@@ -28,7 +28,7 @@ from membrane_ctrl.metrology.rays import (
 )
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
-SURE = 1e-6  # probability that good data look as bad
+SIGNIFICANCE = 1e-6  # probability that good data look as bad
 _CAMERA = tuple(
     bench_parameters.NAMES.index(name)
     for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg")
@@ -40,9 +40,9 @@ _LASER_SIGMA = 1.0  # of its scale when the optics alone determine it
 _DETERMINED = 1e-10  # eigenvalue, of scaled equations, from which on a combination is determined
 
 
-def _is_sure(fall: float, freedom: int) -> bool:
+def _is_significant(fall: float, freedom: int) -> bool:
     """Whether noise hardly ever causes as large a fall of the sum of squares."""
-    return bool(chi2.sf(fall, freedom) < SURE)
+    return bool(chi2.sf(fall, freedom) < SIGNIFICANCE)
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ class Suspect:
     figure_um: float
 
     @property
-    def sure(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether noise hardly ever causes as large a fall."""
-        return _is_sure(self.fall, 1)
+        return _is_significant(self.fall, 1)
 
 
 @dataclass(frozen=True)
@@ -90,10 +90,10 @@ class LaserScale:
     fall: float
 
     @property
-    def sure(self) -> bool:
+    def is_significant(self) -> bool:
         """As for `Suspect`: whether it is off by more than its data sheet allows."""
         sigma = np.hypot(self.sigma, bench_parameters.LASER.sigma)
-        return _is_sure(((self.value - 1) / sigma) ** 2, 1)
+        return _is_significant(((self.value - 1) / sigma) ** 2, 1)
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,9 @@ class CameraBump:
     fall: float
 
     @property
-    def sure(self) -> bool:
+    def is_significant(self) -> bool:
         """As for `Suspect`."""
-        return _is_sure(self.fall, len(_CAMERA))
+        return _is_significant(self.fall, len(_CAMERA))
 
 
 @dataclass(frozen=True)
@@ -142,9 +142,9 @@ class MountCreep:
     freedom: int
 
     @property
-    def sure(self) -> bool:
+    def is_significant(self) -> bool:
         """As for `Suspect`."""
-        return _is_sure(self.fall, self.freedom)
+        return _is_significant(self.fall, self.freedom)
 
 
 @dataclass(frozen=True)
@@ -167,8 +167,8 @@ class LeftOut:
 
     @property
     def disagrees(self) -> bool:
-        """As for `Suspect.sure`."""
-        return _is_sure(self.fall, self.freedom)
+        """As for `Suspect.is_significant`."""
+        return _is_significant(self.fall, self.freedom)
 
 
 def find_suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
@@ -179,18 +179,20 @@ def find_suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
     held_squares = _sum_squares(sums, solution)
 
     # From a change of the parameters to the change of a surface, without its plane.
-    response = figure_uncertainty.surface_response(solution, solution.problem.middle)[:, :-1]
+    response = figure_uncertainty.surface_response(solution, solution.problem.middle_film_set)[
+        :, :-1
+    ]
     flat_heights = disc_heights.remove_plane(*disc_heights.heights_over_disc(1.0))
 
     suspects = []
     for name in bench_parameters.NAMES[len(bench_parameters.POSE) : bench_poses.OPTICAL]:
-        if name in solution.free:
+        if name in solution.free_names:
             continue
         # The solution with this one free.
         k = bench_parameters.NAMES.index(name)
         freed = solution.problem.sigmas.copy()
         freed[k] = bench_parameters.usual_sigma(name)
-        moved = solver.solve_step(sums + solution.known(freed), freed)
+        moved = solver.solve_step(sums + solution.prior_sums(freed), freed)
 
         change_mm = flat_heights @ (response @ moved.delta[: bench_poses.OPTICAL])
         suspect = Suspect(
@@ -200,7 +202,7 @@ def find_suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
             fall=held_squares - moved.squares,
             figure_um=1e3 * float(np.std(change_mm)),
         )
-        if suspect.sure:
+        if suspect.is_significant:
             suspects.append(suspect)
     return tuple(sorted(suspects, key=lambda suspect: -suspect.fall))
 
@@ -211,7 +213,7 @@ def laser_scale(solution: solver.Solution) -> LaserScale:
     free = solution.problem.sigmas.copy()
     free[k] = _LASER_SIGMA
     sums = np.sum(_reduce_equations(solution), axis=0)
-    moved = solver.solve_step(sums + solution.known(free), free)
+    moved = solver.solve_step(sums + solution.prior_sums(free), free)
     return LaserScale(
         value=1 + float(solution.common[k] + moved.delta[k]),
         sigma=float(np.sqrt(moved.covariance[k, k])),
@@ -242,9 +244,9 @@ def find_moved_screens(solution: solver.Solution) -> list[tuple[int, float]]:
     for k, of_set in enumerate(solution.equations):
         # The equations of this set with the screens' moves free.
         free = replace(of_set, sums=_free_screen_moves(solution, k))
-        others = [*reduced[:k], free.reduced(), *reduced[k + 1 :]]
+        others = [*reduced[:k], free.eliminate_surface(), *reduced[k + 1 :]]
         fall = held_squares - _sum_squares(np.sum(others, axis=0), solution)
-        if _is_sure(fall, bench_poses.SCREEN_MOVE):
+        if _is_significant(fall, bench_poses.SCREEN_MOVE):
             found.append((k, float(fall)))
     return found
 
@@ -286,7 +288,7 @@ def find_camera_bumps(solution: solver.Solution) -> tuple[CameraBump, ...]:
         amounts, fall = _free_motion(solution, _CAMERA, share, sigmas)
         yaw, pitch, roll = amounts
         bump = CameraBump(group, (yaw, pitch, roll), fall)
-        if bump.sure:
+        if bump.is_significant:
             bumps.append(bump)
     return tuple(sorted(bumps, key=lambda bump: -bump.fall))
 
@@ -309,7 +311,7 @@ def find_mount_creep(solution: solver.Solution) -> MountCreep | None:
     most = max(poses, key=lambda k: alone[k][1])
     amounts, _ = alone[most]
     creep = MountCreep(bench_parameters.NAMES[most], amounts[0], fall, len(poses))
-    if not creep.sure:
+    if not creep.is_significant:
         return None
     return creep
 
@@ -344,7 +346,7 @@ def _free_motion(
     sums = np.sum([_with_more(each, columns, part) for each, part in pairs], axis=0)
 
     # What is known of all unknowns before the sets.
-    known = _with_more(solution.known(prior), columns, 0.0)
+    known = _with_more(solution.prior_sums(prior), columns, 0.0)
     extra = np.arange(set_state.COMMON, set_state.COMMON + len(columns))
     known[extra, extra] += 1 / sigmas**2
 
@@ -365,7 +367,8 @@ def leave_set_out(solution: solver.Solution, index: int) -> solver.Solution:
     linear = tuple(solution.equations[k] for k in keep)
     sigmas = problem.sigmas
     moved = solver.solve_step(
-        np.sum([each.reduced() for each in linear], axis=0) + solution.known(sigmas), sigmas
+        np.sum([each.eliminate_surface() for each in linear], axis=0) + solution.prior_sums(sigmas),
+        sigmas,
     )
     common = solution.common + moved.delta
     return replace(
@@ -385,7 +388,7 @@ def move_to_solution(solution: solver.Solution) -> solver.Solution:
     """
     sigmas = solution.problem.sigmas
     reduced = np.sum(_reduce_equations(solution), axis=0)
-    moved = solver.solve_step(reduced + solution.known(sigmas), sigmas)
+    moved = solver.solve_step(reduced + solution.prior_sums(sigmas), sigmas)
     common = solution.common + moved.delta
     pairs = zip(solution.states, solution.equations, strict=True)
     return replace(
@@ -398,7 +401,7 @@ def move_to_solution(solution: solver.Solution) -> solver.Solution:
 
 
 def _reduce_equations(solution: solver.Solution) -> list[FloatArray]:
-    return [each.reduced() for each in solution.equations]
+    return [each.eliminate_surface() for each in solution.equations]
 
 
 def film_rise(solution: solver.Solution, film: set_state.FilmModel) -> float:
@@ -449,7 +452,7 @@ def _change_film_rows(
 ) -> solver.Solution:
     """The solution with rows added to the equations of its films, or subtracted."""
     changed = list(solution.equations)
-    for k in solution.problem.films:
+    for k in solution.problem.film_sets:
         sign, rows = rows_of(solution.problem.sets[k], solution.states[k])
         changed[k] = replace(changed[k], sums=changed[k].sums + sign * rows.T @ rows)
     return replace(solution, equations=tuple(changed))
@@ -457,7 +460,7 @@ def _change_film_rows(
 
 def _sum_squares(sums: FloatArray, solution: solver.Solution) -> float:
     sigmas = solution.problem.sigmas
-    return solver.solve_step(sums + solution.known(sigmas), sigmas).squares
+    return solver.solve_step(sums + solution.prior_sums(sigmas), sigmas).squares
 
 
 def _fit_alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:

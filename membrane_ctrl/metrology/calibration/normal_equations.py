@@ -62,7 +62,7 @@ class Equations:
         right = self.sums[:local, -1]
         return np.asarray(np.linalg.solve(own, right - mixed @ common_step))
 
-    def moved(self, local_step: FloatArray, common_step: FloatArray) -> list[FloatArray]:
+    def screen_steps(self, local_step: FloatArray, common_step: FloatArray) -> list[FloatArray]:
         """Steps (MOVED,) of the screens elsewhere that go with those."""
         moved = moved_screen.MOVED
         step = np.append(local_step, common_step)
@@ -72,7 +72,7 @@ class Equations:
             steps.append(np.asarray(np.linalg.solve(sums[:moved, :moved], right)))
         return steps
 
-    def reduced(self) -> FloatArray:
+    def eliminate_surface(self) -> FloatArray:
         """Schur complement over the set's own unknowns, (COMMON + 1, squared)."""
         return eliminate_first(self.sums, forward_model.LOCAL)
 

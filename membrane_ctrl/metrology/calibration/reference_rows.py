@@ -12,7 +12,7 @@ from membrane_ctrl.metrology.calibration.set_state import (
     References,
     SetState,
     rim_beyond,
-    rim_of,
+    rim_height_harmonics,
 )
 from membrane_ctrl.metrology.calibration.turned_rows import (
     form_rows,
@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.calibration.turned_rows import (
     shift_derivatives,
 )
 from membrane_ctrl.metrology.film import terms_beyond_fit
-from membrane_ctrl.metrology.film.terms_beyond_fit import round_of
+from membrane_ctrl.metrology.film.terms_beyond_fit import film_round_terms_mm
 from membrane_ctrl.metrology.rays import (
     bench_poses,
     forward_model,
@@ -87,7 +87,7 @@ def reference_rows(
     ring[0, PARAMETERS] = 1.0
     ring[:, forward_model.BEYOND] = rim_beyond()
     rows[:RING, forward_model.LOCAL :][:, RING_PLACE] = -np.eye(RING)
-    ring[:, -1] = common[RING_PLACE] - rim_of(state)
+    ring[:, -1] = common[RING_PLACE] - rim_height_harmonics(state)
     ring /= references.ring_sigma_um * 1e-3
     if phases.turned is not None:
         # It stands elsewhere, and its waves are part of the figure that turns.
@@ -113,8 +113,8 @@ def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
     if film == "prestressed":
         # The law gives them for the surface's own excess.
         excess_mm = surface.parameters[-1]
-        here = round_of(excess_mm, surface.sag_mm)
-        there = round_of(excess_mm + _EXCESS_STEP_MM, surface.sag_mm)
+        here = film_round_terms_mm(excess_mm, surface.sag_mm)
+        there = film_round_terms_mm(excess_mm + _EXCESS_STEP_MM, surface.sag_mm)
         rows[:, PARAMETERS - 1] = (here - there) / _EXCESS_STEP_MM
         rows[:, -1] += here
     sigma_mm = _LAW_MM

@@ -19,7 +19,7 @@ _LEAST_CONTRAST = 1 / 4  # of an edge, over the brightest line's inner end
 _HEIGHT_STEPS = 4  # the rim's height hardly changes with the place: each gains three digits
 
 
-def on_rim(
+def meet_rim(
     geometry: Geometry, edges: FloatArray, rim_z: HeightFunction
 ) -> tuple[FloatArray, FloatArray]:
     """Where the rays of edges meet the rim's height.
@@ -161,6 +161,6 @@ def _fit_ellipse(points_px: FloatArray) -> FloatArray:
     return np.asarray(middle[:, None] + size * (centre[:, None] + around))
 
 
-def from_middle(edges: FloatArray) -> FloatArray:
+def subtract_mean_place(edges: FloatArray) -> FloatArray:
     """Edges (2, n) less their mean."""
     return np.asarray(edges - edges.mean(axis=1, keepdims=True))

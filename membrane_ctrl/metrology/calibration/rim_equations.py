@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.metrology.calibration.rim_edges import EDGE_SIGMA_PX, RADIUS_SIGMA_MM, on_rim
+from membrane_ctrl.metrology.calibration.rim_edges import EDGE_SIGMA_PX, RADIUS_SIGMA_MM, meet_rim
 from membrane_ctrl.metrology.calibration.set_state import RING_PLACE
 from membrane_ctrl.metrology.rays import bench_parameters, bench_poses
 from membrane_ctrl.metrology.rays.geometry import Geometry
@@ -33,7 +33,7 @@ class Rim:
     radius_sigma_mm: float = RADIUS_SIGMA_MM
 
     @classmethod
-    def of(
+    def from_edges(
         cls, edges_px: Sequence[FloatArray], radius_mm: float, radius_sigma_mm: float
     ) -> "Rim | None":
         """The edges of several sets together; None without any."""
@@ -41,7 +41,7 @@ class Rim:
             return cls(np.concatenate(edges_px, axis=1), radius_mm, radius_sigma_mm)
         return None
 
-    def sums(self, stated: Geometry, common: FloatArray) -> FloatArray:
+    def make_sums(self, stated: Geometry, common: FloatArray) -> FloatArray:
         """Normal equations (COMMON + 1, squared) of the five
         observations at the common unknowns.
         """
@@ -81,7 +81,7 @@ class Rim:
             return np.asarray(ring[0] + waves.T @ ring[1:])
 
         # Where the edges' rays meet that rim, and their distance from the circle.
-        x, y = on_rim(geometry, self.edges_px, height)
+        x, y = meet_rim(geometry, self.edges_px, height)
         theta = np.arctan2(y, x)
 
         # Harmonics 0 to 2 of this distance: size, place and ellipse.

@@ -14,9 +14,9 @@ from membrane_ctrl.metrology.calibration.rim_edges import (
     EDGE_SIGMA_PX,
     LEAST_FOUND,
     RIM_POINTS,
-    from_middle,
-    on_rim,
+    meet_rim,
     rim_edges,
+    subtract_mean_place,
 )
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, usual_sigma
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
@@ -96,7 +96,7 @@ def ring_pose(
         raise ValueError(
             f"only {edges.shape[1] / RIM_POINTS:.0%} of the rim is seen as an edge of light"
         )
-    mm_per_px = radius_mm / float(np.mean(np.hypot(*from_middle(edges))))
+    mm_per_px = radius_mm / float(np.mean(np.hypot(*subtract_mean_place(edges))))
 
     def miss_px(x: FloatArray) -> FloatArray:
         """Distances (n,) of the edges from the ring, with the pose x (5,) in units of `_UNITS`."""
@@ -131,7 +131,7 @@ def _make_bench(stated: Geometry, pose: FloatArray) -> Geometry:
 
 def _radii_mm(geometry: Geometry, edges: FloatArray, rim_z: HeightFunction) -> FloatArray:
     """Distances (n,) from the axis at which the rays of edges (2, n) meet the rim's height."""
-    return np.asarray(np.hypot(*on_rim(geometry, edges, rim_z)))
+    return np.asarray(np.hypot(*meet_rim(geometry, edges, rim_z)))
 
 
 def _shared_misses(edges: FloatArray, radius_sigma_px: float) -> FloatArray:
@@ -140,7 +140,7 @@ def _shared_misses(edges: FloatArray, radius_sigma_px: float) -> FloatArray:
     The radius; and the edge's own error as a rim that is larger, longer across, or longer along a
     diagonal.
     """
-    x, y = from_middle(edges) / np.hypot(*from_middle(edges))
+    x, y = subtract_mean_place(edges) / np.hypot(*subtract_mean_place(edges))
     larger = np.full(x.size, np.hypot(radius_sigma_px, EDGE_SIGMA_PX))
     across = EDGE_SIGMA_PX * (x * x - y * y)
     diagonal = EDGE_SIGMA_PX * 2 * x * y

@@ -69,11 +69,13 @@ def advise_screen_sets(solution: Solution, index: int) -> tuple[ScreenAdvice, ..
         The most useful first.
     """
     problem = solution.problem
-    half_mm = np.max([np.abs(problem.sets[k].screen_mm).max(axis=1) for k in problem.films], axis=0)
+    half_mm = np.max(
+        [np.abs(problem.sets[k].screen_mm).max(axis=1) for k in problem.film_sets], axis=0
+    )
     candidates: list[Placement] = []
     if not any(isinstance(phases.artefact, SeenScreen) for phases in problem.sets):
         candidates.append("screen")
-    if not any(problem.sets[k].moved_screens for k in problem.films):
+    if not any(problem.sets[k].moved_screens for k in problem.film_sets):
         candidates.append("screen_moved")
 
     # Add the best candidate, as long as it reduces the sigma enough.
@@ -113,10 +115,10 @@ def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[
     # The bins of the film's set, which see the screen instead.
     film = solution.problem.sets[index]
     film = replace(
-        film.subset(film.seen_with(0)),
+        film.subset(film.select_screen(0)),
         displacement_um=np.nan,
         screen=None,
-        moved_screens=(MovedScreen.anywhere(),),
+        moved_screens=(MovedScreen.unknown_place(),),
     )
 
     # The distance at which the fringes fill the picture.
@@ -151,10 +153,10 @@ def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Sol
     known = MovedScreen((0.0, 0.0, _RAIL_MM), RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0)
     move = known.make_prior(solution.problem.references.laser_sigma_um)[0]
     state = replace(solution.states[index], moved_screens=(move,))
-    there = foreseen_set(solution, film.beside(film, known), state, half_mm)
-    again = there.subset(there.seen_with(1))
+    there = foreseen_set(solution, film.add_screen_place(film, known), state, half_mm)
+    again = there.subset(there.select_screen(1))
     all_weights = np.append(present.robust.weights, np.ones(again.sigma_mm.size))
     robust = replace(present.robust, weights=all_weights)
     linear = list(solution.equations)
-    linear[index] = foreseen_equations(solution, film.beside(again, known), state, robust)
+    linear[index] = foreseen_equations(solution, film.add_screen_place(again, known), state, robust)
     return with_equations(solution, tuple(linear)), _RAIL_MM

@@ -83,7 +83,7 @@ class References:
     form_sigma_um: float = FORM_SIGMA_UM
 
 
-def rim_of(state: SetState) -> FloatArray:
+def rim_height_harmonics(state: SetState) -> FloatArray:
     """Harmonics (RING,) of the rim's height in world, mm."""
     out = rim_harmonics() @ state.surface.parameters
     out[0] += state.vertex_z_mm

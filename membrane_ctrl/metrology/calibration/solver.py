@@ -83,7 +83,7 @@ class Problem:
     rim: Rim | None = None
 
     @property
-    def films(self) -> list[int]:
+    def film_sets(self) -> list[int]:
         """Numbers of the sets that show the film; the others show artefacts."""
         return [k for k, phases in enumerate(self.sets) if phases.artefact is None]
 
@@ -93,11 +93,11 @@ class Problem:
         return any(isinstance(phases.artefact, Artefact) for phases in self.sets)
 
     @property
-    def middle(self) -> int:
+    def middle_film_set(self) -> int:
         """Number of the film's set in the middle of their order: results are stated for a figure
         like that one.
         """
-        return self.films[len(self.films) // 2]
+        return self.film_sets[len(self.film_sets) // 2]
 
 
 @dataclass(frozen=True)
@@ -141,14 +141,14 @@ class Solution:
         """The calibrated bench."""
         return bench_poses.bench_at(self.problem.stated, self.values)
 
-    def known(self, sigmas: FloatArray) -> FloatArray:
+    def prior_sums(self, sigmas: FloatArray) -> FloatArray:
         """Knowledge besides the sets, as sums (COMMON + 1, COMMON + 1), with these sigmas
         (len(NAMES),) of the hand measurements.
         """
         return make_prior(sigmas, self.common) + self.at_rim
 
     @property
-    def free(self) -> list[str]:
+    def free_names(self) -> list[str]:
         """Names of the parameters that were free."""
         pairs = zip(bench_parameters.NAMES, self.problem.sigmas, strict=True)
         return [name for name, sigma in pairs if sigma > 0]
@@ -255,7 +255,7 @@ def solve_calibration(
         If there is no set of the film, if a set's points do not determine a surface, or if the
         steps diverge.
     """
-    if not problem.films:
+    if not problem.film_sets:
         raise ValueError("no capture set of the film to calibrate with")
     with np.errstate(over="ignore", invalid="ignore"):  # a divergence is reported below
         return _solve_sets(problem, progress, start)
@@ -268,7 +268,7 @@ def _solve_sets(
     largest = max(phases.sigma_mm.size for phases in problem.sets)
     if start is None and largest > 2 * _FEW:
         # Some of the bins give a bench that is nearly right.
-        some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
+        some = replace(problem, sets=tuple(phases.thin_to(_FEW) for phases in problem.sets))
         start = _solve_sets(some, progress, None)
         if not start.converged:
             return start  # means about a diverged bench would be meaningless
@@ -310,8 +310,8 @@ def _iterate(
         linear = _linearise_sets(problem, states, common, weights)
         at_rim = np.zeros((common.size + 1, common.size + 1))
         if problem.rim is not None:
-            at_rim = problem.rim.sums(problem.stated, common)
-        of_sets = np.sum([equations.reduced() for equations in linear], axis=0)
+            at_rim = problem.rim.make_sums(problem.stated, common)
+        of_sets = np.sum([equations.eliminate_surface() for equations in linear], axis=0)
         sums = of_sets + make_prior(problem.sigmas, common) + at_rim
         step = solve_step(sums, problem.sigmas)
         sigmas = np.sqrt(np.diag(step.covariance))
@@ -413,7 +413,7 @@ def move_state(
     # Vertex, motion from y to x, and the places of the screen.
     vertex_z_mm = state.vertex_z_mm + own[PARAMETERS]
     motion_mm = state.motion_mm + own[forward_model.MOTION]
-    steps = linear.moved(own, common_step)
+    steps = linear.screen_steps(own, common_step)
     moved_screens = tuple(
         move + step for move, step in zip(state.moved_screens, steps, strict=True)
     )
@@ -427,13 +427,17 @@ def _with_form_sag(problem: Problem, states: Sequence[set_state.SetState]) -> Pr
     references = problem.references
     if references.form_sag_mm is not None or all(each.turned is None for each in problem.sets):
         return problem
-    sag_mm = float(np.mean([states[k].surface.sag_mm for k in problem.films]))
+    sag_mm = float(np.mean([states[k].surface.sag_mm for k in problem.film_sets]))
     return replace(problem, references=replace(references, form_sag_mm=sag_mm))
 
 
 def _make_first_common(problem: Problem, states: Sequence[set_state.SetState]) -> FloatArray:
     """The parameters as stated, the ring as the first surfaces have it, and no figure."""
-    rings = [set_state.rim_of(states[k]) for k in problem.films if problem.sets[k].turned is None]
+    rings = [
+        set_state.rim_height_harmonics(states[k])
+        for k in problem.film_sets
+        if problem.sets[k].turned is None
+    ]
     if not rings:
         raise ValueError("every mirror was turned: a set of the mirror as it stands is needed")
     common = np.zeros(set_state.COMMON)
@@ -495,9 +499,9 @@ def fit_on(
     ValueError
         If its points determine no surface.
     """
-    phases = phases.subset(phases.seen_with(0))
+    phases = phases.subset(phases.select_screen(0))
     tracer = ray_tracing.Tracer(bench.geometry, radius_mm, vertex_z_mm)
     rays = forward_model.camera_rays(bench.geometry, phases)
-    points = ray_tracing.Points.of(rays, phases.screen_mm * bench.pitch)
+    points = ray_tracing.Points.from_rays(rays, phases.screen_mm * bench.pitch)
     start = ray_tracing.make_parabola(_START_SAG_MM, radius_mm)
     return surface_fit.fit_surface(tracer, points, start)

@@ -40,14 +40,14 @@ def find_unturned_figures(solution: Solution) -> tuple[UnturnedFigure, ...]:
         freed = _free_figure(solution, k)
         found_deg = find_angle_of_set(freed, k)
         fall = everything - model_tests.sum_of_squares(freed)
-        if chi2.sf(fall, len(film_form.TURNING)) < model_tests.SURE:
+        if chi2.sf(fall, len(film_form.TURNING)) < model_tests.SIGNIFICANCE:
             explained = fall - 2 * len(film_form.TURNING)
             out.append(UnturnedFigure(k, explained, found_deg))
 
         # Its angle alone is free: was it turned by another one?
         turned = _free_angle(solution, k)
         fall = everything - model_tests.sum_of_squares(turned)
-        if chi2.sf(fall, 1) < model_tests.SURE:
+        if chi2.sf(fall, 1) < model_tests.SIGNIFICANCE:
             more_deg = float(np.degrees(turned.states[k].seat[2]))
             linear_deg = phases.turned.angle_deg + more_deg
             angle_deg = linear_deg
@@ -117,9 +117,9 @@ def find_wrong_angles(
     list of (int, float)
         Number of the set, and the angle of its figure in degrees.
     """
-    usual = [k for k in problem.films if problem.sets[k].turned is None]
+    usual = [k for k in problem.film_sets if problem.sets[k].turned is None]
     out = []
-    for k in problem.films if usual else []:
+    for k in problem.film_sets if usual else []:
         turned = problem.sets[k].turned
         if turned is None:
             continue

@@ -87,8 +87,8 @@ def check_before_solving(problem: Problem) -> tuple[CalibrationFinding, ...]:
         )
 
     # How far the film's sets are apart, by the laser and by the fringes.
-    moved_um = np.array([problem.sets[k].displacement_um for k in problem.films])
-    sag_um = np.array([1e3 * states[k].surface.sag_mm for k in problem.films])
+    moved_um = np.array([problem.sets[k].displacement_um for k in problem.film_sets])
+    sag_um = np.array([1e3 * states[k].surface.sag_mm for k in problem.film_sets])
     known = np.isfinite(moved_um)
     spread_um = 0.0
     if known.any():
@@ -141,7 +141,7 @@ def check_solution(solution: Solution) -> tuple[CalibrationFinding, ...]:
     findings: list[CalibrationFinding] = []
     causes = [*of_film, *list_causes(solution)]
     if causes:
-        findings.append(_of_still_sets(solution, find_largest_cause(causes).finding))
+        findings.append(_name_still_set_cause(solution, find_largest_cause(causes).finding))
     else:
         findings += _judge_scatter(solution)
     return (*findings, *_judge_spread(solution))
@@ -213,7 +213,7 @@ def _describe_angle(problem: Problem, index: int, found_deg: float) -> str:
     )
 
 
-def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> CalibrationFinding:
+def _name_still_set_cause(solution: Solution, finding: CalibrationFinding) -> CalibrationFinding:
     """The finding to report where the film moved much in some sets: that of the other sets, or the
     motion if they have none. Without such sets, the given one.
     """
@@ -224,7 +224,7 @@ def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> Calibrati
 
     # The causes that the others show, if there are enough of them.
     causes: list[Cause] = []
-    if len(solution.problem.films) - len(moved) > 1:
+    if len(solution.problem.film_sets) - len(moved) > 1:
         rest = solution
         for k in reversed(moved):
             rest = model_tests.leave_set_out(rest, k)
@@ -258,7 +258,7 @@ def _judge_film(solution: Solution) -> list[Cause]:
     # By how much the stated kind raises the sum of squares of that solution.
     freedom = len(terms_beyond_fit.ROUND_DEGREES) * len(problem.sets)
     rise = model_tests.film_rise(other, kind)
-    if not other.converged or chi2.sf(rise, freedom) > model_tests.SURE:
+    if not other.converged or chi2.sf(rise, freedom) > model_tests.SIGNIFICANCE:
         return []
     description = f"the film's figure is not {_FILM_NAMES[kind]}: use --film free"
     return [Cause(rise - 2 * freedom, CalibrationFinding(True, description))]
@@ -391,7 +391,7 @@ def _have_common_bench(problem: Problem) -> bool:
     """Whether the sets share one bench; a few points of each are enough to show that they do
     not.
     """
-    few = replace(problem, sets=tuple(phases.thinned(_FEW_POINTS) for phases in problem.sets))
+    few = replace(problem, sets=tuple(phases.thin_to(_FEW_POINTS) for phases in problem.sets))
     try:
         solution = solve_calibration(few)
     except ValueError:
@@ -414,7 +414,7 @@ def _name_wrong_part(solution: Solution, index: int) -> str:
     # vertex.
     rest = model_tests.leave_set_out(solution, index)
     ring_mm = rest.common[len(bench_parameters.NAMES)]
-    rim_mm = set_state.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
+    rim_mm = set_state.rim_height_harmonics(replace(solution.states[index], vertex_z_mm=0.0))[0]
     vertex_um = 1e3 * (ring_mm - rim_mm)
 
     # The laser's reading against it: vertex = -(1 + scale) (d - reference).
@@ -441,7 +441,7 @@ def _judge_scatter(solution: Solution) -> list[CalibrationFinding]:
 def _judge_laser(solution: Solution) -> list[Cause]:
     """A laser whose scale is off by more than its data sheet allows."""
     laser = model_tests.laser_scale(solution)
-    if not laser.sure:
+    if not laser.is_significant:
         return []
     description = (
         f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} µm "
@@ -477,7 +477,7 @@ def _judge_spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     problem = solution.problem
     if problem.with_artefact:
         return ()  # the sag rests on the artefacts
-    readings_um = np.array([problem.sets[k].displacement_um for k in problem.films])
+    readings_um = np.array([problem.sets[k].displacement_um for k in problem.film_sets])
     known_um = readings_um[np.isfinite(readings_um)]
     if known_um.size < 2:
         description = (

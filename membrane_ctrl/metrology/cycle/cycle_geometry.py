@@ -102,12 +102,12 @@ class CycleGeometry:
         slopes = SlopeMisfit(self._measure_curl_urad(tracer, state, surface), self._explained_urad)
         outline = self._find_outline(tracer, surface, light)
         rim = None if outline is None else measure_rim_misfit(bench, self._spread, outline)
-        return GeometryStatement.of(self._known_by, self._source, rim, slopes)
+        return GeometryStatement.from_evidence(self._known_by, self._source, rim, slopes)
 
     def _make_bench(self, tracer: Tracer, state: TrackedPoints, surface: Surface) -> TrialBench:
         places_px = self._places_px[:, state.index]
         exact = np.zeros((2, state.index.size))
-        return TrialBench.of_points(
+        return TrialBench.from_points(
             self._optics, tracer, surface, state.points, places_px, exact, _BENCH_POINTS
         )
 

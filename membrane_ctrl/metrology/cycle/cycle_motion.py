@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
+from membrane_ctrl.metrology.numerics.grouped_sums import sum_by_group
 from membrane_ctrl.metrology.rays import bench_motions, ray_tracing
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.uncertainty.motion_evidence import (
@@ -53,7 +53,7 @@ class CycleMotion:
     changed_mm: FloatArray
 
     @classmethod
-    def of(
+    def from_reference(
         cls,
         tracer: ray_tracing.Tracer,
         points: ray_tracing.Points,
@@ -85,7 +85,7 @@ class CycleMotion:
         # The square of the mirror in which each bin is.
         place = tracer.position_mm(points) / surface.radius_mm
         column, row = np.floor((place + 1) / 2 * _SQUARES).astype(int)
-        effects = MotionEffects.of(changes, jacobian, np.ones((2, index.size)))
+        effects = MotionEffects.from_changes(changes, jacobian, np.ones((2, index.size)))
         square = (row + 1) * (_SQUARES + 2) + column + 1
         return cls(effects, surface, covariance_mm2, index, square, changed_mm[:, order])
 
@@ -118,7 +118,7 @@ class CycleMotion:
         # Sums over the squares: independent errors of each show what scatter alone gives.
         left = self.effects.left[:, :, place]
         parts = np.einsum("kan,an->kn", left, changed_mm[:, known])
-        squares = sums_by(self.square[place], parts, (_SQUARES + 2) ** 2)
+        squares = sum_by_group(self.square[place], parts, (_SQUARES + 2) ** 2)
         flat = left.reshape(len(left), -1)
 
         # The test of each motion, with the tilt of the ring, which the mirror's own change also
@@ -131,7 +131,7 @@ class CycleMotion:
             None,
         )
         moved_mm = surface.parameters - self.surface.parameters
-        return test.find(ring @ moved_mm, np.zeros(2), parts.sum(axis=1))
+        return test.find_motions(ring @ moved_mm, np.zeros(2), parts.sum(axis=1))
 
     def tilt_urad(self, surface: Surface) -> float:
         """Tilt of the ring since the reference."""

@@ -185,10 +185,10 @@ class LiveReconstructor:
             self._reference_um = float(readings[np.isfinite(readings)][0])
 
         # Sums over the bins, without bands of the backlight.
-        self._binner.clear()
+        self._binner.clear_saturation()
         shown = [frames[k] for k in sinusoids]
         self._binner.white_adu = find_clip_levels(shown, self._full_scale_adu).white_adu
-        self._binner.add(frames, range(len(frames)), watched=sinusoids)
+        self._binner.sum_frames(frames, range(len(frames)), watched=sinusoids)
         self._take_bands(np.zeros(0))
 
         # Absolute phases of the bins near the mirror.
@@ -214,7 +214,7 @@ class LiveReconstructor:
         self._remove_lag_of_full(state)
         self._watch.begin(state, self._lag)
         self._statement = None
-        estimate = self._follow("full", state, times, readings)
+        estimate = self._follow_phases("full", state, times, readings)
         estimate = self._judge_geometry(estimate, state, readings)
 
         # If no surface explains the slopes, pictures or pattern may be turned.
@@ -253,12 +253,12 @@ class LiveReconstructor:
             return make_rejected_cycle(
                 "fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True
             )
-        self._binner.clear()
-        self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
+        self._binner.clear_saturation()
+        self._binner.sum_frames(frames, np.r_[self._slots.sinusoids].tolist())
         if self._bands_rad.size:
             self._take_bands(self._bands_rad)
         self._remove_lag_of_fringes()
-        estimate = self._follow("fringes", self._tracked, times, readings)
+        estimate = self._follow_phases("fringes", self._tracked, times, readings)
         return self._degrade_contradicted(estimate)
 
     def prepare(self) -> None:
@@ -330,7 +330,7 @@ class LiveReconstructor:
             vertex_z_mm = -(mean_um - self._reference_um) * 1e-3
         return ray_tracing.Tracer(self._geometry, self._optics.mirror.radius_mm, vertex_z_mm)
 
-    def _follow(
+    def _follow_phases(
         self,
         kind: Kind,
         state: tracked_points.TrackedPoints,
@@ -350,8 +350,10 @@ class LiveReconstructor:
             return make_rejected_cycle(kind, times, readings, reason, tracking_lost=True)
 
         # The surface, without the effect of what the frames show of their own light and motion.
-        fit = self._fit(state, usable, readings)
-        cycle = cycle_errors.Cycle(self._make_tracer(readings), state, fit, self._sums(), readings)
+        fit = self._fit_points(state, usable, readings)
+        cycle = cycle_errors.Cycle(
+            self._make_tracer(readings), state, fit, self._sinusoid_sums(), readings
+        )
         errors = self._watch.estimate_errors(cycle)
         corrected = fit.surface.parameters - errors.correction_mm
         corrected_surface = surface.Surface.from_parameters(corrected, fit.surface.radius_mm)
@@ -369,7 +371,7 @@ class LiveReconstructor:
         estimate = self._estimate(kind, state, fit, errors, quality, times, readings)
         if estimate.verdict == "rejected":
             # The points go back onto the last good surface.
-            self._make_tracer(readings).start(state.points, state.surface.height)
+            self._make_tracer(readings).place_on_shape(state.points, state.surface.height)
         else:
             state.accept(fit.surface, usable)
             self._tracked = state
@@ -381,7 +383,7 @@ class LiveReconstructor:
         `known` are the frequencies that the last full cycle found; empty in a full cycle.
         """
         slots = np.r_[self._slots.sinusoids]
-        binned = self._binned(self._binner.sums[slots])
+        binned = self._mean_of_bins(self._binner.sums[slots])
         stack = self._stack_without_frames(self._patterns)
         stack, binned, found = band_removal.remove_bands(stack, binned, known)
         self._bands_rad = known if known.size else found
@@ -412,7 +414,7 @@ class LiveReconstructor:
         sample = Binned(self._bin_px, means, np.broadcast_to(is_saturated, means.shape), levels)
         self._lag = image_lag.find_image_lag(stack, sample, state.accepted[:, 0, some])
         if self._lag.corrected:
-            binned = self._binned(self._binner.sums[: self._slots.count])
+            binned = self._mean_of_bins(self._binner.sums[: self._slots.count])
             corrected = image_lag.remove_image_lag(stack, binned, self._lag)
             slots = np.r_[self._slots.sinusoids]
             self._binner.sums[slots] = np.rint(corrected.means[slots] * self._bin_px**2)
@@ -424,7 +426,7 @@ class LiveReconstructor:
             return
         slots = np.r_[self._slots.sinusoids]
         stack = self._stack_without_frames(self._patterns)
-        binned = self._binned(self._binner.sums[slots])
+        binned = self._mean_of_bins(self._binner.sums[slots])
         corrected = image_lag.remove_image_lag(stack, binned, self._lag)
         self._binner.sums[slots] = np.rint(corrected.means * self._bin_px**2)
 
@@ -433,7 +435,7 @@ class LiveReconstructor:
         none = np.empty((len(patterns), self._optics.camera.height_px, 0), np.uint8)
         return FrameStack(none, patterns, np.full(len(patterns), math.nan), {})
 
-    def _binned(self, sums: AnyArray) -> Binned:
+    def _mean_of_bins(self, sums: AnyArray) -> Binned:
         """Sums of frames as means."""
         # in single precision, which holds every sum exactly: a third of the time
         means = sums.astype(np.float32)
@@ -448,7 +450,7 @@ class LiveReconstructor:
         means /= np.float32(self._bin_px**2)
         return means
 
-    def _sums(self) -> list[AnyArray]:
+    def _sinusoid_sums(self) -> list[AnyArray]:
         """Bin sums (N, bins) of the sinusoids of x and of y."""
         return [
             self._binner.sums[slots].reshape(self._slots.steps, -1)
@@ -468,7 +470,7 @@ class LiveReconstructor:
                 )
             )
         phase_change.update_phases(
-            self._sums(),
+            self._sinusoid_sums(),
             state.index,
             combined,
             state.sensitivity_rad_per_um,
@@ -476,7 +478,7 @@ class LiveReconstructor:
             state.fresh,
         )
 
-    def _fit(
+    def _fit_points(
         self, state: tracked_points.TrackedPoints, usable: BoolArray, readings: FloatArray
     ) -> surface_fit.Fit:
         """One or two steps from the last surface; the full cycle's normal matrix while its points
@@ -578,7 +580,7 @@ class LiveReconstructor:
         changed_mm = self._mm_per_rad * errors.changed_rad
         if errors.is_reference or self._motion is None:
             points = state.points.subset(errors.points)
-            self._motion = cycle_motion.CycleMotion.of(
+            self._motion = cycle_motion.CycleMotion.from_reference(
                 self._make_tracer(readings), points, index, fit.surface, covariance_mm2, changed_mm
             )
             return None, ""

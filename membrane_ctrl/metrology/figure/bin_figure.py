@@ -61,7 +61,7 @@ def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None =
     BinFigure
     """
     state = checked.state
-    film = film or FilmMotion.of(checked)
+    film = film or FilmMotion.from_set(checked)
 
     # Phases of the bins. The loop takes any numbers: here means over the bins instead of sums,
     # hence bins of one pixel in the combinations of the steps.

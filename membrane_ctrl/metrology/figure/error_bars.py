@@ -79,7 +79,7 @@ def figure_bars(
         return FigureBars(nothing, np.full(zernike.FRINGE_TERMS, np.nan))
 
     # Trials on a thinned grid, unless few cells of a sparse map would be left.
-    thin = seen.part(max(1, seen.axis_mm.size // _TRIAL_CELLS))
+    thin = seen.take_every(max(1, seen.axis_mm.size // _TRIAL_CELLS))
     if np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS:
         thin = seen
     rough = FigureOf(thin, evaluate.aperture_mm)
@@ -98,13 +98,13 @@ def figure_bars(
     squares = np.zeros(len(fields(Quantities)))
     for _ in range(_TRIALS):
         change = np.tensordot(random.normal(size=len(root)), modes, axes=1)
-        disturbed = rough(thin.plus(change))
+        disturbed = rough(thin.add_change(change))
         squares += _compute_change(nominal, disturbed) ** 2 / _TRIALS
 
     # And by the cells' own noise, which is independent of them.
     if cell_slope > 0:
         for change in _propagate_white_noise(seen, evaluate.aperture_mm, cell_slope, random):
-            moved = np.array(astuple(evaluate(seen.plus(change)).numbers))
+            moved = np.array(astuple(evaluate(seen.add_change(change)).numbers))
             squares += (moved - astuple(found.numbers)) ** 2 / _WHITE_TRIALS
 
     # The Fringe terms are linear in the parameters.

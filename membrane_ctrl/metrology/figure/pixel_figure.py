@@ -176,13 +176,13 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
 
     # Their rays, followed to the surface of the bins.
     rays = _trace_pixel_rays(tracer.geometry, column, row)
-    points = ray_tracing.Points.of(rays, np.empty((2, index.size)))
+    points = ray_tracing.Points.from_rays(rays, np.empty((2, index.size)))
     del row, column, rays
     points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
     tracer.intersect(points, surface, newton=4)
 
     # Their phases, in the period of their bin.
-    film = FilmMotion.of(checked)
+    film = FilmMotion.from_set(checked)
     moved = film.is_worth_correcting
     motion_um = film.motion_um if moved else (None, None)
     sensitivity_rad_per_um = np.zeros((2, index.size))
@@ -281,7 +281,7 @@ def _gather_previous(stack: FrameStack, used: list[int]) -> Image | None:
         return None
     previous = []
     for frame in used:
-        before = stack.before_of(frame)
+        before = stack.frame_before(frame)
         previous.append(frame if before < 0 else before)
     gathered: Image = stack.frames[previous]
     return gathered

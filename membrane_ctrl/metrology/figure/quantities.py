@@ -107,7 +107,7 @@ class FigureOf:
         sphere = best_sphere.best_sphere(points)
         deviation_mm, sphere_normals = sphere.deviation(points)
         deviation_um = 1e3 * (deviation_mm - deviation_mm.mean())
-        rotational_um = self._rings.invariant(deviation_um)
+        rotational_um = self._rings.round_part(deviation_um)
         deviation_map_um = _place_values(deviation_um, mask)
         smooth_map_um = self._pvr.values(self._pvr.coefficients(deviation_map_um))
         smooth_um = smooth_map_um[mask]
@@ -175,20 +175,20 @@ class _Rings:
         self._low = np.minimum(place.astype(np.int64), knots - 2)
         self._share = place - self._low
         # The normal matrix of the least squares is tridiagonal.
-        by_lower = self._sums((1 - self._share) ** 2)
-        by_upper = self._sums(self._share**2)
+        by_lower = self._sum_by_knot((1 - self._share) ** 2)
+        by_upper = self._sum_by_knot(self._share**2)
         diagonal = by_lower + np.append(0.0, by_upper[:-1])
-        beside = self._sums(self._share * (1 - self._share))[:-1]
+        beside = self._sum_by_knot(self._share * (1 - self._share))[:-1]
         self._normal = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
 
-    def _sums(self, values: FloatArray) -> FloatArray:
+    def _sum_by_knot(self, values: FloatArray) -> FloatArray:
         """Sum of values by their lower knot, (knots,)."""
         return np.bincount(self._low, values, self._knots).astype(np.float64)
 
-    def invariant(self, values: FloatArray) -> FloatArray:
+    def round_part(self, values: FloatArray) -> FloatArray:
         """That part at the same cells."""
-        right = self._sums((1 - self._share) * values)
-        right[1:] += self._sums(self._share * values)[:-1]
+        right = self._sum_by_knot((1 - self._share) * values)
+        right[1:] += self._sum_by_knot(self._share * values)[:-1]
         knots = np.linalg.lstsq(self._normal, right, rcond=1e-10)[0]
         return np.asarray((1 - self._share) * knots[self._low] + self._share * knots[self._low + 1])
 

@@ -48,7 +48,7 @@ class FilmMotion:
     noise_um: float
 
     @classmethod
-    def of(cls, checked: Checked) -> "FilmMotion":
+    def from_set(cls, checked: Checked) -> "FilmMotion":
         """The motion during a checked set.
 
         The fringes show the motion from frame to frame of one axis to 0.1 µm, where the laser's

@@ -26,7 +26,7 @@ class SurfaceMap:
     slope_x: FloatArray
     slope_y: FloatArray
 
-    def part(self, stride: int) -> "SurfaceMap":
+    def take_every(self, stride: int) -> "SurfaceMap":
         """Every `stride`-th cell along both axes."""
         every = slice(None, None, stride)
         return SurfaceMap(
@@ -36,7 +36,7 @@ class SurfaceMap:
             slope_y=self.slope_y[every, every],
         )
 
-    def plus(self, change: FloatArray) -> "SurfaceMap":
+    def add_change(self, change: FloatArray) -> "SurfaceMap":
         """With another height and slopes (3, n, n) added."""
         return SurfaceMap(
             axis_mm=self.axis_mm,

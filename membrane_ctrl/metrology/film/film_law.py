@@ -139,14 +139,14 @@ class FilmLaw:
         if not (np.all(np.asarray(self.stiffness_n_per_m) > 0) and self.radius_mm > 0):
             raise ValueError("stiffness_n_per_m and radius_mm must be above 0")
 
-    def under(self, pressure_pa: FloatArray | float) -> "Bowl":
+    def under_pressure(self, pressure_pa: FloatArray | float) -> "Bowl":
         """The film under a gauge pressure above 0. Raises ValueError if it would be slack at its
         ring.
         """
         load = np.asarray(pressure_pa) * self.radius_mm * 1e-3 / self.stiffness_n_per_m
-        return self.loaded(load)
+        return self.under_load(load)
 
-    def loaded(self, load: FloatArray) -> "Bowl":
+    def under_load(self, load: FloatArray) -> "Bowl":
         """The film under a load q = p a / (E t). Raises ValueError as `under`."""
         wanted = np.asarray(self.prestrain / load ** (2 / 3))
         slackness = _invert_for_slackness(lambda s: _ring_strain(s, self.poisson), wanted)

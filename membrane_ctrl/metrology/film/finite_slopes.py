@@ -43,7 +43,7 @@ def finite_rise_mm(law: FilmLaw, load: float, rho: FloatArray) -> FloatArray:
         The film would be slack at its ring.
     """
     v, outward, outward_v, slope = _finite_tables()
-    bowl = law.loaded(np.asarray(load))
+    bowl = law.under_load(np.asarray(load))
     prestrain = float(law.prestrain)
     poisson = float(law.poisson)
     film = prestrain, poisson, load

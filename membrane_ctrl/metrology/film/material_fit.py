@@ -158,7 +158,7 @@ def fit_film(
         figures, radius_mm, reach, gauge, seen_mm
     )
     law = FilmLaw(float(unknowns[0]), float(unknowns[1]), float(np.exp(unknowns[2])), radius_mm)
-    bowls = law.loaded(np.exp(unknowns[3:, None]))
+    bowls = law.under_load(np.exp(unknowns[3:, None]))
     of_waves = fit_waves(figures, bowls, reach, seen_mm)
 
     # What both leave of the figures.
@@ -269,7 +269,7 @@ def _fit_round(
     def make_bowls(x: FloatArray) -> tuple[FilmLaw, Bowl]:
         """The film and its bowls for the unknowns (3 + n,)."""
         law = FilmLaw(float(x[0]), float(x[1]), 1.0, radius_mm)
-        return law, law.loaded(np.exp(x[3:, None]))
+        return law, law.under_load(np.exp(x[3:, None]))
 
     def predict(x: FloatArray) -> FloatArray:
         """The data for the unknowns (3 + n,)."""

@@ -92,7 +92,7 @@ def _film_family() -> tuple[FloatArray, FloatArray]:
     return table[:, 0], table[:, 1:]
 
 
-def round_of(excess_mm: float, sag_mm: float) -> FloatArray:
+def film_round_terms_mm(excess_mm: float, sag_mm: float) -> FloatArray:
     """Terms of `ROUND_DEGREES` (3,) in mm of the film of this law whose excess, of unit RMS, is
     this at this sag.
 

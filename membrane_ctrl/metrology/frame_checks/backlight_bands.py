@@ -15,7 +15,7 @@ Derivation: section 9 of docs/explanation/metrology.md.
 import numpy as np
 from scipy import ndimage
 
-from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
+from membrane_ctrl.metrology.numerics.grouped_sums import sum_by_group
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 # Widths and frequencies are in bands over the picture's height.
@@ -61,31 +61,31 @@ class Bands:
         # Mean over the frames of the clear power of each frequency.
         self._mean = np.zeros(self._place.size // 2 * FREQUENCIES_PER_BIN)
 
-    def gain(self, amplitudes: FloatArray) -> Singles:
+    def gain_of_bins(self, amplitudes: FloatArray) -> Singles:
         """What multiplies the light of each bin (n,), from the amplitudes (2 k,) of the waves."""
         if not amplitudes.size:
             return self._steady
         gain_of_rows = np.asarray(1 + amplitudes @ self.waves, np.float32)
         return gain_of_rows[self.row]
 
-    def sums(self, values: Singles) -> FloatArray:
+    def sum_over_rows(self, values: Singles) -> FloatArray:
         """Sums (k, R) over each row, of values (k, n)."""
-        return np.asarray(sums_by(self.row, values, self._place.size))
+        return np.asarray(sum_by_group(self.row, values, self._place.size))
 
-    def search(self, rows: FloatArray) -> bool:
+    def add_wave_of_frame(self, rows: FloatArray) -> bool:
         """Whether the rest of a fit with all known waves shows one more, which is then added.
 
         `rows` (2, R) are the sums of `fitted_waves`.
         """
         clear = clear_power(row_power(rows[0]), _LEAST_BANDS)
         self._mean = _KEEPS * self._mean + (1 - _KEEPS) * clear
-        return self._add(np.maximum(clear / _CLEAR, self._mean / _CLEAR_MEAN))
+        return self._add_clearest_wave(np.maximum(clear / _CLEAR, self._mean / _CLEAR_MEAN))
 
-    def recall(self) -> bool:
+    def add_wave_of_first_frames(self) -> bool:
         """Whether the first frames show one more wave together, which is then added."""
-        return self._add(self._mean / _CLEAR_FIRST)
+        return self._add_clearest_wave(self._mean / _CLEAR_FIRST)
 
-    def _add(self, clear: FloatArray) -> bool:
+    def _add_clearest_wave(self, clear: FloatArray) -> bool:
         """Add the clearest wave if it is clear enough and not known; returns whether it was added.
 
         `clear` is the power of each frequency over what a wave must have.
@@ -98,16 +98,16 @@ class Bands:
         self._mean *= 0
         self._rad_per_row = np.append(self._rad_per_row, found_rad)
         self._determined = np.append(self._determined, 0.0)
-        self._draw()
+        self._evaluate_waves()
         return True
 
-    def keep(self, count: int) -> None:
+    def keep_first_waves(self, count: int) -> None:
         """Forget all waves but those of the first `count` of 2 k amplitudes."""
         self._rad_per_row = self._rad_per_row[: count // 2]
         self._determined = self._determined[: count // 2]
-        self._draw()
+        self._evaluate_waves()
 
-    def refine(self, rows: FloatArray, amplitudes: FloatArray) -> None:
+    def refine_frequencies(self, rows: FloatArray, amplitudes: FloatArray) -> None:
         """Move the frequencies by one step of least squares on what a fit leaves.
 
         Parameters
@@ -125,9 +125,9 @@ class Bands:
         self._determined = self._determined + change**2 @ rows[1]
         step_rad = change @ rows[0] / np.maximum(self._determined, 1e-30)
         self._rad_per_row = self._rad_per_row + step_rad
-        self._draw()
+        self._evaluate_waves()
 
-    def _draw(self) -> None:
+    def _evaluate_waves(self) -> None:
         self.waves = row_waves(self._rad_per_row, self._place).astype(np.float32)
 
 

@@ -16,7 +16,7 @@ from membrane_ctrl.metrology.frame_checks.backlight_bands import (
     row_power,
     row_waves,
 )
-from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
+from membrane_ctrl.metrology.numerics.grouped_sums import sum_by_group
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.phase.full_decoder import CONTRAST_SHARE
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
@@ -73,7 +73,7 @@ class _Steps:
         self._fit()
         self._first_squares = max(float(np.sum(self._rest**2)), 1e-30)
 
-    def gain(self, place: FloatArray | IntArray) -> FloatArray:
+    def row_gain(self, place: FloatArray | IntArray) -> FloatArray:
         """Of the light of rows (N, R)."""
         return np.maximum(1 + self.amplitudes @ row_waves(self.rad_per_row, place), _DARKEST)
 
@@ -83,35 +83,35 @@ class _Steps:
         `_parts` (3, n) are level, cosine and sine; `_shown` (N, n) is what they show, `_lit` the
         same over the gain, `_rest` what they leave.
         """
-        gain = self.gain(self._rows)[:, self._row]
+        gain = self.row_gain(self._rows)[:, self._row]
         self._parts = self._inverse @ (self._seen / gain)
         self._shown = self._design @ self._parts
         self._rest = self._seen / gain - self._shown
         self._lit = self._shown / gain
 
-    def _sums(self, values: FloatArray) -> FloatArray:
+    def _sum_rows(self, values: FloatArray) -> FloatArray:
         """Over each row (N, R), of values (N, n)."""
-        return np.asarray(sums_by(self._row, values, self._rows.size))
+        return np.asarray(sum_by_group(self._row, values, self._rows.size))
 
-    def left(self) -> FloatArray:
+    def residual_power(self) -> FloatArray:
         """Power of each frequency along the rows in what the steps leave, weighed with their light;
         the mean over the steps.
         """
-        sums = self._sums((self._rest - self._others) * self._shown)
+        sums = self._sum_rows((self._rest - self._others) * self._shown)
         return np.asarray(row_power(sums).mean(axis=0))
 
-    def brighter(self, other: "_Steps") -> FloatArray:
+    def light_difference(self, other: "_Steps") -> FloatArray:
         """Sums (2, R) of `fitted_waves` for the light by which the other axis differs."""
         level = self._parts[0]
         level_of_other = other._parts[0]
         scale = level @ level / (level_of_other @ level)
         difference = level_of_other * scale - level
-        return self._sums(np.stack([level * difference, level**2]))
+        return self._sum_rows(np.stack([level * difference, level**2]))
 
-    def along(self) -> float:
+    def share_along_rows(self) -> float:
         """1 if the fringes are along the rows, 0 if they cross them many times."""
         phasors = self._parts[1:]
-        of_rows = np.sum(np.hypot(*self._sums(phasors)))
+        of_rows = np.sum(np.hypot(*self._sum_rows(phasors)))
         of_bins = np.sum(np.hypot(*phasors))
         return float(of_rows / of_bins)
 
@@ -180,14 +180,14 @@ class _Steps:
 
         # Normal equations of waves with waves.
         products = np.array(
-            [off[k][:, None] * self._sums(self._lit[k] * self._lit) for k in range(count)]
+            [off[k][:, None] * self._sum_rows(self._lit[k] * self._lit) for k in range(count)]
         )
         wave_matrix = np.einsum("jkr,pr,qr->jpkq", products, waves, waves)
         wave_matrix = wave_matrix.reshape(unknowns_of_frames, unknowns_of_frames)
 
         # Of waves with harmonics, and on the right-hand side of waves with the rest.
         fields = (*harmonics, self._rest)
-        by_waves = np.array([self._sums(self._lit * field) @ waves.T for field in fields])
+        by_waves = np.array([self._sum_rows(self._lit * field) @ waves.T for field in fields])
         by_waves = by_waves.reshape(len(fields), -1)
         mixed = by_waves[:-1]
         wave_right = by_waves[-1]
@@ -240,11 +240,11 @@ def remove_bands(
     # like bands.
     x = _Steps(stack, binned, axes[0], index)
     y = _Steps(stack, binned, axes[1], index)
-    across, other = sorted([x, y], key=_Steps.along)
+    across, other = sorted([x, y], key=_Steps.share_along_rows)
     rows = np.arange(binned.means.shape[1])
     across.solve(known)
     while True:
-        found = _add_frequency(across.rad_per_row, across.left(), rows)
+        found = _add_frequency(across.rad_per_row, across.residual_power(), rows)
         if found.size == across.rad_per_row.size:
             break
         across.solve(found)
@@ -253,7 +253,7 @@ def remove_bands(
 
     # Bands common to all steps of an axis bend none of its phases, but in the light of the other
     # axis the film would seem to move (`frame_evidence.estimate_light_and_film`).
-    y.amplitudes += fitted_waves(row_waves(found, rows), x.brighter(y))
+    y.amplitudes += fitted_waves(row_waves(found, rows), x.light_difference(y))
 
     # Bins and rows of pixels are divided by the gain.
     first_row = (1 - 1 / binned.bin_px) / 2
@@ -261,8 +261,8 @@ def remove_bands(
     gain = np.ones((len(stack.patterns), pixel_rows.size))
     means = binned.means.copy()
     for steps in (x, y):
-        gain[steps.frames] = steps.gain(pixel_rows)
-        means[steps.frames] /= steps.gain(rows)[..., None].astype(np.float32)
+        gain[steps.frames] = steps.row_gain(pixel_rows)
+        means[steps.frames] /= steps.row_gain(rows)[..., None].astype(np.float32)
     return replace(stack, gain=gain), replace(binned, means=means), found
 
 

@@ -51,7 +51,7 @@ class Closure:
     without_rms_adu: FloatArray
 
     @property
-    def suspect(self) -> int | None:
+    def suspect_frame(self) -> int | None:
         """The frame that explains the disagreement best when left out; None if the data cannot
         decide.
         """
@@ -60,9 +60,9 @@ class Closure:
         return int(np.argmin(self.without_rms_adu))
 
     @property
-    def gain(self) -> float:
+    def residual_ratio(self) -> float:
         """Residual of all frames over that without the suspect: about 1 if no frame is wrong."""
-        if self.suspect is None:
+        if self.suspect_frame is None:
             return 1.0
         without_suspect_adu = float(self.without_rms_adu.min())
         return self.rms_adu / max(without_suspect_adu, _TINY)

@@ -64,11 +64,11 @@ class SampledBins:
     phase_rad: FloatArray
     sensitivity_rad_per_um: FloatArray
 
-    def thinned(self, enough: int = _SAMPLE) -> "SampledBins":
+    def thin_to(self, enough: int = _SAMPLE) -> "SampledBins":
         """Return every k-th bin, so that at least `enough` of them stay."""
-        return self.part(slice(None, None, max(1, self.index.size // enough)))
+        return self.select_bins(slice(None, None, max(1, self.index.size // enough)))
 
-    def part(self, which: slice | BoolArray) -> "SampledBins":
+    def select_bins(self, which: slice | BoolArray) -> "SampledBins":
         """Return some of the bins."""
         return SampledBins(
             self.index[which],
@@ -147,7 +147,7 @@ def measure_frames(
     dict
         The evidence by frame.
     """
-    scene = scene.thinned()
+    scene = scene.thin_to()
     readings_um = np.nan_to_num(stack.displacement_um - np.nan_to_num(stack.mean_reading_um))
     models = [
         _make_model(stack, scene, k, float(reading_um)) for k, reading_um in enumerate(readings_um)
@@ -194,7 +194,7 @@ def estimate_light_and_film(
     sigma_um : float
         Its standard uncertainty, RMS over the frames.
     """
-    scene = scene.thinned(_SAMPLED_PX // binned.bin_px**2)
+    scene = scene.thin_to(_SAMPLED_PX // binned.bin_px**2)
     readings_um = np.nan_to_num(stack.displacement_um - stack.mean_reading_um)
 
     # Polynomials in the place on the mirror, to which the phases are about proportional.

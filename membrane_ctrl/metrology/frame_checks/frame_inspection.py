@@ -247,7 +247,7 @@ def _judge_gray(
             defect, reason = _name_gray_defect(own, bright, is_wrong_content)
             flags.append(Flag(k, defect, reason, severity))
     for role in ("white", "black"):
-        single = stack.single(role)
+        single = stack.find_frame(role)
         if single is not None and single in evidence:
             flags += _judge_flat(single, evidence[single], bright, is_white=role == "white")
     return flags

@@ -41,7 +41,9 @@ CLOSURE_TIMES = 3.0
 # 0.7 of the amplitude or more where a quarter of a period is seen.
 SAME_SHARE = 0.15
 LEFT_TIMES = 2.0  # closure of the other frames over the limit, once the bad frame is left out
-GAIN = 2.0  # least `Closure.gain` of a bad frame: good ones reach 1.4, a stale one gives 6.8
+GAIN = (
+    2.0  # least `Closure.residual_ratio` of a bad frame: good ones reach 1.4, a stale one gives 6.8
+)
 INCONSISTENT_SHARE = 0.1  # share of pixels whose frequencies disagree; 0 in a good set
 # Share of pixels that the fringes show brighter than white, or darker than black; by more than a
 # tenth of their range.
@@ -223,13 +225,13 @@ def _repair_series(
 
     # The wrong step: it shows an earlier picture, or without it the others agree.
     closures = _compute_closures(axis, index)
-    clearest = max(closures, key=lambda found: found.gain)
-    step = clearest.suspect
+    clearest = max(closures, key=lambda found: found.residual_ratio)
+    step = clearest.suspect_frame
     reason = "does not agree with the other steps"
     same_picture = _find_same_picture(axis, index, axes)
     if same_picture is not None:
         step, reason = same_picture
-    elif step is None or clearest.gain < GAIN:
+    elif step is None or clearest.residual_ratio < GAIN:
         return [], axis
     flags = [SeriesFlag(axis.axis, index, step, reason)]
 

@@ -89,7 +89,7 @@ class ImageLag:
         return (self.rise + self.fall) / 2
 
     @property
-    def left(self) -> float:
+    def remaining_sigma(self) -> float:
         """Standard uncertainty of the share that is left in the frames; NaN if unknown."""
         if self.corrected:
             return self.sigma
@@ -115,7 +115,7 @@ def estimate_image_lag(
     ImageLag
         `ImageLag.unknown()` if no frame shows both shares, or only with an uncertainty above 3 %.
     """
-    scene = scene.thinned()
+    scene = scene.thin_to()
     means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
     clipped = binned.saturated.reshape(len(stack.patterns), -1)[:, scene.index]
     smooth = scene.smooth_columns()
@@ -124,7 +124,7 @@ def estimate_image_lag(
     rises: list[ShareOfFrame] = []
     falls: list[ShareOfFrame] = []
     for frame in range(len(stack.patterns)):
-        previous = stack.before_of(frame)
+        previous = stack.frame_before(frame)
         if previous < 0 or {frame, previous} & set(excluded):
             continue
         if stack.patterns[previous].role not in ("sin", "gray"):
@@ -186,7 +186,7 @@ def remove_image_lag(stack: FrameStack, binned: Binned, lag: ImageLag) -> Binned
     """Return the bins with the previous pictures taken out."""
     means = binned.means.copy()
     for frame in range(len(stack.patterns)):
-        previous = stack.before_of(frame)
+        previous = stack.frame_before(frame)
         if previous >= 0:
             means[frame] += lag_correction(binned.means[frame], binned.means[previous], lag)
     return replace(binned, means=means)
@@ -273,13 +273,13 @@ def add_first_predecessor(
     """
     share = lag.share
     x_frames = stack.sinusoids(AXES[0])
-    without_predecessor = [frame for frame in x_frames if stack.before_of(frame) < 0]
+    without_predecessor = [frame for frame in x_frames if stack.frame_before(frame) < 0]
     if len(without_predecessor) != 1 or share <= 0:
         return stack
     first = without_predecessor[0]
 
     # Swing of each sinusoid of x.
-    scene = scene.thinned()
+    scene = scene.thin_to()
     constant = np.ones((1, scene.index.size))
     swings = {}
     for frame in x_frames:
@@ -298,7 +298,7 @@ def add_first_predecessor(
     ratio = swings[first] / max(others, _LEAST_AMPLITUDE)
     if abs(ratio - (1 - share)) >= abs(ratio - 1):
         return stack
-    before = [stack.before_of(frame) for frame in range(len(stack.patterns))]
+    before = [stack.frame_before(frame) for frame in range(len(stack.patterns))]
     before[first] = stack.last_taken
     return replace(stack, before=tuple(before))
 

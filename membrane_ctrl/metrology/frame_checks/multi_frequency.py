@@ -144,7 +144,7 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
 
 def _take_finest(stack: FrameStack, count: int) -> FrameStack:
     """The set of the first `count` frames alone."""
-    before = [stack.before_of(frame) for frame in range(count)]
+    before = [stack.frame_before(frame) for frame in range(count)]
     return FrameStack(
         stack.frames[:count],
         stack.patterns[:count],
@@ -248,13 +248,13 @@ def _find_bad_frame(
         if not np.isfinite(place_mm).any():
             continue
         found = each.compute_naming_closure(place_mm)
-        if found.suspect is None or found.gain <= GAIN:
+        if found.suspect_frame is None or found.residual_ratio <= GAIN:
             continue
         reason = (
             f"does not agree with the other steps: {shares[k]:.0%} of the fringes' amplitude is "
             "left"
         )
-        frame = each.frames[found.suspect]
+        frame = each.frames[found.suspect_frame]
         flags.append(Flag(frame, FrameDefect.INCONSISTENT, reason, shares[k] / limit))
     return max(flags, key=lambda flag: flag.severity, default=None)
 

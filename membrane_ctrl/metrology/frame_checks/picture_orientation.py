@@ -147,7 +147,7 @@ def _residual_urad(
     count = int(np.count_nonzero(inside))
     if count < _LEAST_BINS:
         return math.inf, count
-    points = Points.of(rays[:, inside], screen_mm[:, inside])
+    points = Points.from_rays(rays[:, inside], screen_mm[:, inside])
     start = make_parabola(optics.mirror.sag_mm, tracer.radius_mm)
     try:
         fit = surface_fit.fit_surface(tracer, points, start, tolerance_mm=_TOLERANCE_MM)

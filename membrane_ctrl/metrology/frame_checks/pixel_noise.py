@@ -88,7 +88,7 @@ def _take_squares(
 def _take_pixels(stack: FrameStack, frame: int, row: IntArray, column: IntArray) -> FloatArray:
     """Light (n,) of a frame without that of the previous picture, and without bands."""
     seen: FloatArray = stack.frames[frame, row, column].astype(float)
-    previous = stack.before_of(frame)
+    previous = stack.frame_before(frame)
     if any(stack.lag_shares) and previous >= 0:
         rise, fall = (share / (1 - share) for share in stack.lag_shares)
         more = seen - stack.frames[previous, row, column]

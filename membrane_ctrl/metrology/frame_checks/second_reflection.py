@@ -79,7 +79,7 @@ class SecondReflection:
         return cls(0.0, math.nan)
 
     @property
-    def found(self) -> bool:
+    def is_found(self) -> bool:
         """Whether there is one."""
         return self.share > 0
 
@@ -151,7 +151,7 @@ def find_second_reflection(
     """
     # The best place along each axis, by itself.
     centre_rad = screen_scale.centre_phase_rad(pattern)
-    scene = scene.thinned(_BINS)
+    scene = scene.thin_to(_BINS)
     places = [
         _search_axis(stack, binned, scene, excluded, axis, centre_rad) for axis in range(len(AXES))
     ]
@@ -184,7 +184,7 @@ def find_second_reflection(
 
 def describe_second_reflection(found: SecondReflection) -> str:
     """Why a set is degraded by a second image; empty if it has none."""
-    if not found.found:
+    if not found.is_found:
         return ""
     places = [
         f"{found.mm_per_rad * shift:+.0f} mm along {axis}"
@@ -265,7 +265,7 @@ def _compare_places(
     shift_rad = fine.shift_rad[best]
 
     # What the other places explain of the rest shows how much chance explains.
-    image = images.at(scale, np.array([shift_rad]))[:, 0]
+    image = images.light_at(scale, np.array([shift_rad]))[:, 0]
     without = [
         replace(frame, left=frame.left - share * frame.free_of_own(of_frame))
         for frame, of_frame in zip(frames, image, strict=True)
@@ -304,7 +304,7 @@ class _Images:
         self._table = np.stack(shown)
         self._bright = bright * np.stack([frame.sure for frame in frames])
 
-    def at(self, scale: float, shifts_rad: FloatArray) -> FloatArray:
+    def light_at(self, scale: float, shifts_rad: FloatArray) -> FloatArray:
         """Light (frames, shifts, n) of images of the same brightness as the first."""
         place_rad = scale * self._phase_rad + shifts_rad[:, None] + self._reach_rad
         cell = np.rint(place_rad / _CELL_RAD).astype(np.int32)
@@ -367,7 +367,7 @@ def _score_places(
     """Score the places at which the frames determine a second image."""
     rows = [np.zeros((5, 0))]
     for scale, shifts_rad in places:
-        image = images.at(scale, shifts_rad)
+        image = images.light_at(scale, shifts_rad)
         whole_power = np.sum(image**2, axis=(0, 2))
         power = whole_power.copy()
         product = np.zeros(shifts_rad.size)  # of the image with what is left

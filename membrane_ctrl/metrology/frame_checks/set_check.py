@@ -200,7 +200,11 @@ def _put_back(
         order = _exchange(len(stack.patterns), a, b)
         try:
             checked = _check_rounds(
-                stack.reordered(order), binned.reordered(order), optics, anchor, _EXCHANGE_ROUNDS
+                stack.exchange_frames(order),
+                binned.exchange_frames(order),
+                optics,
+                anchor,
+                _EXCHANGE_ROUNDS,
             )
         except RejectedSetError:
             continue
@@ -243,7 +247,7 @@ def _check_rounds(
     A round ends in one of four ways: it leaves out frames, it exchanges two, it repeats the fit
     with the light that each frame had, or it accepts the set.
     """
-    bench = _Bench.of(optics, binned.bin_px, anchor)
+    bench = _Bench.from_optics(optics, binned.bin_px, anchor)
     taken = binned  # as the camera took them
 
     # Frames that are bad without any prediction.
@@ -301,8 +305,8 @@ def _check_rounds(
         pair = _find_swapped_pair(fresh, known)
         if pair is not None:
             order = _exchange(len(stack.patterns), *pair)
-            stack = stack.reordered(order)
-            taken = taken.reordered(order)
+            stack = stack.exchange_frames(order)
+            taken = taken.exchange_frames(order)
             known |= {flag.frame: flag for flag in flags if flag.frame in pair}
             continue
 
@@ -340,7 +344,7 @@ def _estimate_light_and_film(
     scene = attempt.scene
     is_inner = np.all(inside_pattern(scene.phase_rad, optics.pattern, _BLURRED_RAD), axis=0)
     if np.mean(is_inner) > _LEAST_INNER:
-        scene = scene.part(is_inner)
+        scene = scene.select_bins(is_inner)
     phase_rad = attempt.phase_rad.reshape(2, -1)
     return frame_evidence.estimate_light_and_film(
         stack, binned, scene, attempt.view.used, phase_rad
@@ -424,7 +428,7 @@ class _Bench:
     anchor: Anchor | None
 
     @classmethod
-    def of(cls, optics: OpticsConfig, bin_px: int, anchor: Anchor | None) -> "_Bench":
+    def from_optics(cls, optics: OpticsConfig, bin_px: int, anchor: Anchor | None) -> "_Bench":
         """The bench of sets with bins of this side."""
         geometry = Geometry.from_config(optics)
         grid = bin_grid.BinGrid(geometry, optics.camera, bin_px)

@@ -6,7 +6,7 @@ from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 
 
 @compile_kernel
-def sums_by(number, values, count):  # type: ignore[no-untyped-def]
+def sum_by_group(number, values, count):  # type: ignore[no-untyped-def]
     """Sums (k, count) of values (k, n) over the columns of each `number` (n,), which is below
     `count`.
     """

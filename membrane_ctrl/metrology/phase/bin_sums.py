@@ -133,11 +133,11 @@ class Binner:
         self.sums = np.zeros((slots, *shape), np.uint32)
         self.saturated = np.zeros(shape, np.uint32)
 
-    def clear(self) -> None:
+    def clear_saturation(self) -> None:
         """Forget the saturation counts, at the start of a cycle."""
         self.saturated[:] = 0
 
-    def add(
+    def sum_frames(
         self, frames: Sequence[Image], slots: Sequence[int], watched: Container[int] | None = None
     ) -> None:
         """Sum frames into slots.

@@ -62,19 +62,19 @@ class FrameStack:
         """
         return [k for k, p in enumerate(self.patterns) if p.role == "gray" and p.axis == axis]
 
-    def single(self, role: str) -> int | None:
+    def find_frame(self, role: str) -> int | None:
         """The white or the black frame."""
         return next((k for k, p in enumerate(self.patterns) if p.role == role), None)
 
     def white_and_black(self, excluded: Collection[int]) -> tuple[int, int] | None:
         """The white and the black frame; None unless the set has both and neither is excluded."""
-        white = self.single("white")
-        black = self.single("black")
+        white = self.find_frame("white")
+        black = self.find_frame("black")
         if white is None or black is None or white in excluded or black in excluded:
             return None
         return white, black
 
-    def before_of(self, frame: int) -> int:
+    def frame_before(self, frame: int) -> int:
         """The frame that was taken before this one; -1: none of the set, or no picture."""
         before = frame - 1
         if self.before is not None:
@@ -86,7 +86,7 @@ class FrameStack:
     @property
     def last_taken(self) -> int:
         """The frame that was taken last."""
-        followed = {self.before_of(frame) for frame in range(len(self.patterns))}
+        followed = {self.frame_before(frame) for frame in range(len(self.patterns))}
         return next(frame for frame in range(len(self.patterns)) if frame not in followed)
 
     def shifts_rad(self, frames: list[int]) -> FloatArray:
@@ -109,14 +109,14 @@ class FrameStack:
             return None
         return self.light[:, frames]
 
-    def reordered(self, order: list[int]) -> "FrameStack":
+    def exchange_frames(self, order: list[int]) -> "FrameStack":
         """Return the set with pictures exchanged: frame k shows what `order[k]` did."""
         gain = self.gain
         if gain is not None:
             gain = gain[order]
         new_place = {taken: frame for frame, taken in enumerate(order)}
         new_place[-1] = -1  # no frame before
-        before = tuple(new_place[self.before_of(taken)] for taken in order)
+        before = tuple(new_place[self.frame_before(taken)] for taken in order)
         return replace(self, frames=self.frames[order], light=None, gain=gain, before=before)
 
     @property
@@ -168,8 +168,8 @@ class Binned:
     clip: ClipLevels
     black: BoolArray | None = None
 
-    def reordered(self, order: list[int]) -> "Binned":
-        """As `FrameStack.reordered`."""
+    def exchange_frames(self, order: list[int]) -> "Binned":
+        """As `FrameStack.exchange_frames`."""
         black = self.black
         if black is not None:
             black = black[order]
@@ -206,8 +206,8 @@ def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
     means = np.empty(shape, np.float32)
     saturated = np.empty(shape, bool)
     for k, frame in enumerate(stack.frames):
-        binner.clear()
-        binner.add([frame], [0])
+        binner.clear_saturation()
+        binner.sum_frames([frame], [0])
         np.multiply(binner.sums[0], 1 / bin_px**2, out=means[k], casting="unsafe")
         saturated[k] = binner.saturated > 0
     if clip.black_adu < 0:

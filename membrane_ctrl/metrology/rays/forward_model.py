@@ -108,9 +108,9 @@ def place_rays(
     Points
         n rays, with their lengths to the surface.
     """
-    points = Points.of(camera_rays(bench.geometry, phases), phases.screen_mm)
+    points = Points.from_rays(camera_rays(bench.geometry, phases), phases.screen_mm)
     tracer = Tracer(bench.geometry, surface.radius_mm, vertex_z_mm)
-    tracer.start(points, make_parabola(surface.sag_mm, surface.radius_mm))
+    tracer.place_on_shape(points, make_parabola(surface.sag_mm, surface.radius_mm))
     tracer.intersect(points, surface, newton=4)  # from some mm: 0.1 mm, 1 nm, 1e-16 mm
     if surface.beyond_mm:
         _follow_waves(tracer, points, surface)
@@ -204,11 +204,11 @@ def screen_views(
         at_rest = Poses(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)))
         before_move = replace(bench, geometry=there)
         moved = displace_screen(before_move, [at_rest] * len(turns), moves[0][:SCREEN_MOVE])
-        yield 1, *moved, phases.seen_with(0)
+        yield 1, *moved, phases.select_screen(0)
         return
-    yield 0, bench, turns, phases.seen_with(0)
+    yield 0, bench, turns, phases.select_screen(0)
     for k, move in enumerate(moves, start=1):
-        yield k, *displace_screen(bench, turns, move[:SCREEN_MOVE]), phases.seen_with(k)
+        yield k, *displace_screen(bench, turns, move[:SCREEN_MOVE]), phases.select_screen(k)
 
 
 def linearise_points(

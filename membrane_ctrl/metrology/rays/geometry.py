@@ -65,7 +65,7 @@ class Geometry:
             screen_origin_mm=origin,
             screen_s_x=s_x,
             screen_s_y=s_y,
-            face=Face.of(optics.geometry.screen),
+            face=Face.from_config(optics.geometry.screen),
         )
 
     def rays(self, columns_px: ArrayLike, rows_px: ArrayLike) -> FloatArray:

@@ -66,7 +66,7 @@ class MovedScreen:
         )
 
     @classmethod
-    def anywhere(cls) -> "MovedScreen":
+    def unknown_place(cls) -> "MovedScreen":
         """A screen that is seen directly: nothing is known of its place, and its pixels may lie
         behind some mm of glass.
         """

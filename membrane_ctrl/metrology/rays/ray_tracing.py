@@ -41,7 +41,7 @@ class Points:
     t_mm: FloatArray
 
     @classmethod
-    def of(
+    def from_rays(
         cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None
     ) -> "Points":
         """Points at the pinhole, with unit weights unless given; shapes as the attributes'."""
@@ -83,7 +83,9 @@ class Tracer:
         self._plane = np.vstack([geometry.screen_origin_mm, geometry.screen_axes])
         self._face = geometry.face
 
-    def start(self, points: Points, height: HeightFunction, steps: int = _START_STEPS) -> None:
+    def place_on_shape(
+        self, points: Points, height: HeightFunction, steps: int = _START_STEPS
+    ) -> None:
         """Put the points on a starting shape, by t <- (vertex_z + h - F_z) / d_z.
 
         Each step contracts by slope times inclination of the ray (below 0.1), also at the kink of a

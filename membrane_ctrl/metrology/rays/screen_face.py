@@ -40,7 +40,7 @@ class Face(NamedTuple):
     pitch_mm: FloatArray
 
     @classmethod
-    def of(cls, screen: ScreenPoseConfig | None) -> "Face":
+    def from_config(cls, screen: ScreenPoseConfig | None) -> "Face":
         """The face that a configuration describes; a plane for None."""
         bow_mm = 0.0
         if screen is not None:

@@ -62,13 +62,13 @@ class SetPhases:
     screen: IntArray | None = None
     period_mm: float = 0.0
 
-    def seen_with(self, screen: int) -> BoolArray:
+    def select_screen(self, screen: int) -> BoolArray:
         """Which points (n,) were seen with the screen in that place."""
         if self.screen is None:
             return np.full(self.sigma_mm.size, True)
         return np.asarray(self.screen == screen)
 
-    def thinned(self, most: int) -> "SetPhases":
+    def thin_to(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""
         return self.subset(slice(None, None, -(-self.column_px.size // most)))
 
@@ -77,7 +77,7 @@ class SetPhases:
         parts = {name: getattr(self, name)[..., keep] for name in _PER_POINT}
         return replace(self, **parts, screen=None if self.screen is None else self.screen[keep])
 
-    def beside(self, again: "SetPhases", known: MovedScreen) -> "SetPhases":
+    def add_screen_place(self, again: "SetPhases", known: MovedScreen) -> "SetPhases":
         """The set with the points of the same film, seen again with the screen elsewhere."""
         before = self.screen
         if before is None:

@@ -71,7 +71,7 @@ def fit_surface(
     if isinstance(start, Surface):
         surface = start
     else:
-        tracer.start(points, start)
+        tracer.place_on_shape(points, start)
         surface = Surface.from_parameters(np.zeros(PARAMETERS), tracer.radius_mm)
 
     # Gauss-Newton steps, each with the points moved onto the present surface, until the largest

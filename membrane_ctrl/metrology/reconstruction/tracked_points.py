@@ -112,10 +112,12 @@ def select_points(
     index, phase_rad = candidates[finite], phase_rad[:, finite]
     if index.size < _MIN_POINTS:
         raise ValueError(f"only {index.size} bins see the pattern in the mirror")
-    points = ray_tracing.Points.of(grid.rays[:, index], screen_scale.screen_mm(phase_rad, pattern))
+    points = ray_tracing.Points.from_rays(
+        grid.rays[:, index], screen_scale.screen_mm(phase_rad, pattern)
+    )
     surface = _fit_some(tracer, points)
     near = ray_tracing.make_parabola(surface.sag_mm, tracer.radius_mm)
-    tracer.start(points, near, steps=_PLACING_STEPS)
+    tracer.place_on_shape(points, near, steps=_PLACING_STEPS)
     tracer.intersect(points, surface, newton=3)
 
     # Without bins outside the analysed radius, then without outliers of the surface through all:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
+from membrane_ctrl.metrology.numerics.grouped_sums import sum_by_group
 from membrane_ctrl.metrology.rays import bench_motions, ray_tracing
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
@@ -76,14 +76,14 @@ class _FirstSaddle:
     count: int = 0
     is_settled: bool = False
 
-    def compare(self, saddle_mm: FloatArray) -> FloatArray:
+    def subtract_first(self, saddle_mm: FloatArray) -> FloatArray:
         """Change (2,) since the first frames of a saddle since the reference (2,)."""
         if not self.is_settled and self.count < ENOUGH_STEPS:
             self.count += 1
             self.mean_mm = self.mean_mm + (saddle_mm - self.mean_mm) / self.count
         return saddle_mm - self.mean_mm
 
-    def settle(self, moved_mm: FloatArray) -> None:
+    def end_first_frames(self, moved_mm: FloatArray) -> None:
         """Take no more frames; the first five steps have moved their figures."""
         if not self.is_settled:
             self.mean_mm = self.mean_mm + moved_mm
@@ -112,10 +112,10 @@ class BenchWatch:
 
         # Signatures of the motions. They vary slowly over the mirror: one ray in the middle of each
         # cell is enough.
-        rays = cells.planes(scene.points.rays)[:, 0].astype(float)
+        rays = cells.fit_planes(scene.points.rays)[:, 0].astype(float)
         rays /= np.linalg.norm(rays, axis=0)
-        points = ray_tracing.Points.of(rays, np.zeros((2, rays.shape[1])))
-        scene.tracer.start(points, scene.surface.height)
+        points = ray_tracing.Points.from_rays(rays, np.zeros((2, rays.shape[1])))
+        scene.tracer.place_on_shape(points, scene.surface.height)
         scene.tracer.intersect(points, scene.surface, newton=2)
         changes_mm = bench_motions.screen_changes(
             scene.tracer.geometry,
@@ -125,12 +125,12 @@ class BenchWatch:
             scene.tracer.vertex_z_mm,
         )
         jacobian = self.fitter.jacobian[:, :, 0].astype(float)
-        weights = cells.sums(self._bin_weights(scene)).astype(float)
-        self._effects = MotionEffects.of(scene.rad_per_mm * changes_mm, jacobian, weights)
+        weights = cells.sum_cells(self._bin_weights(scene)).astype(float)
+        self._effects = MotionEffects.from_changes(scene.rad_per_mm * changes_mm, jacobian, weights)
 
         # The square of the mirror that each cell is in.
         place = (scene.position_mm / scene.surface.radius_mm + 1) / 2 * _BLOCKS
-        column, row = np.floor(cells.planes(place)[:, 0]).astype(int)
+        column, row = np.floor(cells.fit_planes(place)[:, 0]).astype(int)
         self._square = (row + 1) * (_BLOCKS + 2) + column + 1
 
         # What is known of the frames so far: nothing.
@@ -157,7 +157,7 @@ class BenchWatch:
         moved_mm : (parameters,) array
             Change of the figures of its steps.
         """
-        self._saddle.settle(ring_saddle() @ moved_mm)
+        self._saddle.end_first_frames(ring_saddle() @ moved_mm)
         weights = self._bin_weights(scene)
         moved_rad = (scene.beyond_mm - self._reference.beyond_mm) * scene.rad_per_mm
         self._anchor = self._scores(weights * moved_rad, weights)
@@ -166,10 +166,10 @@ class BenchWatch:
     def _scores(self, values: AnyArray, weights: AnyArray) -> _Scores:
         """Scores of weighted phase errors (2, n) of the bins, with their weights (2, n)."""
         cells = self._reference.cells
-        sums = cells.sums(values).astype(float)
+        sums = cells.sum_cells(values).astype(float)
         parts = np.einsum("kan,an->kn", self._effects.left, sums)
-        squares = sums_by(self._square, parts, (_BLOCKS + 2) ** 2)
-        gram = self._effects.gram(cells.sums(weights).astype(float))
+        squares = sum_by_group(self._square, parts, (_BLOCKS + 2) ** 2)
+        gram = self._effects.gram(cells.sum_cells(weights).astype(float))
         return _Scores(parts.sum(axis=1), squares @ squares.T, gram)
 
     def find(
@@ -204,14 +204,14 @@ class BenchWatch:
         assert self._test is not None
 
         # Evidence of the slopes that no surface has: of this frame, and of the bins' own phases.
-        sums = self._reference.cells.sums(errors).astype(float)
+        sums = self._reference.cells.sum_cells(errors).astype(float)
         signatures = self._effects.left.reshape(len(self._anchor_left), -1)
         left = signatures @ sums.ravel() + self._anchor_left
 
         # Evidence of the ring: its tilt since the reference, its saddle since the first frames.
         moved_mm = fit.surface.parameters - self._reference.surface.parameters
-        saddle_mm = self._saddle.compare(ring_saddle() @ moved_mm)
-        return self._test.find(ring_tilt() @ moved_mm, saddle_mm, left)
+        saddle_mm = self._saddle.subtract_first(ring_saddle() @ moved_mm)
+        return self._test.find_motions(ring_tilt() @ moved_mm, saddle_mm, left)
 
     def _renew_test(self, of_frame: _Scores, covariance_mm2: FloatArray) -> None:
         """Renew the covariances of ring and slopes from a frame.

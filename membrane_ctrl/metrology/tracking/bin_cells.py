@@ -37,7 +37,7 @@ class Cells:
     offset: Singles
 
     @staticmethod
-    def of(index: IntArray, columns: int) -> "tuple[IntArray, BoolArray, Cells]":
+    def from_bins(index: IntArray, columns: int) -> "tuple[IntArray, BoolArray, Cells]":
         """Arrange bins in cells.
 
         Parameters
@@ -83,41 +83,41 @@ class Cells:
         """Offsets (2, n) of the bins."""
         return self.offset.swapaxes(0, 1).reshape(2, -1)
 
-    def sums(self, values: AnyArray) -> AnyArray:
+    def sum_cells(self, values: AnyArray) -> AnyArray:
         """Sums (..., N) over the cells, of values of bins (..., n)."""
         lead = values.shape[:-1]
         blocks = len(self.offset)
         of_blocks = values.reshape(*lead, blocks, CELL_BINS, BLOCK_CELLS).sum(axis=-2)
         return np.asarray(of_blocks.reshape(*lead, blocks * BLOCK_CELLS))
 
-    def moments(self, values: AnyArray) -> AnyArray:
+    def sum_moments(self, values: AnyArray) -> AnyArray:
         """Sums (..., 3, N) over the cells, of values of bins (..., n) times 1 and their offsets."""
-        by_offset = [self.sums(values * offset) for offset in self._offsets]
-        return np.stack([self.sums(values), *by_offset], axis=-2)
+        by_offset = [self.sum_cells(values * offset) for offset in self._offsets]
+        return np.stack([self.sum_cells(values), *by_offset], axis=-2)
 
-    def each(self, values: AnyArray) -> AnyArray:
+    def repeat_over_bins(self, values: AnyArray) -> AnyArray:
         """For each bin (..., n) the value of its cell (..., N)."""
         lead = values.shape[:-1]
         blocks = len(self.offset)
         repeated = np.repeat(values.reshape(*lead, blocks, 1, BLOCK_CELLS), CELL_BINS, axis=-2)
         return repeated.reshape(*lead, blocks * BLOCK_BINS)
 
-    def spread(self, planes: AnyArray) -> AnyArray:
+    def evaluate_planes(self, planes: AnyArray) -> AnyArray:
         """Values (..., n) of the bins on planes (..., 3, N) of the cells."""
-        mean, along_u, along_v = self.each(np.moveaxis(planes, -2, 0))
+        mean, along_u, along_v = self.repeat_over_bins(np.moveaxis(planes, -2, 0))
         u, v = self._offsets
         return np.asarray(mean + along_u * u + along_v * v)
 
-    def planes(self, values: AnyArray) -> Singles:
+    def fit_planes(self, values: AnyArray) -> Singles:
         """The planes (..., 3, N) that fit values of bins (..., n) best."""
         basis = np.stack([np.ones_like(self._offsets[0]), *self._offsets])
-        normal = self.moments(basis)
+        normal = self.sum_moments(basis)
         normal[[1, 2], [1, 2]] += _LEAST_SQUARE
         inverse = np.linalg.inv(normal.transpose(2, 0, 1))
-        fitted = np.einsum("qij,...jq->...iq", inverse, self.moments(values))
+        fitted = np.einsum("qij,...jq->...iq", inverse, self.sum_moments(values))
         return np.asarray(fitted, np.float32, order="C")
 
-    def blocks(self, *planes: Singles) -> Singles:
+    def arrange_blocks(self, *planes: Singles) -> Singles:
         """Planes, each (k, 3, N), block by block (N / 64, sum of k, 3 x 64)."""
         blocks = len(self.offset)
         every = np.concatenate(planes).reshape(-1, 3, blocks, BLOCK_CELLS)

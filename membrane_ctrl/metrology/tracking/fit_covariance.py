@@ -44,7 +44,7 @@ class FitCovariance:
             fit, shifts_rad = self._due
             self._estimate(fitter, fit, shifts_rad)
 
-    def of_fit(
+    def estimate_frame_covariance(
         self, fitter: FrameFitter, fit: FrameFit, shifts_rad: Shifts, time_s: float, renew: bool
     ) -> FloatArray:
         """Covariance (parameters, parameters) of a frame's fit, on a bench that has not moved.

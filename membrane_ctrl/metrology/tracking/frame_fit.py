@@ -18,7 +18,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.frame_checks.backlight_bands import Bands, fitted_waves
 from membrane_ctrl.metrology.numerics import matrix_inverse
-from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
+from membrane_ctrl.metrology.numerics.grouped_sums import sum_by_group
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.light_kernels import light_left, light_waves
@@ -103,15 +103,15 @@ class FrameFitter:
         self.bands = bands
         self._cells = scene.cells
         if jacobian is None:
-            jacobian = self._cells.planes(scene.jacobian(scene.surface))
+            jacobian = self._cells.fit_planes(scene.jacobian(scene.surface))
         self.jacobian = jacobian
-        self._basis = self._cells.planes(scene.basis)
+        self._basis = self._cells.fit_planes(scene.basis)
         self.light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
         self._base = _reduce_phase(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
         self._out = np.empty((4, scene.index.size), np.float32)
-        self._slow = self._cells.blocks(*self.jacobian, self._basis)
+        self._slow = self._cells.arrange_blocks(*self.jacobian, self._basis)
         self._pull = np.empty((4, PARAMETERS))
         self._response = scene.response.astype(np.float32)
 
@@ -148,7 +148,7 @@ class FrameFitter:
 
     def prepare(self, shifts_rad: Shifts, start: FrameFit) -> None:
         """Make the matrix for frames with these phase steps that will be fitted from `start`."""
-        self._inverse = self._inverted(shifts_rad, start.surface, start.light, start.weights)
+        self._inverse = self._invert_matrix(shifts_rad, start.surface, start.light, start.weights)
 
     def _descend(
         self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach: Singles, patient: bool
@@ -166,18 +166,18 @@ class FrameFitter:
         bands = np.zeros(len(self.bands.waves))
         if bands.size:
             self._evaluate(seen_adu, shifts_rad, shape, light, bands, _ALL_ADU * (reach > 0))
-            bands = fitted_waves(self.bands.waves, self.rows())
+            bands = fitted_waves(self.bands.waves, self.sum_over_rows())
         for _ in range(_MAX_STEPS):
             self._evaluate(seen_adu, shifts_rad, shape, light, bands, reach)
             if self._inverse is None:
-                self._inverse = self._inverted(shifts_rad, shape, light, self._out[1])
+                self._inverse = self._invert_matrix(shifts_rad, shape, light, self._out[1])
                 matrices += 1
                 change = math.inf  # the first step is not compared with one of another matrix
             if self._inverse is None:
                 break
 
             # One Gauss-Newton step of all unknowns.
-            delta = self._inverse @ self._right()
+            delta = self._inverse @ self._right_side()
             last_change = change
             shape = Surface.from_parameters(shape.parameters + delta[:PARAMETERS], shape.radius_mm)
             light += delta[PARAMETERS:_UNKNOWNS].reshape(3, ZERNIKE_TERMS)
@@ -203,20 +203,22 @@ class FrameFitter:
     ) -> None:
         """Compute residual, weights and the right side at a surface, maps of light and bands."""
         light_left(
-            *self._shown(shifts_rad, shape, light),
+            *self._light_arguments(shifts_rad, shape, light),
             self.scene.edge,
-            self.bands.gain(bands),
+            self.bands.gain_of_bins(bands),
             seen,
             reach,
             self._pull,
             self._out,
         )
 
-    def rows(self) -> FloatArray:
+    def sum_over_rows(self) -> FloatArray:
         """Sums (2, R) of the last evaluation over the picture's rows, for `Bands`."""
-        return self.bands.sums(self._out[2:])
+        return self.bands.sum_over_rows(self._out[2:])
 
-    def _shown(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> tuple[AnyArray, ...]:
+    def _light_arguments(
+        self, shifts_rad: Shifts, shape: Surface, light: FloatArray
+    ) -> tuple[AnyArray, ...]:
         """The arguments from which the kernels compute a frame's light."""
         moved_mm = shape.parameters - self._traced.parameters
         if np.max(np.abs(height_probe() @ moved_mm)) > _LINEAR_MM:
@@ -236,24 +238,26 @@ class FrameFitter:
             shifts,
         )
 
-    def _right(self) -> FloatArray:
+    def _right_side(self) -> FloatArray:
         """J^T W r of the last evaluation: (parameters + 3 terms + 2 bands,)."""
         of_bands = np.zeros(0)
         if len(self.bands.waves):
-            of_bands = self.bands.waves @ self.rows()[0]
+            of_bands = self.bands.waves @ self.sum_over_rows()[0]
         return np.concatenate([self._pull.ravel(), of_bands])
 
-    def _waves(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> Singles:
+    def _compute_light_waves(
+        self, shifts_rad: Shifts, shape: Surface, light: FloatArray
+    ) -> Singles:
         """Rows (6, n): dI by phi_x, phi_y, relative changes of A, B_x and B_y, and of all light."""
         waves = np.empty((6, self.scene.index.size), np.float32)
-        light_waves(*self._shown(shifts_rad, shape, light), waves)
+        light_waves(*self._light_arguments(shifts_rad, shape, light), waves)
         return waves
 
-    def _inverted(
+    def _invert_matrix(
         self, shifts_rad: Shifts, shape: Surface, light: FloatArray, weights: Singles
     ) -> FloatArray | None:
         """(J^T W J)^-1; None if the bins do not determine the unknowns."""
-        *waves, shown = self._waves(shifts_rad, shape, light)
+        *waves, shown = self._compute_light_waves(shifts_rad, shape, light)
         bands = shown * self.bands.waves[:, self.bands.row]
         weights = weights * self.scene.edge
         # What changes slowly counts with its mean over each cell: the matrix need not be exact.
@@ -264,12 +268,12 @@ class FrameFitter:
         for i, j in product(range(len(slow)), repeat=2):
             rows = slice(_STARTS[i], _STARTS[i] + PARAMETERS)
             columns = slice(_STARTS[j], _STARTS[j] + PARAMETERS)
-            both = self._cells.sums(waves[i] * waves[j] * weights)
+            both = self._cells.sum_cells(waves[i] * waves[j] * weights)
             matrix[rows, columns] += (slow[i] * both) @ slow[j].T
 
         # Those of the bands by them, and by each other.
         for start, planes, wave in zip(_STARTS, slow, waves, strict=True):
-            both = self._cells.sums(bands * wave * weights)
+            both = self._cells.sum_cells(bands * wave * weights)
             matrix[start : start + PARAMETERS, _UNKNOWNS:] += planes @ both.T
         matrix[_UNKNOWNS:, :_UNKNOWNS] = matrix[:_UNKNOWNS, _UNKNOWNS:].T
         matrix[_UNKNOWNS:, _UNKNOWNS:] = (bands * weights) @ bands.T
@@ -306,7 +310,7 @@ class FrameFitter:
         """
         is_usable = self._inverse is not None and len(self._inverse) == self._count_unknowns()
         if not is_usable:
-            self._inverse = self._inverted(shifts_rad, fit.surface, fit.light, fit.weights)
+            self._inverse = self._invert_matrix(shifts_rad, fit.surface, fit.light, fit.weights)
         if self._inverse is None:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
 
@@ -321,9 +325,9 @@ class FrameFitter:
             ],
             axis=1,
         )
-        waves = self._waves(shifts_rad, fit.surface, fit.light)[:5]
+        waves = self._compute_light_waves(shifts_rad, fit.surface, fit.light)[:5]
         weighted_residual = self.scene.edge * fit.weights * fit.residual_adu
-        sums = self.in_squares(slow, waves * weighted_residual)
+        sums = self.average_in_squares(slow, waves * weighted_residual)
 
         # Scatter of the squares' effects, enlarged for the fitted degrees of freedom.
         used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
@@ -355,11 +359,11 @@ class FrameFitter:
         weights : (2, n) array
             Squares of these derivatives, weighted likewise.
         """
-        waves = self._waves(shifts_rad, fit.surface, fit.light)[:2]
+        waves = self._compute_light_waves(shifts_rad, fit.surface, fit.light)[:2]
         weights = self.scene.edge * fit.weights
         return waves * (weights * fit.residual_adu), waves**2 * weights
 
-    def in_squares(self, slow: Singles, values: AnyArray) -> FloatArray:
+    def average_in_squares(self, slow: Singles, values: AnyArray) -> FloatArray:
         """Sums over squares of the mirror whose errors count as independent.
 
         Squares of 2.3 fringes fade into their neighbours: what cancels over whole fringes cancels
@@ -380,8 +384,8 @@ class FrameFitter:
         place = (self.scene.position_mm / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
 
         # The lower left of them, and how much belongs to the upper and right ones.
-        low = np.floor(self._cells.planes(place)[:, 0]).astype(int)
-        upper = np.sin(np.pi / 2 * np.clip(place - self._cells.each(low), 0, 1)) ** 2
+        low = np.floor(self._cells.fit_planes(place)[:, 0]).astype(int)
+        upper = np.sin(np.pi / 2 * np.clip(place - self._cells.repeat_over_bins(low), 0, 1)) ** 2
         (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
         side = _BLOCKS + 2
         low_square = low[1] * side + low[0]
@@ -395,8 +399,8 @@ class FrameFitter:
         # Sums of the pulls on the surface's terms, over each square.
         total = np.zeros((len(slow), side**2))
         for share, offset in shares_of_squares:
-            pull = np.einsum("pkiq,kiq->pq", slow, self._cells.moments(share * values))
-            total += sums_by(low_square + offset, pull, side**2)
+            pull = np.einsum("pkiq,kiq->pq", slow, self._cells.sum_moments(share * values))
+            total += sum_by_group(low_square + offset, pull, side**2)
         return np.asarray(total / _OVERLAP)
 
     def period_um(self) -> FloatArray:

@@ -15,7 +15,7 @@ from membrane_ctrl.metrology.tracking.bin_cells import (
     spread_planes,
 )
 
-# Where the planes of phi_x, phi_y and of the three maps of light begin in `Cells.blocks`.
+# Where the planes of phi_x, phi_y and of the three maps of light begin in `Cells.arrange_blocks`.
 _FIRST_PLANE = (0, PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS)
 # Share of the reach within which weights are 1. If they fall from 0 on, as Tukey's do, they differ
 # between bright and dark fringes as soon as the light changes slowly, and bend the figure: 20 nm of
@@ -136,7 +136,8 @@ def light_left(  # type: ignore[no-untyped-def]
     light : (3, n) array
         A, B_x and B_y.
     slow, offset : arrays
-        As in `Cells.blocks` and `Cells`: what phases and light change by, a plane over each cell.
+        As in `Cells.arrange_blocks` and `Cells`: changes of phases and light, a plane over each
+        cell.
     response : (4,) array
         Response of panel and camera.
     changes : (4, parameters) array

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
+from membrane_ctrl.metrology.numerics.grouped_sums import sum_by_group
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.frame_verdict import CONTRAST, COVERED_DEGRADED, Finding
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
@@ -52,7 +52,9 @@ class LightSquares:
 
     def _average_bins(self, *values: Singles) -> FloatArray:
         """Means (k, squares) of k values, each (n,), of the bins."""
-        return np.asarray(sums_by(self._number, np.stack(values), self._count.size) / self._count)
+        return np.asarray(
+            sum_by_group(self._number, np.stack(values), self._count.size) / self._count
+        )
 
     def judge_light(self, seen_adu: Singles) -> tuple[float, BoolArray]:
         """Compare a frame with the scene.

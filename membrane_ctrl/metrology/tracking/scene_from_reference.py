@@ -92,12 +92,12 @@ def make_scene(
     columns = camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(len(fine), -1)
     known = np.isfinite(coarse).all(axis=0)
-    index, counted, cells = Cells.of(np.flatnonzero(known), columns)
+    index, counted, cells = Cells.from_bins(np.flatnonzero(known), columns)
 
     # Rays of the bins, traced to the surface.
     grid = bin_grid.BinGrid(tracer.geometry, camera, bin_px)
-    points = ray_tracing.Points.of(grid.rays[:, index], np.zeros((2, index.size)))
-    tracer.start(points, shape.height)
+    points = ray_tracing.Points.from_rays(grid.rays[:, index], np.zeros((2, index.size)))
+    tracer.place_on_shape(points, shape.height)
     bias_mm = grid.averaging_bias_mm(tracer, points, shape, index)
     position_mm = tracer.position_mm(points)
     seen_rad = tracer.predict_screen(points, shape) * rad_per_mm

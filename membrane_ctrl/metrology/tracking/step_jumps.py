@@ -24,9 +24,9 @@ class StepJumps:
     def __init__(self) -> None:
         self._still_mm2: deque[FloatArray] = deque(maxlen=_STILL_FRAMES)
         self._steps_mm2: deque[FloatArray] = deque(maxlen=_STEP_FRAMES)
-        self.begin()
+        self.forget_frames()
 
-    def begin(self) -> None:
+    def forget_frames(self) -> None:
         """Do not compare the next frame with those before it."""
         self._path: deque[tuple[Shifts, FloatArray]] = deque(maxlen=3)
 

@@ -137,7 +137,7 @@ def _split_phases(
     # Normal matrix from the means over the cells. It need not be exact: what it leaves is solved
     # again.
     means = slow[:, :, 0]
-    weighted = means * cells.sums(weights)[:, None]
+    weighted = means * cells.sum_cells(weights)[:, None]
     matrix: FloatArray = np.sum(weighted @ means.transpose(0, 2, 1), axis=0, dtype=float)
 
     # Rounds of least squares, without stray phases.
@@ -145,13 +145,13 @@ def _split_phases(
     left_rad = off_rad
     used = weights
     for _ in range(_SPLIT_ROUNDS):
-        right = np.einsum("apiq,aiq->p", slow, cells.moments(used * left_rad), dtype=float)
+        right = np.einsum("apiq,aiq->p", slow, cells.sum_moments(used * left_rad), dtype=float)
         moved_mm += np.linalg.solve(matrix, right)
-        left_rad = off_rad - cells.spread(np.tensordot(moved_mm, slow, (0, 1)))
+        left_rad = off_rad - cells.evaluate_planes(np.tensordot(moved_mm, slow, (0, 1)))
         median_rad = np.median(np.abs(left_rad[weights > 0]))
         reach_rad = _STRAY_SIGMAS * _SIGMA_OVER_MAD * median_rad
         used = weights * (np.abs(left_rad) <= reach_rad).all(axis=0)
 
-    pull = fitter.in_squares(slow.swapaxes(0, 1), used * left_rad)
+    pull = fitter.average_in_squares(slow.swapaxes(0, 1), used * left_rad)
     errors_mm = np.linalg.solve(matrix, pull)
     return moved_mm, np.asarray(np.sum(errors_mm**2, axis=1)), left_rad

@@ -138,7 +138,7 @@ class Tracker:
         self._shown_rad = (math.nan, math.nan)
         self._covariance.drop_request()
         self._squares = light_squares.LightSquares(scene)
-        self._jumps.begin()
+        self._jumps.forget_frames()
         self._steps: list[step_means.StepMeans] = []
 
     def measure_steps(
@@ -183,7 +183,7 @@ class Tracker:
         if not min(used) > max(max(used) - OTHER_BINS_SHARE, 0):
             return found
 
-        if self._bands.recall():
+        if self._bands.add_wave_of_first_frames():
             # A band was found on the way: fit all frames again with it. Time runs back.
             self._begin_scene(self._fitter.scene, self._last.surface, self._last.light)
             self._last_time_s = math.nan
@@ -402,8 +402,8 @@ class Tracker:
 
     def _bin_frame(self, frame: Image) -> tuple[Singles, BoolArray]:
         """Means (n,) of a frame over the scene's bins, and the bins (n,) with a clipped pixel."""
-        self._binner.clear()
-        self._binner.add([frame], [0])
+        self._binner.clear_saturation()
+        self._binner.sum_frames([frame], [0])
         index = self._fitter.scene.index
         pixels = np.float32(self._binner.bin_px**2)
         means_adu: Singles = self._binner.sums[0].ravel()[index].astype(np.float32) / pixels
@@ -440,15 +440,15 @@ class Tracker:
 
         # New bands of the backlight, one after the other.
         known = len(self._bands.waves)
-        while self._bands.search(self._fitter.rows()):
+        while self._bands.add_wave_of_frame(self._fitter.sum_over_rows()):
             for _ in range(_BAND_FITS):
                 begin = start if self._robust.has_failed(fit) else fit
                 fit = self._fit_robustly(seen_adu, shifts_rad, begin, left_out)
                 if not self._robust.has_failed(fit):
-                    self._bands.refine(self._fitter.rows(), fit.bands)
+                    self._bands.refine_frequencies(self._fitter.sum_over_rows(), fit.bands)
         if self._robust.has_failed(fit) and len(self._bands.waves) > known:
             # A lost order leaves fringes, which are no bands.
-            self._bands.keep(known)
+            self._bands.keep_first_waves(known)
             fit = self._fit_robustly(seen_adu, shifts_rad, start, left_out)
 
         # The film may have moved further than the fit can follow: begin where the laser saw it.
@@ -528,9 +528,9 @@ class Tracker:
         self._last = fit
         self._light = light
         self._shown_rad = shifts_rad
-        self._clear = self._seen / self._bands.gain(fit.bands)
+        self._clear = self._seen / self._bands.gain_of_bins(fit.bands)
         if fit.bands.size:
-            self._bands.refine(self._fitter.rows(), fit.bands)
+            self._bands.refine_frequencies(self._fitter.sum_over_rows(), fit.bands)
         self._last_time_s = time_s
         self._last_displacement_um = displacement_um
         self._scale_adu = self._robust.scale_adu(fit)
@@ -548,7 +548,7 @@ class Tracker:
         """
         tilt_urad = self._watch.tilt_urad(fit.surface)
         reason = find_motion_doubt(motion, covariance_mm2, tilt_urad)
-        if motion.is_sure and reason:
+        if motion.is_proven and reason:
             self._knocked = reason
         if not reason:
             return None
@@ -557,7 +557,9 @@ class Tracker:
     def _covariance_mm2(self, fit: FrameFit, shifts_rad: Shifts, time_s: float) -> FloatArray:
         """Covariance (parameters, parameters) of a frame's fit, on a bench that has not moved."""
         has_new_jump = self._jumps.add_frame(shifts_rad, fit.surface.parameters)
-        fit_mm2 = self._covariance.of_fit(self._fitter, fit, shifts_rad, time_s, has_new_jump)
+        fit_mm2 = self._covariance.estimate_frame_covariance(
+            self._fitter, fit, shifts_rad, time_s, has_new_jump
+        )
 
         # Errors that frames of one step share: the mirror's place in it, and the jumps between
         # steps beyond those of the places.

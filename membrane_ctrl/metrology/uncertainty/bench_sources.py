@@ -43,7 +43,7 @@ def geometry_sources(
         several = ", ".join(names)
         if set(names) & set(GENERAL_NAMES):
             several = "calibrated"
-        root = spread.root()[np.ix_(is_linked, is_linked)]
+        root = spread.covariance_root()[np.ix_(is_linked, is_linked)]
         effects = jacobian[:, is_linked] @ root
         description = f"poses and optics, with their correlations: {several}"
         yield Source("geometry", description, math.nan, effects)

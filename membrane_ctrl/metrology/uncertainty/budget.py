@@ -64,7 +64,7 @@ class Source:
         """Covariance (parameters, parameters)."""
         return np.asarray(self.known_mm @ self.known_mm.T)
 
-    def change(self, earlier: "Source | None") -> list[FloatArray]:
+    def list_change_effects(self, earlier: "Source | None") -> list[FloatArray]:
         """Effects on the change since an earlier set, arrays of (parameters, k) each."""
         if earlier is None:
             return [self.known_mm]
@@ -128,7 +128,7 @@ class Budget:
         before = {source.name: source for source in earlier.sources}
         parts = [np.zeros((PARAMETERS, 1))]
         for own in self.sources:
-            parts += own.change(before.pop(own.name, None))
+            parts += own.list_change_effects(before.pop(own.name, None))
         only_earlier = [source.known_mm for source in before.values()]
         effects = np.concatenate([*parts, *only_earlier], axis=1)
         return np.asarray(effects @ effects.T)
@@ -145,7 +145,7 @@ class Budget:
                 "sigma": source.sigma if math.isfinite(source.sigma) else None,
                 "common": source.common,
             }
-            rows.append(about | self.sizes(source.covariance_mm2))
+            rows.append(about | self.compute_sigmas_um(source.covariance_mm2))
         return sorted(rows, key=lambda row: -float(row["height_rms_um"]))
 
     def total(self) -> dict[str, Any]:
@@ -153,9 +153,9 @@ class Budget:
         whole = self.covariance(True) + self.covariance(False)
         to_coeffs = parameter_to_coeffs()
         coeffs = 1e3 * np.sqrt(np.maximum(np.diag(to_coeffs @ whole @ to_coeffs.T), 0.0))
-        return self.sizes(whole) | {"coeffs_um": coeffs.tolist()}
+        return self.compute_sigmas_um(whole) | {"coeffs_um": coeffs.tolist()}
 
-    def sizes(self, covariance_mm2: FloatArray) -> dict[str, float]:
+    def compute_sigmas_um(self, covariance_mm2: FloatArray) -> dict[str, float]:
         """1 sigma of the sag, and over the disc of the height and of the figure (the height without
         its plane).
         """

@@ -84,7 +84,7 @@ class LiveErrors:
     corrected_um2: FloatArray
 
     @classmethod
-    def of(
+    def from_benches(
         cls,
         bench: trial_bench.TrialBench,
         wave_bench: trial_bench.TrialBench,
@@ -159,7 +159,7 @@ class LiveErrors:
             + display
         )
 
-    def own_mm2(
+    def unshared_covariance_mm2(
         self, seen: FrameErrors, readings_um: FloatArray, laser_noise_um: float, moved_um: float
     ) -> FloatArray:
         """Covariance of what the reference cycle does not share, without slopes and pixels.
@@ -398,7 +398,9 @@ class ErrorWatch:
             changed_rad2 = np.mean(np.square(changed_rad[:, known]), axis=1)
         return CycleErrors(
             correction_mm=self._errors.correction_mm(seen),
-            own_mm2=self._errors.own_mm2(seen, cycle.readings_um, self._laser_noise_um, moved_um),
+            own_mm2=self._errors.unshared_covariance_mm2(
+                seen, cycle.readings_um, self._laser_noise_um, moved_um
+            ),
             changed_rad2=changed_rad2,
             known_points=int(np.count_nonzero(known)),
             points=points,
@@ -443,8 +445,10 @@ class ErrorWatch:
         field = tracer.slope_field(state.points, fit.surface)
         slopes = field[2:4] - field[4:6]
         reach_mm = self._optics.mirror.analysis_radius_mm
-        patches = residual_patches.Patches.of(field[:2], state.points.weights, slopes, reach_mm)
-        rings = RoundSlopes.of(field[:2], state.points.weights, slopes, reach_mm)
+        patches = residual_patches.Patches.from_points(
+            field[:2], state.points.weights, slopes, reach_mm
+        )
+        rings = RoundSlopes.from_points(field[:2], state.points.weights, slopes, reach_mm)
         inverse = fit.normal.inverse
         of_round, _ = film_shape_error.round_effect(patches, rings, tracer.radius_mm, inverse)
         of_waves, _ = film_shape_error.wave_effect(patches, tracer.radius_mm, inverse)
@@ -468,7 +472,7 @@ class ErrorWatch:
         bench = self._make_bench(cycle, places_px, points)
         wave_bench = self._make_bench(cycle, places_px, many)
         left = np.column_stack([left, image_lag_of_cycles(bench, self._shifts_rad, self._lag)])
-        return LiveErrors.of(
+        return LiveErrors.from_benches(
             bench,
             wave_bench,
             self._shifts_rad,
@@ -487,7 +491,7 @@ class ErrorWatch:
         `places_px` (2, tracked points) are the places of all tracked points in the picture,
         `points` (n,) the numbers of those to use.
         """
-        return trial_bench.TrialBench.of_points(
+        return trial_bench.TrialBench.from_points(
             self._optics,
             cycle.tracer,
             cycle.fit.surface,

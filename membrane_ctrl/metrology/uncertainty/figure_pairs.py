@@ -53,7 +53,7 @@ class FigurePair:
     later: Moment
 
     @property
-    def change(self) -> FloatArray:
+    def change_mm(self) -> FloatArray:
         """Change (parameters,), mm, from the earlier set to the later."""
         return self.later.parameters - self.earlier.parameters
 

@@ -198,12 +198,12 @@ def film_shape_sources(full: FullResult, slope_variance: FloatArray) -> tuple[bu
     variance = float(slope_variance.mean())
 
     # Slopes that the fit leaves, as patches and as means of rings.
-    patches = residual_patches.Patches.of_grid(grid)
+    patches = residual_patches.Patches.from_grid(grid)
     seen = grid.count > 0
     x, y = np.meshgrid(grid.axis_mm, grid.axis_mm)
     places_mm = np.stack([x[seen], y[seen]])
     slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
-    rings = RoundSlopes.of(places_mm, grid.count[seen], slopes, float(grid.axis_mm[-1]))
+    rings = RoundSlopes.from_points(places_mm, grid.count[seen], slopes, float(grid.axis_mm[-1]))
     of_round = round_effect(patches, rings, radius_mm, inverse, variance)
     of_waves = wave_effect(patches, radius_mm, inverse, variance)
     rows = (

@@ -81,14 +81,14 @@ class GeometrySpread:
             raise ValueError("matrix: not a covariance (an eigenvalue is negative)")
 
     @classmethod
-    def independent(cls, sigmas: dict[str, float]) -> "GeometrySpread":
+    def from_sigmas(cls, sigmas: dict[str, float]) -> "GeometrySpread":
         """The spread of independent numbers, with one sigma for each name."""
         return cls(tuple(sigmas), np.diag(np.square(np.array(list(sigmas.values()), float))))
 
-    def with_others(self, sigmas: dict[str, float]) -> "GeometrySpread":
+    def add_independent(self, sigmas: dict[str, float]) -> "GeometrySpread":
         """This spread with independent numbers added; those already named stay."""
         added = {n: sigma for n, sigma in sigmas.items() if n not in self.names and sigma > 0}
-        other = GeometrySpread.independent(added)
+        other = GeometrySpread.from_sigmas(added)
         size = len(self.names)
         covariance = np.zeros((size + len(added), size + len(added)))
         covariance[:size, :size] = self.covariance
@@ -105,11 +105,11 @@ class GeometrySpread:
         scale = np.where(self.sigmas > 0, self.sigmas, 1.0)
         return np.asarray(self.covariance / np.outer(scale, scale))
 
-    def draw(self, rng: np.random.Generator) -> FloatArray:
+    def draw_change(self, rng: np.random.Generator) -> FloatArray:
         """Draw one change (k,)."""
-        return np.asarray(self.root() @ rng.standard_normal(len(self.names)))
+        return np.asarray(self.covariance_root() @ rng.standard_normal(len(self.names)))
 
-    def root(self) -> FloatArray:
+    def covariance_root(self) -> FloatArray:
         """Root (k, k) of the covariance: times its transpose it is the covariance."""
         values, vectors = np.linalg.eigh(self.correlation())
         root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
@@ -124,7 +124,7 @@ def stated_spread(geometry: GeometryConfig) -> GeometrySpread | None:
     if geometry.a_mm is None or all(sigma is None for sigma in sigmas):
         return None
     stated = {name: sigma or 0.0 for name, sigma in zip(SHORT_NAMES, sigmas, strict=True)}
-    return GeometrySpread.independent(stated)
+    return GeometrySpread.from_sigmas(stated)
 
 
 def change_geometry(
@@ -218,4 +218,4 @@ def _to_vector(values: FloatArray) -> Vector3:
 
 
 # The paper's instruments: laser distance meter and digital protractor.
-PAPER_SPREAD = GeometrySpread.independent({"a_mm": 2.0, "b_mm": 2.0, "alpha_deg": 0.3})
+PAPER_SPREAD = GeometrySpread.from_sigmas({"a_mm": 2.0, "b_mm": 2.0, "alpha_deg": 0.3})

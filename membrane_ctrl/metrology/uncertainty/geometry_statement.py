@@ -59,7 +59,7 @@ class GeometryStatement:
     slopes: SlopeMisfit
 
     @classmethod
-    def of(
+    def from_evidence(
         cls, known_by: KnownBy, source: str, rim: RimMisfit | None, slopes: SlopeMisfit
     ) -> "GeometryStatement":
         """Judge by what the uncertainty rests on, by the rim and by the slopes."""

@@ -37,7 +37,9 @@ class HeightMap:
     matrix: FloatArray
 
     @classmethod
-    def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> "HeightMap":
+    def over_disc(
+        cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE
+    ) -> "HeightMap":
         """A grid over the analysis radius; `radius_mm` is that of the Zernike disc."""
         axis = np.linspace(-analysis_radius_mm, analysis_radius_mm, side)
         x, y = np.meshgrid(axis, axis)

@@ -21,7 +21,7 @@ def image_lag_source(
     bench: TrialBench, stack: FrameStack, used: tuple[list[int], list[int]], lag: ImageLag
 ) -> Source:
     """Return the row of the budget; without an estimate its uncertainty is 0, and so stated."""
-    sigma = lag.left if math.isfinite(lag.left) else 0.0
+    sigma = lag.remaining_sigma if math.isfinite(lag.remaining_sigma) else 0.0
     effect = image_lag_effect(bench, stack, used)
     # The panel has the same share in all sets of a bench, but each set estimates it.
     return Source(
@@ -42,7 +42,7 @@ def image_lag_of_cycles(bench: TrialBench, shifts_rad: FloatArray, lag: ImageLag
     count = len(shifted)
     stack = FrameStack(np.empty((count, 0, 0), np.uint8), shifted, np.full(count, np.nan), {})
     used = (stack.sinusoids(AXES[0]), stack.sinusoids(AXES[1]))
-    sigma = lag.left if math.isfinite(lag.left) else 0.0
+    sigma = lag.remaining_sigma if math.isfinite(lag.remaining_sigma) else 0.0
     return sigma * image_lag_effect(bench, stack, used)
 
 
@@ -57,7 +57,7 @@ def image_lag_effect(
     for axis, frames in enumerate(used):
         _, cosine, sine = phase_steps.step_weights(stack.shifts_rad(frames))
         for k, frame in enumerate(frames):
-            previous = stack.before_of(frame)
+            previous = stack.frame_before(frame)
             if previous < 0:
                 continue
             change = _wave(stack, previous, angle) - _wave(stack, frame, angle)

@@ -51,7 +51,7 @@ def run_trials(
     """
     out = np.empty((len(trials), len(benches), PARAMETERS))
     for row, trial in enumerate(trials):
-        change = spread.draw(np.random.default_rng((seed, 0, trial)))
+        change = spread.draw_change(np.random.default_rng((seed, 0, trial)))
         for k, bench in enumerate(benches):
             random = np.random.default_rng((seed, 1 + first_set + k, trial))
             noise_mm = random.standard_normal(bench.sigma_mm.shape) * bench.sigma_mm

@@ -123,7 +123,9 @@ class MotionEffects:
     left: FloatArray
 
     @classmethod
-    def of(cls, changes: FloatArray, jacobian: FloatArray, weights: FloatArray) -> "MotionEffects":
+    def from_changes(
+        cls, changes: FloatArray, jacobian: FloatArray, weights: FloatArray
+    ) -> "MotionEffects":
         """Split the effects of the motions into a change of the figure and the rest.
 
         Parameters
@@ -206,7 +208,7 @@ class MotionFinding:
         return self.found_mm2 + self.allowed_mm2
 
     @property
-    def is_tilt_sure(self) -> bool:
+    def is_tilt_proven(self) -> bool:
         """Whether something else than film and mirror has moved, by the ring's tilt."""
         mirror = max(fit.gain for fit in self.tilted if GROUPS[fit.group].is_of_mirror)
         return self.tilted[0].gain - mirror > _SURE_GAIN
@@ -217,7 +219,7 @@ class MotionFinding:
         return any(fit.gain > _gain_by_chance(GROUPS[fit.group].components) for fit in self.tilted)
 
     @property
-    def is_hidden_sure(self) -> bool:
+    def is_hidden_proven(self) -> bool:
         """Whether the ring has bent, most likely by a hidden motion."""
         if not self.bent:
             return False
@@ -225,16 +227,16 @@ class MotionFinding:
         return GROUPS[best.group].is_hidden and best.gain > _SURE_GAIN
 
     @property
-    def is_sure(self) -> bool:
+    def is_proven(self) -> bool:
         """Whether a motion of the bench is proven that bends the figure."""
-        return (self.is_tilt_sure and self.figure_um > _PROVEN_UM) or (
-            self.is_hidden_sure and self.hidden_um > _PROVEN_UM
+        return (self.is_tilt_proven and self.figure_um > _PROVEN_UM) or (
+            self.is_hidden_proven and self.hidden_um > _PROVEN_UM
         )
 
     def describe(self) -> str:
         """The most likely motion, with the second one unless it is excluded."""
         candidates = self.bent
-        if self.is_tilt_sure or not self.bent:
+        if self.is_tilt_proven or not self.bent:
             candidates = self.tilted
         best, second = candidates[:2]
         if best.gain - second.gain > _PLAUSIBLE_GAIN:
@@ -260,7 +262,7 @@ def find_motion_doubt(motion: MotionFinding, own_mm2: FloatArray, tilt_urad: flo
     tilt_urad : float
         Tilt of the ring since the reference.
     """
-    if motion.is_sure:
+    if motion.is_proven:
         return f"knocked: {motion.describe()}; check camera and screen"
     own_um = 1e3 * math.sqrt(float(np.trace(own_mm2[_FIGURE, _FIGURE])))
     if motion.is_beyond_chance and motion.figure_um > max(own_um, _POSSIBLE_UM):
@@ -296,7 +298,7 @@ class _GroupTest:
     information: FloatArray
     spread: FloatArray
 
-    def weigh(self, ring_mm: FloatArray, left: FloatArray) -> FloatArray:
+    def make_right_side(self, ring_mm: FloatArray, left: FloatArray) -> FloatArray:
         """b (k,) of the ring's tilt or saddle (2,) and of the products q (components,)."""
         return np.asarray(self.by_ring @ ring_mm + self.by_left @ left[self.columns])
 
@@ -357,10 +359,10 @@ class MotionTest:
     ) -> None:
         self._effects = effects
         self._slopes = slopes
-        self._by_tilt = self._tests(ring_tilt(), tilt_mm2)
+        self._by_tilt = self._make_group_tests(ring_tilt(), tilt_mm2)
         self._by_saddle: dict[int, _GroupTest] = {}
         if saddle_mm2 is not None:
-            self._by_saddle = self._tests(ring_saddle(), saddle_mm2)
+            self._by_saddle = self._make_group_tests(ring_saddle(), saddle_mm2)
 
         # What motions may have done that are too small to be found, within their allowances.
         self._undetected_mm2 = np.zeros((len(effects.figure_mm),) * 2)
@@ -377,7 +379,9 @@ class MotionTest:
                 allowed = _spread(test.information, group.allowance)
             self._undetected_mm2 += effect @ allowed @ effect.T
 
-    def _tests(self, harmonic: FloatArray, ring_mm2: FloatArray) -> dict[int, _GroupTest]:
+    def _make_group_tests(
+        self, harmonic: FloatArray, ring_mm2: FloatArray
+    ) -> dict[int, _GroupTest]:
         """The test of each group, by a harmonic of the ring and by the slopes.
 
         `harmonic` (2, parameters) is `ring_tilt` or `ring_saddle`, `ring_mm2` (2, 2) its
@@ -405,7 +409,9 @@ class MotionTest:
             )
         return tests
 
-    def find(self, tilt_mm: FloatArray, saddle_mm: FloatArray, left: FloatArray) -> MotionFinding:
+    def find_motions(
+        self, tilt_mm: FloatArray, saddle_mm: FloatArray, left: FloatArray
+    ) -> MotionFinding:
         """Estimate every group.
 
         Parameters
@@ -416,7 +422,7 @@ class MotionTest:
             q of the slopes; no effect if slopes are not compared.
         """
         tilted = [fit for fit in self._fit_tilt(tilt_mm, left) if not GROUPS[fit.group].is_hidden]
-        bent = self._fit(self._by_saddle, saddle_mm, left)
+        bent = self._fit_groups(self._by_saddle, saddle_mm, left)
         bent = [fit for fit in bent if not GROUPS[fit.group].is_of_mirror]
         seen_mm, seen_um = _worst_effect(self._effects, tilted, is_hidden=False)
         hidden_mm, hidden_um = _worst_effect(self._effects, bent, is_hidden=True)
@@ -434,20 +440,22 @@ class MotionTest:
         # Tilt of the mirror if only it had moved; K of every group is at least a multiple of it.
         mirror = next(number for number, group in enumerate(GROUPS) if group.is_of_mirror)
         test = self._by_tilt[mirror]
-        tilt = np.linalg.solve(test.information, test.weigh(tilt_mm, left))
+        tilt = np.linalg.solve(test.information, test.make_right_side(tilt_mm, left))
         tilt_knock = _KNOCK_PER_TILT * float(np.linalg.norm(tilt))
         tests = dict(self._by_tilt)
         for number, test in self._by_tilt.items():
             if tilt_knock > GROUPS[number].knock:
                 tests[number] = replace(test, spread=_spread(test.information, tilt_knock))
-        return self._fit(tests, tilt_mm, left)
+        return self._fit_groups(tests, tilt_mm, left)
 
     @staticmethod
-    def _fit(tests: dict[int, _GroupTest], ring_mm: FloatArray, left: FloatArray) -> list[GroupFit]:
+    def _fit_groups(
+        tests: dict[int, _GroupTest], ring_mm: FloatArray, left: FloatArray
+    ) -> list[GroupFit]:
         """Estimate every group, the most likely first."""
         fits = []
         for number, test in tests.items():
-            right = test.weigh(ring_mm, left)
+            right = test.make_right_side(ring_mm, left)
             amount = test.spread @ right
             fits.append(GroupFit(number, amount, float(right @ amount)))
         return sorted(fits, key=lambda fit: -fit.gain)

@@ -39,7 +39,7 @@ class PairMotion:
     parameters_mm: FloatArray
 
     @classmethod
-    def of(cls, bench: TrialBench) -> "PairMotion":
+    def from_bench(cls, bench: TrialBench) -> "PairMotion":
         """Of a set. Raises ArithmeticError if a fit does not converge."""
         nominal = bench.geometry()
         tracer, points = traced_points(bench, nominal.geometry)
@@ -61,4 +61,4 @@ class PairMotion:
         test = MotionTest(self.effects, ring @ covariance_mm2 @ ring.T, None, None)
         moved_mm = self.parameters_mm - earlier.parameters_mm
         none = np.zeros(bench_motions.COMPONENTS)
-        return test.find(ring @ moved_mm, np.zeros(2), none)
+        return test.find_motions(ring @ moved_mm, np.zeros(2), none)

@@ -37,7 +37,7 @@ def pixel_sources(
     yield Source("noise_adu", "noise of the pixels", noise_adu, noise, False, False)
 
     # Residual slopes, as one error for each patch of the mirror.
-    left = Patches.of_grid(full.fit_grid).effects(full.surface.radius_mm, inverse)
+    left = Patches.from_grid(full.fit_grid).effects(full.surface.radius_mm, inverse)
     left_urad = 1e6 * math.hypot(fit.residual_x, fit.residual_y)
     noise_mm2 = float(np.sum(noise**2))
     description = "slopes that the fit leaves: gamma, light, dust, ripple"
@@ -63,7 +63,7 @@ class Patches:
     slopes: FloatArray
 
     @classmethod
-    def of(
+    def from_points(
         cls, places_mm: FloatArray, count: FloatArray, slopes: FloatArray, reach_mm: float
     ) -> "Patches":
         """Average points over patches.
@@ -90,7 +90,7 @@ class Patches:
         return cls(means[:2], np.asarray(sums[0], float), means[2:])
 
     @classmethod
-    def of_grid(cls, grid: ResidualGrid) -> "Patches":
+    def from_grid(cls, grid: ResidualGrid) -> "Patches":
         """Average the cells of a grid, in which each pixel has its weight in the fit.
 
         The fit's matrix is made with the same weights. Slopes that the fit left out, of wrinkles at
@@ -100,7 +100,7 @@ class Patches:
         x_mm, y_mm = np.meshgrid(grid.axis_mm, grid.axis_mm)
         places_mm = np.stack([x_mm[seen], y_mm[seen]])
         slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
-        return cls.of(places_mm, grid.count[seen], slopes, float(grid.axis_mm[-1]))
+        return cls.from_points(places_mm, grid.count[seen], slopes, float(grid.axis_mm[-1]))
 
     def effects(self, radius_mm: float, inverse: FloatArray) -> FloatArray:
         """Effects of the residual slopes on the parameters, if only those of different patches are

@@ -40,7 +40,7 @@ class RoundSlopes:
     share: FloatArray
 
     @classmethod
-    def of(
+    def from_points(
         cls, places_mm: FloatArray, count: FloatArray, slopes: FloatArray, reach_mm: float
     ) -> "RoundSlopes":
         """Average the slopes of points.

@@ -22,7 +22,7 @@ def second_reflection_source(bench: TrialBench, seen: SecondReflection) -> Sourc
     A set that cannot show a second image has a row of 0.
     """
     sigma = seen.sigma if math.isfinite(seen.sigma) else 0.0
-    share = seen.share if seen.found else _HIDDEN_SIGMAS * sigma
+    share = seen.share if seen.is_found else _HIDDEN_SIGMAS * sigma
     scale = screen_scale.mm_per_rad(bench.optics.pattern)
     effects = []
     for axis in range(2):
@@ -30,14 +30,14 @@ def second_reflection_source(bench: TrialBench, seen: SecondReflection) -> Sourc
         off[axis] = scale * share * _phase_error(bench.screen_mm[axis] / scale, seen, axis)
         solved = bench.solve(bench.geometry(), off, linear=True)
         effects.append(solved - bench.surface.parameters)
-    if seen.found:  # one image: its effects on x and y belong together
+    if seen.is_found:  # one image: its effects on x and y belong together
         effects = [effects[0] + effects[1]]
     return Source("second_image", _SAYS, share, np.stack(effects, axis=1))
 
 
 def _phase_error(phase: FloatArray, seen: SecondReflection, axis: int) -> FloatArray | float:
     """Error of the phase over the share; `phase` (n,) is counted from the pattern's middle."""
-    if not seen.found:
+    if not seen.is_found:
         return _RMS_SINE
     shift = seen.shift_rad[axis]
     if not math.isfinite(shift):

@@ -103,7 +103,7 @@ def assemble_budget(
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
 
     # Motion of the film from x to y: by the laser, or by the fringes.
-    motion = FilmMotion.of(checked)
+    motion = FilmMotion.from_set(checked)
     unseen = None
     if not math.isfinite(motion.x_to_y_sigma_um):
         unseen = estimate_unseen_motion(bench, spread)
@@ -143,14 +143,14 @@ def assemble_budget(
         image_lag_source(bench, checked.stack, checked.view.used, checked.lag),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
-    whole = budget.Budget(tuple(sources), disc, PairMotion.of(bench))
+    whole = budget.Budget(tuple(sources), disc, PairMotion.from_bench(bench))
     return SetBudget(whole, tuple(doubts), rim, slopes)
 
 
 def _make_bench(optics: OpticsConfig, checked: Checked) -> TrialBench:
     """A trial bench of some of the set's bins, without noise, which has a separate row."""
     state = checked.state
-    return TrialBench.of_points(
+    return TrialBench.from_points(
         optics,
         checked.tracer,
         state.surface,
@@ -226,7 +226,7 @@ def _film_rows(
     description = "noise of the fringes that show the film's motion from x to y"
     noise = bench_sources.film_source(bench, (unseen.noise_um,), description, paired=False)
     rows = [source, replace(noise, name="film_seen_um")]
-    if not unseen.is_sure:
+    if not unseen.is_significant:
         return rows, []
     doubt = (
         f"the film moved by {unseen.moved_um:+.0f} +- {unseen.sigma_um:.0f} µm from the x to the y "

@@ -71,7 +71,7 @@ class TrialBench:
     normal: normal_matrix.NormalMatrix
 
     @classmethod
-    def of(
+    def from_set(
         cls,
         optics: OpticsConfig,
         checked: Checked,
@@ -80,7 +80,7 @@ class TrialBench:
     ) -> "TrialBench":
         """The trial bench of a set and its figure, with about `count` of the bins."""
         places_px = checked.places_px(figure.index)
-        return cls.of_points(
+        return cls.from_points(
             optics,
             checked.tracer,
             figure.fit.surface,
@@ -91,7 +91,7 @@ class TrialBench:
         )
 
     @classmethod
-    def of_points(
+    def from_points(
         cls,
         optics: OpticsConfig,
         tracer: ray_tracing.Tracer,
@@ -172,7 +172,7 @@ class TrialBench:
         geometry = there.geometry
         screen_mm = there.pitch * (self.screen_mm + disturbance_mm)
         tracer = ray_tracing.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
-        points = ray_tracing.Points.of(geometry.rays(self.column_px, self.row_px), screen_mm)
+        points = ray_tracing.Points.from_rays(geometry.rays(self.column_px, self.row_px), screen_mm)
         points.t_mm[:] = self.t_mm
         tracer.intersect(points, self.surface, newton=3)
 
@@ -263,6 +263,6 @@ def traced_points(
 
     `bent` (3, n) is added to the directions of their rays.
     """
-    points = Points.of(geometry.rays(bench.column_px, bench.row_px) + bent, bench.screen_mm)
+    points = Points.from_rays(geometry.rays(bench.column_px, bench.row_px) + bent, bench.screen_mm)
     points.t_mm[:] = bench.t_mm
     return Tracer(geometry, bench.surface.radius_mm, bench.vertex_z_mm), points

@@ -40,7 +40,7 @@ class UnseenMotion:
     noise_um: float
 
     @property
-    def is_sure(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the film moved beyond the uncertainty."""
         return abs(self.moved_um) > _SURE_SIGMAS * self.sigma_um
 

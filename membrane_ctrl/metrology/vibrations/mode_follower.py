@@ -65,9 +65,9 @@ class VibrationFollower:
         self._terms_um = []
         if len(time_s) < LEAST_RATE_HZ * SEARCH_S:
             return []
-        return self.search(time_s, terms_um)
+        return self.search_minute(time_s, terms_um)
 
-    def search(self, time_s: FloatArray, terms_um: FloatArray) -> list[events.Event]:
+    def search_minute(self, time_s: FloatArray, terms_um: FloatArray) -> list[events.Event]:
         """Search a minute of terms.
 
         Parameters
@@ -99,7 +99,7 @@ class VibrationFollower:
             return []
 
         # Only modes with a past are judged.
-        settled = [mode for mode in modes if mode.past and not mode.gone]
+        settled = [mode for mode in modes if mode.past and not mode.is_replaceable]
         return [
             _make_vibrations_event(modes),
             *self._judge_tension(settled, utc_s),
@@ -114,7 +114,7 @@ class VibrationFollower:
         candidates = [
             mode
             for mode in modes
-            if mode.line is None and not mode.gone and line.is_like(mode.last)
+            if mode.line is None and not mode.is_replaceable and line.is_like(mode.last)
         ]
         if candidates:
             nearest = min(
@@ -124,7 +124,7 @@ class VibrationFollower:
             return
 
         # Else a new mode, in the place of one that is gone.
-        free = next((k for k, mode in enumerate(modes) if mode.gone), len(modes))
+        free = next((k for k, mode in enumerate(modes) if mode.is_replaceable), len(modes))
         if free < MODES:
             mode = FollowedMode(line)
             mode.add(line, utc_s)
@@ -136,10 +136,10 @@ class VibrationFollower:
         limit = MOVED
         if is_active:
             limit = MOVED / 2
-        moved = next((mode for mode in modes if abs(mode.moved[0]) > limit), None)
+        moved = next((mode for mode in modes if abs(mode.largest_change[0]) > limit), None)
         sentence = ""
         if moved is not None:
-            change, since_s, then_hz = moved.moved
+            change, since_s, then_hz = moved.largest_change
             hours = max(1, round((utc_s - since_s) / 3600.0))
             sentence = (
                 f"the mirror's vibration at {then_hz:.2f} Hz moved by {change:+.1%} within "
@@ -223,12 +223,12 @@ class FollowedMode(StateNode):
     past: list[tuple[float, float]] = field(default_factory=list)
 
     @property
-    def gone(self) -> bool:
+    def is_replaceable(self) -> bool:
         """Whether another mode may take its place: it was transient, or not found for a week."""
         return self.missed >= _SEARCHES and not self.past
 
     @property
-    def moved(self) -> tuple[float, float, float]:
+    def largest_change(self) -> tuple[float, float, float]:
         """The largest relative change within a week, its time (UTC, s), and the frequency then
         (Hz).
         """

@@ -130,17 +130,17 @@ class _Piece:
     alias_hz: FloatArray
     blind: BoolArray
 
-    def projected(self, terms_um: FloatArray) -> ComplexArray:
+    def project_terms(self, terms_um: FloatArray) -> ComplexArray:
         """X (frequencies, terms - 1) of terms (n, terms - 1)."""
         return np.asarray(self.waves @ (self.window[:, None] * terms_um))
 
-    def goes_with(self, frequency_hz: float) -> BoolArray:
+    def shares_alias(self, frequency_hz: float) -> BoolArray:
         """The frequencies (frequencies,) that have nearly the alias of a line."""
         alias_hz = abs(frequency_hz - self.rate_hz * round(frequency_hz / self.rate_hz))
         reach_hz = (_REMOVED_OFFSETS[-1] + 1) / PIECE_S
         return np.asarray(np.abs(self.alias_hz - alias_hz) < reach_hz)
 
-    def noise(self, power: FloatArray, gone: BoolArray) -> FloatArray:
+    def estimate_noise(self, power: FloatArray, gone: BoolArray) -> FloatArray:
         """Noise (frequencies, terms - 1) under the lines: a function of the alias that falls
         with it, from drift to white noise.
 
@@ -177,7 +177,9 @@ class _Piece:
         columns = [np.interp(log_alias, middles, column) for column in logs.T]
         return np.asarray(np.exp(np.column_stack(columns)))
 
-    def without(self, terms_um: FloatArray, frequency_hz: float, shapes: FloatArray) -> FloatArray:
+    def remove_oscillations(
+        self, terms_um: FloatArray, frequency_hz: float, shapes: FloatArray
+    ) -> FloatArray:
         """The terms (n, terms - 1) without the oscillations about a frequency that the projection
         `shapes` (terms - 1, terms - 1) selects.
         """
@@ -232,7 +234,7 @@ def find_modes(
         noises = []
         for spectrum, before, piece, away in zip(spectra, whole_power, pieces, gone, strict=True):
             power = np.where(away[:, None], before, np.abs(spectrum) ** 2)
-            noises.append(piece.noise(power, away))
+            noises.append(piece.estimate_noise(power, away))
         seen = _compute_evidence(spectra, noises, pieces)
         if seen.max() < margin * _compute_threshold(seen, grid_hz.size):
             break
@@ -261,15 +263,17 @@ def find_modes(
         remaining = []
         for piece, part, noise in zip(pieces, terms, noises, strict=True):
             shapes = np.eye(own.size) if is_known else _projection_onto(own, noise[k])
-            remaining.append(piece.without(part, frequency, shapes))
+            remaining.append(piece.remove_oscillations(part, frequency, shapes))
         terms = remaining
-        gone = [away | piece.goes_with(frequency) for piece, away in zip(pieces, gone, strict=True)]
+        gone = [
+            away | piece.shares_alias(frequency) for piece, away in zip(pieces, gone, strict=True)
+        ]
     return tuple(_drop_false_aliases(mode, found) for mode in found)
 
 
 def _project_pieces(pieces: Sequence[_Piece], terms: Sequence[FloatArray]) -> list[ComplexArray]:
     """X (frequencies, terms - 1) of each piece."""
-    return [piece.projected(part) for piece, part in zip(pieces, terms, strict=True)]
+    return [piece.project_terms(part) for piece, part in zip(pieces, terms, strict=True)]
 
 
 def _drop_false_aliases(mode: VibrationMode, found: list[VibrationMode]) -> VibrationMode:

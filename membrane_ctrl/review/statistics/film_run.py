@@ -44,7 +44,9 @@ def film_run_command(
         raise errors.RejectedError(f"film: {error}") from None
     # at the same pressure a softer film is deeper by the law
     now = law.with_sag(sag_mm[np.argmax(time_s)])
-    softer = FilmLaw(prestrain, poisson, math.exp(-1e-3), radius_mm).under(law.pressure_pa(now))
+    softer = FilmLaw(prestrain, poisson, math.exp(-1e-3), radius_mm).under_pressure(
+        law.pressure_pa(now)
+    )
     um_per_log = -1e6 * float(softer.sag_mm - now.sag_mm)
     table = _make_table(runs, stiffness, creep, um_per_log) | {
         "prestrain": prestrain,

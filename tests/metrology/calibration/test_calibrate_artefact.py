@@ -15,7 +15,7 @@ from membrane_ctrl.config.optics import GeometryConfig, OpticsConfig, ScreenPose
 from membrane_ctrl.metrology.calibration.geometry_tables import (
     Origin,
     general_covariance,
-    tables_of,
+    make_geometry_tables,
 )
 from membrane_ctrl.metrology.calibration.solver import Solution, solve_calibration
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas
@@ -40,7 +40,7 @@ def solution() -> Solution:
 
 
 def test_the_file_contains_the_calibrated_bench(solution: Solution) -> None:
-    tables = tomllib.loads(tomli_w.dumps(tables_of(solution, OPTICS, ORIGIN)))
+    tables = tomllib.loads(tomli_w.dumps(make_geometry_tables(solution, OPTICS, ORIGIN)))
     geometry = GeometryConfig.model_validate(tables["geometry"])
     assert geometry.reference_displacement_um == 0.0
     there = Geometry.from_config(OpticsConfig(geometry=geometry))
@@ -54,12 +54,12 @@ def test_the_file_contains_the_calibrated_bench(solution: Solution) -> None:
     assert tables["camera"]["distortion"] == list(bench.geometry.distortion)
     assert tables["pattern"]["period_mm"] == pytest.approx(OPTICS.pattern.period_mm * bench.pitch)
     assert tables["calibration"]["sets"] == ["a", "b"]
-    assert tables["parameters"]["names"] == solution.free
+    assert tables["parameters"]["names"] == solution.free_names
 
 
 def test_only_what_was_free_is_written() -> None:
     truth = make(np.zeros(len(NAMES)), seed=4, points=1200)
-    tables = tables_of(solve_calibration(truth.problem(prior_sigmas())), OPTICS, ORIGIN)
+    tables = make_geometry_tables(solve_calibration(truth.problem(prior_sigmas())), OPTICS, ORIGIN)
     assert not {"camera", "pattern"} & set(tables)
     assert tables["geometry"]["screen"]["bow_mm"] == 0
 
@@ -78,7 +78,7 @@ def test_a_stated_bow_and_map_are_kept() -> None:
     assert bench.geometry.face.bow_per_mm * 200.0**2 == pytest.approx(2.0)
     assert bench.geometry.face.cells_mm.size
     truth = make(np.zeros(len(NAMES)), seed=4, points=1200)
-    screen = tables_of(solve_calibration(truth.problem(prior_sigmas())), optics, ORIGIN)[
+    screen = make_geometry_tables(solve_calibration(truth.problem(prior_sigmas())), optics, ORIGIN)[
         "geometry"
     ]["screen"]
     assert ScreenPoseConfig.model_validate(screen).height_map == stated.screen.height_map
@@ -95,7 +95,9 @@ def test_the_covariance_is_that_of_drawn_parameters(solution: Solution) -> None:
     spread = GeometrySpread(GENERAL_NAMES, covariance[:12, :12])
     # a change along one parameter, and the poses' own change by the twelve numbers that stand for
     # it
-    config = GeometryConfig.model_validate(tables_of(solution, OPTICS, ORIGIN)["geometry"])
+    config = GeometryConfig.model_validate(
+        make_geometry_tables(solution, OPTICS, ORIGIN)["geometry"]
+    )
     rng = np.random.default_rng(0)
     inverse = np.linalg.pinv(spread.correlation(), rcond=1e-10)
     k = len(solution.values)
@@ -133,10 +135,10 @@ def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def test_the_hash_depends_on_the_numbers_alone(solution: Solution) -> None:
-    tables = tables_of(solution, OPTICS, ORIGIN)
+    tables = make_geometry_tables(solution, OPTICS, ORIGIN)
     there_and_back = tomllib.loads(tomli_w.dumps(tables))
     assert hash_content(there_and_back) == tables["calibration"]["hash"]
-    later = tables_of(
+    later = make_geometry_tables(
         solution, OPTICS, Origin("2027-01-01T00:00:00+00:00", ("c",), 1.0, 2.0, 1.5, 3.0)
     )
     assert later["calibration"]["hash"] == tables["calibration"]["hash"]

@@ -137,7 +137,7 @@ def seen_directly(
         np.full(screen_mm.shape[1], sigma),
         np.nan,
         artefact=screen,
-        moved_screens=(MovedScreen.anywhere(),),
+        moved_screens=(MovedScreen.unknown_place(),),
     )
 
 
@@ -270,7 +270,7 @@ def test_derivatives_of_moved_and_seen_screens_are_those_of_the_rays() -> None:
         dark,
         ones,
         0.0,
-        moved_screens=(MovedScreen.anywhere(),),
+        moved_screens=(MovedScreen.unknown_place(),),
         screen=np.repeat([0, 1], 20),
     )
     values = SIGMAS * rng.normal(size=len(NAMES))

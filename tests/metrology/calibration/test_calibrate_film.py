@@ -19,7 +19,7 @@ from membrane_ctrl.metrology.calibration.solver import Solution, solve_calibrati
 from membrane_ctrl.metrology.calibration.verdict import check_solution
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.metrology.film.hencky_bowl import excess_rms
-from membrane_ctrl.metrology.film.terms_beyond_fit import round_of
+from membrane_ctrl.metrology.film.terms_beyond_fit import film_round_terms_mm
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas, usual_sigma
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
 from membrane_ctrl.metrology.rays.geometry import project_points
@@ -76,7 +76,10 @@ def test_the_terms_beyond_follow_the_excess_of_any_film_of_the_law() -> None:
         hencky = np.array([2150.47, 206.34, 21.05, 2.24])  # nm at 37 mm
         excess_mm = terms[0] / (1e-6 * hencky[0]) * 37.0 * excess_rms()
         expected = np.array(terms[1:]) - terms[0] * hencky[1:] / hencky[0]
-        assert round_of(excess_mm, 37.0) == pytest.approx(expected, abs=2e-8), (strain, poisson)
+        assert film_round_terms_mm(excess_mm, 37.0) == pytest.approx(expected, abs=2e-8), (
+            strain,
+            poisson,
+        )
 
 
 @pytest.mark.parametrize(

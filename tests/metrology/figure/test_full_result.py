@@ -168,7 +168,7 @@ def test_noisy_pictures_move_no_film_and_hide_no_motion(
             noisy = replace(
                 checked.stack, displacement_um=place_um + rng.standard_normal(place_um.size)
             )
-            film = FilmMotion.of(replace(checked, stack=noisy))
+            film = FilmMotion.from_set(replace(checked, stack=noisy))
             found_um = [axis_um * film.is_worth_correcting for axis_um in film.motion_um]
             off = [
                 axis_um - place_um[used]

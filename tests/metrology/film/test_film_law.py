@@ -30,7 +30,7 @@ def test_bowl_solves_the_differential_equation(
     prestrain: float, poisson: float, pressure_pa: float
 ) -> None:
     law = FilmLaw(prestrain, poisson, STIFFNESS, RADIUS_MM)
-    bowl = law.under(pressure_pa)
+    bowl = law.under_pressure(pressure_pa)
     load = pressure_pa * 0.5 / STIFFNESS
     strain = prestrain / load ** (2 / 3)
     sag_mm = RADIUS_MM * load ** (1 / 3) * film_solution(strain, poisson).y[2, -1] / 2
@@ -42,7 +42,7 @@ def test_bowl_solves_the_differential_equation(
 
 def test_the_sag_alone_gives_the_same_film_as_the_pressure() -> None:
     law = FilmLaw(3e-4, 0.38, STIFFNESS, RADIUS_MM)
-    under = law.under(np.array([[350.0], [600.0], [900.0]]))
+    under = law.under_pressure(np.array([[350.0], [600.0], [900.0]]))
     with_sag = law.with_sag(under.sag_mm)
     assert law.pressure_pa(with_sag) == pytest.approx(law.pressure_pa(under), rel=1e-11)
     assert with_sag.height_mm(RHO) == pytest.approx(under.height_mm(RHO), abs=1e-11)
@@ -51,7 +51,7 @@ def test_the_sag_alone_gives_the_same_film_as_the_pressure() -> None:
 def test_a_drum_is_a_paraboloid_of_the_linear_membrane() -> None:
     """p a^2 / (4 N) with N = E t e / (1 - nu); the next term is of the order of q^(2/3) / e."""
     law = FilmLaw(0.3, 0.35, STIFFNESS, RADIUS_MM)
-    bowl = law.under(0.1)
+    bowl = law.under_pressure(0.1)
     linear_mm = 0.1 * 0.25 / (4 * STIFFNESS * 0.3 / 0.65) * 1e3
     assert bowl.height_mm(RHO) == pytest.approx(linear_mm * RHO**2, rel=1e-6)
 
@@ -59,7 +59,7 @@ def test_a_drum_is_a_paraboloid_of_the_linear_membrane() -> None:
 def test_forces_balance_the_pressure() -> None:
     """Inside any radius the film's pull along z carries the load: 2 r N_r h' = p r^2."""
     law = FilmLaw(2e-4, 0.3, STIFFNESS, RADIUS_MM)
-    bowl = law.under(640.0)
+    bowl = law.under_pressure(640.0)
     radial, hoop = bowl.stresses(RHO)
     pull = 2 * radial * STIFFNESS * bowl.rise_mm(RHO) / RADIUS_MM
     assert pull == pytest.approx(640.0 * 0.5 * RHO, rel=1e-12)
@@ -68,7 +68,7 @@ def test_forces_balance_the_pressure() -> None:
 
 def test_a_film_that_no_ring_holds_is_refused() -> None:
     with pytest.raises(ValueError, match="slack at its ring"):
-        FilmLaw(-6e-3, 0.3, STIFFNESS, RADIUS_MM).under(600.0)
+        FilmLaw(-6e-3, 0.3, STIFFNESS, RADIUS_MM).under_pressure(600.0)
     with pytest.raises(ValueError, match=r"poisson = 0.6 is outside 0 .. 0.5"):
         FilmLaw(0.0, 0.6, STIFFNESS, RADIUS_MM)
 
@@ -78,7 +78,7 @@ def test_disturbances_of_the_ring() -> None:
     second order.
     """
     law = FilmLaw(4e-4, 0.35, STIFFNESS, RADIUS_MM)
-    bowl = law.under(600.0)
+    bowl = law.under_pressure(600.0)
     amounts: dict[tuple[HarmonicCause, int], float] = {
         ("prestrain", 2): 6e-5,
         ("flat", 3): 0.1,

@@ -22,7 +22,7 @@ def test_profile_solves_the_equation() -> None:
 def test_published_constants() -> None:
     """Centre coefficient 0.65344 and volume factor 0.5214 for nu = 0.3 (Fichter, NASA TP-3658)."""
     v = np.linspace(0, 1, 20001)
-    bowl = FilmLaw(0.0, 0.3, 1.0, 1.0).under(1e3)  # q = 1 for a radius of 1 mm
+    bowl = FilmLaw(0.0, 0.3, 1.0, 1.0).under_pressure(1e3)  # q = 1 for a radius of 1 mm
     assert float(bowl.sag_mm) == pytest.approx(0.65344, abs=1e-5)
     assert 1 - np.trapezoid(hencky_bowl.bowl_profile(np.sqrt(v)), v) == pytest.approx(
         0.5214, abs=1e-4

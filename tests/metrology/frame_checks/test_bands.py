@@ -219,7 +219,7 @@ def test_the_gain_belongs_to_the_picture_that_it_was_found_in() -> None:
     found, *_ = remove_bands(stack, bin_frames(stack, 4095))
     order = [1, 0, *range(2, 8)]
     assert found.gain is not None
-    moved = found.reordered(order).gain
+    moved = found.exchange_frames(order).gain
     assert moved is not None
     np.testing.assert_array_equal(moved, found.gain[order])
 

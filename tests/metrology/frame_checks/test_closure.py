@@ -73,8 +73,8 @@ def test_four_steps_alone_show_the_fault_but_no_suspect():
         15, rel=0.01
     )  # (I0 - I1 + I2 - I3) / 2 for one degree of freedom
     np.testing.assert_allclose(result.frame_rms_adu, 7.5, rtol=0.01)
-    assert result.suspect is None
-    assert result.gain == 1
+    assert result.suspect_frame is None
+    assert result.residual_ratio == 1
 
 
 @pytest.mark.parametrize("shifts", [equal_shifts(6), np.array([0.0, 1.1, 2.9, 3.3, 5.2, 5.9])])
@@ -125,8 +125,8 @@ def test_images_and_lists_of_pixels_give_the_same():
         == flat.rms_adu
     )
     assert (
-        closure_with_phase(image, shifts, phase.reshape(50, 80)).gain
-        == closure_with_phase(frames, shifts, phase).gain
+        closure_with_phase(image, shifts, phase.reshape(50, 80)).residual_ratio
+        == closure_with_phase(frames, shifts, phase).residual_ratio
     )
 
 

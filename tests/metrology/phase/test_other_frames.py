@@ -115,7 +115,9 @@ def test_the_example_of_the_page_measures_another_bench() -> None:
     rotation = np.stack([right, np.cross(forward, right), forward])
     truth = TrueFilm(0.0, {4: 21.2, 5: 0.2, 8: -0.1})
     s_x, s_y = np.array([-1.0, 0, 0]), np.array([0.0, 1, 0])
-    bench = Geometry(camera, rotation, 3000.0, (319.5, 239.5), (), screen, s_x, s_y, Face.of(None))
+    bench = Geometry(
+        camera, rotation, 3000.0, (319.5, 239.5), (), screen, s_x, s_y, Face.from_config(None)
+    )
     columns, rows = (
         a.ravel().astype(float) for a in np.meshgrid(np.arange(640.0)[::4], np.arange(480.0)[::4])
     )

@@ -24,7 +24,7 @@ def test_sums_are_those_of_the_pixels(bin_px: int, kind: type) -> None:
     frames = RNG.integers(0, top + 1, (2, 50, 71)).astype(kind)
     frames[0, : 2 * bin_px] = top  # the largest sum there can be
     binner = Binner(50, 71, bin_px, top, 2)
-    binner.add(frames, [1, 0])
+    binner.sum_frames(frames, [1, 0])
     rows, columns = 50 // bin_px, 71 // bin_px
     blocks = frames[:, : rows * bin_px, : columns * bin_px].reshape(
         2, rows, bin_px, columns, bin_px
@@ -36,9 +36,9 @@ def test_sums_are_those_of_the_pixels(bin_px: int, kind: type) -> None:
 def test_only_watched_frames_count_as_saturated() -> None:
     binner = Binner(8, 8, 4, 255, 2)
     bright = np.full((8, 8), 255, np.uint8)
-    binner.add([bright, bright], [0, 1], watched=[1])
+    binner.sum_frames([bright, bright], [0, 1], watched=[1])
     assert np.all(binner.saturated == 16)
-    binner.clear()
+    binner.clear_saturation()
     assert not binner.saturated.any()
 
 
@@ -46,11 +46,11 @@ def test_views_and_read_only_frames_are_accepted() -> None:
     frames = RNG.integers(0, 255, (8, 24)).astype(np.uint8)
     binner = Binner(8, 8, 4, 255, 1)
     view = frames[:, ::3]
-    binner.add([view], [0])
+    binner.sum_frames([view], [0])
     before = binner.sums.copy()
     copy = view.copy()
     copy.setflags(write=False)
-    binner.add([copy], [0])
+    binner.sum_frames([copy], [0])
     assert np.array_equal(binner.sums, before)
 
 
@@ -60,7 +60,7 @@ def test_views_and_read_only_frames_are_accepted() -> None:
 )
 def test_wrong_frames_are_refused(frame: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Binner(8, 8, 4, 255, 1).add([frame], [0])
+        Binner(8, 8, 4, 255, 1).sum_frames([frame], [0])
 
 
 @compile_kernel

@@ -60,13 +60,13 @@ def _error_um(surface: Surface) -> float:
 
 def test_the_map_passes_through_its_nodes_and_a_cubic_is_exact() -> None:
     x, y = np.meshgrid(NODES_X, NODES_Y)
-    face = Face.of(ScreenPoseConfig(height_map=MAP))
+    face = Face.from_config(ScreenPoseConfig(height_map=MAP))
     assert face.heights(np.stack([x, y]))[0] == pytest.approx(np.array(MAP.heights_mm), abs=1e-12)
 
     def cubic(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.asarray(1e-7 * a**3 - 2e-5 * a * b + 3e-8 * b**3 + 1e-3 * b)
 
-    face = Face.of(ScreenPoseConfig(height_map=_map(NODES_X, NODES_Y, cubic(x, y))))
+    face = Face.from_config(ScreenPoseConfig(height_map=_map(NODES_X, NODES_Y, cubic(x, y))))
     a, b = RNG.uniform(-200, 200, (2, 50))
     w, by_a, by_b = face.heights(np.stack([a, b]))
     assert w == pytest.approx(cubic(a, b), abs=1e-11)
@@ -77,18 +77,20 @@ def test_the_map_passes_through_its_nodes_and_a_cubic_is_exact() -> None:
 def test_few_nodes_make_a_bow_or_a_plane() -> None:
     points = RNG.uniform(-190, 190, (2, 40))
     x, y = np.meshgrid([-200.0, 0, 200], [-200.0, 0, 200])
-    bowed = Face.of(ScreenPoseConfig(height_map=_map(x[0], y[:, 0], 1.5 * (x**2 + y**2) / 200**2)))
-    assert bowed.heights(points) == pytest.approx(
-        Face.of(ScreenPoseConfig(bow_mm=1.5)).heights(points), abs=1e-12
+    bowed = Face.from_config(
+        ScreenPoseConfig(height_map=_map(x[0], y[:, 0], 1.5 * (x**2 + y**2) / 200**2))
     )
-    tilted = Face.of(
+    assert bowed.heights(points) == pytest.approx(
+        Face.from_config(ScreenPoseConfig(bow_mm=1.5)).heights(points), abs=1e-12
+    )
+    tilted = Face.from_config(
         ScreenPoseConfig(height_map=_map(np.array([-200.0, 200]), y[:, 0], 0.01 * x[:, ::2]))
     )
     assert tilted.heights(points)[0] == pytest.approx(0.01 * points[0], abs=1e-12)
 
 
 def test_beyond_the_map_the_height_of_its_edge_continues() -> None:
-    face = Face.of(ScreenPoseConfig(height_map=MAP))
+    face = Face.from_config(ScreenPoseConfig(height_map=MAP))
     edge, beyond = face.heights(np.array([[250.0, 400.0], [30.0, 30.0]])).T
     assert beyond[0] == pytest.approx(edge[0])
     assert beyond[1] == 0
@@ -108,9 +110,9 @@ def test_rays_meet_the_face_where_the_twin_has_them() -> None:
         screen_pose(optics.geometry),
     )
     inside = seen.on_film(475.0)
-    points = Points.of(rays[:, inside], np.zeros((2, int(inside.sum()))))
+    points = Points.from_rays(rays[:, inside], np.zeros((2, int(inside.sum()))))
     tracer, surface = Tracer(geometry, 500.0), Surface.hencky_bowl(37.1, 500.0)
-    tracer.start(points, surface.height)
+    tracer.place_on_shape(points, surface.height)
     tracer.intersect(points, surface, newton=3)
     found = tracer.predict_screen(points, surface)
     there = np.stack([seen.s_x_mm, seen.s_y_mm])[:, inside]
@@ -128,8 +130,8 @@ def test_the_calibration_follows_rays_to_the_same_face() -> None:
     rays = geometry.rays(columns, rows)
     plane = geometry.pinhole_mm[:2, None] - geometry.pinhole_mm[2] * rays[:2] / rays[2]
     inside = np.hypot(*plane) < 450
-    points = Points.of(rays[:, inside], np.zeros((2, int(inside.sum()))))
-    tracer.start(points, surface.height)
+    points = Points.from_rays(rays[:, inside], np.zeros((2, int(inside.sum()))))
+    tracer.place_on_shape(points, surface.height)
     tracer.intersect(points, surface, newton=3)
     seen = tracer.predict_screen(points, surface)
     phases = SetPhases("set", columns[inside], rows[inside], seen, np.ones(inside.sum()), 0.0)

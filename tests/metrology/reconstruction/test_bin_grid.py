@@ -23,8 +23,8 @@ FILM = Surface.from_parameters(PARAMETERS, RADIUS_MM)
 
 
 def _traced(rays: np.ndarray) -> tuple[Points, np.ndarray]:
-    points = Points.of(rays, np.zeros((2, rays.shape[1])))
-    TRACER.start(points, FILM.height)
+    points = Points.from_rays(rays, np.zeros((2, rays.shape[1])))
+    TRACER.place_on_shape(points, FILM.height)
     TRACER.intersect(points, FILM, 3)
     return points, TRACER.predict_screen(points, FILM)
 

@@ -98,7 +98,7 @@ def rig():
         screen_origin_mm=np.array([2000.0, -100.0, 10_000.0]),
         screen_s_x=np.array([1.0, 0.0, 0.0]),
         screen_s_y=np.array([0.0, 1.0, 0.0]),
-        face=Face.of(None),
+        face=Face.from_config(None),
     )
 
 

@@ -66,7 +66,7 @@ def _seen(film_name: str, stride: int = 2) -> Seen:
 
 
 def _points(seen: Seen) -> Points:
-    return Points.of(seen.rays, seen.screen_mm.copy())  # tests write on it
+    return Points.from_rays(seen.rays, seen.screen_mm.copy())  # tests write on it
 
 
 def _error_mm(surface: Surface, film: TrueFilm) -> np.ndarray:
@@ -123,7 +123,7 @@ def test_all_starts_end_in_one_surface(start) -> None:  # type: ignore[no-untype
 def test_kept_normal_matrix_has_the_same_end() -> None:
     points = _points(_seen("bowl"))
     renewed = fit_surface(TRACER, points, START, tolerance_mm=1e-12)
-    TRACER.start(points, START)
+    TRACER.place_on_shape(points, START)
     of_the_start = NormalMatrix.from_points(TRACER, points)
     kept = fit_surface(TRACER, points, START, normal=of_the_start, tolerance_mm=1e-12)
     assert kept.surface.parameters == pytest.approx(renewed.surface.parameters, abs=1e-10)
@@ -206,7 +206,7 @@ def test_measured_slopes_are_those_of_the_papers_scalar_equations() -> None:
     tan_theta = np.tan(0.5 * np.arctan(ae * np.cos(gap) / (pe - ae * np.sin(gap))))  # eq. tan2theta
     normal = film.normal(seen.film_mm[0], seen.film_mm[1])
     points = _points(seen)
-    TRACER.start(points, film.height)
+    TRACER.place_on_shape(points, film.height)
     measured = TRACER.slope_field(points, Surface(np.zeros(ZERNIKE_TERMS), 0.0, RADIUS_MM))[2]
     assert measured == pytest.approx(-normal[0] / normal[2], abs=1e-11)
     assert -tan_theta == pytest.approx(measured, abs=1e-11)

@@ -36,8 +36,8 @@ def grid() -> BinGrid:
 
 
 def placed(rays: Array) -> Points:
-    points = Points.of(rays, np.zeros((2, rays.shape[1])))
-    TRACER.start(points, FILM.height)
+    points = Points.from_rays(rays, np.zeros((2, rays.shape[1])))
+    TRACER.place_on_shape(points, FILM.height)
     TRACER.intersect(points, FILM, 3)
     return points
 

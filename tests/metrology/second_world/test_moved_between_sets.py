@@ -65,7 +65,7 @@ def test_motions_of_a_bench_at_rest_are_small_and_unnamed(
     assert after.budget is not None
     found = after.budget.find_motion(before.budget)
     assert found is not None
-    assert not found.is_sure
+    assert not found.is_proven
     sigmas_um = after.change_sigma_um(before)[:9]
     assert sigmas_um[0] < 0.3
     assert sigmas_um[1:].max() < 0.15

@@ -230,7 +230,7 @@ def test_jumps_at_steps_of_the_pattern_are_distinguished_from_noise_and_motion()
     )  # of that much the place explains
     assert known[1] == pytest.approx(0.0998, rel=0.05)
     assert (known[2:] < sigma[2:].clip(1e-9)).all()
-    jumps.begin()  # what was before is no jump
+    jumps.forget_frames()  # what was before is no jump
     assert not jumps.add_frame((9.0, 0.0), np.ones(ZERNIKE_TERMS))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
+from membrane_ctrl.metrology.numerics.grouped_sums import sum_by_group
 from membrane_ctrl.metrology.tracking.bin_cells import Cells
 from membrane_ctrl.metrology.tracking.light_kernels import light_left, light_waves
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -29,22 +29,26 @@ def disc_with_holes() -> NDArray[np.intp]:
 
 def test_each_bin_counts_once_and_those_that_repeat_it_not_at_all() -> None:
     bins = disc_with_holes()
-    index, counted, cells = Cells.of(bins, COLUMNS)
+    index, counted, cells = Cells.from_bins(bins, COLUMNS)
     assert sorted(index[counted]) == list(bins)
     assert index.size == 1024 * len(cells.offset)
-    assert cells.sums(counted).sum() == bins.size
-    assert set(np.unique(cells.sums(counted))) >= {1, 16}  # else nothing is shown
+    assert cells.sum_cells(counted).sum() == bins.size
+    assert set(np.unique(cells.sum_cells(counted))) >= {1, 16}  # else nothing is shown
     number = index // COLUMNS // 4 * COLUMNS + index % COLUMNS // 4  # of the square
-    own = cells.sums(number * counted) / np.maximum(cells.sums(counted), 1)
-    np.testing.assert_array_equal((cells.each(own) - number)[counted], 0)
+    own = cells.sum_cells(number * counted) / np.maximum(cells.sum_cells(counted), 1)
+    np.testing.assert_array_equal((cells.repeat_over_bins(own) - number)[counted], 0)
 
 
 def test_planes_through_the_bins_of_a_cell() -> None:
-    index, counted, cells = Cells.of(disc_with_holes(), COLUMNS)
+    index, counted, cells = Cells.from_bins(disc_with_holes(), COLUMNS)
     row, column = index // COLUMNS, index % COLUMNS
     sloped = (3.0 + 0.2 * row - 0.1 * column).astype(np.float32)
-    full = cells.each(cells.sums(counted)) > 4  # fewer may be in a row, which leaves a slope open
-    np.testing.assert_allclose(cells.spread(cells.planes(sloped))[full], sloped[full], atol=2e-3)
+    full = (
+        cells.repeat_over_bins(cells.sum_cells(counted)) > 4
+    )  # fewer may be in a row, which leaves a slope open
+    np.testing.assert_allclose(
+        cells.evaluate_planes(cells.fit_planes(sloped))[full], sloped[full], atol=2e-3
+    )
 
 
 @pytest.mark.parametrize("response", [(0.0, 0.0, 0.0, 0.0), (0.3, -0.2, 0.1, -0.05)])
@@ -54,7 +58,7 @@ def test_light_and_its_sums_are_those_of_the_formulas(response: tuple[float, ...
     def single(*shape: int, scale: float = 1.0) -> NDArray[np.float32]:
         return (scale * random.normal(size=shape)).astype(np.float32)
 
-    _, counted, cells = Cells.of(disc_with_holes(), COLUMNS)
+    _, counted, cells = Cells.from_bins(disc_with_holes(), COLUMNS)
     bins, squares = counted.size, 64 * len(cells.offset)
     base, light = single(2, bins, scale=2), 50 + single(3, bins, scale=5)
     slow = single(3, ZERNIKE_TERMS, 3, squares)  # derivatives of both phases; terms of the maps
@@ -66,10 +70,10 @@ def test_light_and_its_sums_are_those_of_the_formulas(response: tuple[float, ...
 
     x, y = (
         base
-        + cells.spread(np.einsum("k,akiq->aiq", changes[0], slow[:2]))
+        + cells.evaluate_planes(np.einsum("k,akiq->aiq", changes[0], slow[:2]))
         + shifts[:, None].astype(float)
     )
-    maps = 1 + cells.spread(np.einsum("mk,kiq->miq", changes[1:], slow[2])).astype(float)
+    maps = 1 + cells.evaluate_planes(np.einsum("mk,kiq->miq", changes[1:], slow[2])).astype(float)
     v = 0.5 + 0.25 * (np.cos(x) + np.cos(y))
     beyond = sum(c * (v**k - v) for k, c in enumerate(response, 2))
     slope = sum(c * (k * v ** (k - 1) - 1) for k, c in enumerate(response, 2))
@@ -91,11 +95,11 @@ def test_light_and_its_sums_are_those_of_the_formulas(response: tuple[float, ...
     weight = np.where(reach > 0, (1 - far**2) ** 2, 0)
     assert 0.1 < np.mean(weight == 0) < 0.9
     assert 0.1 < np.mean(weight == 1) < 0.9
-    pull = cells.moments(edge * weight * rest * gain * expected[:5])
+    pull = cells.sum_moments(edge * weight * rest * gain * expected[:5])
     by_surface = np.einsum("akiq,aiq->k", slow[:2].astype(float), pull[:2])
     by_maps = np.einsum("kiq,miq->mk", slow[2].astype(float), pull[2:])
 
-    shown = base, light, cells.blocks(*slow), cells.offset, bent, changes, shifts
+    shown = base, light, cells.arrange_blocks(*slow), cells.offset, bent, changes, shifts
     waves, out, right = (
         np.empty((6, bins), np.float32),
         np.empty((4, bins), np.float32),
@@ -137,5 +141,5 @@ def test_the_loop_over_bins_uses_vector_units() -> None:
 def test_sums_by_number() -> None:
     random = np.random.default_rng(3)
     number, values = random.integers(0, 9, 500), random.normal(size=(2, 500))
-    sums = sums_by(number, values, 12)
+    sums = sum_by_group(number, values, 12)
     np.testing.assert_allclose(sums, [np.bincount(number, one, 12) for one in values])

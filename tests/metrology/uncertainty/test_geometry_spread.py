@@ -44,7 +44,7 @@ def test_draws_have_the_covariance() -> None:
     covariance = np.array([[4.0, 1.8, 0.0], [1.8, 1.0, 0.01], [0.0, 0.01, 0.09]])
     spread = GeometrySpread(SHORT_NAMES, covariance)
     rng = np.random.default_rng(1)
-    draws = np.array([spread.draw(rng) for _ in range(20_000)])
+    draws = np.array([spread.draw_change(rng) for _ in range(20_000)])
     assert np.cov(draws, rowvar=False) == pytest.approx(covariance, abs=0.02 * 4)
     assert np.abs(draws.mean(axis=0) / spread.sigmas).max() < 0.03
 

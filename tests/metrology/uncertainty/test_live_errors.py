@@ -26,7 +26,9 @@ def vertex_sigma_um(moved_um: float, reading_um: float) -> float:
     quiet = np.zeros(FRAMES)
     film = moved_um * np.tile([1.0, -1.0], FRAMES // 2)
     seen = FrameErrors(quiet, quiet, quiet, film, np.zeros((2, 2)), np.zeros((2, 1)))
-    return math.sqrt(errors.own_mm2(seen, np.full(FRAMES, reading_um), 1.0, 0.0)[1, 1])
+    return math.sqrt(
+        errors.unshared_covariance_mm2(seen, np.full(FRAMES, reading_um), 1.0, 0.0)[1, 1]
+    )
 
 
 def test_a_film_that_moves_without_a_laser_leaves_the_vertex_unknown_by_half_its_motion() -> None:

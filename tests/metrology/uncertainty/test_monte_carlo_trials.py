@@ -31,7 +31,7 @@ from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from tests.support.rendered_sets import FILM, bench, patterns, stack_of
 
 OPTICS = bench()
-MAP = HeightMap.over(475.0, 500.0, 41)
+MAP = HeightMap.over_disc(475.0, 500.0, 41)
 NO_SPREAD = GeometrySpread((), np.zeros((0, 0)))
 
 
@@ -58,7 +58,7 @@ def _bench(displacement_um: float = 0.0) -> TrialBench:
     if displacement_um:
         checked = check_set(_stack(displacement_um, "fringes"), _anchored(), checked.make_anchor())
         figure = bin_figure(_anchored(), checked)
-    return TrialBench.of(OPTICS, checked, figure)
+    return TrialBench.from_set(OPTICS, checked, figure)
 
 
 def _anchored() -> OpticsConfig:
@@ -120,7 +120,7 @@ def test_noise_is_that_of_whole_measurements() -> None:
 def test_thinned_points_have_the_noise_of_all() -> None:
     checked, figure = _first()
     sigmas = [
-        MAP.sigma(noise_covariance(TrialBench.of(OPTICS, checked, figure, count))).mean()
+        MAP.sigma(noise_covariance(TrialBench.from_set(OPTICS, checked, figure, count))).mean()
         for count in (1500, 10**9)
     ]
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.05)
@@ -213,4 +213,4 @@ def _inside() -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_spread_too_wide() -> None:
     with pytest.raises(ArithmeticError, match="too wide"):
-        run_trials([_bench()], GeometrySpread.independent({"alpha_deg": 60.0}), 1, range(20))
+        run_trials([_bench()], GeometrySpread.from_sigmas({"alpha_deg": 60.0}), 1, range(20))

@@ -74,8 +74,8 @@ class Bench:
         rays = stated.rays(column.ravel(), row.ravel())
         place_mm = stated.pinhole_mm[:, None] - stated.pinhole_mm[2] / rays[2] * rays
         rays = rays[:, np.hypot(*place_mm[:2]) < 0.9 * optics.mirror.radius_mm]
-        points = Points.of(rays, np.zeros((2, rays.shape[1])))
-        tracer.start(points, surface.height)
+        points = Points.from_rays(rays, np.zeros((2, rays.shape[1])))
+        tracer.place_on_shape(points, surface.height)
         tracer.intersect(points, surface, newton=5)
         half_mm = optics.pattern.periods * optics.pattern.period_mm / 2
         screen_mm = tracer.predict_screen(points, surface)
@@ -95,7 +95,7 @@ class Bench:
         tracer.intersect(points, surface, newton=3)
         changes = bench_motions.screen_changes(stated, points.rays, points.t_mm, surface, 0.0)
         weights = np.ones((2, points.t_mm.size))
-        effects = MotionEffects.of(changes, jacobian, weights)
+        effects = MotionEffects.from_changes(changes, jacobian, weights)
 
         own = np.linalg.inv(np.einsum("apn,aqn->pq", jacobian, jacobian))
         scale = (1e-3 * noise_um) ** 2 / np.trace(own[2:, 2:])
@@ -113,7 +113,7 @@ class Bench:
         left += self.slopes.gram @ motion
         ring = ring_tilt()
         test = MotionTest(self.effects, ring @ change_mm2 @ ring.T, self.slopes, None)
-        found = test.find(ring @ moved_mm, np.zeros(2), left)
+        found = test.find_motions(ring @ moved_mm, np.zeros(2), left)
         doubt = find_motion_doubt(found, self.own_mm2, math.hypot(*(ring @ moved_mm)))
         to_coeffs = parameter_to_coeffs()
         covariance_mm2 = to_coeffs @ (change_mm2 + found.covariance_mm2) @ to_coeffs.T

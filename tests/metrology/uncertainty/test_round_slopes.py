@@ -38,7 +38,7 @@ def round_slopes(places: FloatArray) -> FloatArray:
 def test_waves_cancel_in_a_ring(amplitude_mm: float, lobes: int) -> None:
     places = points(1)
     slopes = round_slopes(places) + wave_slopes(places, amplitude_mm, lobes)
-    rings = RoundSlopes.of(places, np.ones(places.shape[1]), slopes, REACH_MM)
+    rings = RoundSlopes.from_points(places, np.ones(places.shape[1]), slopes, REACH_MM)
     middle = (rings.inner_mm + rings.outer_mm) / 2
     true = 2e-6 * (middle / REACH_MM) ** 9
     assert np.abs((rings.slope - true) / np.maximum(rings.sigma, 1e-8)).max() < 8.0
@@ -55,7 +55,7 @@ def test_white_noise_is_stated() -> None:
     z = []
     for _ in range(20):
         slopes = 1e-5 / 2 * rng.standard_normal(places.shape)
-        rings = RoundSlopes.of(places, count, slopes, REACH_MM)
+        rings = RoundSlopes.from_points(places, count, slopes, REACH_MM)
         z.append(rings.slope / rings.sigma)
         assert np.sqrt(rings.share).mean() * 1e-5 == pytest.approx(rings.sigma.mean(), rel=0.4)
     assert np.sqrt(np.mean(np.square(z))) == pytest.approx(1.1, abs=0.25)
@@ -66,7 +66,7 @@ def test_a_wave_that_looks_round_in_every_fourth_sector_is_in_the_sigma() -> Non
     places = points(4)
     radius, theta = np.hypot(*places), np.arctan2(places[1], places[0])
     slopes = 1e-4 * np.cos(18 * theta) * (radius / REACH_MM) ** 3 * places / radius
-    rings = RoundSlopes.of(places, np.ones(places.shape[1]), slopes, REACH_MM)
+    rings = RoundSlopes.from_points(places, np.ones(places.shape[1]), slopes, REACH_MM)
     assert np.all(np.abs(rings.slope) < 4 * rings.sigma + 1e-9)
 
 
@@ -74,7 +74,7 @@ def test_rings_that_are_partly_hidden() -> None:
     places = points(5)
     hidden = (np.hypot(*places) > 400) & (np.abs(np.arctan2(places[1], places[0])) > 0.2)
     count = np.where(hidden, 0.0, 1.0)
-    rings = RoundSlopes.of(places, count, round_slopes(places), REACH_MM)
+    rings = RoundSlopes.from_points(places, count, round_slopes(places), REACH_MM)
     middle = (rings.inner_mm + rings.outer_mm) / 2
     assert rings.slope == pytest.approx(2e-6 * (middle / REACH_MM) ** 9, abs=3e-7)
     assert np.isfinite(rings.slope).all()

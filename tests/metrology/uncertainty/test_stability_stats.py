@@ -100,7 +100,7 @@ def test_what_both_sets_share_cancels_trial_by_trial() -> None:
     finder = PairFinder((60.0,))
     finder.add(Moment("a", 0.0, np.zeros(ZERNIKE_TERMS), shared + own[0]))
     (pair,) = finder.add(Moment("b", 60.0, np.ones(ZERNIKE_TERMS), shared + own[1]))
-    assert pair.change == pytest.approx(np.ones(ZERNIKE_TERMS))
+    assert pair.change_mm == pytest.approx(np.ones(ZERNIKE_TERMS))
     assert np.sqrt(np.diag(pair.covariance)).mean() == pytest.approx(0.1 * math.sqrt(2), rel=0.05)
 
 

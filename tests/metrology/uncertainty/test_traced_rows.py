@@ -38,12 +38,12 @@ def bench() -> TrialBench:
     rays = geometry.rays(*places_px)
     on_plane_mm = geometry.pinhole_mm[:, None] - geometry.pinhole_mm[2] / rays[2] * rays
     near = np.hypot(*on_plane_mm[:2]) < 440.0
-    points = Points.of(rays[:, near], np.zeros((2, int(near.sum()))))
-    tracer.start(points, FILM.height)
+    points = Points.from_rays(rays[:, near], np.zeros((2, int(near.sum()))))
+    tracer.place_on_shape(points, FILM.height)
     tracer.intersect(points, FILM, newton=3)
     points.screen_mm[:] = tracer.predict_screen(points, FILM)
     exact = np.zeros(points.screen_mm.shape)
-    return TrialBench.of_points(OPTICS, tracer, FILM, points, places_px[:, near], exact, 10_000)
+    return TrialBench.from_points(OPTICS, tracer, FILM, points, places_px[:, near], exact, 10_000)
 
 
 def test_the_row_of_the_blur_is_the_error_of_blurred_phases(bench: TrialBench) -> None:
@@ -86,7 +86,7 @@ def test_a_blur_is_found_by_the_swings_of_its_fringes(sigma_px: float) -> None:
 
 def test_signatures_of_a_pair_are_the_changes_of_the_fitted_surface(bench: TrialBench) -> None:
     """A motion of 10 µm or µrad, and the fit to the screen points after it."""
-    signatures = PairMotion.of(bench).effects.figure_mm
+    signatures = PairMotion.from_bench(bench).effects.figure_mm
     geometry = bench.geometry().geometry
     rays = geometry.rays(bench.column_px, bench.row_px)
     changes = bench_motions.screen_changes(geometry, rays, bench.t_mm, FILM, 0.0)
@@ -115,7 +115,7 @@ def test_points_are_averaged_in_patches_of_a_fortieth_of_the_square() -> None:
     places_mm = np.array([[-395.0, -385.0, 5.0, 5.0], [-395.0, -395.0, 25.0, 35.0]])
     count = np.array([1.0, 3.0, 2.0, 2.0])
     slopes = np.array([[4.0, 8.0, 1.0, 3.0], [0.0, 4.0, -1.0, -1.0]])
-    found = Patches.of(places_mm, count, slopes, 400.0)
+    found = Patches.from_points(places_mm, count, slopes, 400.0)
     corner, middle = 0, 21 * 40 + 20
     assert np.flatnonzero(found.count).tolist() == [corner, middle]
     assert found.count[[corner, middle]].tolist() == [4.0, 4.0]

@@ -130,7 +130,9 @@ def test_a_line_that_one_rate_cannot_see_makes_no_other(seed: int) -> None:
 
 
 def test_a_hold_does_not_tell_of_a_line_that_may_be_another() -> None:
-    assert VibrationFollower().search(*watched(4, lines_hz=(48.0,), rates_hz=(20.0,))[:2]) == []
+    assert (
+        VibrationFollower().search_minute(*watched(4, lines_hz=(48.0,), rates_hz=(20.0,))[:2]) == []
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -178,7 +180,7 @@ def test_a_night_of_steps_and_outliers_shows_no_vibration() -> None:
             * rng.normal(size=(9, ZERNIKE_TERMS))[np.floor((time_s - time_s[0]) / 10).astype(int)]
         )
         coeffs_um[rng.integers(0, time_s.size, 5)] += rng.normal(size=(5, ZERNIKE_TERMS))
-        assert listener.search(time_s, coeffs_um) == []
+        assert listener.search_minute(time_s, coeffs_um) == []
 
 
 @pytest.mark.campaign
@@ -230,7 +232,7 @@ def heard(
         modes = tuple(VibrationMode(hz, 0.01, 5.0, SHAPES[k], 100.0) for k, hz in found.items())
         monkeypatch.setattr(mode_follower, "find_modes", lambda *_, modes=modes: modes)
         told.append(
-            listener.search(
+            listener.search_minute(
                 day * DAY_S + 60.0 * minute + np.arange(0.0, 60.0, 0.05),
                 np.zeros((1200, ZERNIKE_TERMS)),
             )
@@ -388,7 +390,7 @@ def test_a_line_found_once_at_the_strokes_gives_no_notice(monkeypatch: pytest.Mo
 @pytest.mark.campaign
 def test_a_follower_finds_planted_vibrations() -> None:
     time_s, coeffs_um, planted = watched(1, lines_hz=(48.0,))
-    (told,) = VibrationFollower().search(time_s, coeffs_um)
+    (told,) = VibrationFollower().search_minute(time_s, coeffs_um)
     assert isinstance(told, Vibrations)
     assert told.frequency_hz == pytest.approx([planted[0].frequency_hz], abs=0.05)
 
