@@ -34,11 +34,16 @@ class GridFit:
         # The terms as sums of products of Legendre polynomials, which are well conditioned:
         # coefficients (terms, degree + 1, degree + 1).
         degree = max(n for n, _ in orders)
-        powers = [poly2leg(power) for power in np.eye(degree + 1)]
-        to_legendre = np.stack([np.pad(p, (0, degree + 1 - p.size)) for p in powers])
-        self._terms = np.stack(
-            [to_legendre.T @ radial_polynomial(n, m, degree) @ to_legendre for n, m in orders]
-        )
+        rows = []
+        for power in np.eye(degree + 1):
+            series = poly2leg(power)
+            rows.append(np.pad(series, (0, degree + 1 - series.size)))
+        to_legendre = np.stack(rows)
+        terms = []
+        for n, m in orders:
+            in_powers = radial_polynomial(n, m, degree)
+            terms.append(to_legendre.T @ in_powers @ to_legendre)
+        self._terms = np.stack(terms)
 
         # Legendre polynomials (points, degree + 1) along the columns and the rows.
         self._x = legvander(x, degree)
@@ -52,8 +57,20 @@ class GridFit:
         self._gram = np.einsum("kba,acbd,ldc->kl", self._terms, moments, self._terms, optimize=True)
 
     def coefficients(self, values: FloatArray) -> FloatArray:
-        """Coefficients (terms,) of a map (H, W); cells outside the mask are not read."""
-        moments = self._y.T @ np.where(self._mask, values, 0.0) @ self._x
+        """Fit a map.
+
+        Parameters
+        ----------
+        values : (H, W) array
+            The map; cells outside the mask are not read.
+
+        Returns
+        -------
+        (terms,) array
+            Coefficients, in the map's unit.
+        """
+        inside = np.where(self._mask, values, 0.0)
+        moments = self._y.T @ inside @ self._x
         right = np.einsum("kba,ab->k", self._terms, moments)
         return np.asarray(np.linalg.lstsq(self._gram, right, rcond=1e-12)[0])
 

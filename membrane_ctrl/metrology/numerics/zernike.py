@@ -97,6 +97,7 @@ def radial_polynomial(n: int, m: int, degree: int) -> FloatArray:
     half = (n - order) // 2
     out = np.zeros((degree + 1, degree + 1))
     for k in range(half + 1):
+        # (n - k)! / (k! ((n + m) / 2 - k)! ((n - m) / 2 - k)!), as two binomials.
         radial = (-1) ** k * math.comb(n - k, k) * math.comb(n - 2 * k, half - k)
         p = half - k
         for s in range(p + 1):  # u^p: binomial times x^2s y^2(p - s)
@@ -122,11 +123,15 @@ def evaluate_terms(x: FloatArray, y: FloatArray, table: FloatArray | None = None
     """
     if table is None:
         table = monomial_table()
+
+    # The monomials x^p y^q with p + q <= degree; the others' coefficients are 0.
     orders = range(ZERNIKE_DEGREE + 1)
-    p, q = np.array([(p, q) for p in orders for q in range(ZERNIKE_DEGREE + 1 - p)]).T
+    exponents = [(p, q) for p in orders for q in range(ZERNIKE_DEGREE + 1 - p)]
+    p, q = np.array(exponents).T
     powers_x = np.stack([x**k for k in orders])
     powers_y = np.stack([y**k for k in orders])
-    return np.asarray(np.tensordot(table[:, p, q], powers_x[p] * powers_y[q], axes=1))
+    monomials = powers_x[p] * powers_y[q]
+    return np.asarray(np.tensordot(table[:, p, q], monomials, axes=1))
 
 
 def evaluate_gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -85,7 +85,8 @@ def find_clip_levels(frames: Sequence[Image], full_scale_adu: int) -> ClipLevels
 
 def _thin(frames: Sequence[Image]) -> AnyArray:
     """Return every n-th pixel of the rows and of the columns; n is odd, for Bayer sensors."""
-    step = int((len(frames) * frames[0].size / _SAMPLES) ** 0.5)
+    pixels = len(frames) * frames[0].size
+    step = int((pixels / _SAMPLES) ** 0.5)
     step += 1 - step % 2
     return np.stack([frame[::step, ::step] for frame in frames])
 
@@ -95,7 +96,9 @@ def _piled_level(levels: IntArray, counts: IntArray, pile: float) -> int | None:
     total = int(counts.sum())
     if not total:
         return None
-    extreme = int(np.searchsorted(np.cumsum(counts), _STRAY_SHARE * total, side="right"))
+    # The extreme level, but for a few stray pixels beyond it, and the levels beside it.
+    stray = _STRAY_SHARE * total
+    extreme = int(np.searchsorted(np.cumsum(counts), stray, side="right"))
     beside = counts[extreme + 1 : extreme + 1 + _NEIGHBOURS]
     if len(beside) < _NEIGHBOURS or counts[extreme] < _LEAST_SHARE * total:
         return None

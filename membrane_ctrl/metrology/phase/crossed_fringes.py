@@ -35,10 +35,14 @@ def crossed_phasors(
     stack = np.asarray(frames, float)
     x = np.asarray(shifts_x_rad, float)
     y = np.asarray(shifts_y_rad, float)
-    design = np.stack([np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)], axis=1)
+
+    # I = A + C_x cos d_x - S_x sin d_x + C_y cos d_y - S_y sin d_y, linear in five unknowns.
+    columns = [np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)]
+    design = np.stack(columns, axis=1)
     if len(design) < _UNKNOWNS or np.linalg.cond(design) > _LARGEST_CONDITION:
         raise ValueError(
             f"{len(design)} pairs of phase steps do not determine the phases of crossed fringes"
         )
-    _, x_cos, x_sin, y_cos, y_sin = np.tensordot(np.linalg.pinv(design), stack, axes=1)
+    solved = np.tensordot(np.linalg.pinv(design), stack, axes=1)
+    _mean, x_cos, x_sin, y_cos, y_sin = solved
     return np.stack([x_cos + 1j * x_sin, y_cos + 1j * y_sin])

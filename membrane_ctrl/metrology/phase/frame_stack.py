@@ -110,7 +110,10 @@ class FrameStack:
         return self.light[:, frames]
 
     def exchange_frames(self, order: list[int]) -> "FrameStack":
-        """Return the set with pictures exchanged: frame k shows what `order[k]` did."""
+        """Return the set with pictures exchanged: frame k shows what `order[k]` did.
+
+        The light of the frames is forgotten: it was measured with the wrong patterns.
+        """
         gain = self.gain
         if gain is not None:
             gain = gain[order]
@@ -136,8 +139,21 @@ class FrameStack:
 
 
 def find_frames_before(time_s: FloatArray) -> tuple[int, ...] | None:
-    """Return the frame that was taken before each; None if not all times are known."""
-    if not np.isfinite(time_s).all() or np.unique(time_s).size < time_s.size:
+    """Find the frame that was taken before each.
+
+    Parameters
+    ----------
+    time_s : (frames,) array
+        When each frame was taken, NaN without.
+
+    Returns
+    -------
+    tuple of int or None
+        Its number; -1 for the first. None if a time is unknown, or two are equal.
+    """
+    if not np.isfinite(time_s).all():
+        return None
+    if np.unique(time_s).size < time_s.size:
         return None
     order = np.argsort(time_s)
     before = np.full(time_s.size, -1)
@@ -199,8 +215,12 @@ def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
         Bins of up to 4 x 4 pixels, as large as enough of them allow.
     """
     bin_px = bin_side_px(stack.size_px)
+
+    # Where the camera clips, by the sinusoids: each pixel is bright in one of them.
     sinusoids = [k for axis in AXES for k in stack.sinusoids(axis) if k not in stack.unusable]
     clip = find_clip_levels([stack.frames[k] for k in sinusoids], full_scale_adu)
+
+    # Means of one frame after the other; a bin is clipped if any of its pixels is.
     binner = Binner(*stack.size_px, bin_px, clip.white_adu, 1)
     shape = (len(stack.patterns), *binner.saturated.shape)
     means = np.empty(shape, np.float32)
@@ -223,6 +243,7 @@ def _find_black_bins(frames: Image, bin_px: int, black_adu: int) -> BoolArray:
     columns = width // bin_px
     black = np.empty((count, rows, columns), bool)
     for k, frame in enumerate(frames):
-        blocks = frame[: rows * bin_px, : columns * bin_px].reshape(rows, bin_px, columns, bin_px)
+        whole_bins = frame[: rows * bin_px, : columns * bin_px]
+        blocks = whole_bins.reshape(rows, bin_px, columns, bin_px)
         black[k] = blocks.min(axis=(1, 3)) <= black_adu
     return black

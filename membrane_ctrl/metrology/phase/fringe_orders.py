@@ -93,14 +93,17 @@ def resolve_orders_by_votes(
     if mask.any():
         regions = region.max() + 1
     votes = np.zeros((regions, 2 * _MOST_ORDERS + 1), np.int64)
-    ballot = np.clip(lacking[is_voting], -_MOST_ORDERS, _MOST_ORDERS).astype(np.int64)
+    in_range = np.clip(lacking[is_voting], -_MOST_ORDERS, _MOST_ORDERS)
+    ballot = in_range.astype(np.int64)
     np.add.at(votes, (region[is_voting], ballot + _MOST_ORDERS), 1)
+
+    # The most frequent vote of each region; a region of few pixels has none.
     winner = np.zeros(0)
     if regions:
         winner = np.argmax(votes, axis=1) - float(_MOST_ORDERS)
     winner[votes.sum(axis=1) < _LEAST_VOTES] = np.nan
 
-    # The winner holds for the whole region.
+    # The winner holds for the whole region. If few pixels agree with it, the phase itself is wrong.
     shift = np.full(mask.shape, np.nan)
     shift[mask] = winner[region[mask]]
     is_known = np.isfinite(shift) & is_voting

@@ -46,16 +46,21 @@ def decode_full(
     slots = FullSlots(pattern.steps)
     if len(images) != slots.count:
         raise ValueError(f"a full cycle has {slots.count} frames, not {len(images)}")
+    # Pixels that see the screen, by the difference of white and black.
     white = images[slots.white]
     black = images[slots.black]
     contrast = white - black
-    some = contrast.ravel()[:: max(1, contrast.size // _ENOUGH_PIXELS)]
-    valid = contrast > CONTRAST_SHARE * np.percentile(some, _BRIGHTEST_PERCENTILE)
+    stride = max(1, contrast.size // _ENOUGH_PIXELS)
+    bright = np.percentile(contrast.ravel()[::stride], _BRIGHTEST_PERCENTILE)
+    valid = contrast > CONTRAST_SHARE * bright
+
+    # Of each axis: wrapped phase (paper, eq. 1), fringe orders, absolute phase (paper, eq. 2).
     phases = []
     for sinusoids, gray, shifts in zip(slots.sinusoids, slots.gray, shifts_rad, strict=True):
         phasor = compute_phasors(images[sinusoids], shifts)
         k1, k2 = gray_orders(images[gray], white, black)
         phase_rad = absolute_phase(np.angle(phasor), k1, k2)
         phases.append(phase_rad)
-        valid &= (np.abs(phasor) > FRINGE_SHARE * contrast) & inside_pattern(phase_rad, pattern)
+        has_fringes = np.abs(phasor) > FRINGE_SHARE * contrast
+        valid &= has_fringes & inside_pattern(phase_rad, pattern)
     return np.where(valid, np.stack(phases), np.nan)

@@ -59,13 +59,27 @@ def code_orders(bits: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def absolute_phase(wrapped_rad: FloatArray, k1: IntArray, k2: IntArray) -> FloatArray:
-    """Absolute phase (...) by the paper's eq. 2, counted from -pi at the low edge.
+    """Absolute phase from wrapped phase and fringe orders (paper, eq. 2).
 
-    `wrapped_rad` (...) is in (-pi, pi], `k1` and `k2` (...) are the orders of `gray_orders`.
+    Parameters
+    ----------
+    wrapped_rad : (...) array
+        Phase in (-pi, pi].
+    k1, k2 : (...) int arrays
+        The orders of `gray_orders`.
+
+    Returns
+    -------
+    (...) array
+        In rad, counted from -pi at the low edge.
     """
     near_low_end = wrapped_rad <= -math.pi / 2
     near_high_end = wrapped_rad >= math.pi / 2
-    order = np.where(near_low_end, k2, np.where(near_high_end, k2 - 1, k1))
+
+    # Each order is used a quarter period away from its own jumps: K2, which jumps in the middle of
+    # a period, near the ends; K1, which jumps at the ends, in the middle.
+    order = np.where(near_high_end, k2 - 1, k1)
+    order = np.where(near_low_end, k2, order)
     return wrapped_rad + 2 * math.pi * order
 
 
@@ -89,10 +103,13 @@ def gray_bit(phase_rad: FloatArray, bit: int) -> tuple[BoolArray, FloatArray]:
     from_edge_rad : (...) array
         Distance to where the bit changes.
     """
+    # The half period V2 at the phase, its Gray code, and the bit of this frame in it.
     half_periods = (phase_rad + math.pi) / math.pi
     v2 = np.floor(np.nan_to_num(half_periods)).astype(np.int64)
     gray = v2 ^ (v2 >> 1)
     shown = (gray >> (4 - bit)) & 1
+
+    # The bit changes at odd multiples of this spacing, in half periods.
     spacing = 2 ** (4 - bit)
     from_edge = np.abs(half_periods % (2 * spacing) - spacing)
     return shown.astype(bool), from_edge * math.pi

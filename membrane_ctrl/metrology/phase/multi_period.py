@@ -62,7 +62,8 @@ def places_mm(
     """
     periods = np.asarray(periods_mm, float)
     low, high = range_mm
-    is_valid = periods.shape == (len(wrapped_rad),) and periods.size >= 2 and (periods > 0).all()
+    matches = periods.shape == (len(wrapped_rad),)
+    is_valid = matches and periods.size >= 2 and (periods > 0).all()
     if not is_valid or not high > low:
         raise ValueError(
             f"{len(wrapped_rad)} phases need as many periods, at least two, all above zero, "
@@ -73,9 +74,12 @@ def places_mm(
     # The lowest place in the range that the shortest period allows.
     shortest = int(np.argmin(periods))
     pitch_mm = float(periods.min())
-    first_mm = np.mod(turns[shortest] - low / pitch_mm, 1.0) * pitch_mm + low
+    turns_beyond_low = np.mod(turns[shortest] - low / pitch_mm, 1.0)
+    first_mm = turns_beyond_low * pitch_mm + low
 
-    turns_per_mm = (1 / periods).reshape(-1, *[1] * first_mm.ndim)
+    # Each order of the shortest period is a hypothesis; the best and the second best chi-square.
+    axes_of_pixels = [1] * first_mm.ndim
+    turns_per_mm = (1 / periods).reshape(-1, *axes_of_pixels)
     best = np.full(first_mm.shape, np.inf)
     second = np.full(first_mm.shape, np.inf)
     place_mm = np.full(first_mm.shape, np.nan)

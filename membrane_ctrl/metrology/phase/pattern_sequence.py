@@ -27,12 +27,11 @@ def gray_codes(axis: str) -> tuple[Pattern, ...]:
 
 def full_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
     """All images of a full cycle: 2 (N + 4) + 2."""
-    by_axis = (
-        image
-        for axis in AXES
-        for image in (*sinusoid_patterns(axis, pattern.steps), *gray_codes(axis))
-    )
-    return (*by_axis, Pattern("white"), Pattern("black"))
+    images: list[Pattern] = []
+    for axis in AXES:
+        images += sinusoid_patterns(axis, pattern.steps)
+        images += gray_codes(axis)
+    return (*images, Pattern("white"), Pattern("black"))
 
 
 def fringe_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
@@ -41,7 +40,21 @@ def fringe_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
 
 
 class FullSlots:
-    """Positions of the images in the sequence of a full cycle."""
+    """Positions of the images in the sequence of a full cycle.
+
+    Parameters
+    ----------
+    steps : int
+        Phase steps of an axis, N.
+
+    Attributes
+    ----------
+    count : int
+        Images of the cycle, 2 (N + 4) + 2.
+    sinusoids, gray : (slice, slice)
+        Of x and of y.
+    white, black : int
+    """
 
     def __init__(self, steps: int) -> None:
         second = steps + GRAY_BITS  # where the y frames begin

@@ -37,8 +37,12 @@ def step_design(
     (N, 3) array
     """
     shifts = np.asarray(shifts_rad, float)
-    level, swing = np.ones((2, shifts.size)) if light is None else light
-    return np.stack([level, swing * np.cos(shifts), -swing * np.sin(shifts)], axis=1)
+    if light is None:
+        light = np.ones((2, shifts.size))
+    level, swing = light
+    by_cosine = swing * np.cos(shifts)
+    by_sine = -swing * np.sin(shifts)
+    return np.stack([level, by_cosine, by_sine], axis=1)
 
 
 def step_weights(
@@ -98,9 +102,11 @@ def compute_phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray)
     stack = np.asarray(frames)
     if stack.dtype != np.float32:
         stack = stack.astype(float)
+    # C and S of all pixels by one matrix product; the level A is not needed.
     weights = step_weights(shifts_rad)[1:].astype(stack.dtype)
     parts = weights @ stack.reshape(len(stack), -1)
-    out = np.empty(stack.shape[1:], np.result_type(stack, np.complex64))
+    complex_type = np.result_type(stack, np.complex64)
+    out = np.empty(stack.shape[1:], complex_type)
     out.real = parts[0].reshape(out.shape)
     out.imag = parts[1].reshape(out.shape)
     return out
@@ -112,7 +118,8 @@ def step_residual(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -
     Arguments and errors as in `compute_phasors`.
     """
     stack = np.asarray(frames, float)
-    projector = np.eye(len(stack)) - step_design(shifts_rad) @ step_weights(shifts_rad)
+    fitted = step_design(shifts_rad) @ step_weights(shifts_rad)
+    projector = np.eye(len(stack)) - fitted
     return np.asarray(np.tensordot(projector, stack, axes=1))
 
 

@@ -9,19 +9,25 @@ from membrane_ctrl.metrology.numerics.compiled import compile_step
 def branchless_arctan2(y, x):  # type: ignore[no-untyped-def]
     """Angle in [-pi, pi] without a branch, so that loops over it use vector units; (0, 0) gives 0.
 
-    The angle of the smaller over the larger coordinate is halved, tan(a/2) = t / (1 + sqrt(1 +
-    t^2)), which leaves t <= tan(pi/8), where 16 terms of the series of arctan leave less than
-    1e-13. Then follow the octant, the half plane x < 0 and the half plane y < 0.
+    The angle of the smaller over the larger coordinate is halved, which leaves t <= tan(pi/8),
+    where 16 terms of the series of arctan leave less than 1e-13.
     """
+    # The first octant, with 0 <= ratio <= 1; the smallest number keeps (0, 0) from 0 / 0.
     ax = abs(x)
     ay = abs(y)
     ratio = min(ax, ay) / (max(ax, ay) + 1e-300)
+
+    # Half the angle: tan(a / 2) = t.
     t = ratio / (1 + math.sqrt(1 + ratio * ratio))
+
+    # arctan t = t (1 - t^2/3 + t^4/5 - ...), by Horner's rule in t^2.
     square = t * t
     series = 0.0
     for k in range(15, -1, -1):
         series = 1.0 / (2 * k + 1) - square * series
     angle = 2 * t * series
+
+    # The other octant, then the half planes x < 0 and y < 0.
     angle = math.pi / 2 - angle if ay > ax else angle
     angle = math.pi - angle if x < 0 else angle
     return -angle if y < 0 else angle

@@ -37,8 +37,10 @@ def _flood_region(phase, mask, out, region, queue):  # type: ignore[no-untyped-d
                     continue
                 if not mask[r, c] or region[r, c] >= 0:
                     continue
+                # The whole periods between the wrapped phase and the neighbour's continuous one.
                 step = phase[r, c] - out[row, column]
-                out[r, c] = phase[r, c] - 2 * math.pi * math.floor(step / (2 * math.pi) + 0.5)
+                periods = math.floor(step / (2 * math.pi) + 0.5)
+                out[r, c] = phase[r, c] - 2 * math.pi * periods
                 region[r, c] = count
                 queue[tail] = r * width + c
                 tail += 1
@@ -76,7 +78,9 @@ def tear_share(phase_rad: FloatArray) -> float:
 
     0 if the phase does not depend on the way of the walk. NaN is left out.
     """
-    steps = np.concatenate([np.diff(phase_rad, axis=0).ravel(), np.diff(phase_rad, axis=1).ravel()])
+    down = np.diff(phase_rad, axis=0)
+    right = np.diff(phase_rad, axis=1)
+    steps = np.concatenate([down.ravel(), right.ravel()])
     steps = steps[np.isfinite(steps)]
     if steps.size:
         return float(np.mean(np.abs(steps) > math.pi))

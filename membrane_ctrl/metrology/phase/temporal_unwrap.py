@@ -99,6 +99,7 @@ def predict_phase(
         Phase in rad, not wrapped.
     """
     counts = np.asarray(periods, float)
-    kept = np.array([k for k in range(len(counts)) if k != index or k == 0])
+    others = [k for k in range(len(counts)) if k != index or k == 0]
+    kept = np.array(others)
     position = unwrap_in_time(wrapped_rad[kept], counts[kept]).screens
     return np.asarray(2 * math.pi * counts[index] * position)
