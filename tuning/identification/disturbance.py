@@ -16,13 +16,22 @@ _BLOCKS = 10  # of a record, whose variances show how steady the weather is
 
 @dataclass(frozen=True, slots=True)
 class DisturbanceModel:
-    """Disturbances of the centre, and the laser's noise."""
+    """Disturbances of the centre, and the laser's noise.
 
-    rest: Noise  # the laser's noise and the walks that no weather sensor explains
-    barometer: WeatherGain | None  # the part explained by the sensors
+    Attributes
+    ----------
+    rest : Noise
+        The laser's noise, and the walks that no weather sensor explains.
+    barometer, air : WeatherGain or None
+        The part that the sensors explain.
+    unsteady : float
+        Relative, 1 sigma: how far the standard deviation of ten other minutes may be from the
+        predicted one, by weather that comes and goes (gusts).
+    """
+
+    rest: Noise
+    barometer: WeatherGain | None
     air: WeatherGain | None
-    # Relative, 1 sigma: how far the standard deviation of ten other minutes may be from the one
-    # predicted, by weather that comes and goes (gusts)
     unsteady: float = 0.0
 
     @property
@@ -41,11 +50,15 @@ class DisturbanceModel:
         pump = closed_loop.compute_pump_response(model, w_rad_per_s, dt_s)
         total = self.rest.moving_psd(w_rad_per_s)
         for weather, used, gain, filter_s in self._list_channels(loop):
+            # The weather's own way to the centre, and the feed-forward's way through the pump.
             lag = 1 / (1 + 1j * w_rad_per_s * weather.lag_s)
-            reaction = (
-                gain * pump / (1 + 1j * w_rad_per_s * filter_s) if used else np.zeros_like(pump)
-            )
-            total = total + weather.psd(w_rad_per_s) * np.abs(weather.gain * lag - reaction) ** 2
+            reaction = np.zeros_like(pump)
+            if used:
+                reaction = gain * pump / (1 + 1j * w_rad_per_s * filter_s)
+            remaining = np.abs(weather.gain * lag - reaction) ** 2
+            total = total + weather.psd(w_rad_per_s) * remaining
+
+            # The sensor's noise, which only the feed-forward lets in.
             total = total + weather.noise**2 * dt_s * np.abs(reaction) ** 2
         return np.asarray(total, dtype=float)
 
@@ -53,43 +66,56 @@ class DisturbanceModel:
         """Two-sided spectrum of the flow that the loop's feed-forward asks for, (µm/s)^2 s."""
         total = np.zeros_like(w_rad_per_s)
         for weather, used, gain, filter_s in self._list_channels(loop):
-            rate = gain * w_rad_per_s / np.abs(1 + 1j * w_rad_per_s * filter_s) if used else 0.0
-            total = total + rate**2 * (weather.psd(w_rad_per_s) + weather.noise**2 * self.rest.dt_s)
+            if not used:
+                continue
+            # The filtered rate of the reading times its gain, for a true change and for noise.
+            rate = gain * w_rad_per_s / np.abs(1 + 1j * w_rad_per_s * filter_s)
+            reading = weather.psd(w_rad_per_s) + weather.noise**2 * self.rest.dt_s
+            total = total + rate**2 * reading
         return total
 
     def _list_channels(self, loop: LoopConfig) -> list[tuple[WeatherGain, bool, float, float]]:
         """Each weather sensor with its feed-forward: whether it is used, its gain and filter."""
-        channels = (
-            (
-                self.barometer,
-                loop.feedforward_barometer,
-                loop.barometer_gain_um_per_pa,
-                loop.feedforward_filter_s,
-            ),
-            (
-                self.air,
-                loop.feedforward_temperature,
-                loop.temperature_gain_um_per_k,
-                loop.gas_follows_air_s,
-            ),
-        )
-        return [
-            (of, used, gain, filter_s) for of, used, gain, filter_s in channels if of is not None
-        ]
+        channels = []
+        if self.barometer is not None:
+            used = loop.feedforward_barometer
+            gain_um_per_pa = loop.barometer_gain_um_per_pa
+            channels.append((self.barometer, used, gain_um_per_pa, loop.feedforward_filter_s))
+        if self.air is not None:
+            used = loop.feedforward_temperature
+            gain_um_per_k = loop.temperature_gain_um_per_k
+            channels.append((self.air, used, gain_um_per_k, loop.gas_follows_air_s))
+        return channels
 
 
 def observe_disturbance(
     record: Record, model: plant_model.PlantModel, loop: LoopConfig
 ) -> DisturbanceModel:
-    """Weather gains and noise from a quiet hold under any loop. Raises ValueError if it is too
-    short.
+    """Fit weather gains and noise to a quiet hold under any loop.
+
+    Parameters
+    ----------
+    record : Record
+        The hold.
+    model : PlantModel
+        The identified plant.
+    loop : LoopConfig
+        The loop that held, with its feed-forward.
+
+    Returns
+    -------
+    DisturbanceModel
+
+    Raises
+    ------
+    ValueError
+        The record is too short.
     """
     weather = fit_weather(record, model, loop.gas_follows_air_s)
     rest = fit_noise(weather.rest_um, record.dt_s, loop.gas_follows_air_s)
     found = DisturbanceModel(rest, weather.barometer, weather.air)
-    return replace(
-        found, unsteady=_std_uncertainty(record.filled_displacement_um(), found, model, loop)
-    )
+    unsteady = _std_uncertainty(record.filled_displacement_um(), found, model, loop)
+    return replace(found, unsteady=unsteady)
 
 
 def _std_uncertainty(
@@ -101,14 +127,18 @@ def _std_uncertainty(
     From the scatter of the variance among blocks of the record, after Wiener's filter, which leaves
     the movement.
     """
-    w = np.asarray(2 * np.pi * np.fft.rfftfreq(read_um.size, found.rest.dt_s), dtype=float)
+    # Wiener's filter: the share of the movement in the spectrum of the reading.
+    frequencies_hz = np.fft.rfftfreq(read_um.size, found.rest.dt_s)
+    w = np.asarray(2 * np.pi * frequencies_hz, dtype=float)
     w[0] = w[1]
     moving = found.psd(w, model, loop)
-    centre_um = np.fft.irfft(
-        np.fft.rfft(read_um - read_um.mean()) * moving / (moving + found.rest.white_psd),
-        read_um.size,
-    )
-    variances = np.mean(
-        centre_um[: read_um.size // _BLOCKS * _BLOCKS].reshape(_BLOCKS, -1) ** 2, axis=1
-    )
-    return float(variances.std(ddof=1) / max(variances.mean(), FLOOR) / 2 * math.sqrt(2 / _BLOCKS))
+    spectrum = np.fft.rfft(read_um - read_um.mean())
+    filtered = spectrum * moving / (moving + found.rest.white_psd)
+    centre_um = np.fft.irfft(filtered, read_um.size)
+
+    # Variances of the blocks; a relative error of a variance is twice that of its root.
+    used = read_um.size // _BLOCKS * _BLOCKS
+    variances = np.mean(centre_um[:used].reshape(_BLOCKS, -1) ** 2, axis=1)
+    scatter = variances.std(ddof=1) / max(variances.mean(), FLOOR)
+    two_records = math.sqrt(2 / _BLOCKS)
+    return float(scatter / 2 * two_records)

@@ -27,18 +27,38 @@ from tuning.identification.noise_spectrum import (
 from tuning.identification.record import Record, Series
 
 _BLOCK_S = 0.5  # with shorter blocks a barometer's noise hides its signal; longer ones blur events
+_KNOWN_SHARE = 0.1  # standard error over the gain, up to which the fitted gain is used
+_AGREEING_SIGMAS = 3.0
+_MOST_BETA = 0.99  # of the noise
+# Most of a sensor's variance that may be noise: one that shows only noise must not make the matrix
+# singular.
+_MOST_NOISE_SHARE = 0.9
 
 
 @dataclass(frozen=True, slots=True)
 class WeatherGain:
-    """A gain, its standard error, and the random walk of the sensor's quantity."""
+    """A gain of the weather on the centre, and the motion of the sensor's quantity.
 
-    gain: float  # µm per Pa or µm per K
+    Attributes
+    ----------
+    gain, sigma : float
+        µm per Pa or µm per K, and its standard error.
+    walk : float
+        Variance per second of the quantity's random walk, Pa^2/s or K^2/s.
+    noise : float
+        Standard deviation of a reading, Pa or K.
+    lag_s : float
+        Lag of the quantity's effect on the centre.
+    coloured : tuple of (float, float)
+        The quantity's motion that is no walk, as in `noise_spectrum.Coloured`.
+    """
+
+    gain: float
     sigma: float
-    walk: float  # variance per second of the quantity's random walk, Pa^2/s or K^2/s
-    noise: float  # standard deviation of a reading
-    lag_s: float  # lag of the quantity's effect on the centre
-    coloured: Coloured = ()  # the quantity's movement that is no walk
+    walk: float
+    noise: float
+    lag_s: float
+    coloured: Coloured = ()
 
     def psd(self, w_rad_per_s: Series) -> Series:
         """Two-sided spectrum of the quantity, unit^2 s."""
@@ -50,9 +70,11 @@ class WeatherGain:
         Steady weather reveals nothing about its gain; the bench's physics is then the better
         source.
         """
-        if self.sigma <= 0.1 * abs(self.gain):
+        if self.sigma <= _KNOWN_SHARE * abs(self.gain):
             return self.gain
-        return configured if abs(self.gain - configured) <= 3 * self.sigma else self.gain
+        if abs(self.gain - configured) <= _AGREEING_SIGMAS * self.sigma:
+            return configured
+        return self.gain
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,19 +87,37 @@ class WeatherFit:
 
 
 def lag_series(series: Series, lag_s: float, dt_s: float) -> Series:
-    """First-order lag that starts at its first input."""
+    """Series (n,) behind a first-order lag that starts at its first value."""
     share = lag_step_fraction(dt_s, lag_s)
-    followed = np.asarray(lfilter([share], [1.0, share - 1.0], series - series[0]), dtype=float)
+    from_first = series - series[0]
+    followed = np.asarray(lfilter([share], [1.0, share - 1.0], from_first), dtype=float)
     return followed + float(series[0])
 
 
 def fit_weather(
     record: Record, model: plant_model.PlantModel, gas_follows_air_s: float
 ) -> WeatherFit:
-    """Regress the motion not caused by the pump on the weather.
+    """Regress the motion that the pump does not cause on the weather.
 
-    `record` is a quiet hold of some minutes, `gas_follows_air_s` the lag of the gas behind the air.
+    Parameters
+    ----------
+    record : Record
+        A quiet hold of some minutes.
+    model : PlantModel
+        Gain, delay and lag of the pump.
+    gas_follows_air_s : float
+        Lag of the gas behind the air's temperature.
+
+    Returns
+    -------
+    WeatherFit
+
+    Raises
+    ------
+    ValueError
+        The record is too short for the sensors' noise (`fit_noise`).
     """
+    # The sensors that the record has, with the lag of their effect.
     z = remove_pump_motion_um(record, model)
     channels: list[tuple[Series, float]] = []
     if record.has_barometer:
@@ -88,50 +128,81 @@ def fit_weather(
         return WeatherFit(None, None, z)
     noises = [fit_noise(series, record.dt_s, 0.0) for series, _ in channels]
     columns = [lag_series(series, lag_s, record.dt_s) for series, lag_s in channels]
-    # of a lagged sensor's noise only dt / (2 T) of the variance passes the lag
-    shares = [1.0 if lag_s == 0 else record.dt_s / (2 * lag_s) for _, lag_s in channels]
+
+    # Variance of the noise in a block's mean. Of a lagged sensor's noise only dt / (2 T) of the
+    # variance passes the lag.
     per_block = max(1, round(_BLOCK_S / record.dt_s))
-    variances = np.array(
-        [n.white**2 * share / per_block for n, share in zip(noises, shares, strict=True)]
-    )
-    gains, sigmas = _regress_gains(z, columns, variances, per_block)
+    variances = []
+    for noise, (_, lag_s) in zip(noises, channels, strict=True):
+        passing_share = 1.0
+        if lag_s > 0:
+            passing_share = record.dt_s / (2 * lag_s)
+        variances.append(noise.white**2 * passing_share / per_block)
+    gains, sigmas = _regress_gains(z, columns, np.array(variances), per_block)
     found = [
-        WeatherGain(float(g), float(s), noise.fast, noise.white, lag_s, noise.coloured)
-        for g, s, noise, (_, lag_s) in zip(gains, sigmas, noises, channels, strict=True)
+        WeatherGain(float(gain), float(sigma), noise.fast, noise.white, lag_s, noise.coloured)
+        for gain, sigma, noise, (_, lag_s) in zip(gains, sigmas, noises, channels, strict=True)
     ]
-    rest = z - sum(g * (column - column[0]) for g, column in zip(gains, columns, strict=True))
-    return WeatherFit(
-        found[0] if record.has_barometer else None,
-        found[-1] if record.has_thermometer else None,
-        np.asarray(rest, dtype=float),
+
+    # The readings without pump and weather.
+    explained = sum(
+        gain * (column - column[0]) for gain, column in zip(gains, columns, strict=True)
     )
+    barometer = None
+    if record.has_barometer:
+        barometer = found[0]
+    air = None
+    if record.has_thermometer:
+        air = found[-1]
+    return WeatherFit(barometer, air, np.asarray(z - explained, dtype=float))
 
 
 def _regress_gains(
     z: Series, columns: list[Series], variances: Series, per_block: int
 ) -> tuple[Series, Series]:
-    """Gains and their standard errors, with the best-fitting beta of the noise."""
+    """Regress the readings on the sensors, with the best-fitting beta of the noise.
+
+    Parameters
+    ----------
+    z : (n,) array
+        Readings without the pump's motion, µm.
+    columns : list of (n,) arrays
+        The k sensors behind their lags.
+    variances : (k,) array
+        Variance of the noise in a block's mean.
+    per_block : int
+        Samples of a block.
+
+    Returns
+    -------
+    gains, sigmas : (k,) arrays
+    """
+    # Increments of the means over blocks, without their trend.
     used = z.size // per_block * per_block
-    blocks = np.array(
-        [column[:used].reshape(-1, per_block).mean(axis=1) for column in (z, *columns)]
-    )
-    moved = np.diff(blocks, axis=1)
+    means = [column[:used].reshape(-1, per_block).mean(axis=1) for column in (z, *columns)]
+    moved = np.diff(np.array(means), axis=1)
     moved -= moved.mean(axis=1, keepdims=True)
 
-    def fit(beta: float) -> tuple[Series, Series, float]:
+    def regress(beta: float) -> tuple[Series, Series, float]:
+        """Gains, sigmas and variance of the residual, for one beta."""
         white = lfilter([1.0], [1.0, -beta], moved, axis=1)
-        target, given = white[0], white[1:]
+        target = white[0]
+        given = white[1:]
+
+        # Normal equations without the sensors' own noise (Fuller).
         normal = given @ given.T
-        # a sensor that shows only noise must not make the matrix singular
-        noise = np.minimum(2 * variances / (1 + beta) * target.size, 0.9 * np.diag(normal))
+        expected_noise = 2 * variances / (1 + beta) * target.size
+        noise = np.minimum(expected_noise, _MOST_NOISE_SHARE * np.diag(normal))
         inverse = np.linalg.inv(normal - np.diag(noise))
         gains = inverse @ given @ target
+
         rest = target - gains @ given
         variance = float(rest @ rest) / (target.size - len(gains) - 1)
-        return gains, np.sqrt(np.diag(inverse @ normal @ inverse) * variance), variance
+        covariance = inverse @ normal @ inverse
+        return gains, np.sqrt(np.diag(covariance) * variance), variance
 
     best = minimize_scalar(
-        lambda beta: math.log(fit(beta)[2]), bounds=(0.0, 0.99), method="bounded"
+        lambda beta: math.log(regress(beta)[2]), bounds=(0.0, _MOST_BETA), method="bounded"
     )
-    gains, sigmas, _ = fit(float(best.x))
+    gains, sigmas, _ = regress(float(best.x))
     return gains, sigmas
