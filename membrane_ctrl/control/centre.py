@@ -45,7 +45,11 @@ _GAIN_ERROR = 0.2  # share of the barometer's effect that its configured gain ma
 _HUBER2 = 9.0
 _FAR2 = 25.0
 _FAR_COUNT = 3
-LOCK_FRAMES = 5
+LOCK_FRAMES = 5  # from then on the optics alone could hold the mirror
+# The optics' zero is locked once its standard deviation, by the laser's mean, is this small, or so
+# long after the first frame
+_LOCK_SIGMA_UM = 0.03
+_LOCK_MOST_S = 60.0
 _FRAMES_LOST = 3  # after this many missing frames the optics are gone
 _INTERVAL_SHARE = 0.2  # of a new interval in their mean
 _IMPOSSIBLE = 1e4  # µm, Pa or K: no film, weather or mount moves that far in a hold
@@ -122,7 +126,9 @@ class CentreState(StateNode):
         field(default_factory=lambda: [InnovationRamp() for _ in _RUN])
     )
     transit: gas_transit.TransitState = field(default_factory=gas_transit.TransitState)
-    frames: Count = 0  # of the optics since lock
+    frames: Count = 0  # of the optics since they began to be used
+    first_frame_s: float = math.nan
+    locked: bool = False  # the optics' zero is known
     frame_interval_s: float = FRESH_S[Sensor.OPTICS]
     last_frame_s: float = -math.inf
 
@@ -151,7 +157,7 @@ class CentreFilter:
 
     @property
     def frames(self) -> int:
-        """Frames of the optics since lock."""
+        """Frames of the optics since they began to be used."""
         return self.memory.frames
 
     def set_gains(self, loop: LoopConfig) -> None:
@@ -213,6 +219,7 @@ class CentreFilter:
             memory.origin.sag_um = sag_zero_um
             memory.p[_OPTICS_ZERO, _OPTICS_ZERO] = 0.0
             memory.frames = LOCK_FRAMES
+            memory.locked = True
 
     def relock(self) -> None:
         """Take the optics' next readings as a new zero."""
@@ -222,6 +229,7 @@ class CentreFilter:
         memory.x[_OPTICS_ZERO] = 0.0
         memory.origin.sag_um = math.nan
         memory.frames = 0
+        memory.locked = False
         memory.watches[Sensor.OPTICS] = SensorWatch()
 
     def undo_optics_jump(self, mount_um: float) -> None:
@@ -343,16 +351,26 @@ class CentreFilter:
             longer_s = min(interval_s, FRESH_S[Sensor.OPTICS]) - memory.frame_interval_s
             memory.frame_interval_s += _INTERVAL_SHARE * longer_s
         memory.last_frame_s = time_s
+        if not memory.frames:
+            memory.first_frame_s = given.now_s
         memory.frames += 1
-        if memory.frames == LOCK_FRAMES:
+        zero_sigma_um = math.sqrt(max(0.0, float(memory.p[_OPTICS_ZERO, _OPTICS_ZERO])))
+        waited = given.now_s - memory.first_frame_s > _LOCK_MOST_S
+        if (
+            not memory.locked
+            and memory.frames >= LOCK_FRAMES
+            and (waited or zero_sigma_um < _LOCK_SIGMA_UM)
+        ):
             self._lock_figure()
 
     def _lock_figure(self) -> None:
-        """Make the mean figure since lock the one to hold: its uncertainty becomes the laser's.
+        """Make the mean figure so far the one to hold: its uncertainty becomes the laser's.
 
-        A change of coordinates: with e the error of `zero`, the centre becomes c - e, the mount's
-        displacement mount + e.
+        The mean of the laser since the start has related the figure to displacement 0. From now on
+        the laser's mount may drift, and the figure does not follow it. A change of coordinates:
+        with e the error of `zero`, the centre becomes c - e, the mount's displacement mount + e.
         """
+        self.memory.locked = True
         for matrix in (self.memory.p, self.memory.p.T):
             matrix[_GAS] -= matrix[_OPTICS_ZERO]
             matrix[_MOUNT] += matrix[_OPTICS_ZERO]
