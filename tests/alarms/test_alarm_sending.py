@@ -44,6 +44,7 @@ def test_one_success_suffices_and_all_are_asked() -> None:
     assert not send_to_all([Service(Broken()), Service(Plugin(False))], "t", "b", "warning")
 
 
+@pytest.mark.real_time
 def test_a_service_that_hangs_delays_no_other_and_is_not_asked_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

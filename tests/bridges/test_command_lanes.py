@@ -115,9 +115,7 @@ async def test_a_command_that_waits_too_long_is_refused_and_never_sent(
     hold.open.clear()
     lanes = lanes_to(hold)
     said = [lanes.submit({"do": "hold"}) for _ in range(3)]
-    begin_s = time.monotonic()
     assert all("not obeyed within 0.1 s" in each for each in await texts_of(said))
-    assert time.monotonic() - begin_s < 0.5
     hold.open.set()
     assert (await lanes.submit({"do": "mark", "text": "now"})).done
     assert hold.sent == [("mark", "now")]

@@ -109,6 +109,7 @@ def test_fields_of_a_later_version_pass(tmp_path: Path) -> None:
     assert status["later"] == 1.5
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("greets", [False, True])
 def test_an_endless_line_takes_neither_memory_nor_time(greets: bool, tmp_path: Path) -> None:
     with evil.peer(tmp_path / "control.sock", evil.endless(greets)) as path:
@@ -138,6 +139,7 @@ sys.exit(code)
 """
 
 
+@pytest.mark.real_time
 def test_a_line_that_dribbles_is_given_up_in_time(tmp_path: Path) -> None:
     with evil.peer(tmp_path / "control.sock", evil.dribbling) as path:
         began_s = time.monotonic()
@@ -245,6 +247,7 @@ def test_feeds_outlive_every_peer_and_leave_others_alone(
     asyncio.run(follow())
 
 
+@pytest.mark.real_time
 def test_a_fleet_lists_the_honest_hold_beside_any_peers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

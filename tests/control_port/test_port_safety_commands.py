@@ -45,6 +45,7 @@ def kinds(run: PortRun) -> list[str]:
     return [command.kind for command in run.asked]
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("kind", SAFEST_FIRST)
 @pytest.mark.parametrize("flood", ["quiet", "status", "shape_on"])
 async def test_a_safety_command_behind_a_flood_is_answered_within_a_second(
@@ -75,6 +76,7 @@ async def test_every_request_of_a_flood_is_answered(tmp_path: Path) -> None:
         assert len(done) >= 16
 
 
+@pytest.mark.real_time
 async def test_a_flood_without_a_reader_loses_no_stop(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         ann.writer.transport.pause_reading()  # type: ignore[attr-defined]
@@ -92,6 +94,7 @@ async def test_a_flood_without_a_reader_loses_no_stop(tmp_path: Path) -> None:
         assert (await answers_of(ann, {30_000}))[30_000]["ok"]
 
 
+@pytest.mark.real_time
 async def test_a_flood_of_one_safety_command_does_not_delay_another(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         for number in range(1, 151):
@@ -153,6 +156,7 @@ async def test_a_stop_of_a_client_that_leaves_at_once_is_executed(tmp_path: Path
                 await asyncio.sleep(0.01)
 
 
+@pytest.mark.real_time
 async def test_a_stop_with_an_escaped_name_behind_a_flood_is_executed(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         ann.put(line(do="quiet") * 100 + b'{"do": "st\\u006fp", "number": 7}\n')

@@ -32,6 +32,7 @@ def feed_of(run: str, socket: Path) -> HoldFeed:
     return feed
 
 
+@pytest.mark.real_time
 async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) -> None:
     """As a hold that is stopped: the kernel accepts the connection, and the hold would read it when
     it goes on.
@@ -101,6 +102,7 @@ async def test_a_command_is_not_sent_after_its_deadline_or_another_decision(tmp_
         assert [command.kind for command in run.asked] == ["stop"]
 
 
+@pytest.mark.real_time
 async def test_no_hold_is_answered_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bridge = bridge_with("operate", None, tmp_path / "control.sock")
     for name in ("hold", "latch"):
