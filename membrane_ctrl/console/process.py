@@ -19,6 +19,7 @@ from rich.live import Live
 from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console import key_reader, keys, model, requests, why
+from membrane_ctrl.console.page_link import PageLink
 from membrane_ctrl.console.view import ConsolePage
 from membrane_ctrl.model import (
     child_events,
@@ -184,6 +185,7 @@ def _draw_on_terminal(
     page afterwards.
     """
     run, handle = str(spec.run_dir), 2
+    page_link = PageLink(spec.run_dir.parent)
     live = Live(
         console=console,
         screen=True,
@@ -198,13 +200,15 @@ def _draw_on_terminal(
             if not job_control.in_foreground(handle):
                 live.stop()
                 return
-            view = feed.model.make_view(spec.clock.now())
+            now_s = spec.clock.now()
+            view = feed.model.make_view(now_s)
+            link = page_link.find(now_s)
             if reader is None:
-                page = ConsolePage(view, spec.config, run)
+                page = ConsolePage(view, spec.config, run, link=link)
             else:
                 desk.process_keys(reader.read(), view.paused)
                 page = ConsolePage(
-                    view, spec.config, run, desk.bottom_line, desk.is_asking, desk.help
+                    view, spec.config, run, desk.bottom_line, desk.is_asking, desk.help, link
                 )
             live.start()
             live.update(terminal.Plain(page), refresh=True)

@@ -138,6 +138,8 @@ class ConsolePage:
         The last line is a question.
     help_ : bool
         Explain the keys instead of listing events.
+    link : str
+        Of the page; empty without one.
     """
 
     def __init__(
@@ -148,6 +150,7 @@ class ConsolePage:
         foot: str = "",
         asks: bool = False,
         help_: bool = False,
+        link: str = "",
     ) -> None:
         self._view = view
         self._config = config
@@ -155,6 +158,7 @@ class ConsolePage:
         self._foot = foot
         self._asks = asks
         self._help = help_
+        self._link = link
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         height = options.height or console.height
@@ -194,6 +198,9 @@ class ConsolePage:
             figures,
         ]
         parts += _make_help_lines(below) if self._help else _make_event_lines(view, below)
+        if self._link:
+            page = f"page  {self._link}"
+            parts.append(Text(page, style="dim", no_wrap=True, overflow="ellipsis"))
         if self._foot:
             style = "bold yellow" if self._asks else "dim"
             parts.append(Text(self._foot, style=style, no_wrap=True, overflow="ellipsis"))

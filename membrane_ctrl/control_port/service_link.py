@@ -12,8 +12,10 @@ import fcntl
 import json
 import os
 import secrets
+import socket
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.model.state_folder import find_state_folder
@@ -23,6 +25,7 @@ _FOLDER_NAME = "service"
 _KEY_NAME = "link-key"
 _KEY_BYTES = 24
 _ADDRESS_BYTES_MAX = 4096
+_CONNECT_S = 0.5
 
 
 def service_folder() -> Path:
@@ -148,6 +151,17 @@ def find_service(logs: Path) -> str | None:
         with contextlib.suppress(errors.DeviceError):
             return add_key(base_url)
     return base_url
+
+
+def is_answering(link: str) -> bool:
+    """Whether something accepts connections at the address of a link."""
+    address = urlsplit(link)
+    port = address.port or (443 if address.scheme == "https" else 80)
+    try:
+        socket.create_connection((address.hostname or "", port), _CONNECT_S).close()
+    except OSError:
+        return False
+    return True
 
 
 def _parse_address(content: bytes) -> tuple[str, bool] | None:

@@ -108,7 +108,7 @@ def make_closing_lines(closing: RunEnd) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class PageAtEnd:
-    """The page after a hold: its link, or why its service has ended; neither without a page."""
+    """The page after a hold: its link, or why there is none; neither if none was wanted."""
 
     link: str = ""
     problem: str = ""
@@ -151,7 +151,7 @@ def print_closing_report(
     if page is None:
         return
     if page.problem:
-        print(f"no page:    its service has ended: {page.problem}", file=sys.stderr)
+        print(f"no page:    {page.problem}", file=sys.stderr)
     elif page.link:
         print(f"page:       {page.link}", file=sys.stderr)
         print(draw_link_code(page.link), end="", file=sys.stderr)

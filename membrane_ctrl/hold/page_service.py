@@ -25,6 +25,7 @@ from membrane_ctrl.model.optional import describe_missing, find_missing_page_lib
 LOG_NAME = "service.log"
 _IDLE_WORDS = ("--idle-end", "1h")
 _NICE = 10
+_STARTS_S = 120.0
 _ENDS_S = 10.0
 _LOOK_S = 0.1
 _TAIL_BYTES = 2000
@@ -59,13 +60,33 @@ class PageService:
     def wait_until_it_serves(self, patience_s: float) -> str:
         """Wait until the service is ready; returns why it is not, empty if it is."""
         give_up_s = time.monotonic() + patience_s
-        while not service_link.find_service(self._logs):
+        while not self.is_ready():
             if problem := self.find_problem():
                 return problem
             if time.monotonic() > give_up_s:
                 return f"not ready within {patience_s:.0f} s; see {self._logs / LOG_NAME}"
             time.sleep(_LOOK_S)
         return ""
+
+    def is_ready(self) -> bool:
+        """Whether the service has named its address, and the one that was started listens there.
+
+        Another program's may be reachable for browsers alone, behind a proxy.
+        """
+        link = service_link.find_service(self._logs)
+        if not link:
+            return False
+        self.link = link
+        return self._process is None or service_link.is_answering(link)
+
+    def announce(self, tell: Callable[[str], None]) -> None:
+        """State the link as soon as the service is ready, or why it is not, from a thread."""
+
+        def wait_and_tell() -> None:
+            problem = self.wait_until_it_serves(_STARTS_S)
+            tell(f"no page: {problem}" if problem else f"page: {self.link}")
+
+        threading.Thread(target=wait_and_tell, name="page link", daemon=True).start()
 
     def forget(self) -> None:
         """Leave the service to itself: it continues."""

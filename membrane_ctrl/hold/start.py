@@ -138,7 +138,9 @@ def hold_mirror(options: HoldOptions) -> int:
 def _start_service(
     options: HoldOptions, logs_dir: Path, stack: contextlib.ExitStack
 ) -> page_service.PageService | None:
-    """Start the service if it is wanted and none is there; prints the page's link."""
+    """Start the service if it is wanted and none is there; without a console on a terminal, which
+    shows the page's link, prints it.
+    """
     if not options.service or not options.config.port.enabled:
         return None
     ends_with_us = bool(os.environ.get("CI"))
@@ -147,8 +149,8 @@ def _start_service(
     )
     if page is not None:
         stack.callback(page.stop if ends_with_us else page.forget)
-        if page.link:
-            terminal.print_progress(f"page: {page.link}")
+        if not terminal.can_draw():
+            page.announce(terminal.print_progress)
     return page
 
 
@@ -156,5 +158,8 @@ def _describe_page(page: page_service.PageService | None) -> PageAtEnd:
     """The page after the hold: its link, or why its service has ended."""
     if page is None:
         return PageAtEnd()
-    problem = page.find_problem()
-    return PageAtEnd("" if problem else page.link, problem)
+    if problem := page.find_problem():
+        return PageAtEnd(problem=f"its service has ended: {problem}")
+    if not page.is_ready():
+        return PageAtEnd(problem=f"its service is not ready yet; later: {page.link}")
+    return PageAtEnd(page.link)

@@ -8,6 +8,7 @@ stays JSON and keeps its meaning.
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import unicodedata
 from collections.abc import Iterable, Iterator
@@ -134,6 +135,11 @@ def _is_refused(letter: str) -> bool:
 def _escape_letter(letter: str) -> str:
     units = letter.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{int.from_bytes(units[k : k + 2]):04x}" for k in range(0, len(units), 2))
+
+
+def can_draw() -> bool:
+    """Whether stderr is a terminal on which the console is drawn, not printed line by line."""
+    return sys.stderr.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
 
 
 def print_progress(words: str) -> None:

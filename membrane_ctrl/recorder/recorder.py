@@ -112,7 +112,9 @@ class Recorder:
         self._shapes: list[shape_estimate.ShapeEstimate] = []
         self._events: list[EventLine] = []
         self._rows_lost = before.rows_lost
-        self.ended = self.urgent = False
+        # one that replaces another may find the end of the run in the file
+        self.ended = self._status.ended
+        self.urgent = False
 
     def drain_rings(self) -> None:
         """Take all ring messages; events go to `events.jsonl` at once."""

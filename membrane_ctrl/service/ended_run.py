@@ -12,6 +12,7 @@ from pathlib import Path
 
 from membrane_ctrl.model import errors, events, run_events
 from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.event_base import Event
 from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.run_files import table_specs
@@ -227,11 +228,14 @@ def _judge_end(
 
 
 def _find_end(log: Sequence[LoggedEvent]) -> LoggedEvent | None:
-    """Return the last `end` of a log; annotations may follow it."""
-    for each in reversed(log):
-        if isinstance(each.event, run_events.Ended):
-            return each
-    return None
+    """Return the end that the control process has reported, else the last one."""
+    ends = [each for each in log if isinstance(each.event, run_events.Ended)]
+    reported = [each for each in ends if not _is_without_control(each.event)]
+    return next(reversed([*ends[-1:], *reported[-1:]]), None)
+
+
+def _is_without_control(event: Event) -> bool:
+    return isinstance(event, run_events.Ended) and event.exit in run_events.ENDS_WITHOUT_CONTROL
 
 
 def _exit_of(end: LoggedEvent | None) -> str | None:

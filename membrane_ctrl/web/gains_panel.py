@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 from urllib.parse import urlencode
 
@@ -20,7 +20,7 @@ from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.service.work_pool import PoolFullError
 from membrane_ctrl.web.confirmation import confirm
 from membrane_ctrl.web.gains_charts import CHARTS
-from membrane_ctrl.web.gains_views import ExploredGains, GainsSource, GainsViews, Setting
+from membrane_ctrl.web.gains_views import ChosenGains, ExploredGains, GainsSource, GainsViews
 from membrane_ctrl.web.messages import show_message
 from membrane_ctrl.web.sending import send_and_show
 
@@ -45,6 +45,9 @@ _NOTHING = (
 
 class GainsPanel:
     """The sliders of one viewer.
+
+    The setting of a session or run is common to its viewers, so it survives a reload of the page. A
+    viewer without the role `tune` sees it, and moves sliders of his own until it changes.
 
     Parameters
     ----------
@@ -76,7 +79,8 @@ class GainsPanel:
         self._wanted = wanted
         self._source: GainsSource | None = None
         self._explored: ExploredGains | None = None
-        self._setting: Setting | None = None  # None: the gains of `start` themselves
+        self._shown = ChosenGains("", None, "")  # where the sliders are
+        self._common: ChosenGains | None = None  # the newest common setting that was shown
         self._is_placing = False  # the sliders are set by the page
         self._is_drawing = self._is_stale = False
         ui.label("Choose gains by hand").classes("text-h6")
@@ -90,10 +94,12 @@ class GainsPanel:
                 self._table.props('aria-label="figures of the gains"').classes("max-w-full")
             self._build_charts()
         self._body.set_visibility(False)
+        self._show_trial()
         ui.timer(_LOOK_S, self._show_trial)
+        ui.timer(_LOOK_S, self._follow_others)
 
     async def load(self) -> None:
-        """List what can be explored; keeps what is shown."""
+        """List what can be explored; keeps what is shown, and draws it again after another tab."""
         self._text.set_text("Looking for sessions and runs.")
         try:
             names = await self._views.list_sources(self._hold)
@@ -103,20 +109,28 @@ class GainsPanel:
         if self._wanted and self._wanted not in names:
             names = [self._wanted, *names]
         chosen = self._choice.value if self._choice.value in names else self._wanted
+        self._is_placing = True
         self._choice.set_options(names, value=chosen or next(iter(names), None))
+        self._is_placing = False
         if not names:
             self._text.set_text(_NOTHING)
-        elif self._source is not None:
+        elif self._source is None:
+            await self._open()
+        else:
             self._text.set_text(self._source.text)
+            await self._draw()
 
     def _build_sliders(self) -> None:
-        self._choice = ui.select([], label="session or run", on_change=self._open)
+        self._choice = ui.select([], label="session or run", on_change=self._handle_source)
         self._choice.classes("w-full").props('aria-label="session or run"')
-        self._start = ui.select([], label="start from", on_change=self._start_over)
+        self._start = ui.select([], label="start from", on_change=self._handle_start)
         self._start.classes("w-full").props('aria-label="start from"')
-        self._speed = _Slider("response, closed-loop time constant: fast to slow", True, self._move)
-        self._damping = _Slider("robustness: lively to calm; SIMC has 4", False, self._move)
-        self._filter = _Slider("measurement filter: little to much", True, self._move)
+        self._speed = _Slider(
+            "response, closed-loop time constant: fast to slow", True, self._handle_move
+        )
+        self._damping = _Slider("robustness: lively to calm; SIMC has 4", False, self._handle_move)
+        self._filter = _Slider("measurement filter: little to much", True, self._handle_move)
+        self._author = ui.label().classes("text-caption").props('role="status"')
         self._command = (
             ui.label()
             .classes("text-caption")
@@ -153,8 +167,18 @@ class GainsPanel:
                     chart = ui.echart({"series": []}).classes("w-full").style("height: 26rem")
                     self._charts[name] = chart
 
+    def _handle_source(self) -> Awaitable[None] | None:
+        """Open the session or run that the viewer has chosen; its name stays in the address."""
+        if self._is_placing:
+            return None
+        query = {"hold": self._hold, "tab": "tune", "gains": str(self._choice.value or "")}
+        ui.navigate.history.replace(f"?{urlencode(query)}")
+        return self._open()
+
     async def _open(self) -> None:
-        """Read the chosen session or run, and start from its gains."""
+        """Read the chosen session or run, and set the sliders as its viewers have them, or to its
+        gains.
+        """
         name = str(self._choice.value or "")
         if not name:
             return
@@ -175,11 +199,16 @@ class GainsPanel:
         self._damping.set_range(*source.dampings)
         self._filter.set_range(*source.filters_s)
         names = list(source.settings)
-        before = self._start.value
         first = "proposed" if "proposed" in names else names[0]
+        self._is_placing = True
         self._start.set_options(names, value=first)
-        if before == first:  # else its change has started over
-            await self._start_over()
+        self._is_placing = False
+        self._common = self._views.find_chosen(self._hold, name)
+        if self._common is not None and self._common.start in names:
+            self._place(self._common)
+        else:
+            self._place(ChosenGains(first, None, ""))
+        await self._draw()
 
     def _body_visible(self, is_visible: bool) -> None:
         self._body.set_visibility(True)
@@ -187,24 +216,52 @@ class GainsPanel:
         for chart in self._charts.values():
             chart.set_visibility(is_visible)
 
-    async def _start_over(self) -> None:
+    def _handle_start(self) -> Awaitable[None] | None:
         """Set the sliders to gains with a name, and show exactly those."""
-        if self._source is None or self._start.value not in self._source.settings:
+        if self._is_placing or self._source is None:
+            return None
+        return self._choose(ChosenGains(str(self._start.value), None, self._user.name))
+
+    def _handle_move(self) -> Awaitable[None] | None:
+        """Show the gains to which the viewer has moved a slider."""
+        if self._is_placing or self._source is None:
+            return None
+        setting = (self._speed.value, self._damping.value, self._filter.value)
+        return self._choose(ChosenGains(str(self._start.value), setting, self._user.name))
+
+    async def _choose(self, chosen: ChosenGains) -> None:
+        """Show a setting; that of a viewer with the role `tune` is for all."""
+        if role_includes(self._user.role, TRIES):
+            self._common = chosen
+            self._views.choose(self._hold, str(self._choice.value), chosen)
+        self._place(chosen)
+        await self._draw()
+
+    async def _follow_others(self) -> None:
+        """Show what another viewer has chosen."""
+        common = self._views.find_chosen(self._hold, str(self._choice.value or ""))
+        is_known = self._source is not None and common is not None
+        if not is_known or common is self._common:
             return
-        time_constant_s, damping, filter_s = self._source.settings[self._start.value]
+        assert common is not None
+        assert self._source is not None
+        self._common = common
+        if common.start in self._source.settings:
+            self._place(common)
+            await self._draw()
+
+    def _place(self, chosen: ChosenGains) -> None:
+        """Set the sliders."""
+        assert self._source is not None
+        self._shown = chosen
+        time_constant_s, damping, filter_s = chosen.setting or self._source.settings[chosen.start]
         self._is_placing = True
+        self._start.set_value(chosen.start)
         self._speed.set_value(time_constant_s)
         self._damping.set_value(damping)
         self._filter.set_value(filter_s)
         self._is_placing = False
-        self._setting = None
-        await self._draw()
-
-    async def _move(self) -> None:
-        if self._is_placing:
-            return
-        self._setting = (self._speed.value, self._damping.value, self._filter.value)
-        await self._draw()
+        self._author.set_text(f"set by {chosen.author}" if chosen.author else "")
 
     async def _draw(self) -> None:
         """Show the present setting; while one is computed and fetched, only the newest waits."""
@@ -220,7 +277,7 @@ class GainsPanel:
             self._is_drawing = False
 
     async def _show_setting(self) -> None:
-        name, start, setting = str(self._choice.value), str(self._start.value), self._setting
+        name, start, setting = str(self._choice.value), self._shown.start, self._shown.setting
         try:
             found = await self._views.explore(self._hold, name, start, setting)
         except (errors.CommandError, PoolFullError) as error:
@@ -301,7 +358,7 @@ class GainsPanel:
     async def _try_gains(self) -> None:
         """Ask, and set the gains on trial."""
         found, minutes = self._explored, int(self._minutes.value)
-        if found is None:
+        if found is None or found.refusal:
             return
         keys = ", ".join(f"{key} = {value:g}" for key, value in found.loop.items())
         lines = (

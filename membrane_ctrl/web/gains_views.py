@@ -119,6 +119,25 @@ class ExploredGains:
         return f"membrane-ctrl ctl gains --trial 5m '{json.dumps(self.loop)}'"
 
 
+@dataclass(frozen=True, slots=True)
+class ChosenGains:
+    """What the sliders of a session or run are set to.
+
+    Attributes
+    ----------
+    start : str
+        Name of the gains from which they started.
+    setting : Setting or None
+        None: those gains themselves.
+    author : str
+        Who has moved them last.
+    """
+
+    start: str
+    setting: Setting | None
+    author: str
+
+
 class GainsViews:
     """The explored gains of the holds of a page.
 
@@ -131,6 +150,17 @@ class GainsViews:
         self._feeds = feeds
         self._sources = MadeOnce(self._list, GAINS, life_s=_LISTED_S)
         self._explored = MadeOnce(self._explore, GAINS, life_s=_LIFE_S)
+        self._chosen: dict[tuple[str, str], ChosenGains] = {}
+
+    def find_chosen(self, hold: str, name: str) -> ChosenGains | None:
+        """What the sliders of a session or run are set to, for all viewers; None: nobody has moved
+        them.
+        """
+        return self._chosen.get((hold, name))
+
+    def choose(self, hold: str, name: str, chosen: ChosenGains) -> None:
+        """Set the sliders of a session or run that can be explored, for all viewers."""
+        self._chosen[hold, name] = chosen
 
     async def list_sources(self, hold: str) -> list[str]:
         """Names of the sessions and runs that may be explored, the newest session first. Raises

@@ -80,7 +80,12 @@ class NoHoldPanel:
         seen = self._feed.seen
         self._card.set_visibility(bool(seen.problem))
         # the page's line on the state is the headline
-        lines = seen.ended.lines()[1:] if seen.ended is not None else ("no run in this folder yet",)
+        if seen.ended is not None:
+            lines = seen.ended.lines()[1:]
+        elif seen.name:
+            lines = (f"waiting for the record of {seen.name}: how it ended, and why",)
+        else:
+            lines = ("no run in this folder yet",)
         self._report.set_visibility(seen.ended is not None)
         if self._starter is not None:
             self._failure.set_text(self._starter.failure)

@@ -14,6 +14,7 @@ from nicegui import ui
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.control_port.status_lines import alarm_lines, lock_lines
+from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model.columns import MISSING, PUBLISHED, TelemetryColumn
 from membrane_ctrl.service.access import (
     ACTIONS,
@@ -48,6 +49,7 @@ from membrane_ctrl.web.sending import send_and_show
 from membrane_ctrl.web.shared_views import CHART_EVERY_S, FIRST_FIGURE, LOOK_S, SharedViews
 from membrane_ctrl.web.tuning_panel import CHOOSES, TuningPanel
 
+KEEPS: Role = "operate"  # a reference, which all viewers see
 _SESSION_DIGITS = 8
 _FETCH_S = 30.0  # for a browser to fetch a chart
 _FIRST_SIGNALS = ["error_um"]  # of the chart
@@ -337,9 +339,11 @@ class WebPage:
                 label="change since",
                 on_change=lambda e: self._set("_reference", e.value),
             ).props('dense aria-label="change since"')
-            ui.button(
+            keep = ui.button(
                 "Use this figure", icon="push_pin", on_click=self._keep_reference, color=None
-            ).props("dense outline no-caps").tooltip("Keep the newest figure as a reference")
+            ).props("dense outline no-caps")
+            keep.tooltip("Keep the newest figure as a reference, for all viewers")
+            keep.set_enabled(role_includes(self._user.role, KEEPS))
         ui.label("terms removed from the figure").classes("text-caption")
         with ui.row().classes("items-center gap-x-2 gap-y-0"):
             boxes = {
@@ -373,6 +377,8 @@ class WebPage:
         self._chart.style(f"height: {_PANEL_REM[len(self._signals)]}rem")
 
     def _keep_reference(self) -> None:
+        if not role_includes(self._user.role, KEEPS):
+            return
         name = self._views.add_reference(self._hold)
         if not name:
             show_message("There is no usable figure yet.", good=False)

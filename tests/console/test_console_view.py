@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import math
+import socket
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from console_feed import FAULT, HOLDING, NOTHING, event, rows, shape
@@ -12,9 +14,11 @@ from rich.console import Console
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import ConsoleModel, event_line
+from membrane_ctrl.console.page_link import PageLink
 from membrane_ctrl.console.process import format_line
 from membrane_ctrl.console.view import ConsolePage, full_scale, level_bar, signed_bars
 from membrane_ctrl.console.why import format_duration, format_number, format_percent
+from membrane_ctrl.control_port.service_link import publish_address
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.telemetry import SafeLevel, ShapeState, State
 
@@ -37,10 +41,12 @@ def drawn(
     height: int = 24,
     foot: str = "",
     help_: bool = False,
+    link: str = "",
 ) -> list[str]:
     console = Console(width=width, height=height, record=True, file=io.StringIO())
+    view = model.make_view(now_s)
     console.print(
-        ConsolePage(model.make_view(now_s), CONFIG, "logs/20261121T031200Z-demo", foot, help_=help_)
+        ConsolePage(view, CONFIG, "logs/20261121T031200Z-demo", foot, help_=help_, link=link)
     )
     return console.export_text().rstrip("\n").splitlines()
 
@@ -354,3 +360,20 @@ def test_words() -> None:
     assert format_number(-0.125, 2, "µm", sign=True) == "-0.12 µm"
     assert format_number(math.inf, 2, "µm") == "–"
     assert format_percent(0.254) == "25 %"
+
+
+def test_the_link_of_the_page_is_shown_while_its_service_answers(tmp_path: Path) -> None:
+    found = PageLink(tmp_path)
+    assert found.find(0.0) == "", "there is no service"
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}/"
+        with publish_address(tmp_path, url, has_link=False):
+            assert found.find(1.0) == "", "it is not looked for at each picture"
+            assert found.find(3.0) == url
+            listener.close()
+            assert found.find(6.0) == ""
+    page = drawn(held(), link="http://127.0.0.1:7480/?key=zERTzB4rBWUGFTpRBpd9KShA5xyoqVk1")
+    assert len(page) == 24
+    assert any(
+        "page  http://127.0.0.1:7480/?key=zERTzB4rBWUGFTpRBpd9KShA5xyoqVk1" in line for line in page
+    )

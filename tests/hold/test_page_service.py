@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import stat
 import subprocess
 import sys
@@ -130,6 +131,43 @@ def test_a_service_that_does_not_become_ready_is_reported(
     page.stop()
 
 
+def test_the_link_is_stated_once_the_service_answers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A service names its address some seconds before it listens there."""
+    waits = write_interpreter(tmp_path / "waits", "time.sleep(60)")
+    monkeypatch.setattr(sys, "executable", waits)
+    page = start_page_service(tmp_path, None, pytest.fail, ends_with_us=True)
+    assert page is not None
+    lines: list[str] = []
+    try:
+        with socket.socket() as listener:
+            listener.bind(("127.0.0.1", 0))
+            url = f"http://127.0.0.1:{listener.getsockname()[1]}/"
+            with publish_address(tmp_path, url, has_link=True):
+                assert not page.is_ready()
+                page.announce(lines.append)
+                listener.listen()
+                until(lambda: lines)
+        assert lines == [f"page: {add_key(url)}"]
+    finally:
+        page.stop()
+
+
+def test_a_service_that_ends_before_it_answers_is_stated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = write_interpreter(tmp_path / "ends", "print('port taken'); sys.exit(2)")
+    monkeypatch.setattr(sys, "executable", ends)
+    page = start_page_service(tmp_path, None, pytest.fail, ends_with_us=False)
+    assert page is not None
+    lines: list[str] = []
+    page.announce(lines.append)
+    until(lambda: lines)
+    assert lines == ["no page: port taken"]
+    page.forget()
+
+
 def test_a_program_ends_when_its_parent_dies() -> None:
     with subprocess.Popen([sys.executable, "-c", WAITS], stdin=subprocess.PIPE) as page:
         assert page.stdin is not None
@@ -247,7 +285,9 @@ def test_a_hold_names_why_its_page_is_gone(tmp_path: Path) -> None:
         until(lambda: not services_of(logs))
         hold.send_signal(signal.SIGINT)
         _, said = hold.communicate(timeout=120.0)
-    (line,) = [each for each in said.splitlines() if each.startswith("no page:")]
+    lines = [each for each in said.splitlines() if each.startswith("no page:")]
+    assert "is a directory" in lines[0], "at once"
+    line = lines[-1]
     assert line.startswith("no page:    its service has ended: ")
     assert line.endswith("cannot be written (is a directory)")
     assert "page:       http" not in said, "no link that nobody answers"

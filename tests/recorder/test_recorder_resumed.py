@@ -106,6 +106,27 @@ def recorded(run_dir: Path) -> np.ndarray:
     return np.concatenate([recorded_rows(path) for path in sorted(run_dir.glob("*.rrd"))])
 
 
+def test_a_recorder_after_the_end_waits_for_no_second_end(tmp_path: Path, stack: ExitStack) -> None:
+    """The first one is killed while it closes: on a slow disk that takes longer than the hold
+    waits.
+    """
+    run = Run(tmp_path, stack, Config())
+    first = run.recorder(0)
+    run.second(first, 0)
+    run.writers["events"].put(
+        json.dumps({"mono_s": 1.0, "kind": "end", "exit": "safety_trip"}).encode()
+    )
+    first.drain_rings()
+    first.write_second()
+    assert first.ended
+    second = run.recorder(1)
+    assert second.ended
+    second.finish(in_haste=True)
+    lines = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert [line["exit"] for line in lines if line["kind"] == "end"] == ["safety_trip"]
+    assert run.summary["exit"] == "safety_trip"
+
+
 def test_the_next_recorder_continues_and_everything_is_recorded_once(
     tmp_path: Path, stack: ExitStack
 ) -> None:

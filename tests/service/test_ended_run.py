@@ -56,6 +56,12 @@ def write_run(
             EndKind.FAULT,
             "fault 51 locked: a person has locked the mirror",
         ),
+        # a recorder that was replaced while it closed has added an end of its own
+        (
+            [(18.0, FAULT), (20.0, Ended("safety_trip", 5)), (50.0, Ended("terminated"))],
+            EndKind.FAULT,
+            "fault 51 locked: a person has locked the mirror",
+        ),
         (
             [(18.0, FAULT), (18.5, Cleared("locked")), (20.0, Ended("done", 0))],
             EndKind.FINISHED,
@@ -72,7 +78,18 @@ def write_run(
         ),
         ([(19.0, STOP), (400.0, Ended("done", 0))], EndKind.FINISHED, "its duration was over"),
     ],
-    ids=["stop", "duration", "fault", "cleared", "device", "killed", "power", "refused", "old"],
+    ids=[
+        "stop",
+        "duration",
+        "fault",
+        "twice",
+        "cleared",
+        "device",
+        "killed",
+        "power",
+        "refused",
+        "old",
+    ],
 )
 def test_the_cause_is_what_the_record_shows(
     tmp_path: Path, events: list[tuple[float, Event]], kind: EndKind, cause: str

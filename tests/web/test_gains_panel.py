@@ -56,6 +56,12 @@ async def until_loop(tab: Tab, before: dict[str, float]) -> dict[str, float]:
     return found
 
 
+async def until_shown(tab: Tab, wanted: dict[str, float]) -> None:
+    async with asyncio.timeout(60.0):
+        while await shown_loop(tab) != wanted:  # noqa: ASYNC110
+            await asyncio.sleep(0.2)
+
+
 @pytest.mark.parametrize("text", ["1,2", "1,2,nan", "1,2,-3", "a,b,c", "1,2,3,4", "inf,1,1"])
 def test_a_setting_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"three|convert"):
@@ -93,10 +99,28 @@ async def test_gains_are_explored_tried_and_saved(tmp_path: Path) -> None:
                 assert slower["kp_per_s"] < proposed["kp_per_s"]
                 assert slower["ti_s"] > proposed["ti_s"]
                 await tab.screenshot(tmp_path / "gains.png")
-                # a second viewer, and a reload, begin with the proposal
+                # a second viewer sees the same, and moves the sliders of the first
                 async with browser_tab(link + place, tmp_path / "other") as other:
-                    assert await shown_loop(other) == proposed
-                    assert await shown_loop(tab) == slower, "each viewer has sliders of their own"
+                    assert await shown_loop(other) == slower
+                    assert "set by link" in await other.value("document.body.innerText")
+                    await other.value(f"{slider(SPEED)}.focus()")
+                    await other.press(*["ArrowRight"] * 5)
+                    await until_loop(other, slower)
+                    await asyncio.sleep(3.0)
+                    slower = await shown_loop(other)
+                    await until_shown(tab, slower)
+                # a reload keeps them
+                await tab.show_as(1500, 1000)
+                assert await shown_loop(tab) == slower
+                for name in CHARTS:
+                    await tab.until(f"{CHART.format(name)}.series.every(s => s.data.length > 50)")
+                # the charts are there again after another tab
+                await tab.value(f"{PRESS.format('NOW')}; 0")
+                await tab.until("!document.querySelector('[aria-label=\"Nyquist plot\"]')")
+                await tab.value(f"{PRESS.format('TUNE')}; 0")
+                for name in CHARTS:
+                    await tab.until(f"{CHART.format(name)}.series.every(s => s.data.length > 50)")
+                assert await shown_loop(tab) == slower
                 # on trial
                 await tab.click("scienceTry on the hold")
                 await tab.until("!!document.querySelector('.q-dialog')")
