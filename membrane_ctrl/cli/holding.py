@@ -29,8 +29,10 @@ FlatOption = Annotated[
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`, `locks`."""
-    for command in (hold, safe, check, conformance):
+    """Add `hold`, `twin`, `safe`, `check`, `commission`, `devices`, `conformance`, `ctl`, `alarm`,
+    `locks`.
+    """
+    for command in (hold, safe, check, commission, conformance):
         app.command()(command)
     app.add_typer(devices_app, name="devices")
     app.add_typer(twin_app, name="twin")
@@ -207,6 +209,27 @@ def check(config: ConfigArgument, json: JsonOption = False) -> int:
 
     with errors.name_source_in_errors(config):
         return check_config(loaded, str(config), json)
+
+
+def commission(
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Folder of the session; an existing one is resumed."),
+    ] = Path("commissioning"),
+    twin: Annotated[
+        bool, typer.Option("--twin", help="Practise on the emulated bench, in virtual time.")
+    ] = False,
+) -> int:
+    """Take a bench from a box of parts to an accepted hold, step by step; leave a configuration and
+    a report.
+    """
+    from membrane_ctrl.commissioning.guide.command import commission_bench
+
+    if not twin:
+        return commission_bench(folder)
+    from membrane_ctrl.hold.virtual_hold import VirtualHold
+
+    return commission_bench(folder, VirtualHold)
 
 
 @devices_app.callback()

@@ -77,7 +77,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     if config.devices is not None:
         bench.require_separate_ports(config.devices)
         driver_check.require_optics(config.devices)
-    probes, circuits = _probe_all(config)
+    probes, circuits = probe_all_devices(config)
     for probe in probes:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
     missing = list_missing_packages(config)
@@ -121,7 +121,9 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     return errors.Exit.DONE
 
 
-def _probe_all(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.InterlockProbe]]:
+def probe_all_devices(
+    config: Config,
+) -> tuple[list[DeviceProbe], list[interlock_check.InterlockProbe]]:
     """Probe devices and interlocks, except those (including the
     screen) that another program uses.
     """

@@ -86,7 +86,7 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
         for role in roles.ROLES.values():
             section |= _ask_role(role.name, optional=not role.needed)
     section |= (camera := _ask_role("camera", optional=True))
-    if camera and not _shows_patterns(camera["camera"]):
+    if camera and not camera_shows_patterns(camera["camera"]):
         section |= _ask_role("screen", optional=False)
     if interlocks := _ask_interlocks(with_board=bool(board)):
         section["interlocks"] = interlocks
@@ -96,7 +96,7 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
         missing = {key: False for key, role in sensors.items() if role not in section}
         if missing:
             tables["loop"] = missing
-        if _sections_by_driver("pump")[section["pump"]["driver"]] in settings.FLOW_CONTROLLERS:
+        if list_driver_sections("pump")[section["pump"]["driver"]] in settings.FLOW_CONTROLLERS:
             tables["pump"] = dict.fromkeys(
                 ("dead_fraction", "start_fraction", "stall_fraction"), 0.0
             )
@@ -105,7 +105,7 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
     return tables | {"shape": {"enabled": False}}
 
 
-def _shows_patterns(camera: TomlTable) -> bool:
+def camera_shows_patterns(camera: TomlTable) -> bool:
     """Whether this camera's table needs no screen beside it."""
     section: settings.CameraSection = TypeAdapter(settings.CameraConfig).validate_python(camera)
     return section.shows_patterns
@@ -113,7 +113,7 @@ def _shows_patterns(camera: TomlTable) -> bool:
 
 def _ask_interlocks(with_board: bool) -> list[TomlTable]:
     """Ask for one interlock after the other; only a pump board has inputs of its own."""
-    known = _sections_by_driver("interlocks")
+    known = list_driver_sections("interlocks")
     if not with_board:
         del known["board_input"]
     asked: list[TomlTable] = []
@@ -126,11 +126,11 @@ def _ask_interlocks(with_board: bool) -> list[TomlTable]:
 
 def _ask_role(role: str, optional: bool) -> TomlTable:
     """Ask for the device of a role; empty without one."""
-    table = _ask_table(role, _sections_by_driver(role), optional)
+    table = _ask_table(role, list_driver_sections(role), optional)
     return {role: table} if table else {}
 
 
-def _sections_by_driver(field: str) -> dict[str, type[BaseModel]]:
+def list_driver_sections(field: str) -> dict[str, type[BaseModel]]:
     """The sections of the configuration that a field of `[devices]` may hold."""
     sections = toml_file.list_sections(DevicesConfig.model_fields[field].annotation)
     return {
@@ -154,7 +154,9 @@ def _ask_table(name: str, known: Mapping[str, type[BaseModel]], optional: bool) 
         for key, field in known[driver].model_fields.items():
             # only a preset replaces `raw`
             if key == "raw" or (field.is_required() and key != "driver"):
-                answer = _ask_question(f"  {key} ({_key_meaning(f'{driver}.{key}').rstrip('.')})")
+                answer = _ask_question(
+                    f"  {key} ({find_key_meaning(f'{driver}.{key}').rstrip('.')})"
+                )
                 if field.annotation is str:
                     table[key] = answer
                 else:
@@ -183,7 +185,7 @@ def _parse_answer(answer: str) -> Any:
         return answer
 
 
-def _key_meaning(key: str) -> str:
+def find_key_meaning(key: str) -> str:
     return reference.find_explained(key)[0].keys[0].meaning
 
 
@@ -214,6 +216,6 @@ def _format_keys(path: str, table: TomlTable) -> list[str]:
     driver = table.get("driver", path)
     lines = []
     for key, value in table.items():
-        meaning = "" if key == "driver" else f"  # {_key_meaning(f'{driver}.{key}')}"
+        meaning = "" if key == "driver" else f"  # {find_key_meaning(f'{driver}.{key}')}"
         lines.append(f"{key} = {json.dumps(value, ensure_ascii=False)}{meaning}")
     return lines

@@ -1,0 +1,1 @@
+"""`commission`: a guided session from the mirror's data to an accepted hold."""

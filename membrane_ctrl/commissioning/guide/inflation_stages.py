@@ -1,0 +1,244 @@
+"""Step 4: the first inflation, the leak, the pump's curve, and laser against gauge.
+
+The controller of a hold moves the gas, with every safety rule on. Between two depths it holds the
+mirror and a person confirms the next one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.commissioning.guide import thresholds
+from membrane_ctrl.commissioning.guide.mirror_design import derive_design
+from membrane_ctrl.commissioning.guide.stage import (
+    CommissioningStage,
+    StageContext,
+    StageFailedError,
+)
+from membrane_ctrl.commissioning.guide.stage_words import format_duration
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.model import events
+from membrane_ctrl.model.telemetry import State, TelemetryRow
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
+
+_WHO = "commission"
+_HELD_LEAST_SHARE = 0.99  # of the sag: limits.displacement_min_um while the mirror is filled
+_REPORT_S = 600.0  # between two lines of progress
+_LAW_PA = 2.0  # least squares: a gauge's error is a share of its reading, but not below this
+
+
+@dataclass(frozen=True, slots=True)
+class DepthPoint:
+    """Laser and gauge at a held depth."""
+
+    sag_mm: float
+    pressure_pa: float
+
+
+def inflate_in_steps(context: StageContext) -> None:
+    """Fill the mirror in steps, and compare laser and gauge."""
+    facts = context.facts
+    limits = context.config.limits
+    dialogue = context.dialogue
+    sag_um = 1e3 * facts.sag_mm
+    # The depths on the way are below the limit of the finished mirror: it is widened meanwhile.
+    context.set_keys("limits", displacement_min_um=-_HELD_LEAST_SHARE * sag_um)
+    points: list[DepthPoint] = []
+    try:
+        with context.access.start_hold(context.folder, context.config, "inflation") as link:
+            present_um = wait_for_row(link).displacement_um
+            if not np.isfinite(present_um):
+                raise StageFailedError(
+                    "the laser shows nothing: it must see the film from flat to full depth"
+                )
+            for share in context.plan.inflation_shares:
+                setpoint_um = (share - 1.0) * sag_um
+                if setpoint_um < present_um - 0.01 * sag_um:
+                    continue  # a resumed session: the mirror is deeper already
+                request = f"Fill to {share * facts.sag_mm:.1f} mm, {share:.0%} of the depth?"
+                if not dialogue.confirm(f"fill_{share:g}", request):
+                    raise StageFailedError("not confirmed: the pump is off")
+                points.append(hold_depth(context, link, setpoint_um))
+    except HoldError as error:
+        raise StageFailedError(f"the controller ended the inflation: {error}") from None
+    finally:
+        context.set_keys("limits", displacement_min_um=limits.displacement_min_um)
+    judge_law(context, points)
+
+
+def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> DepthPoint:
+    """Hold a depth for a while, and measure it."""
+    link.send_command(Command("setpoint", _WHO, value=setpoint_um))
+    if wait_for_row(link).state == State.STANDBY:
+        link.send_command(Command("hold", _WHO))
+    band_um = context.config.limits.band_um
+
+    def is_there(row: TelemetryRow) -> bool:
+        return row.state == State.HOLD and abs(row.displacement_um - setpoint_um) < 3 * band_um
+
+    timeout_s = context.config.states.inflate_timeout_s
+    watch_rows(context, link, is_there, timeout_s)
+    rows = collect_rows(link, context.plan.settled_s)
+    sag_mm = context.facts.sag_mm + 1e-3 * float(np.mean([row.displacement_um for row in rows]))
+    pressure_pa = float(np.mean([row.gauge_pressure_pa for row in rows]))
+    context.dialogue.show(f"  holding {sag_mm:.2f} mm at {pressure_pa:.1f} Pa")
+    return DepthPoint(sag_mm, pressure_pa)
+
+
+def wait_for_row(link: HoldLink) -> TelemetryRow:
+    """The newest row."""
+    while True:
+        rows = link.read_news().rows
+        if rows:
+            return rows[-1]
+
+
+def watch_rows(
+    context: StageContext,
+    link: HoldLink,
+    is_done: Callable[[TelemetryRow], bool],
+    timeout_s: float,
+) -> TelemetryRow:
+    """Follow the hold until a row is as wanted. Raises StageFailedError on a fault or time-out."""
+    began_s = shown_s = None
+    while True:
+        news = link.read_news()
+        for event in news.events:
+            if isinstance(event, events.Fault):
+                raise StageFailedError(
+                    f"the controller ended it: {event.sentence}; the pump is off"
+                )
+        for row in news.rows:
+            if began_s is None or shown_s is None:
+                began_s = shown_s = row.mono_s
+            if is_done(row):
+                return row
+            if row.mono_s - shown_s >= _REPORT_S:
+                shown_s = row.mono_s
+                context.dialogue.show(
+                    f"  {format_duration(row.mono_s - began_s)}: {row.displacement_um:.0f} µm, "
+                    f"{row.gauge_pressure_pa:.0f} Pa, pump {row.pump_fraction:.2f}"
+                )
+            if row.mono_s - began_s > timeout_s:
+                raise StageFailedError(f"not reached within {format_duration(timeout_s)}")
+
+
+def collect_rows(link: HoldLink, duration_s: float) -> list[TelemetryRow]:
+    """The rows of a time. Raises HoldError if the hold ends."""
+    rows: list[TelemetryRow] = []
+    while not rows or rows[-1].mono_s - rows[0].mono_s < duration_s:
+        rows += link.read_news().rows
+    return rows
+
+
+def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
+    """Compare laser and gauge by the film's law, p = p0 + c w^3."""
+    if len(points) < 3:
+        context.leave_out(
+            "laser against gauge", "the mirror was filled already: fewer than three depths"
+        )
+        return
+    cubes = np.array([point.sag_mm**3 for point in points])
+    pressures_pa = np.array([point.pressure_pa for point in points])
+    weights = 1.0 / np.maximum(_LAW_PA, 0.02 * pressures_pa)
+    matrix = np.stack([np.ones_like(cubes), cubes], axis=1)
+    fitted, *_ = np.linalg.lstsq(matrix * weights[:, None], pressures_pa * weights, rcond=None)
+    zero_pa, factor = float(fitted[0]), float(fitted[1])
+    expected_pa = matrix @ fitted
+    scatter = np.abs(pressures_pa - expected_pa) / np.maximum(expected_pa, 0.1 * expected_pa[-1])
+    context.judge(
+        "pressure against depth, difference from the film's law",
+        100.0 * float(np.max(scatter)),
+        thresholds.FIT_SCATTER,
+        "laser or gauge is not linear, or the laser's zero is not where the bowl has its depth",
+    )
+    design = derive_design(context.facts)
+    ratio = factor * context.facts.sag_mm**3 / design.pressure_pa
+    context.judge(
+        "measured over stated stiffness of the film, or the reverse",
+        max(ratio, 1.0 / ratio) if ratio > 0 else float("inf"),
+        thresholds.STIFFNESS_RATIO,
+        "check thickness, modulus, diameter, and the units of laser and gauge",
+    )
+    context.note("gauge zero by the fit", f"{zero_pa:+.1f} Pa")
+    context.note("pressure at the full depth", f"{pressures_pa[-1]:.1f} Pa")
+    context.set_keys("optics.mirror", pressure_pa=round(float(pressures_pa[-1]), 1))
+
+
+def measure_leak(context: StageContext) -> None:
+    """Hold the mirror, switch the pump off for a minute, and see how fast it sinks."""
+    try:
+        with context.access.start_hold(context.folder, context.config, "leak") as link:
+            hold_depth(context, link, context.config.loop.setpoint_um)
+            held = collect_rows(link, context.plan.settled_s)
+            link.send_command(Command("lower", _WHO))
+            rows = [
+                row
+                for row in collect_rows(link, context.plan.leak_s)
+                if row.state in (State.LOWER, State.STANDBY) and row.pump_fraction == 0.0
+            ]
+    except HoldError as error:
+        raise StageFailedError(f"the controller ended it: {error}") from None
+    if len(rows) < 10:
+        raise StageFailedError("the pump did not stay off")
+    times_s = np.array([row.mono_s for row in rows])
+    leak_um_per_s = -float(np.polyfit(times_s, [row.displacement_um for row in rows], 1)[0])
+    context.judge(
+        "leak at the held depth",
+        leak_um_per_s,
+        thresholds.LEAK_LEAST,
+        "open a bleed (`loop.bleed_fraction`)",
+    )
+    context.judge(
+        "leak over the pump's full flow",
+        leak_um_per_s / context.config.pump.flow_full_um_per_s,
+        thresholds.LEAK_SHARE,
+        "find the leak, or fit a larger pump",
+    )
+    estimated = float(np.mean([row.leak_um_per_s for row in held]))
+    context.note("leak as the controller estimates it", f"{estimated:.2f} µm/s")
+    time_constant_s = 1e3 * context.facts.sag_mm / (3.0 * max(leak_um_per_s, 1e-6))
+    context.set_keys("twin", leak_time_constant_s=float(f"{time_constant_s:.4g}"))
+    context.note("time constant of the leak", format_duration(time_constant_s))
+
+
+def map_pump(context: StageContext) -> None:
+    """Measure the pump's curve with `tune pump`."""
+    context.dialogue.show("  `membrane-ctrl tune pump` measures it; 15 to 35 min at a real bench")
+    try:
+        with context.access.start_hold(context.folder, context.config, "pump") as link:
+            hold_depth(context, link, context.config.loop.setpoint_um)
+            link.close()
+            code = context.access.run_tuning(context.folder, context.config, "pump")
+    except HoldError as error:
+        raise StageFailedError(f"the controller ended it: {error}") from None
+    context.require(
+        "pump's curve", code == 0, f"exit code {code}", "read the messages above; then try again"
+    )
+
+
+STAGES = (
+    CommissioningStage(
+        step=4,
+        name="inflation",
+        does="fills the mirror with the controller, depth by depth, each after your confirmation",
+        look_for="a round film without folds, gauge and laser that agree with the film's law",
+        run=inflate_in_steps,
+        must_pass=True,
+    ),
+    CommissioningStage(
+        step=4,
+        name="leak",
+        does="holds the mirror, switches the pump off for a minute, and measures how it sinks",
+        look_for="a leak between 0.4 µm/s and 60 % of the pump's flow",
+        run=measure_leak,
+    ),
+    CommissioningStage(
+        step=4,
+        name="pump",
+        does="measures the pump's flow against its command, by the mirror",
+        look_for="a curve that passes its trial",
+        run=map_pump,
+    ),
+)

@@ -1,0 +1,151 @@
+"""Step 5: camera, screen, geometry, first figure."""
+
+import numpy as np
+
+from membrane_ctrl.commissioning.guide import thresholds
+from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth
+from membrane_ctrl.commissioning.guide.session_state import SessionState, TomlTable
+from membrane_ctrl.commissioning.guide.stage import (
+    CommissioningStage,
+    StageContext,
+    StageFailedError,
+)
+from membrane_ctrl.config import sight
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.sessions.live_hold import HoldError
+
+_FIGURES = 5
+_FIGURES_WITHIN_S = 300.0
+_FULL_8_BITS = 255.0
+_GOOD_SHARE = thresholds.Threshold(
+    "figures with the verdict ok", 0.8, "of all", "one of five may be disturbed", is_least=True
+)
+
+
+def ask_geometry(context: StageContext) -> None:
+    """Ask for the distances that a tape measures, and judge what the camera then sees."""
+    dialogue = context.dialogue
+    geometry = context.config.optics.geometry
+    if geometry.a_mm is None or geometry.b_mm is None or geometry.alpha_deg is None:
+        context.note("geometry", "general poses are configured; they are kept")
+    else:
+        context.set_keys(
+            "optics.geometry",
+            a_mm=dialogue.ask_number(
+                "a_mm", "mirror's vertex to the camera's pinhole", geometry.a_mm, 100, 1e5, "mm"
+            ),
+            b_mm=dialogue.ask_number(
+                "b_mm", "mirror's vertex to the pattern's centre", geometry.b_mm, 100, 1e5, "mm"
+            ),
+            alpha_deg=dialogue.ask_number(
+                "alpha_deg",
+                "angle of either line of sight above the mirror's plane",
+                geometry.alpha_deg,
+                1,
+                179,
+                "degrees",
+            ),
+        )
+    optics = context.config.optics
+    seen = sight.trace_view(optics, optics.mirror.sag_mm)
+    context.judge(
+        "part of the mirror that camera and pattern can measure by the stated geometry",
+        seen.measured,
+        thresholds.SEEN_SHARE,
+        "measure the distances again, then move the screen or use a wider lens",
+    )
+    doubt = sight.find_doubt(optics)
+    if doubt is not None:
+        context.require(f"optics.{doubt.table}.{doubt.key}", False, doubt.why, doubt.remedy)
+
+
+def test_screen(context: StageContext) -> None:
+    """Focus and exposure by hand, then the pattern, settling and response of the screen."""
+    context.dialogue.wait(
+        "focus",
+        "Focus on the mirror's rim, close the diaphragm by two stops from open, and fix both rings",
+    )
+    probes = context.access.probe_optics(context.config)
+    if not probes:
+        context.leave_out(
+            "exposure, pattern, settling and response", "this emulation has no camera frames"
+        )
+    for probe in probes:
+        seen = probe.problem or f"{probe.identity}: {probe.reading}; {probe.notes}"
+        context.require(f"camera and screen on {probe.device}", not probe.problem, seen)
+
+
+def measure_figure(context: StageContext) -> None:
+    """Hold the mirror and judge its first figures."""
+    try:
+        with context.access.start_hold(context.folder, context.config, "figure") as link:
+            hold_depth(context, link, context.config.loop.setpoint_um)
+            found: list[ShapeEstimate] = []
+            waited_s = 0.0
+            while len(found) < _FIGURES and waited_s < _FIGURES_WITHIN_S:
+                news = link.read_news()
+                found += news.shapes
+                if len(news.rows) > 1:
+                    waited_s += news.rows[-1].mono_s - news.rows[0].mono_s
+    except HoldError as error:
+        raise StageFailedError(f"the controller ended it: {error}") from None
+    if len(found) < _FIGURES:
+        context.require(
+            "first figures",
+            False,
+            f"{len(found)} in {_FIGURES_WITHIN_S:g} s",
+            "read the events of the run (`membrane-ctrl runs show last`)",
+        )
+        return
+    good = [figure for figure in found if figure.verdict == "ok"]
+    context.judge("figures with the verdict ok", len(good) / len(found), _GOOD_SHARE)
+    context.judge(
+        "part of the mirror that a figure measures",
+        float(np.median([figure.valid_fraction for figure in found])),
+        thresholds.VALID_FRACTION,
+        "look at a frame: shadows, the rim, the screen's border",
+    )
+    full_scale = float(1 << context.config.optics.camera.bits)
+    modulation = float(np.median([figure.modulation_median_adu for figure in found]))
+    context.judge(
+        "median modulation of the fringes",
+        modulation * _FULL_8_BITS / full_scale,
+        thresholds.MODULATION,
+        "focus, expose longer, or brighten the screen",
+    )
+    if context.access.simulated:
+        context.note("origin of these figures", "the twin's truth, not camera frames")
+    context.note("calibration", "by hand; `membrane-ctrl calibrate` refines it with capture sets")
+
+
+def has_camera(state: SessionState, tables: TomlTable) -> bool:
+    """Whether a camera is configured."""
+    return "camera" in tables.get("devices", {})
+
+
+STAGES = (
+    CommissioningStage(
+        step=5,
+        name="screen",
+        does="takes pictures of a checkerboard, of steps and of a ramp of grey",
+        look_for="a good exposure, single pixels, a settling time, a gamma",
+        run=test_screen,
+        is_needed=has_camera,
+    ),
+    CommissioningStage(
+        step=5,
+        name="geometry",
+        does="asks for the distances measured by hand, and follows the camera's rays",
+        look_for="the whole mirror reflects the pattern",
+        run=ask_geometry,
+        is_needed=has_camera,
+    ),
+    CommissioningStage(
+        step=5,
+        name="figure",
+        does="holds the mirror and measures five figures",
+        look_for="verdict ok, most of the mirror measured, bright fringes",
+        run=measure_figure,
+        is_needed=has_camera,
+    ),
+)

@@ -1,0 +1,156 @@
+"""The configured devices, and a hold of their own program."""
+
+import asyncio
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from firmware_iface import roles
+from membrane_ctrl.commissioning import check
+from membrane_ctrl.commissioning.devices import (
+    FoundDevice,
+    find_cameras,
+    find_displays,
+    find_drivers,
+    find_ports,
+)
+from membrane_ctrl.commissioning.guide.bench_access import Action, HandMotion, OpenBench
+from membrane_ctrl.commissioning.guide.session_state import CONFIGURATION
+from membrane_ctrl.config.port import SOCKET_NAME
+from membrane_ctrl.config.schema import Config, DevicesConfig
+from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.instruments import bench, device_claim, device_names, lock_keys, lock_store
+from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.sessions.live_hold import HoldLink, live_hold
+
+T = TypeVar("T")
+_STARTS_S = 90.0
+_OWN_END_S = 10.0
+_ENDS_S = 120.0
+_POLL_S = 0.2
+_CLIENT = "commission"
+
+
+class RealBench:
+    """A `BenchAccess` to the configured devices."""
+
+    simulated = False
+
+    def find_devices(self) -> list[FoundDevice]:
+        """What is connected to this machine."""
+        cameras, _ = find_cameras()
+        return [*find_ports(), *cameras, *find_displays(), *find_drivers()]
+
+    def probe_devices(self, config: Config) -> list[check.DeviceProbe]:
+        """Probe the configured devices without writing to them."""
+        probes, _ = check.probe_all_devices(config)
+        return [probe for probe in probes if probe.role != "camera"]
+
+    def probe_optics(self, config: Config) -> list[check.DeviceProbe]:
+        """Probe camera and screen together."""
+        return check.probe_optics(config)
+
+    def act(self, config: Config, action: Action[T]) -> T:
+        """Open the bench, do something with it, and leave it with the pump off."""
+        devices = config.devices
+        if devices is None:
+            raise DeviceError("no devices are configured")
+        with device_claim.claim_devices(device_names.list_device_names(devices)):
+            lock_store.require_unlocked(
+                lock_store.LockStore.of_machine(), lock_keys.list_device_keys(devices)
+            )
+            return asyncio.run(self._act(devices, action))
+
+    async def _act(self, devices: DevicesConfig, action: Action[T]) -> T:
+        made = bench.make_bench(devices)
+        identity = await bench.connect_bench(made, devices)
+        loop = asyncio.get_running_loop()
+        try:
+            return await action(OpenBench(made, identity, asyncio.sleep, loop.time))
+        finally:
+            await stop_outputs(made)
+            await made.close()
+
+    def move_hand(self, motion: HandMotion) -> None:
+        """The person has done it."""
+
+    @contextlib.contextmanager
+    def start_hold(self, folder: Path, config: Config, name: str) -> Iterator[HoldLink]:
+        """Start `hold --standby` with the session's configuration, and stop it at the end."""
+        logs = folder / "logs"
+        logs.mkdir(parents=True, exist_ok=True)
+        command = [
+            *_own_command(),
+            "hold",
+            "--config",
+            str(folder / CONFIGURATION),
+            "--standby",
+            "--name",
+            name,
+            "--logs",
+            str(logs),
+            "--no-service",
+        ]
+        output = (folder / f"{name}.log").open("ab")
+        with output:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output
+            )
+        try:
+            _wait_for_socket(process, logs / SOCKET_NAME, folder / f"{name}.log")
+            with live_hold(Where(logs=logs), take_over=False, session=_CLIENT) as link:
+                yield link
+        finally:
+            _end_process(process)
+
+    def run_tuning(self, folder: Path, config: Config, command: str) -> int:
+        """Run `tune` on the hold that runs."""
+        logs = str(folder / "logs")
+        arguments = [*_own_command(), "tune", command, "--logs", logs, "--yes", "--take-over"]
+        found = subprocess.run(arguments, check=False)
+        if found.returncode == 0:
+            configuration = str(folder / CONFIGURATION)
+            saved = [*_own_command(), "tune", "save", "--logs", logs, "--config", configuration]
+            found = subprocess.run([*saved, "--yes"], check=False)
+        return found.returncode
+
+
+async def stop_outputs(open_bench: roles.Bench) -> None:
+    """Switch the pump off and shut the vent; a bench that does not answer has its watchdog."""
+    with contextlib.suppress(roles.LinkError):
+        await open_bench.write(roles.BenchCommand(0.0, 0.0))
+
+
+def _own_command() -> list[str]:
+    return [sys.executable, "-m", "membrane_ctrl"]
+
+
+def _wait_for_socket(process: "subprocess.Popen[bytes]", socket: Path, log: Path) -> None:
+    """Wait until the hold listens. Raises DeviceError if it ends before, or takes too long."""
+    until_s = time.monotonic() + _STARTS_S
+    while not socket.exists():
+        if process.poll() is not None:
+            lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+            last = lines[-1] if lines else "no message"
+            raise DeviceError(f"the hold does not start: {last} ({log})")
+        if time.monotonic() > until_s:
+            raise DeviceError(f"the hold does not listen within {_STARTS_S:g} s ({log})")
+        time.sleep(_POLL_S)
+
+
+def _end_process(process: "subprocess.Popen[bytes]") -> None:
+    """End the hold as Ctrl-C does, and wait until it has stopped safely.
+
+    A Ctrl-C of the terminal has reached it already: then it only needs time.
+    """
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        if isinstance(sys.exc_info()[1], KeyboardInterrupt):
+            process.wait(_OWN_END_S)
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+    process.wait(_ENDS_S)

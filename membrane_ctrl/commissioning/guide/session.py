@@ -1,0 +1,207 @@
+"""The command `commission`: runs the stages in order, and resumes where it stopped."""
+
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from firmware_iface import roles
+from membrane_ctrl.commissioning.guide import (
+    acceptance_stages,
+    device_stages,
+    inflation_stages,
+    mirror_stages,
+    optics_stages,
+    report,
+    wiring_stages,
+)
+from membrane_ctrl.commissioning.guide.bench_access import BenchAccess
+from membrane_ctrl.commissioning.guide.dialogue import (
+    Choice,
+    Dialogue,
+    GoBackError,
+    ReadLine,
+    StopSessionError,
+)
+from membrane_ctrl.commissioning.guide.session_state import (
+    CONFIGURATION,
+    SessionState,
+    StageRecord,
+    read_state,
+    read_tables,
+    write_state,
+)
+from membrane_ctrl.commissioning.guide.stage import (
+    FULL_PLAN,
+    CommissioningStage,
+    SessionPlan,
+    StageContext,
+    StageFailedError,
+)
+from membrane_ctrl.model import errors
+from membrane_ctrl.model.account import account_name
+
+STAGES: tuple[CommissioningStage, ...] = (
+    *mirror_stages.STAGES,
+    *device_stages.STAGES,
+    *wiring_stages.STAGES,
+    *inflation_stages.STAGES,
+    *optics_stages.STAGES,
+    *acceptance_stages.STAGES,
+)
+_AGAIN, _ON, _BACK = "again", "continue", "back"
+_HELP = (
+    "At every prompt: `back` returns to the stage before, `stop` or Ctrl-C ends; nothing is lost."
+)
+
+
+class CommissioningSession:
+    """Runs a session in a folder.
+
+    Parameters
+    ----------
+    folder : path
+        Of the session: `session.json`, `lab.toml`, runs, report.
+    access : BenchAccess
+    read_line, show_line : callable
+        See `Dialogue`.
+    plan : SessionPlan, optional
+    stages : sequence of CommissioningStage, optional
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        access: BenchAccess,
+        read_line: ReadLine,
+        show_line: Callable[[str], None],
+        plan: SessionPlan = FULL_PLAN,
+        stages: Sequence[CommissioningStage] = STAGES,
+    ) -> None:
+        self._folder = folder
+        self._access = access
+        self._plan = plan
+        self._stages = stages
+        self._state = self._open_state()
+        self._dialogue = Dialogue(
+            read_line, show_line, self._state.answers, lambda: write_state(folder, self._state)
+        )
+
+    def _open_state(self) -> SessionState:
+        """The folder's state, or a new one. Raises InputError for one of the other kind."""
+        state = read_state(self._folder)
+        if state is None:
+            return SessionState(
+                created_utc=_now_utc(), author=account_name(), simulated=self._access.simulated
+            )
+        if state.simulated != self._access.simulated:
+            kind = "the emulated bench" if state.simulated else "a real bench"
+            raise errors.InputError(f"{self._folder}: a session on {kind}; name another folder")
+        return state
+
+    def run(self) -> errors.Exit:
+        """Run the stages that are not done; returns REJECTED if the bench is not accepted.
+
+        Raises DeviceError or InputError for files that cannot be written or read.
+        """
+        self._dialogue.show(_HELP)
+        index = self._find_first_open()
+        try:
+            while index < len(self._stages):
+                index = self._run_stage(index)
+        except (StopSessionError, KeyboardInterrupt, EOFError):
+            self._dialogue.show(
+                "", f"stopped; `membrane-ctrl commission {self._folder}` resumes this session"
+            )
+            return errors.Exit.INTERRUPTED
+        return self._finish()
+
+    def _find_first_open(self) -> int:
+        """Index of the first stage that has no record."""
+        for index, stage in enumerate(self._stages):
+            if self._is_needed(stage) and self._state.find_record(stage.name) is None:
+                return index
+        return len(self._stages)
+
+    def _is_needed(self, stage: CommissioningStage) -> bool:
+        return stage.is_needed(self._state, read_tables(self._folder))
+
+    def _run_stage(self, index: int) -> int:
+        """Run a stage; returns the index of the next one."""
+        stage = self._stages[index]
+        if not self._is_needed(stage):
+            return index + 1
+        title = report.STEP_TITLES[stage.step]
+        self._dialogue.show(
+            "",
+            f"{stage.step}. {title}: {stage.name}",
+            f"  It {stage.does}.",
+            f"  To be seen: {stage.look_for}.",
+        )
+        context = StageContext(self._folder, self._state, self._dialogue, self._access, self._plan)
+        problem = ""
+        try:
+            stage.run(context)
+        except GoBackError:
+            return self._go_back(index)
+        except (StageFailedError, roles.LinkError, errors.DeviceError) as error:
+            problem = str(error)
+        record = StageRecord(
+            stage=stage.name, finished_utc=_now_utc(), checks=tuple(context.checks)
+        )
+        if problem:
+            self._dialogue.show(f"  stopped safely: {problem}")
+        if not problem and not record.failed:
+            self._store(record)
+            return index + 1
+        return self._ask_after_failure(index, record, problem)
+
+    def _ask_after_failure(self, index: int, record: StageRecord, problem: str) -> int:
+        """What to do after a stage that failed: again, back, or on where gas may move anyway."""
+        stage = self._stages[index]
+        choices = [Choice(_AGAIN, "run this stage again"), Choice(_BACK, "the stage before")]
+        if not problem and not stage.must_pass:
+            choices.append(Choice(_ON, "go on; the report names it as a reason not to accept"))
+        self._state.answers.pop(f"{stage.name}.after", None)
+        try:
+            answer = self._dialogue.ask_choice(f"{stage.name}.after", "what now?", choices)
+        except GoBackError:
+            answer = _BACK
+        if answer == _ON:
+            self._store(record)
+            return index + 1
+        return index if answer == _AGAIN else self._go_back(index)
+
+    def _go_back(self, index: int) -> int:
+        """Forget the stage before, and return its index."""
+        for before in range(index - 1, -1, -1):
+            if self._is_needed(self._stages[before]):
+                self._state.remove_record(self._stages[before].name)
+                write_state(self._folder, self._state)
+                return before
+        self._dialogue.show("  this is the first stage")
+        return index
+
+    def _store(self, record: StageRecord) -> None:
+        self._state.add_record(record)
+        write_state(self._folder, self._state)
+
+    def _finish(self) -> errors.Exit:
+        """Ask for the signature, write the report, and show the verdict."""
+        try:
+            signed_by = self._dialogue.ask_text("signature", "your name, to sign the report")
+        except (GoBackError, StopSessionError, KeyboardInterrupt, EOFError):
+            signed_by = ""
+        tables = read_tables(self._folder)
+        accepted = report.write_report(self._folder, self._stages, self._state, tables, signed_by)
+        reasons = report.find_reasons(self._stages, self._state, tables)
+        self._dialogue.show("", "accepted" if accepted else "not accepted:")
+        self._dialogue.show(*(f"  {reason}" for reason in reasons))
+        self._dialogue.show(
+            f"report: {self._folder / report.HTML}, {self._folder / report.PDF}",
+            f"configuration: {self._folder / CONFIGURATION}",
+        )
+        return errors.Exit.DONE if accepted else errors.Exit.REJECTED
+
+
+def _now_utc() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

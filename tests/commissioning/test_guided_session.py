@@ -1,0 +1,243 @@
+"""A commissioning session on the emulated bench in virtual time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.commissioning.guide.dialogue import Dialogue
+from membrane_ctrl.commissioning.guide.inflation_stages import DepthPoint, judge_law
+from membrane_ctrl.commissioning.guide.mirror_design import PAPER_MIRROR
+from membrane_ctrl.commissioning.guide.report import HTML, PDF
+from membrane_ctrl.commissioning.guide.session_state import (
+    CONFIGURATION,
+    SessionState,
+    read_state,
+)
+from membrane_ctrl.commissioning.guide.stage import StageContext
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import load_toml
+from membrane_ctrl.controller.cross_check import cross_check
+from membrane_ctrl.model.errors import Exit, InputError
+from tests.commissioning.guided import Person, QuickBench, failed_in, run_stages, state_of
+
+DESK = ("mirror", "devices")
+
+
+@pytest.fixture
+def bench() -> QuickBench:
+    return QuickBench()
+
+
+def test_a_whole_session_ends_accepted_with_configuration_and_report(
+    tmp_path: Path, bench: QuickBench
+) -> None:
+    person = Person()
+    assert run_stages(tmp_path, bench, person) == Exit.DONE, person.text
+    config = load_toml(tmp_path / CONFIGURATION, Config)
+    assert not [finding for finding in cross_check(config) if finding.severity == "error"]
+    assert config.limits.displacement_min_um == -2000.0  # wider only while the mirror was filled
+    assert config.twin.leak_time_constant_s == pytest.approx(1e4, rel=0.1)  # measured
+    html = (tmp_path / HTML).read_text(encoding="utf-8")
+    assert "Accepted." in html
+    assert "emulated bench" in html
+    assert "signed by" in html
+    assert (tmp_path / PDF).read_bytes().startswith(b"%PDF")
+    assert bench.tuned == ["pump", "run"]
+    # A second start finds nothing to do but the signature.
+    again = Person()
+    assert run_stages(tmp_path, bench, again) == Exit.DONE
+    assert again.asked == ["signature"]
+
+
+def test_the_end_of_input_loses_nothing(tmp_path: Path, bench: QuickBench) -> None:
+    class Leaving(Person):
+        def read_line(self, key: str, prompt: str) -> str:
+            if key == "mirror.modulus_gpa":
+                raise EOFError
+            return super().read_line(key, prompt)
+
+    person = Leaving(**{"mirror.sag_mm": "30"})
+    assert run_stages(tmp_path, bench, person, "mirror") == Exit.INTERRUPTED
+    resumed = Person(**{"mirror.sag_mm": [], "mirror.pump_ml_per_s": "100"})
+    run_stages(tmp_path, bench, resumed, "mirror")
+    facts = state_of(tmp_path).facts
+    assert facts is not None
+    assert facts.sag_mm == 30.0  # Enter repeats the answer
+
+
+def test_back_returns_to_the_stage_before(tmp_path: Path, bench: QuickBench) -> None:
+    person = Person(**{"devices.kind": ["back", "board"], "mirror.sag_mm": ["37.1", "30"]})
+    assert run_stages(tmp_path, bench, person, *DESK) == Exit.DONE
+    facts = state_of(tmp_path).facts
+    assert facts is not None
+    assert facts.sag_mm == 30.0
+
+
+def test_a_mirror_whose_film_would_yield_is_refused(tmp_path: Path, bench: QuickBench) -> None:
+    person = Person(**{"mirror.back_thickness_um": "5"})
+    assert run_stages(tmp_path, bench, person, *DESK) == Exit.INTERRUPTED
+    assert failed_in(tmp_path, person) == ["yield stress over the stress at the pressure limit"]
+    assert "continue" not in person.text
+
+
+def test_a_typo_asks_again_and_keeps_the_other_answers(tmp_path: Path, bench: QuickBench) -> None:
+    person = Person(
+        **{
+            "devices.kind": "instruments",
+            "displacement.driver": "optoncdt1420",
+            "displacement.port": "/dev/ttyUSB0",
+            "pump.driver": "modbus_map",
+            "pump.preset": "none",
+            "pump.link": "tcp://192.168.1.40",
+            "pump.address": ["three", "3"],
+            "pump.raw": ["4000", "4000, 20000"],
+            "pump.value": "0, 1",
+            "gauge_pressure.driver": "mks_937b",
+            "gauge_pressure.port": "/dev/ttyUSB1",
+            "vent.driver": "none",
+            "barometer.driver": "none",
+            "thermometer.driver": "none",
+            "interlock1.driver": "none",
+        }
+    )
+    run_stages(tmp_path, bench, person, *DESK)
+    devices = load_toml(tmp_path / CONFIGURATION, Config).devices
+    assert devices is not None
+    assert devices.pump is not None
+    assert devices.pump.model_dump()["raw"] == (4000.0, 20000.0)
+    assert devices.pump.model_dump()["link"] == "tcp://192.168.1.40"
+
+
+WIRING = (
+    ("gauge_zero", "gauge_offset_pa", 20.0, "gauge reading of the vented mirror"),
+    ("gauge_zero", "gauge_stuck", True, "the gauge's last digit moves"),
+    ("laser", "no_light", True, "laser sees the card"),
+    ("laser", "laser_stuck", True, "laser's sign"),
+    ("outputs", "readback_fraction", 0.9, "pump"),
+    ("watchdog", "readback_fraction", 0.35, "pump off after the last command, beyond the"),
+)
+
+
+@pytest.mark.parametrize(("stage", "name", "value", "check"), WIRING)
+def test_wrong_wiring_is_found(
+    tmp_path: Path, bench: QuickBench, stage: str, name: str, value: object, check: str
+) -> None:
+    run_stages(tmp_path, bench, Person(), *DESK, "probe")
+    setattr(bench.bench.wrong, name, value)
+    person = Person()
+    assert run_stages(tmp_path, bench, person, stage) == Exit.INTERRUPTED
+    failed = failed_in(tmp_path, person)
+    assert any(found.startswith(check) for found in failed), person.text
+    assert bench.bench.board.pump_fraction == 0.0
+
+
+def test_a_reversed_laser_is_found(tmp_path: Path, bench: QuickBench) -> None:
+    run_stages(tmp_path, bench, Person(), *DESK, "probe")
+    bench.laser_sign = -1
+    person = Person()
+    run_stages(tmp_path, bench, person, "laser")
+    assert failed_in(tmp_path, person) == ["laser's sign"]
+
+
+def test_a_closed_vent_stops_the_pump(tmp_path: Path, bench: QuickBench) -> None:
+    run_stages(tmp_path, bench, Person(), *DESK, "probe")
+    bench.bench.wrong.gauge_offset_pa = 200.0  # the gas does not get out
+    person = Person()
+    assert run_stages(tmp_path, bench, person, "outputs") == Exit.INTERRUPTED
+    assert "the pump is off, the vent open" in person.text
+    assert bench.bench.board.pump_fraction == 0.0
+
+
+def test_a_pump_that_runs_on_without_its_cable_is_a_reason(
+    tmp_path: Path, bench: QuickBench
+) -> None:
+    run_stages(tmp_path, bench, Person(), *DESK, "probe")
+    person = Person(**{"cable_stopped": "n", "cable.after": "continue"})
+    assert run_stages(tmp_path, bench, person, "cable") == Exit.REJECTED
+    assert "Not accepted: 1 reasons." in (tmp_path / HTML).read_text(encoding="utf-8")
+
+
+def test_without_interlocks_or_relief_valve_it_is_not_accepted(
+    tmp_path: Path, bench: QuickBench
+) -> None:
+    person = Person(**{"interlock1.driver": "none", "mirror.relief_pa": "0"})
+    run_stages(tmp_path, bench, person, *DESK)
+    more = Person(
+        **{
+            "stop_fitted": "n",
+            "interlocks.after": "continue",
+            "emergency_stop.after": "continue",
+            "relief.after": "continue",
+        }
+    )
+    names = ("interlocks", "emergency_stop", "relief")
+    assert run_stages(tmp_path, bench, more, *names) == Exit.REJECTED
+    assert failed_in(tmp_path, more) == ["interlocks", "emergency stop", "relief valve"]
+
+
+def test_a_circuit_that_never_opens_is_found(tmp_path: Path, bench: QuickBench) -> None:
+    run_stages(tmp_path, bench, Person(), *DESK, "probe")
+    bench.move_hand = lambda motion: None  # type: ignore[method-assign]  # wired elsewhere
+    person = Person()
+    run_stages(tmp_path, bench, person, "interlocks")
+    assert "emergency_stop open" in failed_in(tmp_path, person)
+
+
+def test_a_pump_without_gas_ends_the_inflation(tmp_path: Path, bench: QuickBench) -> None:
+    run_stages(tmp_path, bench, Person(), *DESK, "probe")
+    bench.bench.wrong.pump_share = 0.0
+    person = Person()
+    assert run_stages(tmp_path, bench, person, "inflation") == Exit.INTERRUPTED
+    assert "the pump is off" in person.text
+    assert load_toml(tmp_path / CONFIGURATION, Config).limits.displacement_min_um == -2000.0
+    assert bench.bench.board.pump_fraction == 0.0
+
+
+def context_of(folder: Path, bench: QuickBench, person: Person) -> StageContext:
+    state = SessionState(created_utc="", author="", simulated=True, facts=PAPER_MIRROR)
+    dialogue = Dialogue(person.read_line, person.shown.append, {}, lambda: None)
+    return StageContext(folder, state, dialogue, bench)
+
+
+@pytest.mark.parametrize(
+    ("factor", "zero_um", "failed"),
+    [
+        (1.0, 0.0, []),
+        (2.0, 0.0, ["measured over stated stiffness of the film, or the reverse"]),
+        (
+            1.0,
+            5000.0,
+            [
+                "pressure against depth, difference from the film's law",
+                "measured over stated stiffness of the film, or the reverse",
+            ],
+        ),
+    ],
+)
+def test_laser_and_gauge_are_compared_by_the_films_law(
+    tmp_path: Path, bench: QuickBench, factor: float, zero_um: float, failed: list[str]
+) -> None:
+    person = Person()
+    sags_mm = [37.1 * share for share in (0.1, 0.35, 0.6, 0.8, 0.9, 1.0)]
+    points = [
+        DepthPoint(sag_mm + 1e-3 * zero_um, factor * 600.0 * (sag_mm / 37.1) ** 3)
+        for sag_mm in sags_mm
+    ]
+    judge_law(context_of(tmp_path, bench, person), points)
+    assert failed_in(tmp_path, person) == failed
+
+
+def test_a_damaged_state_is_named(tmp_path: Path) -> None:
+    (tmp_path / "session.json").write_text("{", encoding="utf-8")
+    with pytest.raises(InputError, match=r"session\.json: damaged"):
+        read_state(tmp_path)
+
+
+def test_numbers_are_asked_until_they_are_within_limits() -> None:
+    answers = ["x", "nan", "-1", "12,5"]
+    shown: list[str] = []
+    dialogue = Dialogue(lambda key, prompt: answers.pop(0), shown.append, {}, lambda: None)
+    assert dialogue.ask_number("sag", "sag", 37.1, 0.1, 100.0, "mm") == 12.5
+    assert len(shown) == 3
