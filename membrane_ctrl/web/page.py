@@ -14,7 +14,7 @@ from nicegui import ui
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.control_port.status_lines import alarm_lines, lock_lines
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model.columns import MISSING, PUBLISHED, TelemetryColumn
 from membrane_ctrl.service.access import (
     ACTIONS,

@@ -8,7 +8,8 @@ import pytest
 from fastapi.routing import APIRoute
 
 from membrane_ctrl.control_port.sender import role_includes
-from membrane_ctrl.controller.commands import TABLE, Role
+from membrane_ctrl.controller.command import Role
+from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.service.access import ACTIONS, STOP, UNLOCK
 from membrane_ctrl.service.api import make_api
 from membrane_ctrl.service.configuration_editor import ConfigurationEditor

@@ -19,11 +19,11 @@ from nicegui.page import page
 
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.sender import role_includes
-from membrane_ctrl.controller.commands import Role
-from membrane_ctrl.service.access import WebUser
+from membrane_ctrl.controller.command import Role
 from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_starter import HoldStarter, StartOptions
+from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.web.page import WebPage
 from membrane_ctrl.web.shared_views import FIRST_FIGURE, HEIGHT, SharedViews
 from tests.worlds.designed_session import make_designed_session
