@@ -1,7 +1,7 @@
 """A hold on the twin in virtual time that begins in standby, as a session sees a hold."""
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import events, shape_estimate, telemetry

@@ -17,7 +17,7 @@ from membrane_ctrl.commissioning.guide.stage import (
     StageFailedError,
 )
 from membrane_ctrl.commissioning.guide.stage_words import format_duration
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model import events
 from membrane_ctrl.model.telemetry import State, TelemetryRow
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink

@@ -95,7 +95,7 @@ def derive_design(facts: MirrorFacts) -> MirrorDesign:
     back = FilmLaw(0.0, facts.poisson, _stiffness(facts, facts.back_thickness_um), facts.radius_mm)
     front_bowl = front.with_sag(facts.sag_mm)
     pressure_pa = float(front.pressure_pa(front_bowl))
-    back_bowl = back.under(pressure_pa)
+    back_bowl = back.under_pressure(pressure_pa)
     front_stress_mpa = _stress_mpa(front, front_bowl, facts.thickness_um)
     back_stress_mpa = _stress_mpa(back, back_bowl, facts.back_thickness_um)
     stress_mpa = max(front_stress_mpa, back_stress_mpa)
