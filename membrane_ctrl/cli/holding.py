@@ -74,7 +74,9 @@ def hold(
     autotune: Annotated[
         bool,
         typer.Option(
-            "--autotune", help="Tune the loop on trial once the mirror is held; ten minutes."
+            "--autotune",
+            help="Tune the loop on trial once the mirror is held: ten minutes; where the pump's "
+            "curve must be measured first, 25 to 45. The run's autotune.log states which.",
         ),
     ] = False,
     observe: Annotated[

@@ -24,19 +24,27 @@ class Progress:
         self._live = sys.stderr.isatty()
         self._step = ""
         self._planned_s = 0.0
+        self._longest_s = 0.0
         self._after_s = 0.0
         self._done_s = self._shown_s = 0.0
         self._asking = False
         self.interrupted = False
 
-    def begin_step(self, step: str, planned_s: float, after_s: float) -> None:
-        """Start a step with its planned duration, and that of the later steps."""
+    def begin_step(
+        self, step: str, planned_s: float, after_s: float, longest_s: float = 0.0
+    ) -> None:
+        """Start a step with its planned duration, and that of the later steps; `longest_s` is its
+        duration where the planned one does not suffice.
+        """
         self._step = step
         self._planned_s = planned_s
+        self._longest_s = max(planned_s, longest_s)
         self._after_s = after_s
         self._done_s = self._shown_s = 0.0
         line = step
-        if planned_s:
+        if self._longest_s > planned_s:
+            line = f"{step}: {_format_clock(planned_s)} to {_format_clock(longest_s)}"
+        elif planned_s:
             line = f"{step}: about {_format_clock(planned_s)}"
         self._print_text(line)
         self.log_entry("step", step, planned_s=planned_s, after_s=after_s)
@@ -50,7 +58,10 @@ class Progress:
         if self._done_s - self._shown_s < _EVERY_S[self._live]:
             return
         self._shown_s = self._done_s
-        left_s = max(0.0, self._planned_s - self._done_s)
+        expected_s = self._planned_s
+        if self._done_s > self._planned_s:
+            expected_s = self._longest_s
+        left_s = max(0.0, expected_s - self._done_s)
         line = (
             f"{self._step}: {_format_clock(self._done_s)}, {_format_clock(left_s)} left, session "
             f"{_format_clock(left_s + self._after_s)}"

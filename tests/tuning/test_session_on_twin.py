@@ -461,9 +461,8 @@ def test_history_rollback_and_comparison(
     assert back["reason"] == "did not like it"
     assert kept["traded"]["candidate"] == "least-variance"
     assert kept["traded"]["before"]["std_um"] > kept["traded"]["after"]["std_um"]
-    assert (
-        f"| least-variance | {kept['traded']['before']['std_um']:.3f} -> "
-        in journal.format_history(journal.read_entries(copied))
+    assert f"| balanced | {kept['traded']['before']['std_um']:.3f} -> " in journal.format_history(
+        journal.read_entries(copied)
     )
 
 
@@ -539,7 +538,8 @@ def test_the_candidate_that_a_person_chooses_is_the_one_that_is_applied(
     ]
     assert "ziegler-nichols: is not applied: Ms" in said
     shown = [line.split()[0] for line in said.splitlines() if line.strip()]
-    ordered = ["present", "least-variance", *[name for name in NAMES[1:] if name in shown]]
+    ordered = ["present", *[name for name in NAMES if name in shown]]
+    assert ordered[1] == "least-variance"  # it keeps the load peak, and is the proposal
     assert [
         name for name in shown if name in ordered
     ] == 2 * ordered  # the figures, and what gets better and worse
@@ -570,16 +570,18 @@ def test_no_answer_applies_nothing(
     assert ("nothing is applied; `membrane-ctrl tune apply" in said) == (code == Exit.DONE)
 
 
-def test_the_proposal_is_the_same_load_where_it_answers_a_load_no_worse(
-    done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["balanced", "same-load"])
+def test_the_least_variance_is_the_same_load_where_it_answers_a_load_no_worse(
+    done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """`hold --autotune` asks for `same-load`, which is designed only where the proposal answers a
-    load worse.
+    """`hold --autotune` asks for `same-load`, which is designed only where the least variance
+    answers a load worse.
     """
-    rows = [row for row in design.load_candidates(done)[0] if row.name != "same-load"]
+    bounded = ("balanced", "same-load")
+    rows = [row for row in design.load_candidates(done)[0] if row.name not in bounded]
     opened = open_session(Path(shutil.copytree(done.path, tmp_path / "copy")))
     monkeypatch.setattr(design, "load_candidates", lambda folder: (tuple(rows), rows[0]))
-    apply.select_candidate(opened, "same-load")
+    apply.select_candidate(opened, name)
     assert load_gains(opened.file_path("gains.toml")).candidate == "least-variance"
 
 

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
@@ -41,6 +42,9 @@ from tuning.proposal.verification import (
     STAGES,
     VerificationTrial,
     estimate_centre_std_um,
+    estimate_growth_sigma,
+    estimate_sensitivity,
+    explain_no_benefit,
     find_settling_time_s,
     judge_stage,
 )
@@ -118,6 +122,63 @@ def test_a_deviation_that_was_predicted_and_accepted_is_no_failure(
     assert bool(stage.reason) == bool(reason)
 
 
+def test_gains_that_change_nothing_are_no_better_beyond_the_error() -> None:
+    """The same gains, and gains that differ by 2 %, against gains with half the deviation."""
+    slow = LOOP.model_copy(update={"kp_per_s": 0.1, "ti_s": 60.0})
+    record, _ = held(LOOP)
+    about_um = np.zeros(len(record))
+    for before, better in (
+        (LOOP, False),
+        (LOOP.model_copy(update={"kp_per_s": 1.02 * LOOP.kp_per_s}), False),
+        (slow, True),
+    ):
+        trial = VerificationTrial(PLANT, WEATHER, before, LOOP)
+        stage = judge_stage(record, about_um, trial, 1.1)
+        assert not stage.reason
+        assert 0.02 < stage.growth_sigma < 0.15
+        assert stage.is_better == better
+        assert bool(explain_no_benefit(stage, trial)) != better
+    accepted = replace(trial, before=LOOP, accepted=True)
+    assert explain_no_benefit(judge_stage(record, about_um, accepted, 1.1), accepted) == ""
+
+
+def test_gains_without_margin_are_replaced_even_if_the_deviation_stays() -> None:
+    sharp = LOOP.model_copy(update={"kp_per_s": 2.6, "ti_s": 6.0})
+    record, _ = held(LOOP)
+    trial = VerificationTrial(PLANT, WEATHER, sharp, LOOP)
+    stage = replace(judge_stage(record, np.zeros(len(record)), trial, 1.1), growth=1.0)
+    assert not stage.is_better
+    assert explain_no_benefit(stage, trial) == ""
+
+
+def test_a_short_record_shows_no_benefit() -> None:
+    record, _ = held(LOOP)
+    trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
+    minute = record.part(0.0, 60.0)
+    stage = judge_stage(minute, np.zeros(len(minute)), trial, 2.0)
+    assert math.isinf(stage.growth_sigma)
+    assert not stage.is_better
+    assert explain_no_benefit(stage, trial) == ""
+
+
+def test_the_error_of_a_ratio_is_that_of_drawn_records() -> None:
+    """Two loops that share most of their weather, 60 records of ten minutes at 10 Hz."""
+    rng = np.random.default_rng(4)
+    ratios: list[float] = []
+    sigmas: list[float] = []
+    for _ in range(60):
+        common, own, other = (
+            lfilter([0.1], [1.0, -0.97], rng.standard_normal(6000)) for _ in range(3)
+        )
+        pair = common + 0.5 * own, common + 0.5 * other
+        stds = [float(part.std()) for part in pair]
+        ratios.append(stds[0] / stds[1])
+        sigmas.append(estimate_growth_sigma(*pair, *stds, 0.1))
+    assert float(np.std(ratios)) == pytest.approx(
+        math.sqrt(float(np.mean(np.square(sigmas))) - 0.03**2), rel=0.3
+    )
+
+
 def test_a_plant_with_less_margin_than_designed_shows_in_the_readings() -> None:
     """Gain and delay that have grown since: the model is content, the spectrum is not."""
     loop = LOOP.model_copy(update={"kp_per_s": 1.0, "ti_s": 8.0, "measurement_filter_s": 0.1})
@@ -128,6 +189,18 @@ def test_a_plant_with_less_margin_than_designed_shows_in_the_readings() -> None:
     )
     assert stage.ms > 2.0
     assert "less margin than designed" in stage.reason
+
+
+def test_doors_and_a_pulsating_pump_are_no_lack_of_margin() -> None:
+    """Four doors that ring at 0.8 Hz, and a pump that pulsates at 1.3 Hz all the time."""
+    record, _ = held(LOOP)
+    time_s = np.arange(len(record)) * record.dt_s
+    disturbed_um = record.displacement_um + 0.3 * np.sin(2 * np.pi * 1.3 * time_s)
+    for at_s in (40.0, 190.0, 320.0, 500.0):
+        since_s = np.maximum(time_s - at_s, 0.0)
+        disturbed_um += 4.0 * np.sin(2 * np.pi * 0.8 * since_s) * np.exp(-0.4 * since_s)
+    trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
+    assert estimate_sensitivity(disturbed_um, trial, WEATHER) < 2.0
 
 
 STORM_PUMP = PumpConfig(

@@ -33,7 +33,8 @@ def choose_candidate(folder: SessionFolder, yes: bool, name: str, progress: Prog
     folder : SessionFolder
         With a finished design.
     yes : bool
-        Apply the gains in `gains.toml` without asking.
+        Apply the gains in `gains.toml` without asking, unless they are a proposal that is no better
+        than the present gains.
     name : str
         The candidate to apply without asking; empty to ask.
     progress : Progress
@@ -58,7 +59,12 @@ def choose_candidate(folder: SessionFolder, yes: bool, name: str, progress: Prog
     screen.print(candidate_table.format_terminal(rows, title, model.leak_um_per_s))
     if name:
         return design.find_candidate(folder, name).name
-    return "" if yes else _ask_for_candidate(folder, progress)
+    if not yes:
+        return _ask_for_candidate(folder, progress)
+    if no_benefit := design.explain_no_benefit(folder):
+        progress.print_line(no_benefit)
+        return None
+    return ""
 
 
 def _ask_for_candidate(folder: SessionFolder, progress: Progress) -> str | None:

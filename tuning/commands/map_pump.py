@@ -5,7 +5,7 @@ from membrane_ctrl.sessions.folder import SessionFolder
 from membrane_ctrl.sessions.progress import Progress
 from tuning import connection
 from tuning.commands.conclusion import conclude
-from tuning.identification.pump_survey import TYPICAL_S as PUMP_TYPICAL_S
+from tuning.identification import pump_survey
 from tuning.options import TuneOptions
 from tuning.rigs.hold_rig import HoldRig
 from tuning.sentences import TOO_TIGHT, describe_gains
@@ -20,9 +20,10 @@ def run_map_pump(options: TuneOptions) -> int:
 
 
 def measure_pump(
-    folder: SessionFolder, rig: HoldRig, limit_um: float, progress: Progress
+    folder: SessionFolder, rig: HoldRig, limit_um: float, progress: Progress, after_s: float = 0.0
 ) -> SessionFolder:
-    progress.begin_step("pump", PUMP_TYPICAL_S, 0.0)
+    """Measure the curve, apply it and print it; `after_s` is what the session takes after it."""
+    progress.begin_step("pump", pump_survey.TYPICAL_S, after_s, pump_survey.LONGEST_S)
     mapped, folder = map_pump.map_pump(folder, rig, limit_um)
     found, pump = mapped.found, mapped.found.pump
     progress.print_line(

@@ -11,6 +11,7 @@ from tuning.commands import choose
 from tuning.commands.conclusion import conclude
 from tuning.commands.map_pump import measure_pump
 from tuning.commands.open_page import find_page, link_to_tab
+from tuning.identification import pump_survey
 from tuning.options import TuneOptions
 from tuning.proposal.verification import SETTLE_LEAST_S, Stage
 from tuning.report import page
@@ -50,8 +51,9 @@ def run_session(options: TuneOptions) -> int:
         except characterise.PumpUnknownError as error:
             if map_pump.has_pump_map(folder):
                 raise
-            progress.print_line(str(error))
-            folder = measure_pump(folder, rig, options.limit_um, progress)
+            progress.print_line(f"{error}; {_announce_pump_map(options)}")
+            rest_s = sum(_plan_steps(options).values())
+            folder = measure_pump(folder, rig, options.limit_um, progress, rest_s)
             _run_steps(list(STEPS), folder, rig, options, progress)
         # if the session was killed before it did
         _note_verified(folder, options.logs, options.reason)
@@ -178,11 +180,28 @@ def _note_verified(folder: SessionFolder, logs: Path, reason: str, again: bool =
 
 def _announce_step(progress: Progress, options: TuneOptions, step: str, after: list[str]) -> None:
     """Show the step and the time that it and the later ones are expected to take."""
-    planned = {
+    planned_s = _plan_steps(options)
+    progress.begin_step(
+        step, planned_s.get(step, 0.0), sum(planned_s.get(later, 0.0) for later in after)
+    )
+
+
+def _plan_steps(options: TuneOptions) -> dict[str, float]:
+    """Expected durations of the steps that need the hold's time, in s."""
+    return {
         "characterise": options.plan.typical_s,
         "observe": 0.0 if options.short else options.observe_s,
         "verify": SETTLE_LEAST_S + options.verify_s,
     }
-    progress.begin_step(
-        step, planned.get(step, 0.0), sum(planned.get(later, 0.0) for later in after)
+
+
+def _announce_pump_map(options: TuneOptions) -> str:
+    """What the session does about an unknown pump, and how long it takes from here on."""
+    rest_s = sum(_plan_steps(options).values())
+    shortest_min, longest_min = (
+        round((map_s + rest_s) / 60.0) for map_s in (pump_survey.TYPICAL_S, pump_survey.LONGEST_S)
+    )
+    return (
+        "the pump's curve is measured first, then the session starts again on it: "
+        f"{shortest_min} to {longest_min} min from here"
     )

@@ -43,7 +43,10 @@ _TOO_MUCH = 0.6
 _MOST_ROUNDS = 40
 _MOST_S = 1500.0
 _ROUND_S = 120.0
-TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
+# Of a survey, with the holds between its rounds and the check of the curve: the median of drawn
+# pumps, and gusts or a laser of 1 µm
+TYPICAL_S = 900.0
+LONGEST_S = 2100.0
 _LEAST_S = 1.5  # of a run
 _DARK_S = 15.0  # a longer run has shown something before its reading was lost
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10

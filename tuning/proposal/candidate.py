@@ -12,12 +12,16 @@ from tuning.identification.disturbance import DisturbanceModel
 from tuning.identification.margins import Margins, compute_margins
 from tuning.proposal import gain_search, lower_bound, prediction
 
-# What `tune run --choose` accepts; `SAME_LOAD` is there if the proposal answers a step of the leak
-# worse than the present gains.
+# What `tune run --choose` accepts. `BALANCED` is there if `LEAST_VARIANCE` lets a step of the leak
+# move the centre too far beyond what the present gains let it, `SAME_LOAD` if it answers that step
+# worse than they do. The proposal is the first of those that are there.
 PRESENT = "present"
+BALANCED = "balanced"
+LEAST_VARIANCE = "least-variance"
 SAME_LOAD = "same-load"
 NAMES = (
-    "least-variance",
+    BALANCED,
+    LEAST_VARIANCE,
     SAME_LOAD,
     "simc",
     "simc-slow",

@@ -32,7 +32,8 @@ class Demands:
     load_step_um_per_s: float = 0.6
     load_peak_um: float = 2.0
     recovery_s: float = 60.0  # three integral times at most
-    # A further demand: as good an answer to that step as this one
+    # Further demands: the exact peak after that step, and as good an answer to it as this one
+    peak_most_um: float = math.inf
     as_good_as: load_step.LoadStep | None = None
     # Standard deviations of the flow's change per tick within the rate limit: beyond, it distorts
     # the loop's answer
@@ -102,6 +103,9 @@ def search_least_variance(
             / demands.reading_um
         )
         shares = [jump, peak, slow, reading]
+        if math.isfinite(demands.peak_most_um):
+            answer = load_step.simulate_load_step(gains, model, demands.load_step_um_per_s, dt_s)
+            shares += [answer.peak_um / demands.peak_most_um]
         if demands.as_good_as is not None:
             answer = load_step.simulate_load_step(gains, model, demands.load_step_um_per_s, dt_s)
             shares += [answer.peak_um / demands.as_good_as.peak_um]

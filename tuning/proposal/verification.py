@@ -32,7 +32,17 @@ _SETTLE_MOST_S = 120.0
 # of the loop's slowest mode: 2 % of the transient from the change of gains is left
 _SETTLE_TIME_CONSTANTS = 4.0
 MS_MAX = 2.0  # sensitivity seen; its estimate scatters by a tenth
+MS_PRESENT_MAX = 1.6  # previous gains beyond it lack margin: `gains_file` refuses them
 _CLOSE = 1.13  # of the largest growth
+# Gains that are no better are of no use. Standard errors of the growth by which it must be below
+# 1: the same gains would pass in 1 of 15 verifications
+_CERTAIN_SIGMAS = 1.5
+_ERROR_BLOCK_S = 30.0  # several times the loop's memory: the blocks scatter independently
+_ERROR_BLOCKS_LEAST = 5
+# Of the replayed loop against the one that held: 24 holds with unchanged gains scatter by this
+_REPLAY_SIGMA = 0.03
+# A larger predicted growth cannot be shown to be a benefit
+GROWTH_OF_BENEFIT = 1.0 - _CERTAIN_SIGMAS * _REPLAY_SIGMA
 _SEGMENT_S = 20.0
 # 17 half-overlapping segments: power to a quarter. Before that the session's weather is assumed: a
 # plant that has changed would look like weather, in which the old gains do no better
@@ -55,14 +65,24 @@ class Stage:
     )
     growth: float  # ratio of the two
     growth_max: float  # the limit
+    growth_sigma: float  # standard error of the ratio; infinite while the record is too short
     ms: float  # sensitivity seen; NaN while the record is too short
     lost_fraction: float  # readings lost
     reason: str  # why it fails; empty if it passes
 
     @property
     def is_close(self) -> bool:
-        """Whether it fails by less than the standard deviation of ten minutes scatters."""
-        return self.growth_max < self.growth < _CLOSE * self.growth_max
+        """Whether it fails by less than the standard deviation of ten minutes scatters, or whether
+        the new gains look better by less than the error of the comparison.
+        """
+        if self.growth > self.growth_max:
+            return self.growth < _CLOSE * self.growth_max
+        return self.growth + self.growth_sigma < 1.0 and not self.is_better
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the standard deviation is smaller, beyond the error of the comparison."""
+        return self.growth + _CERTAIN_SIGMAS * self.growth_sigma < 1.0
 
 
 def find_settling_time_s(loop: LoopConfig) -> float:
@@ -117,18 +137,53 @@ def estimate_centre_std_um(
     return math.sqrt(max(0.0, predicted_um**2 + float(np.mean(seen - expected))))
 
 
+def estimate_growth_sigma(
+    after_um: Series, before_um: Series, after_std_um: float, before_std_um: float, dt_s: float
+) -> float:
+    """Standard error of the ratio of two standard deviations in the same weather.
+
+    Both have the scatter of that weather, so that the difference of their relative variances in
+    blocks of the record is what scatters. `after_um` and `before_um` are (n,) readings less
+    setpoint, of the loop that held and of the replayed one. To this comes the replay's own error.
+    """
+    size = min(after_um.size, before_um.size)
+    blocks = math.floor(size * dt_s / _ERROR_BLOCK_S)
+    if blocks < _ERROR_BLOCKS_LEAST or after_std_um <= 0 or before_std_um <= 0:
+        return math.inf
+
+    def block_variances(off_um: Series) -> Series:
+        off = off_um[:size] - off_um[:size].mean()
+        return np.array([_mean_covariance(part, dt_s) for part in np.array_split(off, blocks)])
+
+    apart = block_variances(after_um) / after_std_um**2
+    apart -= block_variances(before_um) / before_std_um**2
+    scatter = 0.5 * float(np.std(apart, ddof=1)) / math.sqrt(blocks)
+    return after_std_um / before_std_um * math.hypot(scatter, _REPLAY_SIGMA)
+
+
+def _mean_covariance(off_um: Series, dt_s: float) -> float:
+    """Mean autocovariance over the lags in which the centre's motion dominates, µm^2."""
+    lags = range(1, round(_LAGS_S / dt_s) + 1)
+    return float(np.mean([off_um[lag:] @ off_um[:-lag] / (off_um.size - lag) for lag in lags]))
+
+
 def estimate_sensitivity(
     off_um: Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel
 ) -> float:
     """Largest sensitivity, from the excess of the spectrum over the model's prediction.
 
-    Increased gain or delay of the plant shows as a peak near the crossover. The level of the
-    weather does not
-    matter: only the shape is compared, each band with the median band.
+    Increased gain or delay of the plant shows as a broad peak near the crossover, all the time. The
+    level of the weather does not matter: only the shape is compared, each band with the median
+    band. Doors and gusts are in a few segments, a pump's pulsation in a few bins of a band: medians
+    over both leave them out.
     """
     gains, dt_s = closed_loop.Gains.from_config(trial.after), weather.rest.dt_s
     frequency_hz, power = welch(
-        off_um, 1 / dt_s, nperseg=round(_SEGMENT_S / dt_s), detrend="constant"
+        off_um,
+        1 / dt_s,
+        nperseg=round(_SEGMENT_S / dt_s),
+        detrend="constant",
+        average="median",
     )
     w: Series = 2 * np.pi * frequency_hz
     fastest = math.pi / (2 * (trial.model.delay_s + gains.filter_s + dt_s))
@@ -140,9 +195,9 @@ def estimate_sensitivity(
     peak = s >= min(1.0, s.max())
     excess, bands = power[peak] / (s * (moving + weather.rest.white_psd))[peak], w[peak]
     bands = np.floor(np.log(bands / w[0]) / math.log(_BAND)).astype(int)
-    means = np.array([excess[bands == band].mean() for band in np.unique(bands)])
+    levels = np.array([np.median(excess[bands == band]) for band in np.unique(bands)])
     model_ms = margins.compute_margins(gains, trial.model, dt_s).ms
-    return float(model_ms * math.sqrt(max(1.0, means.max() / np.median(means))))
+    return float(model_ms * math.sqrt(max(1.0, levels.max() / np.median(levels))))
 
 
 def judge_stage(
@@ -160,9 +215,11 @@ def judge_stage(
         for loop in (trial.before, trial.after)
     )
     predicted_growth = after_um / before_um
+    growth_sigma = math.inf
     if replayed:
         would_um = replay_um(record, off_um, trial.model, trial.before, trial.pump)
         before_um = estimate_centre_std_um(would_um, trial, weather, trial.before)
+        growth_sigma = estimate_growth_sigma(off_um, would_um, std_um, before_um, record.dt_s)
     if trial.accepted:
         growth_max *= max(1.0, predicted_growth)
     growth = std_um / before_um
@@ -179,5 +236,32 @@ def judge_stage(
             "designed"
         )
     return Stage(
-        record.duration_s, std_um, before_um, growth, growth_max, ms, record.lost_fraction, reason
+        record.duration_s,
+        std_um,
+        before_um,
+        growth,
+        growth_max,
+        growth_sigma,
+        ms,
+        record.lost_fraction,
+        reason,
+    )
+
+
+def explain_no_benefit(stage: Stage, trial: VerificationTrial) -> str:
+    """Why gains that passed the last stage are not worth keeping; empty if they are.
+
+    Gains whose price a person accepted are, and so are those that replace gains without enough
+    margin. A record too short for a replay shows no benefit; whoever asks for so short a
+    verification gets gains that are no worse.
+    """
+    if math.isinf(stage.growth_sigma):
+        return ""
+    present = closed_loop.Gains.from_config(trial.before)
+    present_ms = margins.find_sensitivity_peak(present, trial.model, trial.weather.rest.dt_s)
+    if trial.accepted or present_ms > MS_PRESENT_MAX or stage.is_better:
+        return ""
+    return (
+        f"the standard deviation is {stage.growth:.2f} +- {stage.growth_sigma:.2f} of that of the "
+        "previous gains: no better beyond the error of the comparison"
     )

@@ -18,7 +18,7 @@ from tuning.gains_file import (
 )
 from tuning.identification import closed_loop, plant_model
 from tuning.journal import Traded
-from tuning.proposal import candidate, candidate_table, design, gain_search
+from tuning.proposal import candidate, candidate_table, design, gain_search, verification
 from tuning.proposal.preview import Preview
 from tuning.proposal.robustness import Robustness
 from tuning.report.pictures import embed_picture, is_outdated, save_figure
@@ -117,8 +117,9 @@ def find_candidate(session: folder.SessionFolder, name: str) -> candidate.Candid
     """The candidate of this name. Raises InputError if it is unknown or must not be applied."""
     rows, _ = load_candidates(session)
     known = {row.name: row for row in rows if row.name != candidate.PRESENT}
-    if name == candidate.SAME_LOAD and name not in known:
-        name = candidate.NAMES[0]  # its response to a step of the leak is no worse
+    if name in (candidate.BALANCED, candidate.SAME_LOAD) and name not in known:
+        # the least variance already answers a step of the leak as well as this one must
+        name = candidate.LEAST_VARIANCE
     if name not in known:
         raise errors.InputError(
             f"{name}: not a candidate of {session.path.name}; known: {', '.join(known)}"
@@ -127,6 +128,27 @@ def find_candidate(session: folder.SessionFolder, name: str) -> candidate.Candid
     if refusal:
         raise errors.InputError(f"{name}: is not applied: {refusal}")
     return known[name]
+
+
+def explain_no_benefit(session: folder.SessionFolder) -> str:
+    """Why the designed proposal is not worth a trial; empty if it is, or if a person chose or
+    edited the gains.
+    """
+    rows, now = load_candidates(session)
+    present = next((row for row in rows if row.name == candidate.PRESENT), None)
+    if now.name not in (candidate.BALANCED, candidate.LEAST_VARIANCE) or present is None:
+        return ""
+    if load_gains(session.file_path("gains.toml")).candidate:
+        return ""
+    growth = now.figures.std_um / present.figures.std_um
+    lacks_margin = candidate.find_refusal(present) != ""
+    if lacks_margin or not growth > verification.GROWTH_OF_BENEFIT:
+        return ""
+    return (
+        f"the present gains are as good as the proposal: its predicted std is {growth:.2f} of "
+        "theirs, and a verification shows no smaller difference than "
+        f"{1 - verification.GROWTH_OF_BENEFIT:.0%}"
+    )
 
 
 def compare_with_present(session: folder.SessionFolder) -> Traded:

@@ -16,6 +16,7 @@ from tuning.gains_file import load_gains
 from tuning.identification import closed_loop, plant_model, record_file
 from tuning.identification.record import Record
 from tuning.proposal import verification
+from tuning.proposal.candidate import SAME_LOAD
 from tuning.report.pictures import (
     SPECTRUM_SEGMENT_S,
     embed_picture,
@@ -54,9 +55,9 @@ def run_verify(
     """
     session.require_done("apply")
     after, before = load_checked_gains(session), session.head.before
-    accepted = (
-        load_gains(session.file_path("gains.toml")).candidate == load_candidates(session)[1].name
-    )
+    named = load_gains(session.file_path("gains.toml")).candidate
+    # `same-load` has no price that a person could have accepted
+    accepted = named == load_candidates(session)[1].name != SAME_LOAD
     session.begin_step("verify")
     model, weather = load_identified(session).identified.model, load_disturbance(session)
     trial = verification.VerificationTrial(model, weather, before, after, accepted, rig.pump)
@@ -74,8 +75,10 @@ def run_verify(
             looks.append(verification.judge_stage(record, setpoint_um, trial, growth_max))
             report_stage(looks[-1])
             reason = looks[-1].reason
-            if until_s == stages[-1][0] and looks[-1].is_close:
+            if until_s == stages[-1][0] and _needs_longer(looks[-1], accepted):
                 continue  # as likely the weather as the gains: as long again decides
+            if until_s >= stages[-1][0] and not reason:
+                reason = verification.explain_no_benefit(looks[-1], trial)
             if reason or until_s == stages[-1][0]:
                 break
     except live_hold.HoldError as error:
@@ -92,6 +95,11 @@ def run_verify(
         record_file.save_record(session.file_path("verify.npz"), record)
     session_json.write_session_file(session.file_path("verified.json"), done)
     return done
+
+
+def _needs_longer(stage: verification.Stage, accepted: bool) -> bool:
+    """Whether the last stage is too close to decide; a benefit is not asked of accepted gains."""
+    return stage.is_close and not (accepted and not stage.reason)
 
 
 def load_verified(session: folder.SessionFolder) -> Verified:
@@ -122,7 +130,7 @@ def make_report_part(session: folder.SessionFolder) -> PageSection | None:
             f"{stage.time_s:.0f} s",
             f"{stage.std_um:.3f}",
             f"{stage.before_um:.3f}",
-            f"{stage.growth:.2f}",
+            _format_growth(stage),
             f"{stage.ms:.2f}" if math.isfinite(stage.ms) else "record too short",
             stage.reason,
         )
@@ -133,6 +141,13 @@ def make_report_part(session: folder.SessionFolder) -> PageSection | None:
         "Verification",
         [PageText(verdict, mark), PageTable(heads, rows), *embed_picture(session, _PICTURE)],
     )
+
+
+def _format_growth(stage: verification.Stage) -> str:
+    """The ratio of the standard deviations, with its error once that is known."""
+    if math.isinf(stage.growth_sigma):
+        return f"{stage.growth:.2f}"
+    return f"{stage.growth:.2f} +- {stage.growth_sigma:.2f}"
 
 
 def draw_picture(session: folder.SessionFolder) -> None:
