@@ -461,8 +461,9 @@ def test_history_rollback_and_comparison(
     assert back["reason"] == "did not like it"
     assert kept["traded"]["candidate"] == "least-variance"
     assert kept["traded"]["before"]["std_um"] > kept["traded"]["after"]["std_um"]
-    assert f"| balanced | {kept['traded']['before']['std_um']:.3f} -> " in journal.format_history(
-        journal.read_entries(copied)
+    assert (
+        f"| least-variance | {kept['traded']['before']['std_um']:.3f} -> "
+        in journal.format_history(journal.read_entries(copied))
     )
 
 
