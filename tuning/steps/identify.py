@@ -11,6 +11,7 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.report_pages.blocks import PageBlock, PageSection, PageTable, PageText, TextMark
 from membrane_ctrl.sessions import folder, session_json
 from tuning.identification import experiments, fit_quality, plant_fit, plant_model
+from tuning.identification.actuator_kind import ActuatorKind, recognise_actuator
 from tuning.identification.record import Record
 from tuning.report.pictures import embed_picture, is_outdated, save_figure
 from tuning.sentences import TOO_TIGHT
@@ -26,6 +27,7 @@ class IdentifiedPlant:
     identified: plant_fit.Identified
     quality: fit_quality.FitQuality
     data_sha256: str
+    actuator: ActuatorKind
 
 
 def run_identify(session: folder.SessionFolder) -> IdentifiedPlant:
@@ -36,7 +38,8 @@ def run_identify(session: folder.SessionFolder) -> IdentifiedPlant:
         all_of_it = experiments.fit_experiments(done)
     except ValueError as error:
         raise errors.RejectedError(f"identify: {error}") from None
-    found = IdentifiedPlant(all_of_it.identified, all_of_it.quality, done.record.sha256())
+    actuator = recognise_actuator(done.record, all_of_it.identified)
+    found = IdentifiedPlant(all_of_it.identified, all_of_it.quality, done.record.sha256(), actuator)
     session_json.write_session_file(session.file_path("identified.json"), found)
     return found
 
@@ -67,12 +70,14 @@ def describe_result(session: folder.SessionFolder) -> str:
     reasons = "".join(f"; {reason}" for reason in found.quality.reasons)
     too_tight = model.leak_um_per_s < TOO_TIGHT_UM_PER_S
     lossy = describe_losses(load_experiments(session).record, session.config.by_optics)
+    actuator = found.actuator.describe()
     return (
         f"k {model.gain:.3f} +- {sigma.gain:.3f}, "
         f"delay {model.delay_s:.3f} +- {sigma.delay_s:.3f} s "
         f"(dead time {model.dead_time_s:.3f} +- {sigma.dead_time_s:.3f} s), "
         f"leak {model.leak_um_per_s:.2f} µm/s: {found.quality.verdict}{reasons}"
         + (f"; {TOO_TIGHT}" if too_tight else "")
+        + (f"; {actuator}" if actuator else "")
         + (f"; {lossy}" if lossy else "")
     )
 
@@ -120,10 +125,14 @@ def _describe_fit(session: folder.SessionFolder) -> list[PageBlock]:
         f"{fit.independence_p:.3g}, largest {fit.largest_residual:.1f} sigma. "
         f"Data {found.data_sha256[:16]}."
     )
-    losses = [PageText(f"{lossy[0].upper()}{lossy[1:]}.", TextMark.BAD)] if lossy else []
+    remarks = [
+        PageText(f"{remark[0].upper()}{remark[1:]}.", TextMark.BAD)
+        for remark in (found.actuator.describe(), lossy)
+        if remark
+    ]
     return [
         PageText(f"Data: {found.quality.verdict}. {reasons}", mark),
-        *losses,
+        *remarks,
         PageTable(("", "value", "1 sigma"), rows),
         PageText(tests),
     ]
