@@ -177,7 +177,7 @@ def test_a_close_verification_continues_for_as_long_again(
         pump=PumpConfig(),
         dt_s=1.0,
         set_gains=lambda *given: None,
-        keep=lambda: told.append("keep"),
+        keep_gains=lambda: told.append("keep"),
         hold=lambda seconds: None,
         hold_about=lambda seconds: (held, np.zeros(round(seconds))),
     )

@@ -154,7 +154,7 @@ def test_gains_without_margin_are_replaced_even_if_the_deviation_stays() -> None
 def test_a_short_record_shows_no_benefit() -> None:
     record, _ = held(LOOP)
     trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
-    minute = record.part(0.0, 60.0)
+    minute = record.cut(0.0, 60.0)
     stage = judge_stage(minute, np.zeros(len(minute)), trial, 2.0)
     assert math.isinf(stage.growth_sigma)
     assert not stage.is_better
@@ -339,7 +339,7 @@ class OuterRig:
     ) -> None:
         self.told.append((trial_s, shape_s))
 
-    def keep(self) -> None:
+    def keep_gains(self) -> None:
         self.told.append("keep")
 
     def ticks(self, duration_s: float) -> list[SimpleNamespace]:
