@@ -13,20 +13,35 @@ from tuning.identification.closed_loop import Gains, compute_loop_response, make
 from tuning.identification.plant_model import PlantModel
 
 _POINTS = 3000  # 0.3 % apart: margins to better than 1 %
-_FINE_DT_S = 1e-3
+_FINE_DT_S = 1e-3  # shortest delay that the range of frequencies follows
+_SLOWEST_RAD_PER_S = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """Margins of a loop."""
+    """Margins of a loop.
 
-    ms: float  # largest sensitivity, max |1 / (1 + L)|
-    gain_margin: float  # factor on the gain at which the loop oscillates
+    Attributes
+    ----------
+    ms : float
+        Largest sensitivity, max |1 / (1 + L)|.
+    gain_margin : float
+        Factor on the gain at which the loop oscillates.
+    phase_margin_deg : float
+    delay_margin_s : float
+        Additional dead time at which the loop oscillates.
+    disk_margin : float
+        Balanced disk margin, 2 / max |S - T|: gain and phase may change together within that disk.
+    stable : bool
+        By Nyquist's criterion; if false, the other figures mean nothing.
+    """
+
+    ms: float
+    gain_margin: float
     phase_margin_deg: float
-    delay_margin_s: float  # additional dead time at which the loop oscillates
-    # balanced disk margin, 2 / max |S - T|: gain and phase may change together within that disk
+    delay_margin_s: float
     disk_margin: float
-    stable: bool  # by Nyquist's criterion; if false, the other figures mean nothing
+    stable: bool
 
 
 def compute_margins(gains: Gains, model: PlantModel, dt_s: float) -> Margins:
@@ -36,32 +51,49 @@ def compute_margins(gains: Gains, model: PlantModel, dt_s: float) -> Margins:
     stable if and only if the phase at every gain crossing is above -180 deg. Stability is read from
     the number of turns of 1 + L about 0, which also sees loops with several crossings.
     """
-    w = np.geomspace(1e-4, max(np.pi / dt_s, 20 / max(model.delay_s, _FINE_DT_S)), _POINTS)
+    # Up to Nyquist's frequency, or to 20 over the delay.
+    fastest_rad_per_s = max(np.pi / dt_s, 20 / max(model.delay_s, _FINE_DT_S))
+    w = np.geomspace(_SLOWEST_RAD_PER_S, fastest_rad_per_s, _POINTS)
     response = compute_loop_response(gains, model, w, dt_s)
     sensitivity = 1 / (1 + response)
     frd = control.FrequencyResponseData(response, w, smooth=True)
     gain_margin, phase_margin_deg, _, _, crossing, _ = control.stability_margins(frd)
+
+    # A delay turns the crossing frequency by w delay.
+    delay_margin_s = math.inf
+    if crossing > 0:
+        delay_margin_s = math.radians(float(phase_margin_deg)) / float(crossing)
     return Margins(
         ms=float(np.max(np.abs(sensitivity))),
         gain_margin=float(gain_margin),
         phase_margin_deg=float(phase_margin_deg),
-        delay_margin_s=math.radians(float(phase_margin_deg)) / float(crossing)
-        if crossing > 0
-        else math.inf,
+        delay_margin_s=delay_margin_s,
         disk_margin=float(1 / np.max(np.abs(sensitivity - 0.5))),
         stable=is_stable(response),
     )
 
 
 def is_stable(response: ComplexArray) -> bool:
-    """From the double pole at the origin 1 + L starts at -180 deg (just above it if stable) and
-    must end at 0.
+    """Judge a loop by Nyquist's criterion.
+
+    From the double pole at the origin 1 + L starts at -180 deg (just above it if stable) and must
+    end at 0.
+
+    Parameters
+    ----------
+    response : (n,) complex array
+        L at rising frequencies, close enough that 1 + L turns by less than 180 deg between two.
     """
-    turned = float(np.sum(np.angle((1 + response)[1:] / (1 + response)[:-1])))
-    return abs(float(np.angle(1 + response[0])) % (-2 * math.pi) + turned) < math.pi / 2
+    one_plus_l = 1 + response
+    turns_rad = np.angle(one_plus_l[1:] / one_plus_l[:-1])
+    start_rad = float(np.angle(one_plus_l[0])) % (-2 * math.pi)
+    end_rad = start_rad + float(np.sum(turns_rad))
+    return abs(end_rad) < math.pi / 2
 
 
 def find_sensitivity_peak(gains: Gains, model: PlantModel, dt_s: float) -> float:
     """Ms on a coarse grid (to 1 %), for searches; infinite for an unstable loop."""
     response = compute_loop_response(gains, model, make_frequencies(dt_s), dt_s)
-    return float(np.max(1 / np.abs(1 + response))) if is_stable(response) else math.inf
+    if not is_stable(response):
+        return math.inf
+    return float(np.max(1 / np.abs(1 + response)))

@@ -19,14 +19,25 @@ from tuning.identification.record import Record, Series
 
 @dataclass(frozen=True, slots=True)
 class PlantModel:
-    """Gain, delay and leak."""
+    """Gain, delay and leak.
 
-    gain: float  # k, speed of the centre per commanded flow
-    # theta, from a reading's tick to the first gas in the mirror (half a sample of holding comes on
-    # top)
+    Attributes
+    ----------
+    gain : float
+        k, speed of the centre per commanded flow.
+    dead_time_s : float
+        theta, from a reading's tick to the first gas in the mirror (half a sample of holding comes
+        on top).
+    lag_s : float
+        T.
+    leak_um_per_s : float
+        Loss through leak and bleed.
+    """
+
+    gain: float
     dead_time_s: float
-    lag_s: float  # T
-    leak_um_per_s: float  # loss through leak and bleed
+    lag_s: float
+    leak_um_per_s: float
 
     @property
     def delay_s(self) -> float:
@@ -50,28 +61,47 @@ def delay_series(series: Series, delay_s: float, dt_s: float) -> Series:
 def compute_driven_um(
     flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: float
 ) -> Series:
-    """Path of the centre for unit gain, at each reading, for a flow held between readings; exact.
+    """Compute the path of the centre for unit gain, for a flow held between readings; exact.
 
     From T dq/dt = v - q follows the integral of q = integral of v - T q (+ constant). The integral
     of a held flow is a broken line, so interpolating it between samples is exact for any delay.
     Within a sample the delayed flow changes once, after the share f of the sample: q[i+1] = a q[i]
-    + b1 v[i-m-1] + b2 v[i-m]. The flow before the record is assumed equal to its first value; the
-    path is 0 at the first reading.
+    + b1 v[i-m-1] + b2 v[i-m].
+
+    Parameters
+    ----------
+    flow_um_per_s : (n,) array
+        Commanded flow from each reading to the next; before the record it is equal to the first.
+    dead_time_s, lag_s : float
+        theta and T.
+    dt_s : float
+        Sample time.
+
+    Returns
+    -------
+    (n,) array
+        In µm at each reading; 0 at the first.
     """
+    # The path without the lag: the delayed integral of the flow's changes.
     first = flow_um_per_s[0]
     change = flow_um_per_s - first
-    way = np.concatenate(([0.0], np.cumsum(change[:-1]) * dt_s))
-    way = delay_series(way, dead_time_s, dt_s)
+    integral = np.concatenate(([0.0], np.cumsum(change[:-1]) * dt_s))
+    way = delay_series(integral, dead_time_s, dt_s)
+
+    # Less T q: the recurrence of q, with the weights of the two flows within a sample.
     if lag_s > 0:
         whole = math.floor(dead_time_s / dt_s)
-        left_s = (1.0 - (dead_time_s / dt_s - whole)) * dt_s
-        late, now = (
-            math.exp(-left_s / lag_s) - math.exp(-dt_s / lag_s),
-            -math.expm1(-left_s / lag_s),
-        )
-        weights = np.concatenate((np.zeros(whole + 1), [now, late]))
-        way = way - lag_s * np.asarray(lfilter(weights, [1.0, -math.exp(-dt_s / lag_s)], change))
-    return np.asarray(way + first * dt_s * np.arange(flow_um_per_s.size), dtype=float)
+        part = dead_time_s / dt_s - whole
+        left_s = (1.0 - part) * dt_s
+        decay = math.exp(-dt_s / lag_s)
+        earlier = math.exp(-left_s / lag_s) - decay
+        later = -math.expm1(-left_s / lag_s)
+        weights = np.concatenate((np.zeros(whole + 1), [later, earlier]))
+        way = way - lag_s * np.asarray(lfilter(weights, [1.0, -decay], change))
+
+    # The steady flow's own path.
+    ticks = np.arange(flow_um_per_s.size)
+    return np.asarray(way + first * dt_s * ticks, dtype=float)
 
 
 def compute_pump_share_um(record: Record, model: PlantModel) -> Series:
@@ -79,5 +109,6 @@ def compute_pump_share_um(record: Record, model: PlantModel) -> Series:
     (n,).
     """
     x = compute_driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
-    way = model.gain * x - model.leak_um_per_s * np.arange(len(record)) * record.dt_s
-    return way + float(np.mean(record.filled_displacement_um() - way))
+    leaked_um = model.leak_um_per_s * np.arange(len(record)) * record.dt_s
+    way_um = model.gain * x - leaked_um
+    return way_um + float(np.mean(record.filled_displacement_um() - way_um))

@@ -26,35 +26,64 @@ _SAME = 1e-6  # with two flows in the whole record, x_above is x and t but for r
 
 @dataclass(frozen=True, slots=True)
 class TwoGains:
-    """Gains of the pump above and below the holding flow."""
+    """Gains of the pump above and below the holding flow.
 
-    below: float  # gain of each part
+    Attributes
+    ----------
+    below, above : float
+        Gain of each part.
+    difference_sigma : float
+        Standard error of `above - below`; infinite if the flow had two values only.
+    """
+
+    below: float
     above: float
-    difference_sigma: (
-        float  # standard error of `above - below`; infinite if the flow had two values only
-    )
+    difference_sigma: float
 
 
 def fit_two_gains(record: Record, identified: Identified) -> TwoGains:
-    """Gains below and above the mean flow of a record, which is the flow that holds."""
-    model, dt_s = identified.model, record.dt_s
+    """Fit gains below and above the mean flow of a record, which is the flow that holds.
 
-    def whitened_way(flow_um_per_s: Series) -> Series:
+    Parameters
+    ----------
+    record : Record
+        The record of the fit.
+    identified : Identified
+        The fit with one gain.
+
+    Returns
+    -------
+    TwoGains
+    """
+    model = identified.model
+    dt_s = record.dt_s
+
+    def compute_whitened_way(flow_um_per_s: Series) -> Series:
+        """Increments of the path that a flow drives, filtered so that the noise is white."""
         way_um = plant_model.compute_driven_um(flow_um_per_s, model.dead_time_s, model.lag_s, dt_s)
         return identified.noise.whitened(np.diff(way_um), dt_s)
 
+    # y without the pressure's share.
     moved_um = np.diff(record.filled_displacement_um())
     if identified.pressure_gain_um_per_pa != 0.0:
         moved_um -= identified.pressure_gain_um_per_pa * np.diff(record.ambient_pressure_pa)
     moved_um = identified.noise.whitened(moved_um, dt_s)
-    above_um = whitened_way(np.maximum(record.flow_um_per_s - record.flow_um_per_s.mean(), 0.0))
+
+    # x and t, and x_above.
     leak_um = identified.noise.whitened(np.full(moved_um.size, -dt_s), dt_s)
-    straight = np.column_stack([whitened_way(record.flow_um_per_s), leak_um])
-    rest_um = above_um - straight @ np.linalg.lstsq(straight, above_um, rcond=None)[0]
+    straight = np.column_stack([compute_whitened_way(record.flow_um_per_s), leak_um])
+    flow_above = np.maximum(record.flow_um_per_s - record.flow_um_per_s.mean(), 0.0)
+    above_um = compute_whitened_way(flow_above)
+
+    # r: what is left of x_above when x and t have taken their share.
+    explained = np.linalg.lstsq(straight, above_um, rcond=None)[0]
+    rest_um = above_um - straight @ explained
     if np.linalg.norm(rest_um) < _SAME * np.linalg.norm(above_um):
         return TwoGains(model.gain, model.gain, math.inf)
+
+    # d = r y / r r; then the gain below, from y without d x_above.
     difference = float(rest_um @ moved_um / (rest_um @ rest_um))
-    below = float(np.linalg.lstsq(straight, moved_um - difference * above_um, rcond=None)[0][0])
-    return TwoGains(
-        below, below + difference, identified.innovation_um / float(np.linalg.norm(rest_um))
-    )
+    without_difference_um = moved_um - difference * above_um
+    below = float(np.linalg.lstsq(straight, without_difference_um, rcond=None)[0][0])
+    sigma = identified.innovation_um / float(np.linalg.norm(rest_um))
+    return TwoGains(below, below + difference, sigma)

@@ -20,25 +20,47 @@ def compute_least_std_um(
     loop: LoopConfig,
     write_s: float = 0.0,
 ) -> float:
-    """Bound for the sensors that the loop's feed-forward uses; unused weather counts as
-    disturbance.
+    """Compute the least standard deviation of the centre.
 
-    `write_s` is the time from a reading to its command, if the model's dead time does not include
-    it.
+    Parameters
+    ----------
+    model : PlantModel
+        Its dead time is what no controller can undo.
+    disturbance : DisturbanceModel
+        Weather and noise.
+    loop : LoopConfig
+        Its feed-forward uses some of the sensors; the others' weather counts as disturbance.
+    write_s : float
+        Time from a reading to its command, if the model's dead time does not include it.
+
+    Returns
+    -------
+    float
+        In µm.
     """
+    # What is read: the centre by the laser, and the sensors in use; with the variances of their
+    # noise.
     moving = Walks.from_disturbance(disturbance)
     centre = moving.centre
-    readings, noises = [centre], [disturbance.rest.white**2]
-    for reading, weather, used in (
-        (moving.barometer, disturbance.barometer, loop.feedforward_barometer),
-        (moving.air, disturbance.air, loop.feedforward_temperature),
-    ):
-        if weather is not None and used:
-            readings.append(reading)
-            noises.append(weather.noise**2)
-    c, r = np.array(readings), np.diag(noises)
+    readings = [centre]
+    variances = [disturbance.rest.white**2]
+    if disturbance.barometer is not None and loop.feedforward_barometer:
+        readings.append(moving.barometer)
+        variances.append(disturbance.barometer.noise**2)
+    if disturbance.air is not None and loop.feedforward_temperature:
+        readings.append(moving.air)
+        variances.append(disturbance.air.noise**2)
+    c = np.array(readings)
+    r = np.diag(variances)
+
+    # The steady Kalman filter: covariance of the states before and after a reading.
     transition, kicks = moving.discretise(disturbance.rest.dt_s)
     before = solve_discrete_are(transition.T, c.T, kicks, r)
-    after = before - before @ c.T @ np.linalg.solve(c @ before @ c.T + r, c @ before)
-    transition, kicks = moving.discretise(model.dead_time_s + write_s + disturbance.rest.dt_s / 2)
-    return float(np.sqrt(centre @ (transition @ after @ transition.T + kicks) @ centre))
+    innovation = c @ before @ c.T + r
+    after = before - before @ c.T @ np.linalg.solve(innovation, c @ before)
+
+    # Predicted over the dead time and half a sample of holding.
+    horizon_s = model.dead_time_s + write_s + disturbance.rest.dt_s / 2
+    transition, kicks = moving.discretise(horizon_s)
+    predicted = transition @ after @ transition.T + kicks
+    return float(np.sqrt(centre @ predicted @ centre))

@@ -15,7 +15,7 @@ from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal.disturbance_states import Walks
 from tuning.proposal.driven_centre import DrivenCentre
 
-# arbitrary: only changes matter
+# Levels about which the weather moves; only changes matter.
 _LEVEL_PA = 101_325.0
 _LEVEL_C = 23.0
 
@@ -23,7 +23,21 @@ _LEVEL_C = 23.0
 class ModelBench:
     """A simulated bench made from the identified models; equal seeds give equal weather.
 
-    `leak_step` has the time in s and the size in µm/s of a step of the leak.
+    Parameters
+    ----------
+    model : PlantModel
+    disturbance : DisturbanceModel
+    pump : PumpConfig
+        The pump's curve.
+    seed : int
+        Of the weather and the noise.
+    leak_step : (float, float)
+        Time in s and size in µm/s of a step of the leak.
+
+    Attributes
+    ----------
+    true_um : list of float
+        The centre at each tick.
     """
 
     def __init__(
@@ -43,35 +57,41 @@ class ModelBench:
         self._leaked_um = 0.0
         self._walks = Walks.from_disturbance(disturbance)
         self._transition, kicks = self._walks.discretise(self._dt_s)
-        sizes, ways = np.linalg.eigh(kicks)
-        self._kicks = ways * np.sqrt(np.maximum(sizes, 0.0))
+        # Root of the covariance, from independent Gaussian numbers to a tick's kicks.
+        variances, directions = np.linalg.eigh(kicks)
+        self._kicks = directions * np.sqrt(np.maximum(variances, 0.0))
         self._weather = np.zeros(len(kicks))
         self._ticks = 0
         self.true_um: list[float] = []
 
     def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
         """Run one tick. The vent is assumed as during the identification of the leak."""
-        at_s, size = self._leak_step
-        leak = self._model.leak_um_per_s + (size if self._ticks * self._dt_s >= at_s else 0.0)
-        self._leaked_um += leak * self._dt_s
+        step_s, step_um_per_s = self._leak_step
+        leak_um_per_s = self._model.leak_um_per_s
+        if self._ticks * self._dt_s >= step_s:
+            leak_um_per_s = leak_um_per_s + step_um_per_s
+        self._leaked_um += leak_um_per_s * self._dt_s
         self._driven.step(pump_fraction)
-        self._weather = self._transition @ self._weather + self._kicks @ self._rng.standard_normal(
-            self._weather.size
-        )
+        random = self._rng.standard_normal(self._weather.size)
+        self._weather = self._transition @ self._weather + self._kicks @ random
         return self._read_sample()
 
     def _read_sample(self) -> BenchSample:
-        of, walks = self._disturbance, self._walks
-        true_um = self._driven.way_um - self._leaked_um + float(walks.centre @ self._weather)
+        """The sensors' readings, with their noise; NaN for a sensor that was not identified."""
+        disturbance = self._disturbance
+        walks = self._walks
+        moved_um = self._driven.way_um - self._leaked_um
+        true_um = moved_um + float(walks.centre @ self._weather)
         self.true_um.append(true_um)
         self._ticks += 1
+
         laser, pressure, temperature = self._rng.standard_normal(3).tolist()
-        return BenchSample(
-            true_um + of.laser_um * laser,
-            _LEVEL_PA + float(walks.barometer @ self._weather) + of.barometer.noise * pressure
-            if of.barometer
-            else math.nan,
-            _LEVEL_C + float(walks.air @ self._weather) + of.air.noise * temperature
-            if of.air
-            else math.nan,
-        )
+        pressure_pa = math.nan
+        if disturbance.barometer is not None:
+            true_pa = _LEVEL_PA + float(walks.barometer @ self._weather)
+            pressure_pa = true_pa + disturbance.barometer.noise * pressure
+        temperature_c = math.nan
+        if disturbance.air is not None:
+            true_c = _LEVEL_C + float(walks.air @ self._weather)
+            temperature_c = true_c + disturbance.air.noise * temperature
+        return BenchSample(true_um + disturbance.laser_um * laser, pressure_pa, temperature_c)
