@@ -28,43 +28,55 @@ from tuning.identification.pump_run import Level, PumpRun
 
 _KNOWN_SHARE = 0.009  # standard error of a level, of the full flow
 _BENT_SHARE = 0.02  # of the full flow, by which a kink between two levels may be hidden
-# Likewise of the leak, in flows up to so many leaks: the loop's gain there is the slope of the
-# curve
+# The same of the leak, in flows up to so many leaks: the loop's gain there is the slope of the
+# curve.
 _BENT_LEAKS = 0.15
 _ABOUT_LEAKS = 2.0
-_SURE = 3.0
-_PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
-# commands between which a jump lies; levels for a bend
+_CERTAIN_SIGMAS = 3.0  # of a bend
+_CLEAR_SIGMAS = 4.0  # of a rise between two levels
+_PLAY_SHARE = 0.03  # hysteresis that is worth a second branch, of the full flow
+_PLAY_PROBES = (0.3, 0.6)  # shares of the full flow at which hysteresis is looked for
+_NONE_SHARE = 0.02  # a smaller share of the full flow counts as no flow
+# Commands closer than these are not divided further: about a jump, and in a bend.
 _EDGE = 0.02
 _NEAREST = 0.04
-# a jump to more than this share of the leak may be a steep rise through it
+# A jump to more than this share of the leak may be a steep rise through it: it is divided finely.
 _FINE_EDGE = 0.002
 _TOO_MUCH = 0.6
 _MOST_ROUNDS = 40
 _MOST_S = 1500.0
 _ROUND_S = 120.0
+_MOST_STEPS = 90  # of a round
 # Of a survey, with the holds between its rounds and the check of the curve: the median of drawn
-# pumps, and gusts or a laser of 1 µm
+# pumps, and gusts or a laser of 1 µm.
 TYPICAL_S = 900.0
 LONGEST_S = 2100.0
 _LEAST_S = 1.5  # of a run
 _DARK_S = 15.0  # a longer run has shown something before its reading was lost
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
 _HIGHEST = 0.25  # of the limit, where a run begins at most
-# of the limit; the rest is for gusts, and for the noise that the guard keeps in hand
+# Of the limit; the rest is for gusts, and for the noise that the guard keeps in hand.
 _CAUGHT = 0.55
 _SHARE_LEAST = 0.4  # of the travel: shorter runs see little but noise, and gusts stop them as well
+# Factors on the share of the travel after a run that completed, and after one that was stopped.
+_FARTHER = 1.2
+_LESS_FAR = 0.8
 _NONE_UM_PER_S = 1e-3  # at command 0
 _SHORTEST_S = 0.05
 _PULSE_S = 0.2
 _LONGEST_S = 20.0
 _MOST_VISITS = 6
-_ABOVE = 0.15
-_SCOUTS = (0.25, 0.5, 0.75, 1.0)
-# rounds without any flow; share of the limit at most, by a first pulse
+_ABOVE = 0.15  # by how much a command is larger from which a level is reached from above
+_SCOUTS = (0.25, 0.5, 0.75, 1.0)  # shares of the range in which the first levels are
+# Rounds without any flow; share of the limit that a first pulse rises at most; lengths of the
+# pulses of a round.
 _FIRST_ROUNDS = 5
 _FIRST_RISE = 0.2
 _FIRST_PULSES_S = (0.3, 0.6, 1.2, 2.4, 2.4, 2.4, 2.4)
+_KNOWN_RATIO = 0.3  # standard error over the flow, up to which it counts as known
+_GUESS_FACTOR = 1.3  # of the flow beyond the largest known command: rather too large
+_FULL_TIME_S = 60.0  # longest wait for a place
+_LEAST_LEAK_UM_PER_S = 0.05
 
 
 @dataclass
@@ -101,23 +113,35 @@ class PumpSurvey:
         far.
         """
         self._rounds += 1
+        duration_s = run.fraction.size * run.dt_s
+
+        # How far the next runs go; while no flow is known, how long the pulses are. A weak pump
+        # sinks between short pulses, a strong one rises too far in long ones.
         if not self._lacks_flows:
-            self._share = float(
-                np.clip(self._share * (1.2 if completed else 0.8), _SHARE_LEAST, 1.0)
-            )
-        elif (
-            not completed
-        ):  # a weak pump sinks between short pulses; a strong one rises too far in long ones
-            self._longer *= 2.0 if run.has_sunk else 0.5
-        if run.fraction.size * run.dt_s > _LEAST_S:
+            factor = _LESS_FAR
+            if completed:
+                factor = _FARTHER
+            self._share = float(np.clip(self._share * factor, _SHARE_LEAST, 1.0))
+        elif not completed:
+            if run.has_sunk:
+                self._longer *= 2.0
+            else:
+                self._longer *= 0.5
+
+        if duration_s > _LEAST_S:
             self.runs.append(run)
-        is_short = run.fraction.size * run.dt_s < _DARK_S
-        is_dark = is_short and bool(np.isnan(run.displacement_um[-1:]).any())
-        self.dark = self.dark + 1 if is_dark else 0
+        lost_reading = bool(np.isnan(run.displacement_um[-1:]).any())
+        if duration_s < _DARK_S and lost_reading:
+            self.dark += 1
+        else:
+            self.dark = 0
+
+        # The curve so far; the first fits search from the grid of actuators.
         if self.runs:
-            self.fit = fit_pump(
-                self.runs, self.fit if self._rounds > 3 and self.fit.levels else None
-            )
+            near = None
+            if self._rounds > 3 and self.fit.levels:
+                near = self.fit
+            self.fit = fit_pump(self.runs, near)
             self._branches = {rising: self._make_branch(rising) for rising in (True, False)}
 
     def steps(self) -> tuple[PumpStep, ...]:
@@ -125,62 +149,75 @@ class PumpSurvey:
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
         if self._lacks_flows:
-            hopeless = is_stuck(self.fit, self._branches.get(True, NO_BRANCH))
-            if self._rounds >= (1 if hopeless else 3) * _FIRST_ROUNDS:
-                return ()
-            first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds % _FIRST_ROUNDS))
-            rise_um = min(
-                max(1.0, 1.5 * self.laser_um), _FIRST_RISE * self.limit_um
-            )  # shows in the noise
-            # after a round that sank, at once: it sinks further until the first gas arrives
-            down = [_make_step(0.0, 20.0, -1.5 * rise_um)] if self._longer <= 1.0 else []
-            lengths_s = np.clip(
-                self._longer * np.array(_FIRST_PULSES_S), _SHORTEST_S, _LONGEST_S
-            ).tolist()
-            pulses = (
-                (*down, _make_step(first, longest_s, rise_um), _make_step(0.0, 0.5))
-                for longest_s in lengths_s
-            )
-            return tuple(step for pulse in pulses for step in pulse)
+            return self._plan_first_pulses()
         self._add_levels()
-        made: list[PumpStep] = []
+
+        # As many visits as a round has time for, one at least.
+        steps: list[PumpStep] = []
         left_s = _ROUND_S
         for level in self._plan_visits():
             visit = self._plan_visit(level)
             left_s -= self._lasts_s(level)
-            if made and (left_s < 0 or len(made) + len(visit) > 90):
+            if steps and (left_s < 0 or len(steps) + len(visit) > _MOST_STEPS):
                 break
-            made += visit
-        return tuple(made)
+            steps += visit
+        return tuple(steps)
+
+    def _plan_first_pulses(self) -> tuple[PumpStep, ...]:
+        """Pulses of growing length at a command that grows from round to round; empty when enough
+        rounds have shown no flow.
+        """
+        most_rounds = 3 * _FIRST_ROUNDS
+        if is_stuck(self.fit, self._branches.get(True, NO_BRANCH)):
+            most_rounds = _FIRST_ROUNDS
+        if self._rounds >= most_rounds:
+            return ()
+        stage = 1 + self._rounds % _FIRST_ROUNDS
+        fraction = min(1.0, self.holding_fraction + 0.1 * stage)
+        visible_um = max(1.0, 1.5 * self.laser_um)
+        rise_um = min(visible_um, _FIRST_RISE * self.limit_um)
+        lengths_s = np.clip(self._longer * np.array(_FIRST_PULSES_S), _SHORTEST_S, _LONGEST_S)
+
+        steps: list[PumpStep] = []
+        for longest_s in lengths_s.tolist():
+            # From below; after a round that sank at once, as it sinks further until the first gas
+            # arrives.
+            if self._longer <= 1.0:
+                steps.append(_make_step(0.0, 20.0, -1.5 * rise_um))
+            steps.append(_make_step(fraction, longest_s, rise_um))
+            steps.append(_make_step(0.0, 0.5))
+        return tuple(steps)
 
     @property
     def full_um_per_s(self) -> float:
-        """The largest flow seen for certain; a level that was only
-        passed through may look strong.
+        """The largest flow seen for certain; a level that was only passed through may look
+        strong.
         """
-        return max(
-            [1e-3, *(float((at.flows - 2 * at.sigmas).max()) for at in self._branches.values())]
-        )
+        flows = [float((at.flows - 2 * at.sigmas).max()) for at in self._branches.values()]
+        return max([_NONE_UM_PER_S, *flows])
 
     @property
     def holding(self) -> float:
         """The command that balances the leak, once there is one above and one below it."""
         fractions, flows = self._list_known_flows()
         leak = self.fit.leak_um_per_s
-        between = flows.size > 0 and flows[0] <= leak < flows[-1]
-        return float(np.interp(leak, flows, fractions)) if between else self.holding_fraction
+        if flows.size > 0 and flows[0] <= leak < flows[-1]:
+            return float(np.interp(leak, flows, fractions))
+        return self.holding_fraction
 
     def is_known(self, level: Level) -> bool:
         """Whether its flow is known well enough."""
         return self.flow_sigma(level) <= _KNOWN_SHARE * self.full_um_per_s
 
     def flow_sigma(self, level: Level) -> float:
-        """Standard error of its flow in µm/s, with what its neighbours tell; infinite for one not
-        visited.
+        """Standard error of its flow in µm/s, by its own runs and its neighbours'; infinite for one
+        not visited.
         """
         branch = self._branches[level.rising]
         at = np.flatnonzero(branch.fractions == level.fraction)
-        return float(branch.sigmas[at[0]]) if at.size else math.inf
+        if not at.size:
+            return math.inf
+        return float(branch.sigmas[at[0]])
 
     def _make_branch(self, rising: bool) -> Branch:
         """One branch, from no flow at command 0; its flows never fall, and are as smooth as they
@@ -188,19 +225,24 @@ class PumpSurvey:
         """
         from scipy.optimize import isotonic_regression
 
-        visits = [
-            level in self._wanted or not self._wanted for level in self.fit.levels
-        ]  # not just passed through
-        own = [i for i, level in enumerate(self.fit.levels) if level.rising == rising and visits[i]]
-        levels = list(self.fit.levels.items())
-        at = [(levels[i][0].fraction, levels[i][1].flow_um_per_s) for i in own]
-        fractions, flows = np.array([(0.0, 0.0), *at]).T
-        noise = np.zeros((fractions.size,) * 2)
+        # The levels of this branch that were visited, and not just passed through.
+        own: list[int] = []
+        points = [(0.0, 0.0)]
+        for number, (level, found) in enumerate(self.fit.levels.items()):
+            is_visited = level in self._wanted or not self._wanted
+            if level.rising == rising and is_visited:
+                own.append(number)
+                points.append((level.fraction, found.flow_um_per_s))
+        fractions, flows = np.array(points).T
+
+        # Their flows, smoothed; those of command 0 are known.
+        noise = np.zeros((fractions.size, fractions.size))
         noise[0, 0] = _NONE_UM_PER_S**2
         noise[1:, 1:] = self.fit.covariance[np.ix_(own, own)]
         flows, noise = smooth_flows(fractions, flows, noise)
         sigmas = np.sqrt(np.maximum(np.diag(noise), 0.0))
-        return Branch(fractions, np.asarray(isotonic_regression(np.maximum(flows, 0.0)).x), sigmas)
+        rising_flows = isotonic_regression(np.maximum(flows, 0.0)).x
+        return Branch(fractions, np.asarray(rising_flows), sigmas)
 
     def find_start(self) -> tuple[float, float] | None:
         """The command at which a standing pump starts with a flow at once, and the one below it, if
@@ -213,7 +255,10 @@ class PumpSurvey:
         start = self.find_start()
         for level, above in self.fit.levels.items():
             below = self.fit.levels.get(Level(level.fraction))
-            if level.rising or below is None or (start is not None and level.fraction < start[1]):
+            if level.rising or below is None:
+                continue
+            # Below its start a pump that stands gives nothing: that is no hysteresis of the curve.
+            if start is not None and level.fraction < start[1]:
                 continue
             more = above.flow_um_per_s - below.flow_um_per_s
             sigma = math.hypot(above.sigma_um_per_s, below.sigma_um_per_s)
@@ -226,11 +271,13 @@ class PumpSurvey:
         above.
         """
         if not self._wanted:
-            low, high = self.holding_fraction, min(level.fraction for level in self.fit.levels)
-            self._wanted |= {
-                Level(_round_fraction(high + share * (1 - high))) for share in _SCOUTS
-            } | {Level(high)}
-            self._wanted |= {Level(_round_fraction(low * share)) for share in _SCOUTS}
+            # Above the smallest command that was given, and below the one that holds the mirror.
+            low = self.holding_fraction
+            high = min(level.fraction for level in self.fit.levels)
+            self._wanted.add(Level(high))
+            for share in _SCOUTS:
+                self._wanted.add(Level(_round_fraction(high + share * (1 - high))))
+                self._wanted.add(Level(_round_fraction(low * share)))
         seen = all(level in self.fit.levels for level in self._wanted if self._is_reachable(level))
         if seen:
             self._wanted |= {Level(f) for f in self._list_finer_fractions(True)}
@@ -249,28 +296,33 @@ class PumpSurvey:
         fractions, flows, sigmas = self._branches[rising].columns
         full = self.full_um_per_s
         found: list[float] = []
+        leak_um_per_s = self.fit.leak_um_per_s
+
+        # Jumps: a clear rise from no flow. It is divided finely if the least flow that a loop would
+        # give above it is near the leak.
         for i, (low, high) in enumerate(pairwise(fractions.tolist())):
-            clear = flows[i + 1] - flows[i] > 4 * math.hypot(sigmas[i], sigmas[i + 1])
-            least = float(
-                np.interp(high + STALL_MARGIN, fractions, flows)
-            )  # that a loop would give
-            edge = _FINE_EDGE if least > _TOO_MUCH * self.fit.leak_um_per_s else _EDGE
-            if (
-                clear
-                and flows[i] < 0.02 * full
-                and flows[i + 1] > JUMP_SHARE * full
-                and high - low > edge
-            ):
+            rise = flows[i + 1] - flows[i]
+            is_clear = rise > _CLEAR_SIGMAS * math.hypot(sigmas[i], sigmas[i + 1])
+            is_jump = (
+                is_clear and flows[i] < _NONE_SHARE * full and flows[i + 1] > JUMP_SHARE * full
+            )
+            least_um_per_s = float(np.interp(high + STALL_MARGIN, fractions, flows))
+            edge = _EDGE
+            if least_um_per_s > _TOO_MUCH * leak_um_per_s:
+                edge = _FINE_EDGE
+            if is_jump and high - low > edge:
                 found.append(_round_fraction((low + high) / 2))
         if not rising:
             return found
-        leak_um_per_s = self.fit.leak_um_per_s
+
+        # Bends: anywhere of a share of the full flow, and about the leak of a share of the leak.
         for i, off in enumerate(limit_bend(fractions, flows).tolist()):
             low, high = fractions[i : i + 2].tolist()
-            about = flows[i] < _ABOUT_LEAKS * leak_um_per_s < _ABOUT_LEAKS**2 * flows[i + 1]
-            sure = off > _SURE * math.hypot(sigmas[i], sigmas[i + 1])
-            here = about and sure and off > _BENT_LEAKS * leak_um_per_s and high - low > _EDGE
-            if here or (off > _BENT_SHARE * full and high - low > _NEAREST):
+            is_about_leak = flows[i] < _ABOUT_LEAKS * leak_um_per_s < _ABOUT_LEAKS**2 * flows[i + 1]
+            is_certain = off > _CERTAIN_SIGMAS * math.hypot(sigmas[i], sigmas[i + 1])
+            is_bent_at_leak = is_about_leak and is_certain and off > _BENT_LEAKS * leak_um_per_s
+            is_bent = off > _BENT_SHARE * full
+            if (is_bent_at_leak and high - low > _EDGE) or (is_bent and high - low > _NEAREST):
                 found.append(_round_fraction((low + high) / 2))
         return found
 
@@ -280,10 +332,10 @@ class PumpSurvey:
         """
         fractions, flows, _ = self._branches[True].columns
         reached = np.array([f for f in fractions.tolist() if self._is_reachable(Level(f))])
-        found = [
-            float(reached[np.argmin(np.abs(flows[: reached.size] - s * self.full_um_per_s))])
-            for s in (0.3, 0.6)
-        ]
+        found = []
+        for share in _PLAY_PROBES:
+            distance = np.abs(flows[: reached.size] - share * self.full_um_per_s)
+            found.append(float(reached[np.argmin(distance)]))
         start = self.find_start()
         if start is not None:
             found += [_round_fraction(start[1] / 2), start[1]]
@@ -300,34 +352,37 @@ class PumpSurvey:
         """
         wanted = sorted(level for level in self._wanted if self._is_reachable(level))
         fresh = [level for level in wanted if level not in self.fit.levels]
-        wide = max(_KNOWN_SHARE * self.full_um_per_s, 1e-3)
-        worst = sorted(
-            (level for level in wanted if level not in fresh), key=self.flow_sigma, reverse=True
-        )
-        visits = [3 * (self.flow_sigma(level) / wide) ** 2 for level in worst]
-        again = [
-            level
-            for turn in range(_MOST_VISITS)
-            for level, n in zip(worst, visits, strict=True)
-            if n > max(turn, 3)
-        ]
+
+        # The others, the least known first. Three visits, times the square of the error that is too
+        # large, make a level known.
+        others = [level for level in wanted if level not in fresh]
+        worst = sorted(others, key=self.flow_sigma, reverse=True)
+        wanted_sigma = max(_KNOWN_SHARE * self.full_um_per_s, _NONE_UM_PER_S)
+        visits = [3 * (self.flow_sigma(level) / wanted_sigma) ** 2 for level in worst]
+        again: list[Level] = []
+        for turn in range(_MOST_VISITS):
+            for level, needed in zip(worst, visits, strict=True):
+                if needed > max(turn, 3):
+                    again.append(level)
         return fresh + again
 
     @property
     def _lacks_flows(self) -> bool:
         """No flow is known, or, in the rounds of the first pulses, none that lifts the mirror."""
         flows = self._list_known_flows()[1]
-        return not flows.any() or (
-            self._rounds < 3 * _FIRST_ROUNDS and flows.max() <= self.fit.leak_um_per_s
-        )
+        if not flows.any():
+            return True
+        is_early = self._rounds < 3 * _FIRST_ROUNDS
+        return is_early and bool(flows.max() <= self.fit.leak_um_per_s)
 
     def _list_known_flows(self) -> tuple[FloatArray, FloatArray]:
         """Commands whose flows are known to a third, and the flows."""
         if not self.runs:
             return np.empty(0), np.empty(0)
         fractions, flows, sigmas = self._branches[True].columns
-        sure = (sigmas < 0.3 * np.maximum(flows, 0.3 * self.fit.leak_um_per_s)) & (fractions > 0)
-        return fractions[sure], flows[sure]
+        least = _KNOWN_RATIO * self.fit.leak_um_per_s
+        is_known = (sigmas < _KNOWN_RATIO * np.maximum(flows, least)) & (fractions > 0)
+        return fractions[is_known], flows[is_known]
 
     def _guess_flow(self, fraction: float) -> float:
         """Flow that a command may have, rather too large: beyond the largest known one like a
@@ -336,8 +391,10 @@ class PumpSurvey:
         fractions, flows = (np.append(0.0, column) for column in self._list_known_flows())
         if fraction <= fractions[-1] or not flows[-1]:
             return float(np.interp(fraction, fractions, flows))
-        none = float(fractions[flows < 0.02 * flows[-1]].max(initial=0.0))
-        return float(1.3 * flows[-1] * ((fraction - none) / (fractions[-1] - none)) ** 2)
+        # Beyond it: a square from the largest command without flow.
+        none = float(fractions[flows < _NONE_SHARE * flows[-1]].max(initial=0.0))
+        ratio = (fraction - none) / (fractions[-1] - none)
+        return float(_GUESS_FACTOR * flows[-1] * ratio**2)
 
     def _least_flow(self, fraction: float) -> float:
         """Flow that a command has at least: that of the largest smaller one that is known."""
@@ -346,48 +403,69 @@ class PumpSurvey:
 
     def _plan_visit(self, level: Level) -> list[PumpStep]:
         """From where the mirror may be to the level's run, and until its gas has arrived."""
-        leak, travel_um, up = (
-            max(self.fit.leak_um_per_s, 0.05),
-            self._travel_um,
-            self._lifting_fraction(),
-        )
+        leak = max(self.fit.leak_um_per_s, _LEAST_LEAK_UM_PER_S)
+        travel_um = self._travel_um
         run = _make_step(level.fraction, self._run_s(level))
-        up_s = (
-            60.0 if self._least_flow(up) > leak else _FIRST_PULSES_S[-1]
-        )  # what an unknown command gives is not awaited
+
+        # The command that lifts the mirror; what an unknown command gives is not awaited.
+        up = self._lifting_fraction()
+        up_s = _FIRST_PULSES_S[-1]
+        if self._least_flow(up) > leak:
+            up_s = _FULL_TIME_S
         if self._net_flow(level) > 0:
-            late_s = self.fit.delay_s + self.fit.lag_s
-            late_um, caught_um = (
-                leak * late_s,
-                _CAUGHT * self._share * self.limit_um,
-            )  # sinks before an answer
-            bottom_um = -0.5 * travel_um - min(1.0, 0.1 * self._net_flow(level))
-            above = [] if level.rising else [_make_step(self._higher_fraction(level), 0.1)]
-            # where nothing is known to lift it meanwhile it begins higher, so that its gas can be
-            # awaited
-            sinks_um = late_um + (leak - self._least_flow(level.fraction)) * run.duration_s
-            least_um = min(bottom_um + late_um, 0.0)
-            start_um = max(least_um, min(sinks_um - caught_um, _HIGHEST * self.limit_um))
-            first = [
-                _make_step(up, up_s, bottom_um + start_um - least_um - 0.5),
-                _make_step(0.0, 60.0, start_um),
-            ]
-            wait = [_make_step(0.0, max(0.1, late_s))] if start_um >= sinks_um - caught_um else []
-            # a short run lifts it less than the leak takes meanwhile: the hold must catch it within
-            # the limit
-            until_um = min(late_um - caught_um, 0.0)
-            wait.append(_make_step(0.0, max(0.3, self.fit.answer_s - late_s * len(wait)), until_um))
-            return [*first, *above, run, *wait]
+            return self._plan_rising_visit(level, run, up, up_s)
+
+        # A level that lets the mirror sink begins above the centre.
         lifts_um = max(self._net_flow(Level(up)), 0.0) * self.fit.answer_s
         top_um = max(0.5 * travel_um - lifts_um, -0.2 * travel_um)
-        pause = [_make_step(0.0, 0.3)] if level.rising else []
-        return [_make_step(0.0, 60.0, 0.5 * travel_um), _make_step(up, up_s, top_um), *pause, run]
+        first = [_make_step(0.0, _FULL_TIME_S, 0.5 * travel_um), _make_step(up, up_s, top_um)]
+        if level.rising:
+            first.append(_make_step(0.0, 0.3))
+        return [*first, run]
+
+    def _plan_rising_visit(
+        self, level: Level, run: PumpStep, up: float, up_s: float
+    ) -> list[PumpStep]:
+        """The visit of a level that lifts the mirror: it begins below the centre.
+
+        `up` is the command that brings the mirror to its start, for `up_s` at most.
+        """
+        leak = max(self.fit.leak_um_per_s, _LEAST_LEAK_UM_PER_S)
+        late_s = self.fit.delay_s + self.fit.lag_s
+        late_um = leak * late_s  # by which it sinks before an answer
+        caught_um = _CAUGHT * self._share * self.limit_um
+
+        # Where nothing is known to lift it meanwhile it begins higher, so that its gas can be
+        # awaited.
+        bottom_um = -0.5 * self._travel_um - min(1.0, 0.1 * self._net_flow(level))
+        sinks_um = late_um + (leak - self._least_flow(level.fraction)) * run.duration_s
+        least_um = min(bottom_um + late_um, 0.0)
+        start_um = max(least_um, min(sinks_um - caught_um, _HIGHEST * self.limit_um))
+        steps = [
+            _make_step(up, up_s, bottom_um + start_um - least_um - 0.5),
+            _make_step(0.0, _FULL_TIME_S, start_um),
+        ]
+        if not level.rising:
+            steps.append(_make_step(self._higher_fraction(level), 0.1))
+        steps.append(run)
+
+        # Until its gas has arrived. A short run lifts it less than the leak takes meanwhile: the
+        # hold must catch it within the limit.
+        rest_s = self.fit.answer_s
+        if start_um >= sinks_um - caught_um:
+            steps.append(_make_step(0.0, max(0.1, late_s)))
+            rest_s = self.fit.answer_s - late_s
+        until_um = min(late_um - caught_um, 0.0)
+        steps.append(_make_step(0.0, max(0.3, rest_s), until_um))
+        return steps
 
     @property
     def _travel_um(self) -> float:
+        """Way of a run."""
         return _TRAVEL_UM * self._share * self.limit_um / 10.0
 
     def _net_flow(self, level: Level) -> float:
+        """Speed of the mirror at a level, µm/s, as far as it is known."""
         return self._guess_flow(level.fraction) - self.fit.leak_um_per_s
 
     def _is_reachable(self, level: Level) -> bool:
@@ -395,25 +473,26 @@ class PumpSurvey:
         return self._net_flow(level) * _PULSE_S <= 1.3 * self.limit_um
 
     def _run_s(self, level: Level) -> float:
-        fresh, net = level not in self.fit.levels, self._net_flow(level)
-        longest_s, way_um = _LONGEST_S, self._travel_um
-        if fresh:
-            sinks_um_per_s = self.fit.leak_um_per_s - self._least_flow(
-                level.fraction
-            )  # the guess may be wrong
-            longest_s = min(
-                longest_s, way_um * (0.5 if net > 0 else 1.5) / max(sinks_um_per_s, 1e-3)
-            )
+        """How long a level is given."""
+        net = self._net_flow(level)
+        longest_s = _LONGEST_S
+        way_um = self._travel_um
+        if level not in self.fit.levels:
+            # Its flow is a guess, which may be wrong: it may sink at the least flow's speed.
+            sinks_um_per_s = self.fit.leak_um_per_s - self._least_flow(level.fraction)
+            share = 1.5
+            if net > 0:
+                share = 0.5
+            longest_s = min(longest_s, way_um * share / max(sinks_um_per_s, _NONE_UM_PER_S))
             way_um *= 0.6
-        return max(min(way_um / max(abs(net), 0.05), longest_s), _PULSE_S)
+        return max(min(way_um / max(abs(net), _LEAST_LEAK_UM_PER_S), longest_s), _PULSE_S)
 
     def _lasts_s(self, level: Level) -> float:
-        leak = max(self.fit.leak_um_per_s, 0.05)
-        return (
-            self._run_s(level) * (1 + max(self._net_flow(level), 0.0) / leak)
-            + self.fit.answer_s
-            + self._travel_um / leak
-        )
+        """How long a visit takes, with the way back."""
+        leak = max(self.fit.leak_um_per_s, _LEAST_LEAK_UM_PER_S)
+        back_over_run = max(self._net_flow(level), 0.0) / leak
+        run_and_back_s = self._run_s(level) * (1 + back_over_run)
+        return run_and_back_s + self.fit.answer_s + self._travel_um / leak
 
     def _higher_fraction(self, level: Level) -> float:
         """A larger command, from which a level is reached: beyond any hysteresis."""
@@ -444,8 +523,11 @@ class PumpSurvey:
         lifts = fractions[flows - 2 * sigmas > 1.5 * self.fit.leak_um_per_s]
         if lifts.size:
             return float(lifts[0])
-        may = (_round_fraction(f) for f in np.linspace(fractions[-1], 1.0, 9).tolist())
-        return next((f for f in may if self._net_flow(Level(f)) > self.fit.leak_um_per_s), 1.0)
+        for fraction in np.linspace(fractions[-1], 1.0, 9).tolist():
+            rounded = _round_fraction(fraction)
+            if self._net_flow(Level(rounded)) > self.fit.leak_um_per_s:
+                return rounded
+        return 1.0
 
 
 def _make_step(fraction: float, duration_s: float, until_um: float | None = None) -> PumpStep:
