@@ -438,7 +438,7 @@ def test_the_guard_of_a_round_knows_how_late_the_pump_is(
     monkeypatch.setattr(map_pump, "_brought_back", lambda rig: True)
     given: list[ExperimentSpec] = []
 
-    def performed(spec: ExperimentSpec) -> None:
+    def perform_ticks(spec: ExperimentSpec) -> None:
         given.append(spec)
         raise ValueError("enough")
 
@@ -446,7 +446,7 @@ def test_the_guard_of_a_round_knows_how_late_the_pump_is(
         hold=lambda seconds: None,
         around=lambda held, limit_um: operating_point.OperatingPoint(1.2, 0.3, 5.0, 0.5),
         pump=PumpConfig(),
-        performed=performed,
+        perform_ticks=perform_ticks,
     )
     with pytest.raises(ValueError, match="enough"):
         map_pump._survey_pump(rig, 10.0)  # type: ignore[arg-type]
