@@ -23,9 +23,9 @@ def _pictures(notebook: nbformat.NotebookNode) -> int:
 def test_a_notebook_shows_what_is_stored_in_it(name: str, tmp_path: Path) -> None:
     stored = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     fresh = executed(name, tmp_path)
-    said, again = text_of(stored), text_of(fresh)
-    assert _NUMBER.sub("#", again).split() == _NUMBER.sub("#", said).split()
-    expected = [float(number) for number in _NUMBER.findall(said)]
+    texts, again = text_of(stored), text_of(fresh)
+    assert _NUMBER.sub("#", again).split() == _NUMBER.sub("#", texts).split()
+    expected = [float(number) for number in _NUMBER.findall(texts)]
     assert [float(number) for number in _NUMBER.findall(again)] == pytest.approx(
         expected, rel=0.1, abs=0.02
     )

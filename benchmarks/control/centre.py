@@ -109,7 +109,7 @@ def robust(draw: int, duration_s: float) -> float:
     what the estimator assumes.
     """
     off = 1 + np.random.default_rng(draw).uniform(-0.3, 0.3, 8)
-    told, loop = EstimatorConfig(), LoopConfig()
+    settings, loop = EstimatorConfig(), LoopConfig()
     twin = _bench("all", draw + 1).model_copy(
         update={
             "pump_delay_s": 0.075 * off[0],
@@ -125,7 +125,7 @@ def robust(draw: int, duration_s: float) -> float:
     }
     pump = PumpConfig(flow_full_um_per_s=PumpConfig().flow_full_um_per_s * off[7])
     held = hold(
-        Sensors(), twin, duration_s + SETTLED_S, (), told, loop.model_copy(update=gains), pump
+        Sensors(), twin, duration_s + SETTLED_S, (), settings, loop.model_copy(update=gains), pump
     )
     return float(held.after(SETTLED_S).std())
 

@@ -43,7 +43,7 @@ def pump_of(bench: DrawnBench) -> PumpConfig:
     commands = np.linspace(bottom, top, 25)
     rising = [pump.settled(d) for d in commands]
     falling = [pump.settled(0.0, min(d + bench.play, 1.0)) for d in commands]
-    told = {
+    configured = {
         "curve_fraction": commands.tolist(),
         "curve_um_per_s": rising,
         "flow_full_um_per_s": rising[-1],
@@ -51,7 +51,7 @@ def pump_of(bench: DrawnBench) -> PumpConfig:
         "stall_fraction": bench.stall,
     }
     return PumpConfig.model_validate(
-        told | ({"curve_falling_um_per_s": falling} if bench.play else {})
+        configured | ({"curve_falling_um_per_s": falling} if bench.play else {})
     )
 
 
@@ -82,10 +82,10 @@ def held_um(
     """
     plant, pump, optics = bench.plant(2), pump_of(bench), Optics()
     loop = loop_of(bench, times, weather and bench.barometer)
-    told = EstimatorConfig(
+    configured = EstimatorConfig(
         pump_delay_s=bench.delay_s, pump_lag_s=bench.lag_s, laser_noise_um=bench.laser_um
     )
-    controller, centre = InnerLoop(loop, pump, told), CentreFilter(told, loop)
+    controller, centre = InnerLoop(loop, pump, configured), CentreFilter(configured, loop)
     dt_s, rng = 1 / bench.rate_hz, np.random.default_rng([bench.seed, 7])
     first_um = plant.truth().displacement_um
     controller.start(first_um, bench.leak_um_per_s)

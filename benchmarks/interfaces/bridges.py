@@ -8,7 +8,7 @@ Phases: without bridges, with bridges, without bridges. With bridges, a client o
 twice a second.
 Broker and clients are killed and started again four times each, then the bridge three times. A bare
 loop of the hold's rate, in a separate process, shows what the machine does to any such loop.
-FOLDER gets the raw lines; `--tell` prints the figures from them again.
+FOLDER gets the raw lines; `--figures` prints the figures from them again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.studies.bridge_clients import FRESH_S, NAMES, SAMPLE_S, Line, Told, lines
+from tests.studies.bridge_clients import FRESH_S, NAMES, SAMPLE_S, Line, LineLog, lines
 from tests.support.figures import Figure, at_least, at_most, show
 
 CLIENTS = ("mqtt", "opcua", "ca", "pva")
@@ -79,7 +79,7 @@ class Bench:
 
     def __init__(self, folder: Path, raised: bool) -> None:
         self._folder, self._raised = folder, raised
-        self.tell = Told(folder / "bench.jsonl")
+        self.record = LineLog(folder / "bench.jsonl")
         self._ports = {name: _free_port() for name in CLIENTS}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         (folder / "lab.toml").write_text(CONFIG.format(**self._ports), encoding="utf-8")
@@ -121,7 +121,7 @@ class Bench:
             Path(f"/proc/{process.pid}/autogroup").write_text(RAISED, encoding="utf-8")
         while process.poll() is None and not self._serves(who, out, begin):
             time.sleep(0.05)
-        self.tell(started=who, pid=process.pid)
+        self.record(started=who, pid=process.pid)
 
     def _serves(self, who: str, out: Path, begin: int) -> bool:
         if who == "broker":
@@ -129,12 +129,12 @@ class Bench:
                 return probe.connect_ex(("127.0.0.1", self._ports["mqtt"])) == 0
         if who == "hold":
             return (self._folder / "logs" / "control.sock").exists()
-        said = out.read_bytes()[begin:].decode()
-        return who != "bridge" or all(f"{name}:" in said for name in ("opcua", "epics"))
+        printed = out.read_bytes()[begin:].decode()
+        return who != "bridge" or all(f"{name}:" in printed for name in ("opcua", "epics"))
 
     def kill(self, who: str, number: int = signal.SIGKILL) -> None:
         """End a part at once, or with another signal, and its children with it."""
-        self.tell(killed=who)
+        self.record(killed=who)
         process = self._running.pop(who)
         process.send_signal(number)
         process.wait()
@@ -147,7 +147,7 @@ class Bench:
                 Path(f"/proc/{self._running[who].pid}/statm").read_text(encoding="utf-8").split()[1]
             )
             rss_mb[who] = round(int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6, 2)
-        self.tell(rss_mb=rss_mb, load=os.getloadavg()[0])
+        self.record(rss_mb=rss_mb, load=os.getloadavg()[0])
 
     def wait(self, until_s: float) -> None:
         """Sample until a monotonic time."""
@@ -168,13 +168,13 @@ def measure(folder: Path, minutes: float, apart_minutes: float, raised: bool) ->
         bench.start("bare")
         bench.start("hold")
         bench.wait(time.monotonic() + 30.0)  # until it holds
-        bench.tell(phase="apart")
+        bench.record(phase="apart")
         bench.wait(time.monotonic() + 60.0 * apart_minutes)
         bench.start("broker")
         bench.start("bridge")
         for name in CLIENTS:
             bench.start(name)
-        bench.tell(phase="bridges")
+        bench.record(phase="bridges")
         begin_s = time.monotonic()
         for restart in restarts(60.0 * minutes):
             bench.wait(max(begin_s + restart.at_s, time.monotonic() + BETWEEN_S))
@@ -184,9 +184,9 @@ def measure(folder: Path, minutes: float, apart_minutes: float, raised: bool) ->
         bench.wait(begin_s + 60.0 * minutes)
         for who in (*CLIENTS, "bridge", "broker"):
             bench.kill(who)
-        bench.tell(phase="apart again")
+        bench.record(phase="apart again")
         bench.wait(time.monotonic() + 60.0 * apart_minutes)
-        bench.tell(phase="")
+        bench.record(phase="")
     finally:
         bench.close()
 
@@ -194,12 +194,12 @@ def measure(folder: Path, minutes: float, apart_minutes: float, raised: bool) ->
 # The figures, from the files.
 
 
-def _phases(told: list[Line]) -> list[tuple[str, float, float]]:
-    marks = [(line["phase"], line["utc_s"]) for line in told if "phase" in line]
+def _phases(records: list[Line]) -> list[tuple[str, float, float]]:
+    marks = [(line["phase"], line["utc_s"]) for line in records if "phase" in line]
     return [(name, begin, end) for (name, begin), (_, end) in itertools.pairwise(marks)]
 
 
-def tick_figures(folder: Path, told: list[Line]) -> list[Figure]:
+def tick_figures(folder: Path, records: list[Line]) -> list[Figure]:
     """Lateness and missed ticks of the hold in each phase, beside those of the bare loop."""
     from membrane_ctrl.run_files.run import open_run
 
@@ -210,9 +210,9 @@ def tick_figures(folder: Path, told: list[Line]) -> list[Figure]:
     ticks = run.ticks(["time_s", "lateness_ms", "missed_ticks"])
     utc_s = ticks.column("time_s").to_numpy() + run.origin_utc.timestamp()
     late_ms, missed = (ticks.column(name).to_numpy() for name in ("lateness_ms", "missed_ticks"))
-    bare, loads = lines(folder / "bare.jsonl"), [line for line in told if "load" in line]
+    bare, loads = lines(folder / "bare.jsonl"), [line for line in records if "load" in line]
     found = []
-    for name, begin, end in _phases(told):
+    for name, begin, end in _phases(records):
         within = (utc_s >= begin) & (utc_s < end)
         beside = [line for line in bare if begin <= line["utc_s"] < end]
         beside_ms = np.concatenate([line["late_ms"] for line in beside])
@@ -243,18 +243,18 @@ def _good(sweep: Line) -> bool:
     return sweep.get("names") == len(NAMES) and bool(sweep["oldest_s"] <= FRESH_S)
 
 
-def age_figures(folder: Path, told: list[Line]) -> list[Figure]:
+def age_figures(folder: Path, records: list[Line]) -> list[Figure]:
     """How soon each client has all names again after a restart, and how old they become between
     restarts.
     """
-    ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "bridges")
+    ((_, begin_s, end_s),) = (each for each in _phases(records) if each[0] == "bridges")
     found = []
     for name in CLIENTS:
         sweeps = [
             line for line in lines(folder / f"{name}.jsonl") if begin_s <= line["utc_s"] < end_s
         ]
         back_s, between, first = [], [], True
-        events = [line for line in told if begin_s < line["utc_s"] < end_s]
+        events = [line for line in records if begin_s < line["utc_s"] < end_s]
         returns = [line["utc_s"] for line in events if name in _affected(line.get("started", ""))]
         kills = [line["utc_s"] for line in events if name in _affected(line.get("killed", ""))]
         for at_s, until_s in zip([begin_s, *returns], [*kills, end_s], strict=False):
@@ -282,15 +282,17 @@ def age_figures(folder: Path, told: list[Line]) -> list[Figure]:
     return found
 
 
-def memory_figures(told: list[Line]) -> list[Figure]:
+def memory_figures(records: list[Line]) -> list[Figure]:
     """Memory of the bridge in its longest life, and of the hold."""
-    starts = [line["utc_s"] for line in told if line.get("started") == "bridge"]
-    ends = [line["utc_s"] for line in told if line.get("killed") == "bridge"]
+    starts = [line["utc_s"] for line in records if line.get("started") == "bridge"]
+    ends = [line["utc_s"] for line in records if line.get("killed") == "bridge"]
     begin_s, end_s = max(zip(starts, ends, strict=True), key=lambda life: life[1] - life[0])
     found = []
     for who in ("bridge", "hold"):
         at = [
-            (line["utc_s"], line["rss_mb"][who]) for line in told if who in line.get("rss_mb", {})
+            (line["utc_s"], line["rss_mb"][who])
+            for line in records
+            if who in line.get("rss_mb", {})
         ]
         part = [mb for utc_s, mb in at if begin_s + WARM_S <= utc_s < end_s]
         minutes = (end_s - begin_s - WARM_S) / 60
@@ -303,10 +305,15 @@ def memory_figures(told: list[Line]) -> list[Figure]:
 
 def figures(folder: Path) -> list[Figure]:
     """All figures of a measured folder."""
-    told = lines(folder / "bench.jsonl")
-    ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "bridges")
+    records = lines(folder / "bench.jsonl")
+    ((_, begin_s, end_s),) = (each for each in _phases(records) if each[0] == "bridges")
     span = at_least("minutes with bridges", (end_s - begin_s) / 60, "min", 0.0)
-    return [span, *tick_figures(folder, told), *age_figures(folder, told), *memory_figures(told)]
+    return [
+        span,
+        *tick_figures(folder, records),
+        *age_figures(folder, records),
+        *memory_figures(records),
+    ]
 
 
 def main() -> int:
@@ -323,12 +330,12 @@ def main() -> int:
         help="raise hold and bare loop above the machine's other work",
     )
     parser.add_argument(
-        "--tell", action="store_true", help="only the figures of a folder that was measured"
+        "--figures", action="store_true", help="only the figures of a folder that was measured"
     )
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends what was started, too
-    if not options.tell:
+    if not options.figures:
         measure(options.folder.resolve(), options.minutes, options.apart_minutes, options.raised)
     show("bridges", figures(options.folder))
     return 0

@@ -23,7 +23,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from tests.studies.bridge_clients import Told, lines
+from tests.studies.bridge_clients import LineLog, lines
 from tests.support.figures import Figure, at_most, show
 from tests.worlds.free_port import free_port
 from tests.worlds.port_run import keep_ticking, port_run
@@ -76,11 +76,11 @@ CLIENTS: dict[str, Callable[[str, str], Read]] = {  # of the ports of Channel Ac
 
 def be_client(name: str, out: Path, ca: str, pva: str) -> None:
     """Read until killed; say when values came that are fresh."""
-    tell, read = Told(out), CLIENTS[name](ca, pva)
+    record, read = LineLog(out), CLIENTS[name](ca, pva)
     while True:
         with contextlib.suppress(Exception):  # whatever the library raises: the client goes on
             if min(read()) > time.time() - FRESH_S:
-                tell(fresh=True)
+                record(fresh=True)
         time.sleep(0.05)
 
 

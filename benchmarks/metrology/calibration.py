@@ -234,16 +234,16 @@ def _accuracy() -> list[Figure]:
 
 
 def _bowed() -> list[Figure]:
-    held, freed, told = [], [], 0
+    held, freed, reported = [], [], 0
     for seed in range(BOWED_SEEDS):
         film, sets = _rendered(seed, bow_mm=1.0)
         solution = solve_calibration(_problem(sets))
         held.append(_measured(solution, film))
-        told += bool(find_suspects(solution)) and find_suspects(solution)[0].name == "bow_mm"
+        reported += bool(find_suspects(solution)) and find_suspects(solution)[0].name == "bow_mm"
         solution = solve_calibration(_problem(sets, {"bow_mm": 1.5}))
         freed.append(errors_um(solution.states[2].surface, film, MOVED_UM[2]))
     return [
-        at_least("screen bowed by 1 mm: named", told / BOWED_SEEDS, "share", 1.0),
+        at_least("screen bowed by 1 mm: named", reported / BOWED_SEEDS, "share", 1.0),
         at_most(
             "... figure error with the bow freed",
             _rms(freed, 1),

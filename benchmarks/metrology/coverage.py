@@ -168,8 +168,8 @@ def run(count: int = BENCHES) -> list[Figure]:
                 figures.append(
                     Figure(label, 100 * share, "%", "width over scatter", width, "93 .. 97")
                 )
-    sure = [one for one in given if one["verdict"] == "ok"]
-    far = sum(max(np.abs(one["error_um"]) / np.array(one["sigma_um"])) > 3 for one in sure)
+    accepted = [one for one in given if one["verdict"] == "ok"]
+    far = sum(max(np.abs(one["error_um"]) / np.array(one["sigma_um"])) > 3 for one in accepted)
     label = f"'ok' with an error above 3 sigma, of {len(given)}"
     figures.append(at_most(label, 100 * far / len(given), "%", 0.5))
     figures.append(

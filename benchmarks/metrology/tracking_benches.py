@@ -226,22 +226,22 @@ def answer(number: int) -> dict[str, Any]:
         "faults": {str(k): kind for k, kind in plan.faults.items()},
         "jump_um": world.jump_um,
     }
-    said = io.StringIO()
+    output = io.StringIO()
     with (
         tempfile.TemporaryDirectory() as name,
-        contextlib.redirect_stdout(said),
-        contextlib.redirect_stderr(said),
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(output),
     ):
         folder = Path(name)
         world.write_reference(folder / "full")
         if command(["measure", str(folder / "full"), "--no-pictures"]):
-            return about | {"counts": "reference rejected", "said": said.getvalue()}
+            return about | {"counts": "reference rejected", "said": output.getvalue()}
         world.write_track(
             folder / "track", plan.times, plan.step_every_s, first_steps=plan.first_steps
         )
         spoil(world, folder / "track", plan.faults)
         if command(["track", str(folder / "track"), "--no-pictures"]) not in (0, 3):
-            return about | {"counts": "fringes refused", "said": said.getvalue()}
+            return about | {"counts": "fringes refused", "said": output.getvalue()}
         return about | {"counts": "yes"} | judged(compared(world, folder), plan)
 
 
@@ -256,21 +256,21 @@ def judged(found: TrackedErrors, plan: Run) -> dict[str, Any]:
     sound = [
         k for k in range(jumped) if k not in plan.faults and plan.faults.get(k - 1) != "exposure"
     ]
-    said = [
+    output = [
         f"{verdict} {reason}" for verdict, reason in zip(found.verdicts, found.reasons, strict=True)
     ]
     about: dict[str, Any] = {
-        "frames": len(said),
+        "frames": len(output),
         "verdicts": dict(Counter(found.verdicts)),
         "silent": frames[good & far].tolist(),
-        "false": dict(Counter(said[k].split(":")[0] for k in sound if found.verdicts[k] != "ok")),
+        "false": dict(Counter(output[k].split(":")[0] for k in sound if found.verdicts[k] != "ok")),
         "planted": [
             {
                 "frame": k,
                 "fault": kind,
-                "said": said[k],
+                "said": output[k],
                 "right": k not in frames[far],
-                "named": found.verdicts[k] != "ok" and NAMES[kind] in said[k],
+                "named": found.verdicts[k] != "ok" and NAMES[kind] in output[k],
             }
             for k, kind in plan.faults.items()
         ],

@@ -212,15 +212,15 @@ def _session(bench: DrawnBench, config: Config, limit_um: float, short: bool) ->
         patch.object(twin_hold, "TwinHold", opened),
         patch.object(page, "write_report"),  # its pictures take as long as the session
     ):
-        told = io.StringIO()
+        output = io.StringIO()
         try:
-            with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
+            with contextlib.redirect_stderr(output), contextlib.redirect_stdout(output):
                 found["exit"] = run_session(_options(config, Path(folder), limit_um, short))
         except CommandError as error:
             found |= {"exit": int(error.exit), "refused": "; ".join(error.lines)}
         except Exception as error:
             found |= {"exit": 1, "crashed": f"{type(error).__name__}: {error}"}
-        found["said"] = told.getvalue().splitlines()[-6:]
+        found["said"] = output.getvalue().splitlines()[-6:]
         rows = [row for each in hold for row in each.rows if row.state in (State.HOLD, State.TUNE)]
         rate = bench.rate_hz
         found["minutes"] = len(rows) / rate / 60
@@ -360,9 +360,11 @@ def run(count: int = FRESH) -> list[Figure]:
     )
     if kept:
         ratio = float(np.median([row["tuned_um"] / row["least_um"] for row in kept]))
-        said = max(abs(row["predicted_um"] / row["tuned_um"] - 1) for row in kept)
+        largest_excess = max(abs(row["predicted_um"] / row["tuned_um"] - 1) for row in kept)
         figures.append(at_most("std after tuning over the bound, median", ratio, "", 1.25))
-        figures.append(at_most("predicted std against achieved, worst", 100 * said, "%", 20.0))
+        figures.append(
+            at_most("predicted std against achieved, worst", 100 * largest_excess, "%", 20.0)
+        )
     return figures
 
 

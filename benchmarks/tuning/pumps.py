@@ -213,13 +213,19 @@ def main() -> None:
     parser.add_argument("--full-um-per-s", type=float, help="likewise")
     parser.add_argument("--leak-um-per-s", type=float, help="likewise")
     given = parser.parse_args()
-    alike = {name: getattr(given, name) for name in ("shape", "full_um_per_s", "leak_um_per_s")}
-    alike = {name: value for name, value in alike.items() if value is not None}
-    if "shape" in alike:  # the others are those of the shape drawn
-        alike |= {"start": 0.0, "stall": 0.0, "play": 0.02 if given.shape == "hysteretic" else 0.0}
+    common_settings = {
+        name: getattr(given, name) for name in ("shape", "full_um_per_s", "leak_um_per_s")
+    }
+    common_settings = {name: value for name, value in common_settings.items() if value is not None}
+    if "shape" in common_settings:  # the others are those of the shape drawn
+        common_settings |= {
+            "start": 0.0,
+            "stall": 0.0,
+            "play": 0.02 if given.shape == "hysteretic" else 0.0,
+        }
     rows: list[SurveyedPump] = []
     for seed in range(given.first, given.first + given.pumps):
-        rows.append(surveyed(replace(drawn(seed), **alike), given.limit_um))
+        rows.append(surveyed(replace(drawn(seed), **common_settings), given.limit_um))
         row = rows[-1]
         print(
             f"{row.drawn.named}: off {100 * row.off_share:.1f} %, furthest "

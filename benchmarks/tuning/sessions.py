@@ -71,10 +71,11 @@ def _print(figures: dict[str, Any]) -> None:
         "| bias µm, worst | K 1/s | Ti s | filter s | Ms |\n|---" + "|---" * 9 + "|"
     )
     for name, case in figures["sessions"].items():
-        ratio, said = case["ours_ratio"], case["predicted_over_achieved"]
+        ratio, predicted = case["ours_ratio"], case["predicted_over_achieved"]
         print(
             f"| {name} | {case['least_um']['mean']:.3f} | {case['ours_um']['mean']:.3f} "
-            f"| {ratio['mean']:.2f}, {ratio['max']:.2f} | {said['min']:.2f}, {said['max']:.2f} "
+            f"| {ratio['mean']:.2f}, {ratio['max']:.2f} "
+            f"| {predicted['min']:.2f}, {predicted['max']:.2f} "
             f"| {_worst(case['ours_bias_um']):.3f} | {case['kp_per_s']['mean']:.2f} | "
             f"{case['ti_s']['mean']:.1f} "
             f"| {case['filter_s']['mean']:.2f} | {case['ms']['mean']:.2f} |"

@@ -94,8 +94,8 @@ class _Departure:
     @property
     def contradicts(self) -> bool:
         """Whether the law leaves most of the departure, beyond doubt."""
-        sure = self.left_um > _SURELY_LEFT * self.sigma_um
-        return sure and self.left_um > _UNLIKE_LAW * self.seen_um
+        is_significant = self.left_um > _SURELY_LEFT * self.sigma_um
+        return is_significant and self.left_um > _UNLIKE_LAW * self.seen_um
 
     def _rms_um(self, profiles_mm: FloatArray) -> float:
         share = self.radius_mm / np.sum(self.radius_mm)

@@ -328,8 +328,8 @@ class MapDevice:
         self._written = {
             found.address + n: 0 for found in self._outputs for n in range(found.words)
         }
-        for found, tell in self._outputs.items():
-            self._apply_output(found, tell)
+        for found, set_output in self._outputs.items():
+            self._apply_output(found, set_output)
 
     def read(self, address: int, count: int) -> list[int]:
         """Words. Raises RegisterRefusal."""
@@ -349,13 +349,13 @@ class MapDevice:
         if not all(self._raw_limits[0] <= word <= self._raw_limits[1] for word in words):
             raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_VALUE)
         self._written.update(zip(places, words, strict=True))
-        for found, tell in self._outputs.items():
-            self._apply_output(found, tell)
+        for found, set_output in self._outputs.items():
+            self._apply_output(found, set_output)
 
-    def _apply_output(self, found: ValueMap, tell: Callable[[float], None]) -> None:
+    def _apply_output(self, found: ValueMap, set_output: Callable[[float], None]) -> None:
         value = found.decode([self._written[found.address + n] for n in range(found.words)])
         # a current below 4 mA means a broken wire to the driven device: off
-        tell(value if found.allows(value) else 0.0)
+        set_output(value if found.allows(value) else 0.0)
 
 
 def respond_to_input(pdu: bytes, table: modbus_pdu.RegisterTable) -> bytes:

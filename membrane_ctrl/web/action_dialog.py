@@ -81,11 +81,11 @@ async def ask_for_confirmation(
                 given.on("keydown.enter", confirm)
         take_over = ui.checkbox("take control from another user")
         with ui.row():
-            sure = ui.button("Do it", on_click=confirm).props("color=primary")
+            confirm_button = ui.button("Do it", on_click=confirm).props("color=primary")
             cancel = ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None)
             cancel.props("flat")
             if not action.asks:
-                (sure if enter_confirms else cancel).props("autofocus")
+                (confirm_button if enter_confirms else cancel).props("autofocus")
     answer = await dialog
     found = GivenAnswer(str(given.value or "") if given else "", bool(take_over.value))
     if not dialog.is_deleted:  # with the viewer

@@ -33,10 +33,12 @@ async def confirm(
         for line in lines:
             ui.label(line)
         with ui.row():
-            sure = ui.button(yes, on_click=lambda: dialog.submit("yes")).props(f"color={colour}")
+            confirm_button = ui.button(yes, on_click=lambda: dialog.submit("yes")).props(
+                f"color={colour}"
+            )
             cancel = ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None)
             cancel.props("flat")
-            (sure if enter_confirms else cancel).props("autofocus")
+            (confirm_button if enter_confirms else cancel).props("autofocus")
     answer = await dialog
     if not dialog.is_deleted:  # with the viewer
         dialog.delete()

@@ -349,11 +349,11 @@ class GainsPanel:
             return
         name = str(self._choice.value)
         try:
-            said = await self._views.save(self._hold, name, found.loop, self._user.name)
+            message = await self._views.save(self._hold, name, found.loop, self._user.name)
         except (errors.CommandError, PoolFullError) as error:
             show_message(str(error), good=False)
             return
-        show_message(said, good=True)
+        show_message(message, good=True)
 
     async def _try_gains(self) -> None:
         """Ask, and set the gains on trial."""

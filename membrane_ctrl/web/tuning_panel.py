@@ -223,7 +223,7 @@ class TuningPanel:
             with ui.row():
                 for name in (*seen.progress.among, ""):
                     button = ui.button(
-                        name or "none", on_click=lambda _, said=name: self._answer(seen, said)
+                        name or "none", on_click=lambda _, choice=name: self._answer(seen, choice)
                     )
                     button.props("no-caps" if name else "no-caps flat").tooltip(
                         f"needs the role {CHOOSES}"
@@ -231,12 +231,12 @@ class TuningPanel:
                     button.set_enabled(self._may())
                     self._buttons.append(button)
 
-    async def _answer(self, seen: SessionSeen, said: str) -> None:
+    async def _answer(self, seen: SessionSeen, choice: str) -> None:
         """Ask for a confirmation, answer, and say what became of it."""
-        question = f"{seen.progress.asks} {said or 'none'}"
+        question = f"{seen.progress.asks} {choice or 'none'}"
         if not await confirm(question, enter_confirms=True) or not self._may():
             return
-        given = PageAnswer(said, self._user.name)
+        given = PageAnswer(choice, self._user.name)
         outcome = await ANSWERS.run(answered, seen.path, seen.progress.asks, given)
         with self._steps:  # the button that was pressed is gone once the session has its answer
             show_message(outcome.text, outcome.done)

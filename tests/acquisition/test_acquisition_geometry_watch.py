@@ -70,13 +70,13 @@ def test_a_ring_that_seems_to_tilt_is_reported_and_a_deeper_bowl_is_not() -> Non
     assert not any(drift.check_estimate(deeper) for _ in range(CYCLES))
     tilted = CYCLE.coeffs_um.copy()
     tilted[1] += 4.0  # 2 x of the radius a unit: 8 µm at the rim, 5.7 µm RMS around it
-    told = [
+    reported = [
         event
         for _ in range(CYCLES)
         if (event := drift.check_estimate(replace(CYCLE, coeffs_um=tilted))) is not None
     ]
-    assert [event.name for event in told] == ["calibrate"]
-    assert "the ring is seen 5.7 µm RMS from where it was" in told[0].message
+    assert [event.name for event in reported] == ["calibrate"]
+    assert "the ring is seen 5.7 µm RMS from where it was" in reported[0].message
 
 
 def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
@@ -127,21 +127,21 @@ def test_the_event_states_what_has_changed_since_the_run_before(tmp_path: Path) 
         OPTICS.model_copy(update={"geometry": moved, "camera": lens}),
         OPTICS,
     )
-    said = []
+    messages = []
     for minute, optics in enumerate(benches):
         folder = _make_run(tmp_path, minute, optics)
         (tmp_path / ".remains").mkdir(exist_ok=True)
         geometry = read_run_geometry(folder, Config(optics=optics))
-        said.append(make_geometry_event(geometry, folder).sentence)
+        messages.append(make_geometry_event(geometry, folder).sentence)
     place = "The figures use the geometry of the configuration"
-    assert said[0] == place, "there is no run before"
-    assert said[1] == f"{place}; as in 20260102T030000Z-lab"
-    assert said[2] == (
+    assert messages[0] == place, "there is no run before"
+    assert messages[1] == f"{place}; as in 20260102T030000Z-lab"
+    assert messages[2] == (
         f"{place}; changed since 20260102T030100Z-lab: geometry.a_mm from 2672 to 2675.5, "
         "geometry.a_sigma_mm from none to 2, camera.principal_px from (1223.5, 1023.5) to "
         "(1200, 1000)"
     )
-    assert "from 2675.5 to 2672" in said[3]
+    assert "from 2675.5 to 2672" in messages[3]
 
 
 def test_a_damaged_run_before_is_no_error(tmp_path: Path) -> None:

@@ -34,10 +34,10 @@ class Keeping:
         self._frames = stack.enter_context(closing(FrameWriter(frames.address)))
         self._telemetry = stack.enter_context(closing(RingWriter(telemetry)))
         settings = RecordingConfig(min_free_mb=recording.pop("min_free_mb", 1), **recording)  # type: ignore[arg-type]
-        self.told: list[Any] = []
+        self.reports: list[Any] = []
         raw = folder / "raw"
         self.raw = RawFrames(
-            raw, OPTICS, PLAN, settings, frames.address, telemetry, self.told.append
+            raw, OPTICS, PLAN, settings, frames.address, telemetry, self.reports.append
         )
         self.folder = folder / "raw"
         self.cycle = 0
@@ -176,7 +176,7 @@ def test_a_set_has_to_leave_the_disk_to_the_telemetry(
     keeping = Keeping(stack, tmp_path, min_free_mb=100)
     keeping.take("full")
     assert keeping.kept() == kept
-    assert bool(keeping.told) == (not kept)
+    assert bool(keeping.reports) == (not kept)
 
 
 def test_frames_that_the_disk_did_not_take_whole_are_removed_and_reported_once(
@@ -197,7 +197,7 @@ def test_frames_that_the_disk_did_not_take_whole_are_removed_and_reported_once(
             with pytest.raises(OSError, match="could not be written"):
                 keeping.capture(cycle)
     assert list(keeping.folder.iterdir()) == []
-    assert ["No space left" in told.message for told in keeping.told] == [True]
+    assert ["No space left" in reports.message for reports in keeping.reports] == [True]
     keeping.take()
     keeping.fault(3)
     assert keeping.kept() == ["cycle-000003"]

@@ -24,7 +24,7 @@ class ScriptedRemote(Remote):
     def __init__(self, clock: VirtualClock, script: dict[float, str]) -> None:
         self.clock = clock
         self.script = sorted(script.items())
-        self.told: list[tuple[str, str]] = []
+        self.reports: list[tuple[str, str]] = []
         self.stop = self.paused = self._full = False
         self._capture = None
         self.events: list[dict[str, object]] = []
@@ -40,7 +40,7 @@ class ScriptedRemote(Remote):
         self._execute_command(command)
 
     def report_state(self, state: str, message: str = "", **details: object) -> None:
-        self.told.append((state, message))
+        self.reports.append((state, message))
 
     def send_event(self, event: Event) -> None:
         self.events.append(event.to_dict())
@@ -126,7 +126,7 @@ def test_pause_and_resume() -> None:
     loop = Loop({1.0: "pause", 7.3: "resume", 8.0: "stop"})
     loop.run()
     assert loop.cycle.started_s == [0, 7.3]
-    assert ("paused", "until the command to resume") in loop.remote.told
+    assert ("paused", "until the command to resume") in loop.remote.reports
 
 
 def test_full_on_request_goes_to_the_next_cycle() -> None:
@@ -183,7 +183,7 @@ def test_failure_is_reported_and_waits_out_its_pause() -> None:
     loop.cycle.results = [CycleFailed(1, "camera", "LinkError: no trigger", 4.0)]
     loop.run()
     assert loop.cycle.started_s == [0, 6, 8]
-    assert loop.remote.told[0] == ("retrying", "camera: LinkError: no trigger; again in 4 s")
+    assert loop.remote.reports[0] == ("retrying", "camera: LinkError: no trigger; again in 4 s")
 
 
 def test_rejected_estimate_is_published_and_reported_with_its_reason() -> None:
@@ -191,7 +191,7 @@ def test_rejected_estimate_is_published_and_reported_with_its_reason() -> None:
     loop.cycle.results = [CycleDone(estimate("full", verdict="rejected", reason="no mirror"), 1.0)]
     loop.run()
     assert [e.verdict for e in loop.published] == ["rejected"]
-    assert loop.remote.told == [("running", "rejected: no mirror; next in 1 s")]
+    assert loop.remote.reports == [("running", "rejected: no mirror; next in 1 s")]
 
 
 def test_interrupted_cycle_publishes_nothing() -> None:
@@ -199,7 +199,7 @@ def test_interrupted_cycle_publishes_nothing() -> None:
     loop.cycle.results = [None]
     loop.run()
     assert loop.published == []
-    assert loop.remote.told == []
+    assert loop.remote.reports == []
 
 
 @pytest.mark.parametrize(

@@ -315,15 +315,17 @@ def test_a_shift_of_a_per_cent_within_a_week_of_pictures_is_reported_everywhere(
         assert not any("Maintenance" in text for text in words)
         return
     assert message.count(f"it moved by {change:+.1%}: the film's tension by {2 * change:+.1%}") == 4
-    (told,) = hold.maintenance_events
-    assert (told["kind"], told["name"]) == ("maintenance", "film_tension")
+    (maintenance,) = hold.maintenance_events
+    assert (maintenance["kind"], maintenance["name"]) == ("maintenance", "film_tension")
     # the first five searches end on day 1, and their median is of day 0
     assert (
         f"moved by {change:+.1%} within 144 h: the film's tension by {2 * change:+.1%}"
-        in told["message"]
+        in maintenance["message"]
     )
-    assert told["mono_s"] > 7 * DAY_S
+    assert maintenance["mono_s"] > 7 * DAY_S
     assert (
-        hold.alarmed("film_tension") == [line["message"] for line in reported] == [told["message"]]
+        hold.alarmed("film_tension")
+        == [line["message"] for line in reported]
+        == [maintenance["message"]]
     )
-    assert any(told["message"] in text for text in words)
+    assert any(maintenance["message"] in text for text in words)

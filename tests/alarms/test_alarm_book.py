@@ -103,12 +103,12 @@ def test_a_good_sign_of_nothing_is_nothing() -> None:
 @given(st.lists(st.tuples(st.booleans(), st.floats(0.1, 100.0)), max_size=60))
 def test_raised_and_cleared_take_turns(changes: list[tuple[bool, float]]) -> None:
     book = AlarmBook(CONFIG)
-    now_s, told = 0.0, []
+    now_s, sent = 0.0, []
     for bad, wait_s in changes:
         book.take_sign(BAD if bad else GOOD, now_s)
         now_s += wait_s
-        told += [kind for kind in kinds(book.step(now_s)) if kind in ("raised", "cleared")]
-    assert told == (["raised", "cleared"] * len(told))[: len(told)]
+        sent += [kind for kind in kinds(book.step(now_s)) if kind in ("raised", "cleared")]
+    assert sent == (["raised", "cleared"] * len(sent))[: len(sent)]
 
 
 @pytest.mark.parametrize("name", ["fault", "silent"])

@@ -60,14 +60,14 @@ class _Truths(list[str]):
 
 async def main(kind: str, folder: Path) -> None:
     """Serve until SIGTERM."""
-    told = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, told.set)
+    stopped = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stopped.set)
     truths = _Truths()
     bench = LiveBench(BenchSpec(TwinConfig(seed=5), PumpConfig(), RunClock.start(), port=0), truths)
     board = _python_board if kind == "python" else _qemu_board
     async with board(bench, folder) as url:
         print(url, flush=True)
-        while not told.is_set():
+        while not stopped.is_set():
             bench.catch_up()
             await asyncio.sleep(_PERIOD_S)
     (folder / "truth.txt").write_text("".join(truths))

@@ -99,9 +99,9 @@ class Twins:
         )
 
     def ask(self, pdu: bytes) -> None:
-        said = self.c.ask(pdu)
+        answer = self.c.ask(pdu)
         self._follow(self.c.answered_us)
-        assert said == answer_request(pdu, self.python), (
+        assert answer == answer_request(pdu, self.python), (
             f"request {pdu.hex()} at {self.c.answered_us} us"
         )
         self.c.pass_us(1000 * _SETTLED_MS)

@@ -166,10 +166,10 @@ async def test_a_bridge_asks_by_its_role(
         bridge = bridge_with(
             role, dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock"
         )
-        said = await bridge.ask("mqtt", command)
-        assert ("needs the role" in said) is refused
+        answer = await bridge.ask("mqtt", command)
+        assert ("needs the role" in answer) is refused
         assert [asked.kind for asked in run.asked] == ([] if refused else [command])
-        assert bridge.values()["answer"] == said
+        assert bridge.values()["answer"] == answer
         assert (command in bridge.commands) is not refused
 
 

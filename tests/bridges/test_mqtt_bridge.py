@@ -194,9 +194,9 @@ async def test_what_a_flood_loses_is_reported(tmp_path: Path) -> None:
         await client.publish(f"{BASE}/do/mark", "the last", qos=1)
 
         def reported() -> int:
-            said = listener.of("answer")
-            counted = sum(int(each.split()[0]) for each in said if "more commands" in each)
-            return counted + sum("mark" in each for each in said)
+            answers = listener.of("answer")
+            counted = sum(int(each.split()[0]) for each in answers if "more commands" in each)
+            return counted + sum("mark" in each for each in answers)
 
         with contextlib.suppress(TimeoutError):
             await listener.until(lambda: reported() == 151)

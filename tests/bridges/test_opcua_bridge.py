@@ -141,10 +141,10 @@ async def test_a_safety_command_does_not_wait_for_a_flood_of_calls(
             ]
             safe = asyncio.create_task(answer_to(client, call_of(space, kind, *text_for(kind))))
             assert (await safe).endswith(f"opcua: {kind}: done")
-            said = await asyncio.gather(*flood)
+            answers = await asyncio.gather(*flood)
             assert all(
                 ": done" in each or "too many commands" in each or "takes precedence" in each
-                for each in said
+                for each in answers
             )
             assert [command.kind for command in run.asked].index(kind) < PRECEDING_MAX
 

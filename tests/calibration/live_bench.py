@@ -98,7 +98,7 @@ class LiveBench:
     def __post_init__(self) -> None:
         self.hold = TwinHold(self.config)
         self.name = self.run_dir.name
-        self._told: tuple[Event, ...] = ()
+        self._pending_events: tuple[Event, ...] = ()
 
     def send_command(self, command: Command) -> None:
         self.asked.append(command)
@@ -111,9 +111,9 @@ class LiveBench:
             self.hold.send_command(Command("setpoint", "another", value=77.0))
 
     def read_news(self) -> News:
-        told, self._told = self._told, ()
+        pending, self._pending_events = self._pending_events, ()
         news = self.hold.read_news()
-        return News(news.rows, news.events + told, () if self.blind else news.shapes)
+        return News(news.rows, news.events + pending, () if self.blind else news.shapes)
 
     def close(self) -> None:
         pass
@@ -124,7 +124,7 @@ class LiveBench:
             signal.raise_signal(signal.SIGINT)
         self.hold.bench.wrong.no_light = self.captures == self.dark_at
         if self.fails and (failed := self.fails.pop(0)):
-            self._told = (Capture(failed=failed),)
+            self._pending_events = (Capture(failed=failed),)
             return
         spec = SimulationSpec(
             self.config.optics.model_copy(update={"geometry": TRUE}),
@@ -137,4 +137,4 @@ class LiveBench:
             seed=self.captures,
         )
         simulate_set(self.run_dir / "raw" / f"cycle-{self.captures}", spec)
-        self._told = (Capture(set=f"raw/cycle-{self.captures}", verdict="ok", reason=""),)
+        self._pending_events = (Capture(set=f"raw/cycle-{self.captures}", verdict="ok", reason=""),)

@@ -65,13 +65,13 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def calibrated(folders: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of their calibration, beside `geometry.toml` and a picture."""
     out = tmp_path_factory.mktemp("calibrated")
-    said = io.StringIO()
-    with redirect_stdout(said):
+    captured = io.StringIO()
+    with redirect_stdout(captured):
         assert (
             run(["calibrate", *map(str, folders), "--out", str(out / "geometry.toml"), "--json"])
             == 0
         )
-    (out / "report.json").write_text(said.getvalue())
+    (out / "report.json").write_text(captured.getvalue())
     return out / "report.json"
 
 
@@ -274,11 +274,13 @@ def test_the_report_notes_sets_that_state_different_references(
         text.replace("reference_displacement_um = 0.0", "reference_displacement_um = -4000.0")
     )
     run(["calibrate", str(folders[2]), str(other), "--out", str(tmp_path / "geometry.toml")])
-    said = capsys.readouterr()
-    assert "the sets state reference_displacement_um from -4000 to 0 µm" in said.out + said.err
+    captured = capsys.readouterr()
+    assert (
+        "the sets state reference_displacement_um from -4000 to 0 µm" in captured.out + captured.err
+    )
     run(["calibrate", str(folders[2]), str(folders[0]), "--out", str(tmp_path / "geometry.toml")])
-    said = capsys.readouterr()
-    assert "the sets state" not in said.out + said.err
+    captured = capsys.readouterr()
+    assert "the sets state" not in captured.out + captured.err
 
 
 def test_a_refusal_of_sets_with_different_references_names_these_first() -> None:

@@ -62,12 +62,12 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     bench.interrupt_at = 2
     answer(monkeypatch, "y\n")
     assert run([*live, "--range-um", "4000", "--sets", "3"]) == 130
-    said = capsys.readouterr().err
-    assert "3 of 3 sets from -2000 to 2000 µm" in said
-    assert "a figure after these sets: sag +-" in said
-    assert "limits.gauge_pressure_max_pa allow" in said
+    printed = capsys.readouterr().err
+    assert "3 of 3 sets from -2000 to 2000 µm" in printed
+    assert "a figure after these sets: sag +-" in printed
+    assert "limits.gauge_pressure_max_pa allow" in printed
     session = session_in(tmp_path)
-    assert f"continue with --session {session}" in said
+    assert f"continue with --session {session}" in printed
     assert [path.name for path in (session / "sets").iterdir()] == ["set-1"]
     row = bench.hold.rows[-1]
     assert row.target_um == 0.0  # where it was
@@ -84,27 +84,28 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     bench.fails = ["rejected: somebody walked by"]
     answer(monkeypatch, "y\nno\n")
     assert run([*live, "--session", str(session)]) == 0
-    said = capsys.readouterr()
-    assert "2 of 3 sets" in said.err
+    printed = capsys.readouterr()
+    assert "2 of 3 sets" in printed.err
     assert bench.captures == 2 + 3  # the bad one again, not the one that was there
     assert bench.hold.rows[-1].target_um == 0.0
     assert not [row for row in bench.hold.rows if row.fault]
-    assert "not adopted; `membrane-ctrl calibrate --live --session" in said.err
+    assert "not adopted; `membrane-ctrl calibrate --live --session" in printed.err
     assert (tmp_path / "bench.toml").read_text() == OLD
 
     monkeypatch.setattr(command, "live_hold", None)  # all sets are there: no hold is needed
     assert run([*live, "--session", str(session), "--yes"]) == 0
-    said = capsys.readouterr()
+    printed = capsys.readouterr()
     new = tomllib.loads((tmp_path / "bench.toml").read_text())
     assert new["geometry"]["reference_displacement_um"] == 0.0
-    found = {name: (value, sigma) for name, value, sigma in rows_of(said.out)}
+    found = {name: (value, sigma) for name, value, sigma in rows_of(printed.out)}
     for name, true, known in (("a_mm", 2.0, 2.0), ("b_mm", -2.0, 2.0), ("alpha_deg", 0.3, 0.3)):
         value, sigma = found[name]
         assert abs(value - true) < 4 * sigma, name
         assert sigma < known, name
-    assert "in use: by hand" in said.err
+    assert "in use: by hand" in printed.err
     assert (
-        f"adopted: {tmp_path / 'bench.toml'}; the previous one is {tmp_path / 'bench-'}" in said.err
+        f"adopted: {tmp_path / 'bench.toml'}; the previous one is {tmp_path / 'bench-'}"
+        in printed.err
     )
     assert next(tmp_path.glob("bench-*.toml")).read_text() == OLD
     assert read_geometry(tmp_path / "bench.toml").origin.calibrated_utc
@@ -132,9 +133,9 @@ def test_a_fault_on_the_way_is_left_to_the_safety_table(
 ) -> None:
     bench.dark_at = 1
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 4
-    said = capsys.readouterr().err
-    assert "the mirror is not held, but in state fault (" in said
-    assert "the mirror is left to the client in command; the shape loop is off" in said
+    printed = capsys.readouterr().err
+    assert "the mirror is not held, but in state fault (" in printed
+    assert "the mirror is left to the client in command; the shape loop is off" in printed
     assert (
         bench.asked[-1].value == 500.0
     )  # on its way to the second set; no command after the fault
@@ -146,8 +147,8 @@ def test_who_cannot_wait_for_the_way_back_leaves_the_hold_on_it(
     bench.interrupt_at = 1
     bench.interrupts_again = True
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 130
-    said = capsys.readouterr().err
-    assert "left: the hold continues its ramp to 0 µm; then switch the shape loop on" in said
+    printed = capsys.readouterr().err
+    assert "left: the hold continues its ramp to 0 µm; then switch the shape loop on" in printed
     assert bench.hold.rows[-1].target_um == 0.0
     assert bench.hold.rows[-1].displacement_um < -100.0
 
@@ -208,9 +209,9 @@ def test_somebody_elses_setpoint_ends_it(
 )
 def test_bad_usage(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["calibrate", *words]) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert len(said.splitlines()) == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert len(printed.splitlines()) == 1
 
 
 def test_no_hold_is_running(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

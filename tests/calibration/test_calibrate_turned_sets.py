@@ -130,8 +130,8 @@ def test_a_turn_that_cannot_be_is_refused(
     assert "angle_deg = 120.0" in text
     (wrong / "capture.toml").write_text(text.replace("angle_deg = 120.0", becomes))
     assert run(calibrate([*sets[:3], wrong], tmp_path / "g.toml")) == exit_code
-    said = capsys.readouterr()
-    assert message in said.err + said.out
+    printed = capsys.readouterr()
+    assert message in printed.err + printed.out
     assert not (tmp_path / "g.toml").exists()
 
 

@@ -26,7 +26,7 @@ import campaign_interlock_stories
 import campaign_sensor_stories
 import campaign_stories
 from campaign_cases import CASES, SITUATIONS, Case, Situation
-from campaign_holds import HOLDS, tell
+from campaign_holds import HOLDS, run_hold_story
 from campaign_run import Result, run_case
 from campaign_times import RATE_HZ
 from process_run import ProcessResult, process_table
@@ -52,7 +52,7 @@ SHORT_SEEDS = (3, 4)  # drawn mirrors; the first may resume, the second may not
 
 
 @dataclass(frozen=True)
-class Told:
+class StoryResult:
     """Result of one story."""
 
     name: str
@@ -93,24 +93,24 @@ def run_row(
     return results
 
 
-def run_story(name: str) -> Told:
+def run_story(name: str) -> StoryResult:
     """One story; what it raises is a violation."""
     story = _STORIES.get(name) or _HOLDS[name]
     about = (story.__doc__ or "").strip().splitlines()[0]
     with listening() as tripped:
         try:
-            found = _STORIES[name]() if name in _STORIES else tell(_HOLDS[name])
+            found = _STORIES[name]() if name in _STORIES else run_hold_story(_HOLDS[name])
         except Exception as error:
             found = [f"raised {type(error).__name__}: {error}"]
-    return Told(name, about, tuple(found), tuple(sorted(tripped)))
+    return StoryResult(name, about, tuple(found), tuple(sorted(tripped)))
 
 
-def run_all(processes: int) -> tuple[list[Result], list[Told]]:
+def run_all(processes: int) -> tuple[list[Result], list[StoryResult]]:
     """Every fault in every situation with every seed, and every story."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        told = pool.map(run_story, [*_STORIES, *_HOLDS])
+        story_results = pool.map(run_story, [*_STORIES, *_HOLDS])
         rows = pool.map(run_row, _BY_NAME, [tuple(SEEDS)] * len(_BY_NAME))
-        return [result for row in rows for result in row], list(told)
+        return [result for row in rows for result in row], list(story_results)
 
 
 def run_short(first: str = "") -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -143,12 +143,12 @@ def _run_short_matrix() -> Iterator[tuple[str, tuple[str, ...]]]:
             yield f"{case.name} in {at.name}", run_case(case, at, seed).violations
 
 
-def document(results: list[Result], told: list[Told]) -> str:
+def document(results: list[Result], story_results: list[StoryResult]) -> str:
     """The matrix as Markdown."""
     violations = [
         (f"{r.case}, {r.situation}, seed {r.seed}", v) for r in results for v in r.violations
     ]
-    violations += [(t.name, v) for t in told for v in t.violations]
+    violations += [(t.name, v) for t in story_results for v in t.violations]
     by_cell: dict[tuple[str, str], list[Result]] = defaultdict(list)
     for result in results:
         by_cell[result.case, result.situation].append(result)
@@ -165,7 +165,7 @@ def document(results: list[Result], told: list[Told]) -> str:
         "fault, in which every safe "
         "level times out, and then through a stop.",
         "",
-        f"**{len(results)} runs and {len(told)} stories, {len(violations)} violations of an "
+        f"**{len(results)} runs and {len(story_results)} stories, {len(violations)} violations of an "
         "invariant.**",
         "",
         "A cell shows the deepest safe level, the first cause that was named, and the "
@@ -197,9 +197,16 @@ def document(results: list[Result], told: list[Told]) -> str:
     lines += ["", "## Stories", "", "| story | what must happen |", "|---|---|"]
     lines += [
         f"| {t.name.replace('_', ' ')} | {t.about}{' **bad**' if t.violations else ''} |"
-        for t in told
+        for t in story_results
     ]
-    lines += ["", "## Rules of the safety table", "", *_rules(results, told), "", *_processes()]
+    lines += [
+        "",
+        "## Rules of the safety table",
+        "",
+        *_rules(results, story_results),
+        "",
+        *_processes(),
+    ]
     if violations:
         lines += ["## Violations", ""]
         lines += [f"- {where}: {what}" for where, what in violations] + [""]
@@ -233,12 +240,12 @@ _INVARIANTS = (
 )
 
 
-def _rules(results: list[Result], told: list[Told]) -> list[str]:
+def _rules(results: list[Result], story_results: list[StoryResult]) -> list[str]:
     """In how many runs each rule has tripped, and in which stories."""
     lines = ["| rule | trips in | and in these stories |", "|---|---|---|"]
     for rule in sorted(TABLE, key=lambda rule: rule.code):
         runs = sum(rule.name in result.tripped for result in results)
-        stories = [t.name.replace("_", " ") for t in told if rule.name in t.tripped]
+        stories = [t.name.replace("_", " ") for t in story_results if rule.name in t.tripped]
         more = f" and {len(stories) - 2} more" if len(stories) > 2 else ""
         nowhere = "" if runs or stories else "**nowhere**"
         lines.append(
@@ -284,12 +291,12 @@ def _cell(results: list[Result]) -> str:
     deepest = max((r.safe_level for r in results), default=SafeLevel.NONE)
     if deepest == SafeLevel.NONE:
         return "-"
-    said = ", ".join(sorted({r.said for r in results if r.said}))
+    cause = ", ".join(sorted({r.cause for r in results if r.cause}))
     slowest_s = max(
         (r.reaction_s for r in results if not math.isnan(r.reaction_s)), default=math.nan
     )
     bad = sum(bool(r.violations) for r in results)
-    return f"{deepest.name} {said} {slowest_s:.2f} s" + (f" **{bad} bad**" if bad else "")
+    return f"{deepest.name} {cause} {slowest_s:.2f} s" + (f" **{bad} bad**" if bad else "")
 
 
 def _chosen(
@@ -318,27 +325,29 @@ def main(arguments: list[str] | None = None) -> int:
     if options.short:
         return _main_short(options.first)
     results: list[Result] = []
-    told: list[Told] = []
+    story_results: list[StoryResult] = []
     if options.story:
-        told = [run_story(name) for name in chain(_STORIES, _HOLDS) if options.story in name]
+        story_results = [
+            run_story(name) for name in chain(_STORIES, _HOLDS) if options.story in name
+        ]
     elif options.only:
         results = [
             run_case(*cell) for cell in _chosen(options.only, options.situation, options.seed)
         ]
     else:
-        results, told = run_all(options.processes)
-        DOCUMENT.write_text(document(results, told), encoding="utf-8")
+        results, story_results = run_all(options.processes)
+        DOCUMENT.write_text(document(results, story_results), encoding="utf-8")
     for result in results:
         came_of = result.violations or (
-            (f"{result.safe_level.name} {result.said}",) if options.only else ()
+            (f"{result.safe_level.name} {result.cause}",) if options.only else ()
         )
         for what in came_of:
             print(f"{result.case} in {result.situation}, seed {result.seed}: {what}")
-    for story in told:
+    for story in story_results:
         for what in story.violations or (("nothing wrong",) if options.story else ()):
             print(f"{story.name}: {what}")
-    wrong = sum(len(found.violations) for found in (*results, *told))
-    print(f"{len(results)} runs and {len(told)} stories, {wrong} violations")
+    wrong = sum(len(found.violations) for found in (*results, *story_results))
+    print(f"{len(results)} runs and {len(story_results)} stories, {wrong} violations")
     return int(wrong > 0)
 
 

@@ -33,7 +33,7 @@ class Case:
     name : str
     wrong : dict
         Switches of `virtual_bench.Wrong`.
-    said : frozenset of str
+    causes : frozenset of str
         Rules that may name it; empty: harmless, nothing may trip.
     moving, holding, checking, always : Reaction or None
         What must follow in MOVING states, in `hold` alone, in `check`, in every state (in `fault`
@@ -56,7 +56,7 @@ class Case:
 
     name: str
     wrong: dict[str, float] = field(default_factory=dict)
-    said: frozenset[str] = frozenset()
+    causes: frozenset[str] = frozenset()
     moving: Reaction | None = None
     holding: Reaction | None = None
     checking: Reaction | None = None
@@ -95,7 +95,7 @@ class Case:
     @property
     def harmless(self) -> bool:
         """Nothing may trip."""
-        return not self.said
+        return not self.causes
 
     def reaction(self, state: State) -> Reaction | None:
         """What must follow when it begins while the controller is in `state`."""
@@ -110,8 +110,8 @@ class Case:
         return self.moving if state in MOVING else self.checking if state == State.CHECK else None
 
 
-def _case(name: str, said: str = "", **rest: object) -> Case:
-    return Case(name, said=frozenset(said.split()), **rest)  # type: ignore[arg-type]
+def _case(name: str, causes: str = "", **rest: object) -> Case:
+    return Case(name, causes=frozenset(causes.split()), **rest)  # type: ignore[arg-type]
 
 
 _LOST = "displacement_missing displacement_frozen overdue"

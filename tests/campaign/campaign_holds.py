@@ -427,7 +427,7 @@ async def a_lab_with_another_serial_number() -> list[str]:
     return ["another flow controller is taken"]
 
 
-def tell(story: Callable[[], Awaitable[list[str]]]) -> list[str]:
+def run_hold_story(story: Callable[[], Awaitable[list[str]]]) -> list[str]:
     """Run a story of a rig."""
     return in_virtual_time(cast(Any, story()))
 

@@ -24,9 +24,13 @@ class Registers:
     """
 
     def __init__(
-        self, low: float, high: float, value: Callable[[], float], tell: Callable[[float], None]
+        self,
+        low: float,
+        high: float,
+        value: Callable[[], float],
+        set_value: Callable[[float], None],
     ) -> None:
-        self._low, self._high, self._value, self._tell = low, high, value, tell
+        self._low, self._high, self._value, self._set_value = low, high, value, set_value
 
     def read(self, address: int, count: int) -> list[int]:
         """The value as it is."""
@@ -39,7 +43,7 @@ class Registers:
         if address != 0 or len(words) != 1:
             raise RegisterRefusal(2)
         share = min(max((words[0] - 4000) / 16000, 0.0), 1.0)
-        self._tell(self._low + share * (self._high - self._low))
+        self._set_value(self._low + share * (self._high - self._low))
 
 
 class TableLink:

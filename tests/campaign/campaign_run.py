@@ -79,7 +79,7 @@ class Result:
     case: str
     situation: str
     seed: int
-    said: str
+    cause: str
     safe_level: SafeLevel
     reaction_s: float
     violations: tuple[str, ...]
@@ -150,9 +150,9 @@ def run_case(case: Case, at: Situation, seed: int) -> Result:
             watch.look(run.run_tick(stop), run.now_s)
             stop = ()
         watch.after_the_stop(run)
-    said = watch.names.get(watch.code, "")
+    cause = watch.names.get(watch.code, "")
     return Result(
-        case.name, at.name, seed, said, watch.deepest, watch.reaction_s, tuple(watch.violations)
+        case.name, at.name, seed, cause, watch.deepest, watch.reaction_s, tuple(watch.violations)
     )
 
 

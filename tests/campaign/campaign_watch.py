@@ -121,11 +121,11 @@ class Watch:
                 self._say(now_s, f"the mirror is {off_um:.1f} µm from its setpoint")
         if self._state_then == State.FAULT:
             return  # the first cause is another one, and stays
-        said = self.names.get(self.code, f"code {self.code:g}")
+        cause = self.names.get(self.code, f"code {self.code:g}")
         if self._case.harmless and self.code:
-            self._say(now_s, f"{said} although nothing dangerous was wrong")
-        if self.code and not self._case.harmless and said not in self._case.said:
-            self._say(now_s, f"called {said}")
+            self._say(now_s, f"{cause} although nothing dangerous was wrong")
+        if self.code and not self._case.harmless and cause not in self._case.causes:
+            self._say(now_s, f"called {cause}")
 
     def after_the_stop(self, run: VirtualRun) -> None:
         """Check after a stop was commanded and awaited."""

@@ -38,7 +38,7 @@ class ProcessResult:
     ----------
     exit : str
         As the summary has it.
-    said : str
+    cause : str
         The first cause; empty: nothing tripped.
     pump_s : float
         From the fault until the board's pump stood; NaN if it went on.
@@ -51,7 +51,7 @@ class ProcessResult:
 
     name: str
     exit: str
-    said: str
+    cause: str
     pump_s: float
     lost_s: float
     restarts: int
@@ -105,17 +105,17 @@ def judged(case: ProcessCase, run: Run, code: int, pump_s: float) -> ProcessResu
         repair_run(run_dir)
     summary = json.loads((run_dir / "summary.json").read_text())
     faults = run.faults()
-    said = faults[0] if faults else ""
+    cause = faults[0] if faults else ""
     latched = LatchedFile(run.folder / "logs").read()
     lost_s = lost_telemetry_s(run_dir, run.killed_utc_s)
     checks = {
         f"exit {code} in place of {case.exit}": code == case.exit,
-        f"first cause {said!r}": said in case.faults if case.faults else not said,
+        f"first cause {cause!r}": cause in case.faults if case.faults else not cause,
         f"pump ran on for {pump_s:.2f} s": not case.stops_pump
         or pump_s <= WATCHDOG_S + 2 * run.plant.longest_gap_s,
         "the pump runs after the end": not run.plant.pumping,
         "latched file": (latched is not None) == (case.exit == Exit.SAFETY_TRIP),
-        f"latched as {latched and latched.name!r}": latched is None or latched.name == said,
+        f"latched as {latched and latched.name!r}": latched is None or latched.name == cause,
         f"{lost_s:.2f} s of telemetry lost": lost_s <= case.lost_s,
         "deeper than the limit": run.plant.displacement_max_um
         <= LimitsConfig().displacement_max_um,
@@ -127,7 +127,7 @@ def judged(case: ProcessCase, run: Run, code: int, pump_s: float) -> ProcessResu
     violations = tuple(what for what, holds in checks.items() if not holds)
     restarts = int((summary.get("recorder") or {}).get("restarts", 0))
     return ProcessResult(
-        case.name, str(summary["exit"]), said, pump_s, lost_s, restarts, violations
+        case.name, str(summary["exit"]), cause, pump_s, lost_s, restarts, violations
     )
 
 
@@ -196,7 +196,7 @@ def process_table(results: list[ProcessResult]) -> list[str]:
         pump = "-" if math.isnan(r.pump_s) else f"{r.pump_s:.2f} s"
         bad = f" **{'; '.join(r.violations)}**" if r.violations else ""
         rows.append(
-            f"| {r.name} | {r.exit} | {r.said or '-'} | {pump} | {r.lost_s:.2f} s | "
+            f"| {r.name} | {r.exit} | {r.cause or '-'} | {pump} | {r.lost_s:.2f} s | "
             f"{r.restarts}{bad} |"
         )
     return rows

@@ -303,7 +303,7 @@ class Story:
     pressure_max_pa: float
 
 
-def tell(faults: Sequence[SensorFault], seed: int, camera: bool, from_start: bool) -> Story:
+def run_faults(faults: Sequence[SensorFault], seed: int, camera: bool, from_start: bool) -> Story:
     """Run one story; equal arguments give equal results. Weather, moment and door are drawn from
     the seed.
     """
@@ -357,7 +357,7 @@ class _Watch:
         self._state, self._highest_um = State.STANDBY, -math.inf
         self._astray_um = self._pressure_pa = self._pumped_um = 0.0
 
-    def look(self, row: TelemetryRow, told: Sequence[events.Event], now_s: float) -> None:
+    def look(self, row: TelemetryRow, tick_events: Sequence[events.Event], now_s: float) -> None:
         self._state = State(int(row.state))
         if now_s <= self._begins_s:
             return
@@ -368,7 +368,7 @@ class _Watch:
         if self._state == State.HOLD and row.safe_level == SafeLevel.NONE:
             off_um = truth.displacement_um - row.setpoint_um + row.trim_um
             self._astray_um = max(self._astray_um, abs(off_um))
-        for name in filter(None, map(_speaks, told)):
+        for name in filter(None, map(_speaks, tick_events)):
             if not self._noticed:
                 self._noticed, self._after_s = name, now_s - self._begins_s
 

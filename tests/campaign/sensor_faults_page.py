@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from scipy import stats
-from sensor_faults import CAMERA, FAULTS, PAIRS, SensorFault, Story, tell
+from sensor_faults import CAMERA, FAULTS, PAIRS, SensorFault, Story, run_faults
 from sensor_quiet import QuietHours, quiet_hours
 
 from membrane_ctrl.model.telemetry import State
@@ -136,7 +136,7 @@ def run(job: _Job) -> tuple[_Job, dict[str, Any]]:
     if what == "quiet_hours":
         return job, asdict(quiet_hours(number, flag, HOURS))
     faults = (FAULTS[number],) if what == "fault" else PAIRS[number]
-    return job, asdict(tell(faults, SEED, camera, flag))
+    return job, asdict(run_faults(faults, SEED, camera, flag))
 
 
 def page(found: dict[_Job, dict[str, Any]]) -> str:
@@ -152,10 +152,10 @@ def page(found: dict[_Job, dict[str, Any]]) -> str:
     ]
     for number, fault in enumerate(FAULTS):
         cells = [found.get(("fault", number, camera, start)) for camera, start in _COLUMNS]
-        told = [_cell(Story(**cell)) if cell else "" for cell in cells]
+        shown = [_cell(Story(**cell)) if cell else "" for cell in cells]
         quiet = any(cell is not None and not cell["noticed"] for cell in cells)
         lines.append(
-            f"| {fault.sensor} | {fault.failure} | {' | '.join(told)} | "
+            f"| {fault.sensor} | {fault.failure} | {' | '.join(shown)} | "
             f"{_note(fault) if quiet else ''} |"
         )
     lines += [
@@ -166,9 +166,9 @@ def page(found: dict[_Job, dict[str, Any]]) -> str:
         "|---|---|---|",
     ]
     for number, pair in enumerate(PAIRS):
-        told = [_cell(Story(**found["pair", number, camera, False])) for camera in (False, True)]
+        shown = [_cell(Story(**found["pair", number, camera, False])) for camera in (False, True)]
         words = " and ".join(f"{fault.sensor} {fault.failure}" for fault in pair)
-        lines.append(f"| {words} | {' | '.join(told)} |")
+        lines.append(f"| {words} | {' | '.join(shown)} |")
     return "\n".join([*lines, *_quiet_lines(found), FOOT])
 
 
@@ -214,11 +214,11 @@ def _quiet_lines(found: dict[_Job, dict[str, Any]]) -> list[str]:
     ]
     for other, some in sorted(nights.items()):
         alarms = [alarm for night in some for alarm in night.alarms]
-        told = f"{len(alarms)}: {'; '.join(alarms)}" if alarms else "0"
+        shown = f"{len(alarms)}: {'; '.join(alarms)}" if alarms else "0"
         hours = sum(night.hours for night in some)
         bound_h = hours / (stats.chi2.ppf(0.95, 2 * (len(alarms) + 1)) / 2)  # of a Poisson process
         bench = "other" if other else "the twin"
-        lines.append(f"| {bench} | {len(some)} | {hours:.0f} | {told} | {bound_h:.0f} h |")
+        lines.append(f"| {bench} | {len(some)} | {hours:.0f} | {shown} | {bound_h:.0f} h |")
     return lines
 
 

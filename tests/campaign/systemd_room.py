@@ -25,8 +25,8 @@ adduser --quiet --system --group --home /var/lib/membrane-ctrl membrane
 adduser --quiet membrane dialout
 install -d -m 750 -g membrane /etc/membrane-ctrl
 printf '[twin]\\nport = 1502\\nseed = 1\\n' > /etc/membrane-ctrl/twin.toml
-mkdir -p {_UNITS}/{_UNIT}.service.d /run/told
-chown membrane /run/told
+mkdir -p {_UNITS}/{_UNIT}.service.d /run/notices
+chown membrane /run/notices
 printf '[Service]\\n{_PLACES}\\n' | tee {_UNITS}/{_UNIT}.service.d/room.conf > {_UNITS}/twin.service
 echo "ExecStart={_PROGRAM} twin --config /etc/membrane-ctrl/twin.toml" >> {_UNITS}/twin.service
 cp '/opt/source/membrane_ctrl/examples/membrane-hold@.service' {_UNITS}
@@ -95,11 +95,11 @@ class Room:
         self.run(f"cat > /etc/membrane-ctrl/lab.toml <<'END'\n{text}END")
 
     def drop_in(self, *environment: str) -> None:
-        """Set more variables of the service, and let it write to /run/told."""
+        """Set more variables of the service, and let it write to /run/notices."""
         lines = "".join(f"Environment={each}\\n" for each in environment)
         path = f"{_UNITS}/{_UNIT}.service.d/test.conf"
         self.run(
-            f"printf '[Service]\\nReadWritePaths=/run/told\\n{lines}' > {path}; systemctl "
+            f"printf '[Service]\\nReadWritePaths=/run/notices\\n{lines}' > {path}; systemctl "
             "daemon-reload"
         )
 
@@ -107,7 +107,7 @@ class Room:
         """A new board, no run, no latched fault, nothing started yet."""
         self.run(
             f"systemctl stop {_UNIT} twin; systemctl reset-failed; rm -rf "
-            "/var/lib/membrane-ctrl/* /run/told/*"
+            "/var/lib/membrane-ctrl/* /run/notices/*"
         )
         self._since = self.run("date '+%F %T.%N'")
         self.configure(more)
@@ -122,8 +122,8 @@ class Room:
 
     def show(self, *names: str) -> dict[str, str]:
         """Properties of the service, as systemd sees them."""
-        said = self.run(f"systemctl show {_UNIT} -p {','.join(names)}")
-        return dict(line.split("=", 1) for line in said.splitlines())
+        output = self.run(f"systemctl show {_UNIT} -p {','.join(names)}")
+        return dict(line.split("=", 1) for line in output.splitlines())
 
     @property
     def main_pid(self) -> int:

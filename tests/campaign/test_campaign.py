@@ -104,7 +104,7 @@ def test_the_committed_matrix_is_of_these_faults_stories_and_rules() -> None:
 @pytest.mark.campaign
 @pytest.mark.timeout(1800)
 def test_the_whole_campaign(tmp_path: Path) -> None:
-    results, told = run_all(processes=2)
+    results, story_results = run_all(processes=2)
     assert len(results) >= 1000
-    DOCUMENT.write_text(document(results, told), encoding="utf-8")
-    assert not [violation for found in (*results, *told) for violation in found.violations]
+    DOCUMENT.write_text(document(results, story_results), encoding="utf-8")
+    assert not [violation for found in (*results, *story_results) for violation in found.violations]

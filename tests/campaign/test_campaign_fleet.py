@@ -105,13 +105,13 @@ async def used(folder: Path, file: Path, tab: Tab, holds: subprocess.Popen[str])
     await tab.until(f"{ROWS}.some(r => r.startsWith('mirror3') && r.includes('manual'))")
     await tab.screenshot(folder / "fleet.png")
     code, lines, _ = await asyncio.to_thread(ctl, "fleet", file)
-    said = dict(zip(NAMES, lines, strict=True))
+    line_of = dict(zip(NAMES, lines, strict=True))
     assert code == 4
-    assert "no contact" in said["mirror19"]
-    assert "manual" in said["mirror3"]
+    assert "no contact" in line_of["mirror19"]
+    assert "manual" in line_of["mirror3"]
     others = [
         line.split()[1]
-        for name, line in said.items()
+        for name, line in line_of.items()
         if name not in ("mirror3", "mirror7", "mirror19")
     ]
     assert others == ["hold"] * 17

@@ -23,7 +23,7 @@ SOCKET = f"--socket {RUNS}/control.sock"
 APPRISE = """
 class _Target:
     def notify(self, title, body, notify_type):
-        with open("/run/told/told", "a") as file:
+        with open("/run/notices/sent", "a") as file:
             file.write(title + chr(10))
         return True
 
@@ -59,7 +59,7 @@ def ctl(room: Room, who: str, words: str) -> str:
 
 
 def read_sent(room: Room) -> str:
-    return room.run("cat /run/told/told 2> /dev/null || true")
+    return room.run("cat /run/notices/sent 2> /dev/null || true")
 
 
 def test_the_service_reports_readiness_and_status_and_can_do_no_harm(room: Room) -> None:

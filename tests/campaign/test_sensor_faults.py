@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import pytest
-from sensor_faults import FAULTS, PAIRS, SensorFault, blocked, drift, scaled, stuck, tell
+from sensor_faults import FAULTS, PAIRS, SensorFault, blocked, drift, run_faults, scaled, stuck
 from sensor_quiet import quiet_hours
 
 from membrane_ctrl.config.schema import LimitsConfig
@@ -30,14 +30,14 @@ def creep(um_per_s: float) -> SensorFault:
 def test_a_laser_that_creeps_leads_the_mirror_no_further_than_this(
     faults: Sequence[SensorFault], camera: bool, noticed: str, most_um: float
 ) -> None:
-    story = tell(faults, 1, camera, from_start=False)
+    story = run_faults(faults, 1, camera, from_start=False)
     assert story.noticed == noticed
     assert story.ended_in == State.FAULT
     assert story.pumped_um < most_um
 
 
 def test_a_camera_outvoted_by_two_faulty_sensors_prevails_when_the_gas_agrees_with_it() -> None:
-    story = tell((NOISE_ONLY, creep(-2.0)), 1, camera=True, from_start=False)
+    story = run_faults((NOISE_ONLY, creep(-2.0)), 1, camera=True, from_start=False)
     assert story.noticed == "sensors: optics"
     assert story.ended_in == State.FAULT
     assert story.pumped_um < 350.0
@@ -45,7 +45,7 @@ def test_a_camera_outvoted_by_two_faulty_sensors_prevails_when_the_gas_agrees_wi
 
 @pytest.mark.parametrize("by", [10.0, 0.1, -1.0])
 def test_a_gauge_in_another_unit_keeps_the_mirror_down_from_the_start(by: float) -> None:
-    story = tell(
+    story = run_faults(
         (SensorFault("gauge", f"times {by}", scaled(by), lasts_s=30.0),), 1, False, from_start=True
     )
     assert story.ended_in == State.FAULT
@@ -65,7 +65,7 @@ def test_an_hour_of_everything_that_is_no_fault_of_a_sensor_is_held(other_world:
 def test_one_sensor_alone_never_leads_the_mirror_to_its_limits(
     fault: SensorFault, camera: bool, seed: int
 ) -> None:
-    story = tell((fault,), seed, camera, from_start=False)
+    story = run_faults((fault,), seed, camera, from_start=False)
     limits = LimitsConfig()
     assert story.pumped_um < 200.0
     assert story.pressure_max_pa < limits.gauge_pressure_max_pa
@@ -78,7 +78,7 @@ def test_one_sensor_alone_never_leads_the_mirror_to_its_limits(
 )
 @pytest.mark.parametrize("seed", [2, 3])
 def test_two_at_once_are_found_before_the_limits(faults: Sequence[SensorFault], seed: int) -> None:
-    story = tell(faults, seed, camera=False, from_start=False)
+    story = run_faults(faults, seed, camera=False, from_start=False)
     assert story.ended_in == State.FAULT
     assert story.pumped_um < LimitsConfig().displacement_max_um
 

@@ -52,10 +52,10 @@ def test_hold_prints_its_first_line_before_it_loads_the_control_program() -> Non
     code += "terminal.print_progress = "
     code += "lambda words: sys.exit(str('membrane_ctrl.hold' in sys.modules))\n"
     code += "run(['hold', '--twin'])"
-    said = subprocess.run(
+    finished = subprocess.run(
         [sys.executable, "-c", f"import sys\n{code}"], capture_output=True, text=True, check=False
     )
-    assert said.stderr == "False\n"
+    assert finished.stderr == "False\n"
 
 
 def test_a_file_error_that_no_command_foresaw_is_one_line(

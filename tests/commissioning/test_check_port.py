@@ -24,10 +24,10 @@ def would(config: Config, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
 
 
 def test_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
-    said = would(Config(), capsys)
-    assert said["control port"] == "control.sock beside the run folders"
-    assert said["alarms"] == "not sent: no alarms.urls_file"
-    assert said["shape loop"] == "a cycle every 2 s"
+    printed = would(Config(), capsys)
+    assert printed["control port"] == "control.sock beside the run folders"
+    assert printed["alarms"] == "not sent: no alarms.urls_file"
+    assert printed["shape loop"] == "a cycle every 2 s"
 
 
 def test_check_names_a_hold_that_tracks(capsys: pytest.CaptureFixture[str]) -> None:
@@ -45,9 +45,9 @@ def test_what_is_configured(
     urls = tmp_path / "urls.txt"
     urls.write_text("json://localhost\n")
     port = PortConfig(socket="/run/m.sock")
-    said = would(Config(port=port, alarms=AlarmsConfig(urls_file=str(urls))), capsys)
-    assert said["control port"] == "/run/m.sock"
-    assert said["alarms"] == f"2 rules besides faults, to those in {urls}"
+    printed = would(Config(port=port, alarms=AlarmsConfig(urls_file=str(urls))), capsys)
+    assert printed["control port"] == "/run/m.sock"
+    assert printed["alarms"] == f"2 rules besides faults, to those in {urls}"
     assert would(Config(port=PortConfig(enabled=False)), capsys)["control port"] == "off"
 
 

@@ -105,8 +105,8 @@ def test_what_is_written_passes_its_own_tests_and_the_linter(tmp_path: Path) -> 
         "--rootdir",
         tmp_path,
     ]
-    told = tool(sys.executable, "-m", "pytest", *config, *made, cwd=tmp_path, path=where)
-    assert "62 passed" in told
+    printed_text = tool(sys.executable, "-m", "pytest", *config, *made, cwd=tmp_path, path=where)
+    assert "62 passed" in printed_text
 
 
 class StillPlant:

@@ -44,7 +44,7 @@ def test_a_key_states_its_meaning_and_when_to_change_it(title: str, key: referen
 
 def test_no_key_of_the_schema_is_left_out() -> None:
     """Counted from the classes, which the reference itself does not walk."""
-    missing, told = (
+    missing, listed = (
         [],
         {(table.driver, key.name) for table in reference.list_tables() for key in table.keys},
     )
@@ -54,7 +54,7 @@ def test_no_key_of_the_schema_is_left_out() -> None:
         for name, field in section.model_fields.items():
             inner = list_sections(field.annotation)
             todo += inner
-            if not inner and name != "driver" and (driver, name) not in told:
+            if not inner and name != "driver" and (driver, name) not in listed:
                 missing.append((section.__name__, name))
     assert missing == []
     assert len(todo) > 35

@@ -50,7 +50,7 @@ class Run:
             self._telemetry.put(row.pack())
         self._shapes.put(pack_estimate(shape()))
 
-    def tell(self, kind: str, **more: object) -> None:
+    def put_event(self, kind: str, **more: object) -> None:
         self._events.put(packed(event(self.spec.clock.now(), kind, **more)))
 
     def start(self, stderr: int) -> multiprocessing.process.BaseProcess:
@@ -107,7 +107,7 @@ def test_terminal_shows_the_run_and_is_given_back_at_the_end(
     run.tick()
     process = run.start(theirs)
     read_until(ours, b"faults")
-    run.tell("end", exit="done")
+    run.put_event("end", exit="done")
     assert b"\x1b[?25h" in finish(process, ours)  # the cursor too
 
 
@@ -123,7 +123,7 @@ def test_terminal_is_given_back_on_a_stop_and_sigint_is_not_for_us(
     if number == signal.SIGINT:
         run.tick()
         read_until(ours, b"faults")
-        run.tell("end", exit="done")
+        run.put_event("end", exit="done")
     finish(process, ours)
 
 
@@ -132,9 +132,9 @@ def test_without_a_terminal_lines_and_faults_are_printed(
 ) -> None:
     monkeypatch.setattr(signal, "signal", lambda number, handler: None)
     run.tick()
-    run.tell("fault", **FAULT)
-    run.tell("command", command="hold")
-    run.tell("end", exit="safety_trip")
+    run.put_event("fault", **FAULT)
+    run.put_event("command", command="hold")
+    run.put_event("end", exit="safety_trip")
     with redirect_stderr(sys.stdout):
         console_main(run.spec)
     lines = capsys.readouterr().out.splitlines()
@@ -156,7 +156,7 @@ def test_reader_that_went_away_is_no_error_and_none_for_who_watches_the_console(
 ) -> None:
     class Gone:
         def write(self, words: str) -> int:
-            run.tell("end", exit="done")
+            run.put_event("end", exit="done")
             raise BrokenPipeError
 
         def flush(self) -> None: ...
@@ -179,10 +179,10 @@ def test_a_console_that_replaces_another_does_not_repeat_old_events(
     run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(signal, "signal", lambda number, handler: None)
-    run.tell("fault", **FAULT)
+    run.put_event("fault", **FAULT)
     time.sleep(0.002)
     spec = replace(run.spec, since_s=run.spec.clock.now())
-    run.tell("end", exit="done")
+    run.put_event("end", exit="done")
     ours, theirs = multiprocessing.Pipe()
     with ours, theirs, redirect_stderr(sys.stdout):
         console_main(spec, theirs)

@@ -275,7 +275,7 @@ def test_before_the_first_tick_and_with_nothing_known() -> None:
 
 
 def test_plain_line_has_the_second_in_it() -> None:
-    said = format_line(held().make_view(75.0))
+    line = format_line(held().make_view(75.0))
     for words in (
         "75.0 s  hold",
         "error",
@@ -284,8 +284,8 @@ def test_plain_line_has_the_second_in_it() -> None:
         "shape tracking ok 1 s",
         "45 s left",
     ):
-        assert words in said
-    assert "\n" not in said
+        assert words in line
+    assert "\n" not in line
     assert "no tick for 10.0 s" in format_line(held().make_view(84.98))
     assert format_line(ConsoleModel(CONFIG).make_view(0.0)).endswith("no tick yet")
 

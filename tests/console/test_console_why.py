@@ -15,8 +15,8 @@ from membrane_ctrl.model.telemetry import SafeLevel, State, TelemetryRow
 CONFIG = Config()
 
 
-def line(told: str = "", fault: str = "", **changes: float) -> str:
-    return explain_state(replace(HOLDING, **changes), told, fault, CONFIG)
+def line(expected: str = "", fault: str = "", **changes: float) -> str:
+    return explain_state(replace(HOLDING, **changes), expected, fault, CONFIG)
 
 
 def test_hold_names_the_terms_of_the_flow_largest_first() -> None:
@@ -58,7 +58,7 @@ def test_a_safe_level_names_its_fault() -> None:
         line(safe_level=SafeLevel.VENT, fault="over pressure")
         == "pump is off and the vent is open: over pressure"
     )
-    assert line(safe_level=SafeLevel.HOLD_FLOW, told="laser is back soon").endswith(
+    assert line(safe_level=SafeLevel.HOLD_FLOW, expected="laser is back soon").endswith(
         "laser is back soon"
     )
     assert line(safe_level=SafeLevel.PUMP_OFF) == "pump is off: unknown fault"
@@ -82,8 +82,8 @@ def test_a_bench_without_a_vent_never_shows_an_open_vent() -> None:
     row = replace(
         HOLDING, safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=math.nan
     )
-    said = explain_state(row, "", "over pressure", NO_VENT)
-    assert said == "pump is off; no vent is fitted, the leak lowers the mirror: over pressure"
+    reason = explain_state(row, "", "over pressure", NO_VENT)
+    assert reason == "pump is off; no vent is fitted, the leak lowers the mirror: over pressure"
     assert (
         explain_state(row, "", "over pressure", WITH_VENT)
         == "pump is off and the vent is open: over pressure"
@@ -96,25 +96,27 @@ def test_a_bench_without_a_vent_never_shows_an_open_vent() -> None:
 def test_a_vent_whose_read_back_contradicts_its_command_is_not_shown_as_open(
     readback: float, open_: bool
 ) -> None:
-    said = line(
+    reason = line(
         safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=readback, fault="x"
     )
-    assert said.startswith("pump is off and the vent is open") == open_
+    assert reason.startswith("pump is off and the vent is open") == open_
     if not open_:
-        assert f"commanded open, but its read-back is {100 * readback:.0f}" in said
+        assert f"commanded open, but its read-back is {100 * readback:.0f}" in reason
 
 
 def test_without_a_reading_the_pump_keeps_its_flow() -> None:
-    said = "pump keeps its last mean flow: no valid laser reading"
-    assert line(displacement_um=math.nan) == said
-    assert line(state=State.INFLATE, filtered_um=math.nan) == said  # nothing has been filtered yet
+    reason = "pump keeps its last mean flow: no valid laser reading"
+    assert line(displacement_um=math.nan) == reason
+    assert (
+        line(state=State.INFLATE, filtered_um=math.nan) == reason
+    )  # nothing has been filtered yet
 
 
 @pytest.mark.parametrize(
     "state", [State.STANDBY, State.CHECK, State.LOWER, State.FAULT, State.MANUAL, State.TUNE]
 )
 def test_other_states_show_the_controllers_reason_or_a_fixed_text(state: State) -> None:
-    assert line(state=state, told="waiting for the gauge") == "waiting for the gauge"
+    assert line(state=state, expected="waiting for the gauge") == "waiting for the gauge"
     assert line(state=state).startswith("pump is ")
 
 
@@ -124,9 +126,9 @@ def test_there_is_always_a_line(state: State, safe_level: SafeLevel) -> None:
     empty = replace(
         TelemetryRow(*[math.nan] * 35), state=state, safe_level=safe_level, flow_um_per_s=0.0
     )
-    said = explain_state(empty, "", "", CONFIG)
-    assert "pump" in said
-    assert "nan" not in said
+    reason = explain_state(empty, "", "", CONFIG)
+    assert "pump" in reason
+    assert "nan" not in reason
 
 
 def test_the_sensors_that_hold_the_mirror_are_named_with_their_shares() -> None:

@@ -48,11 +48,11 @@ def run_story(
         film_um, laser_um, gauge_pa, trim_um = story(time_s)
         true_pa = PRESSURE_PA * law(1 + film_um / SAG_UM)
         noise = rng.standard_normal(2)
-        said = monitor.step(
+        findings = monitor.step(
             1 / rate_hz, film_um + laser_um + noise[0], trim_um, true_pa + gauge_pa + 0.5 * noise[1]
         )
-        if said:
-            return said, time_s
+        if findings:
+            return findings, time_s
     return "", math.nan
 
 
@@ -63,9 +63,9 @@ def test_a_laser_that_creeps_is_contradicted_by_the_gauge(rate_um_per_s: float) 
         way_um = rate_um_per_s * max(time_s - 100.0, 0.0)
         return -way_um, way_um, 0.0, 0.0
 
-    said, at_s = run_story(story, 300.0)
-    assert "laser" in said
-    assert "gauge" in said
+    findings, at_s = run_story(story, 300.0)
+    assert "laser" in findings
+    assert "gauge" in findings
     assert (at_s - 100.0) * abs(rate_um_per_s) < 45.0  # µm by which the film was led astray
 
 
@@ -75,16 +75,16 @@ def test_film_motion_after_a_laser_jump_is_detected_within_30_s() -> None:
 
 
 def test_a_drifting_or_insensitive_gauge_is_detected() -> None:
-    said, at_s = run_story(lambda t: (0.0, 0.0, -0.1 * max(t - 100.0, 0.0), 0.0), 300.0)
-    assert said
+    findings, at_s = run_story(lambda t: (0.0, 0.0, -0.1 * max(t - 100.0, 0.0), 0.0), 300.0)
+    assert findings
     assert at_s < 130.0
 
     def blocked(time_s: float) -> tuple[float, float, float, float]:
         way_um = 3.0 * time_s
         return way_um, 0.0, PRESSURE_PA - PRESSURE_PA * hencky(1 + way_um / SAG_UM), 0.0
 
-    said, at_s = run_story(blocked, 120.0)
-    assert said
+    findings, at_s = run_story(blocked, 120.0)
+    assert findings
     assert at_s < 60.0
 
 
@@ -152,8 +152,8 @@ def test_a_drifting_camera_moves_film_and_laser_by_the_same_amount() -> None:
 
 
 def test_a_laser_with_double_scale_is_detected_during_a_move() -> None:
-    said, at_s = run_story(lambda t: (1.75 * t, 1.75 * t, 0.0, 0.0), 300.0)
-    assert said
+    findings, at_s = run_story(lambda t: (1.75 * t, 1.75 * t, 0.0, 0.0), 300.0)
+    assert findings
     assert 1.75 * at_s < 250.0
 
 
@@ -201,8 +201,8 @@ def test_noise_raises_no_contradiction_at_any_rate(rate_hz: float) -> None:
 
 @pytest.mark.parametrize("by", [10.0, 0.1, 1000.0, 0.001, -1.0])
 def test_a_gauge_in_a_wrong_unit_is_detected_within_seconds(by: float) -> None:
-    said, at_s = run_story(lambda t: (0.0, 0.0, (by - 1) * PRESSURE_PA, 0.0), 60.0)
-    assert "600 Pa" in said
+    findings, at_s = run_story(lambda t: (0.0, 0.0, (by - 1) * PRESSURE_PA, 0.0), 60.0)
+    assert "600 Pa" in findings
     assert at_s < 5.0
 
 

@@ -76,27 +76,27 @@ def test_consistent_sensors_raise_no_suspicion(seed: int) -> None:
 @pytest.mark.parametrize("size_um", [-40.0, -20.0, 20.0, 40.0])
 def test_a_displaced_laser_is_identified_within_a_minute(size_um: float, seed: int) -> None:
     # the loop returns the reading to its setpoint, and moves the mirror off it
-    said = judge_story(
+    findings = judge_story(
         lambda t: (-after(200.0, size_um)(t), after(200.0, size_um)(t), 0.0), seed=seed
     )
-    found = said.index(FaultySensor.LASER) / RATE_HZ
+    found = findings.index(FaultySensor.LASER) / RATE_HZ
     assert 200.0 < found < 260.0
-    assert FaultySensor.OPTICS not in said
+    assert FaultySensor.OPTICS not in findings
 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("size_um", [-40.0, -20.0, 20.0, 40.0])
 def test_a_displaced_camera_is_identified_within_a_minute(size_um: float, seed: int) -> None:
-    said = judge_story(lambda t: (0.0, 0.0, after(200.0, size_um)(t)), seed=seed)
-    found = said.index(FaultySensor.OPTICS) / RATE_HZ
+    findings = judge_story(lambda t: (0.0, 0.0, after(200.0, size_um)(t)), seed=seed)
+    found = findings.index(FaultySensor.OPTICS) / RATE_HZ
     assert 200.0 < found < 260.0
-    assert FaultySensor.LASER not in said
+    assert FaultySensor.LASER not in findings
 
 
 def test_a_sensor_error_that_ends_is_cleared() -> None:
-    said = judge_story(lambda t: (0.0, 0.0, 30.0 if 100 <= t < 200 else 0.0))
-    assert FaultySensor.OPTICS in said
-    assert set(said[-500:]) == {FaultySensor.NONE}
+    findings = judge_story(lambda t: (0.0, 0.0, 30.0 if 100 <= t < 200 else 0.0))
+    assert FaultySensor.OPTICS in findings
+    assert set(findings[-500:]) == {FaultySensor.NONE}
 
 
 def test_slow_drifts_raise_no_suspicion() -> None:
@@ -110,9 +110,11 @@ def test_slow_drifts_raise_no_suspicion() -> None:
 
 def test_a_drifting_gauge_does_not_blame_another_sensor() -> None:
     # 0.1 Pa a minute, far more than a gauge's zero moves
-    said = judge_story(lambda t: (0.0, after(200.0, 30.0)(t), 0.0), gauge_drift_pa_per_s=0.1 / 60)
-    assert FaultySensor.LASER in said
-    assert FaultySensor.OPTICS not in said
+    findings = judge_story(
+        lambda t: (0.0, after(200.0, 30.0)(t), 0.0), gauge_drift_pa_per_s=0.1 / 60
+    )
+    assert FaultySensor.LASER in findings
+    assert FaultySensor.OPTICS not in findings
 
 
 def test_without_camera_or_gauge_there_is_no_verdict() -> None:
@@ -164,19 +166,19 @@ def test_an_identified_sensor_stays_faulty_for_any_later_gauge_reading() -> None
 def test_an_identified_sensor_is_cleared_only_below_half_the_limit() -> None:
     judge, time_s = settled(30.0, 0.0, 0.0)
     for second in range(1, 121):
-        said = shown(judge, time_s + second, 7.0, 0.0, 0.0)
-    assert said == FaultySensor.LASER  # 7 µm apart: less than the limit, more than half of it
+        findings = shown(judge, time_s + second, 7.0, 0.0, 0.0)
+    assert findings == FaultySensor.LASER  # 7 µm apart: less than the limit, more than half of it
     for second in range(121, 241):
-        said = shown(judge, time_s + second, 4.0, 0.0, 0.0)
-    assert said == FaultySensor.NONE
+        findings = shown(judge, time_s + second, 4.0, 0.0, 0.0)
+    assert findings == FaultySensor.NONE
 
 
 def test_if_the_gauge_is_between_laser_and_camera_the_verdict_is_unsure() -> None:
     judge, time_s = settled(20.0, 0.0, 10.0)
     assert judge.faulty == FaultySensor.UNKNOWN
     for second in range(1, 121):  # it is not settled: a later verdict of the gauge counts
-        said = shown(judge, time_s + second, 20.0, 0.0, 0.0)
-    assert said == FaultySensor.LASER
+        findings = shown(judge, time_s + second, 20.0, 0.0, 0.0)
+    assert findings == FaultySensor.LASER
 
 
 @pytest.mark.parametrize("speed_um_per_s", [-4.0, 4.0])

@@ -142,12 +142,12 @@ def test_a_probe_segment_with_a_gap_is_discarded() -> None:
 
 def test_a_pump_drift_and_its_end_are_each_reported_once() -> None:
     health = PumpHealth(change_max=0.15)
-    told = []
+    events = []
     for scale in (1.0, 0.9, 0.84, 0.84, 0.86, 0.9, 0.95):
-        told += [
+        events += [
             (warning.bad, warning.message) for warning in health.step(PumpScale(scale, 0.04))[1]
         ]
-    assert told == [
+    assert events == [
         (True, "the pump gives 16 % less than its curve (+- 4 %): check it, then `tune pump`"),
         (False, "no longer so"),
     ]

@@ -53,10 +53,10 @@ def test_an_answer_that_no_hold_sends_is_one_line(
     with evil.peer(tmp_path / "control.sock", evil.answering(line)) as path:
         assert run(["ctl", action, "--socket", str(path)]) == 4
     printed = capsys.readouterr()
-    (said,) = printed.err.splitlines()
-    assert len(said) < 500
+    (error_lines,) = printed.err.splitlines()
+    assert len(error_lines) < 500
     assert printed.out == ""
-    assert all(letter.isprintable() for letter in said)
+    assert all(letter.isprintable() for letter in error_lines)
 
 
 def test_the_cause_names_the_field(tmp_path: Path) -> None:

@@ -101,7 +101,7 @@ class Story:
     pumping_at_the_end: bool = True
 
 
-def tell(config: Config, event: str) -> Story:
+def run_hold(config: Config, event: str) -> Story:
     """Let it hold, let something happen, and check the mirror itself."""
     assert config.devices is not None
     bench = VirtualBench(Plant(config.twin, config.pump), config.devices.watchdog_s)
@@ -133,7 +133,7 @@ def tell(config: Config, event: str) -> Story:
 
 
 def failures(config: Config, event: str) -> Iterator[str]:
-    story = tell(config, event)
+    story = run_hold(config, event)
     if not story.held:
         yield f"never held: {story.faults_before}"
         return

@@ -127,8 +127,8 @@ def test_a_vent_that_does_not_empty_the_mirror_is_reported() -> None:
         {"time_s": 20.0, "command": "vent"},
         duration_s=950.0,
     )
-    (told,) = [event for event in outcome.of("why") if "check the vent" in event["why"]]
-    assert 920.0 <= told["mono_s"] < 930.0
+    (reported,) = [event for event in outcome.of("why") if "check the vent" in event["why"]]
+    assert 920.0 <= reported["mono_s"] < 930.0
     assert not changes(outcome, "standby")
 
 
@@ -430,10 +430,10 @@ def test_the_ramp_does_not_wait_for_a_mirror_that_keeps_up() -> None:
 @pytest.mark.parametrize("pump_share", [0.0, 0.3])  # dead, and too weak for the leak
 def test_a_mirror_that_does_not_rise_is_a_fault(pump_share: float) -> None:
     outcome = played({"time_s": 15.0, "wrong": "pump_share", "value": pump_share}, **_FAR_BELOW)
-    (told,) = outcome.of("fault")
-    assert told["name"] == "overdue"
-    assert "no rise in 60 s" in told["seen"]
-    assert told["mono_s"] == pytest.approx(15.0 + 60.0, abs=10.0)
+    (reported,) = outcome.of("fault")
+    assert reported["name"] == "overdue"
+    assert "no rise in 60 s" in reported["seen"]
+    assert reported["mono_s"] == pytest.approx(15.0 + 60.0, abs=10.0)
 
 
 def test_a_mirror_above_its_setpoint_may_sink_as_slowly_as_it_leaks() -> None:

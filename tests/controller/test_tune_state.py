@@ -463,12 +463,12 @@ def test_the_flow_reserve_is_judged_by_the_present_curve() -> None:
     consistency = held._run._supervisor._controller._consistency
     weak = on_curve(TWICE.model_copy(update={"flow_full_um_per_s": 2.0, "change_max": 0.3}), 10.0)
     held.go(0.1, weak)
-    (told,) = consistency._health.step(3600.0, 1.24, 600.0)
-    assert (told.name, told.message) == ("pump_reserve", "the leak takes 62 % of the pump")
+    (notice,) = consistency._health.step(3600.0, 1.24, 600.0)
+    assert (notice.name, notice.message) == ("pump_reserve", "the leak takes 62 % of the pump")
     assert not consistency._pump.step(PumpScale(0.75, 0.01))[1]
     held.go(10.5)  # the former curve and its limits are back
-    (told,) = consistency._health.step(3600.0, 1.24, 600.0)
-    assert (told.name, told.bad) == ("pump_reserve", False)
+    (notice,) = consistency._health.step(3600.0, 1.24, 600.0)
+    assert (notice.name, notice.bad) == ("pump_reserve", False)
     assert consistency._pump.step(PumpScale(0.75, 0.01))[1][0].bad
 
 

@@ -654,8 +654,8 @@ def test_known_thermal_growth_of_the_camera_mount_does_not_move_the_mirror() -> 
         camera_mount_follows_air_s=4.0,
     )
     config = BY_ALL.model_copy(update={"estimator": estimator})
-    anew = {50 * 30: Command("shape_off", "a test"), 50 * 30 + 5: Command("shape_on", "a test")}
-    ticks = held(33.0, growing, config, AirTemperatureChange(18.0, 0.1), anew)
+    restart = {50 * 30: Command("shape_off", "a test"), 50 * 30 + 5: Command("shape_on", "a test")}
+    ticks = held(33.0, growing, config, AirTemperatureChange(18.0, 0.1), restart)
     assert growing.um == pytest.approx(2.0, abs=0.1)
     before_um = true_um(ticks, 14.0, 18.0).mean()
     assert true_um(ticks, 26.0, 30.0).mean() == pytest.approx(before_um, abs=0.2)

@@ -64,19 +64,19 @@ def reasons(bench: Config, *asked: str, seconds: float = 5.0) -> tuple[list[str]
 
 
 def test_a_fault_of_the_level_vent_states_what_is_fitted() -> None:
-    said, level = reasons(config(vent=False))
+    findings, level = reasons(config(vent=False))
     assert level == SafeLevel.VENT
-    assert said[-1] == "fault: pump off; no vent is fitted, the leak lowers the mirror"
-    said, level = reasons(config(vent=True))
+    assert findings[-1] == "fault: pump off; no vent is fitted, the leak lowers the mirror"
+    findings, level = reasons(config(vent=True))
     assert level == SafeLevel.VENT
-    assert said[-1] == "fault: vent"
+    assert findings[-1] == "fault: vent"
 
 
 def test_the_command_vent_states_that_only_the_leak_lowers_the_mirror() -> None:
-    said, _ = reasons(config(vent=False), "vent")
-    assert re.fullmatch(r"no vent is fitted, the leak lowers the mirror: \d+ Pa left", said[-1])
-    said, _ = reasons(config(vent=True), "vent")
-    assert re.fullmatch(r"venting: \d+ Pa left", said[-1])
+    findings, _ = reasons(config(vent=False), "vent")
+    assert re.fullmatch(r"no vent is fitted, the leak lowers the mirror: \d+ Pa left", findings[-1])
+    findings, _ = reasons(config(vent=True), "vent")
+    assert re.fullmatch(r"venting: \d+ Pa left", findings[-1])
 
 
 def test_check_warns_of_a_missing_vent_with_the_time_to_lower() -> None:

@@ -68,10 +68,10 @@ def test_standby_is_reported_to_systemd_and_a_corrupt_latched_file_prevents_the_
         line = refused.stderr.strip().splitlines()[-1]
         assert NAME in line
         assert "--clear-faults" in line
-        said = beside.submit(told_until_it_stops, systemd)
+        future = beside.submit(told_until_it_stops, systemd)
         waited = start(tmp_path, "--standby", "--duration", "6s")
         assert waited.returncode == Exit.DONE, waited.stderr
-        messages = said.result()
+        messages = future.result()
     assert messages[0] == ["READY=1", "WATCHDOG=1", "STATUS=standby"]
     assert sum("WATCHDOG=1" in message for message in messages) >= 4
     assert (tmp_path / "logs" / NAME).read_text() == "{"  # nobody has acknowledged it

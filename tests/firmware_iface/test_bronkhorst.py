@@ -84,11 +84,11 @@ def virtual(run: Coroutine[Any, Any, None]) -> None:
 def test_the_frames_of_the_manual() -> None:
     instrument = Instrument("DMFC", "M1", 200.0, "mln/min", lambda: 123.456)
     device = ProparDevice(instrument, LINE)
-    said: list[bytes] = []
-    device.send_answer = said.append  # type: ignore[method-assign]
+    answers_sent: list[bytes] = []
+    device.send_answer = answers_sent.append  # type: ignore[method-assign]
     device.received(b":06030421402140\r\n")
-    assert said == [b":080302214042F6E979\r\n"]
-    answer = parse_ascii(said[0])
+    assert answers_sent == [b":080302214042F6E979\r\n"]
+    answer = parse_ascii(answers_sent[0])
     assert answer is not None
     assert parse_values(answer.data) == [(0x21, 0, bytes.fromhex("42F6E979"))]
 

@@ -60,12 +60,12 @@ def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], **settings: Any
 )
 def test_frames(command: bytes, answer: bytes) -> None:
     async def test() -> None:
-        said: list[bytes] = []
+        bytes_sent: list[bytes] = []
         emulator = KeyenceDlRs1aEmulator(lambda: -123.0)
-        emulator.attach(said.append)
+        emulator.attach(bytes_sent.append)
         emulator.receive(command)
         await asyncio.sleep(0.1)
-        assert b"".join(said) == answer
+        assert b"".join(bytes_sent) == answer
 
     run_virtual(test())
 

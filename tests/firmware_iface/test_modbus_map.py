@@ -58,8 +58,8 @@ def test_the_frame_of_the_vendor() -> None:
 
 
 def test_an_output_is_set_read_back_and_left_at_rest() -> None:
-    told: list[float] = []
-    device = MapDevice({}, {PUMP: told.append}, {0x8000: 100}, (0, 20_000))
+    reports: list[float] = []
+    device = MapDevice({}, {PUMP: reports.append}, {0x8000: 100}, (0, 20_000))
 
     async def run() -> None:
         pump = made(device, PUMP, rest=0.0)
@@ -67,10 +67,10 @@ def test_an_output_is_set_read_back_and_left_at_rest() -> None:
         assert identity.firmware == "1.00"
         assert device.read(0, 1) == [4000]
         await pump.set_pump(0.25)
-        assert (device.read(0, 1), told[-1]) == ([8000], 0.25)
+        assert (device.read(0, 1), reports[-1]) == ([8000], 0.25)
         assert await pump.pump_fraction() == 0.25
         await pump.close()
-        assert (device.read(0, 1), told[-1]) == ([4000], 0.0)
+        assert (device.read(0, 1), reports[-1]) == ([4000], 0.0)
 
     run_virtual(run())
 

@@ -46,12 +46,12 @@ def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], **emulator: Any
 
 def test_frames() -> None:
     async def test() -> None:
-        said: list[bytes] = []
+        bytes_sent: list[bytes] = []
         emulator = VaisalaPtb330Emulator(lambda: 101_325.0)
-        emulator.attach(said.append)
+        emulator.attach(bytes_sent.append)
         emulator.receive(b"ECHO OFF\r\nFORM 4.3 P #r #n\r\nSEND\r\nFORM ?\r\nERRS\r\nVERS\r\n")
         await asyncio.sleep(2.0)
-        assert b"".join(said) == (
+        assert b"".join(bytes_sent) == (
             b"ECHO OFF\r\nEcho           : OFF\r\n"
             + b"OK\r\n1013.250\r\nOutput format  : 4.3 P \\r \\n\r\n"
             b"PASS\r\nNo errors\r\nPTB330 / 1.01\r\n"
@@ -62,12 +62,12 @@ def test_frames() -> None:
 
 def test_a_message_carries_its_checksum() -> None:
     async def test() -> None:
-        said: list[bytes] = []
+        bytes_sent: list[bytes] = []
         emulator = VaisalaPtb330Emulator(lambda: 99_800.0)
-        emulator.attach(said.append)
+        emulator.attach(bytes_sent.append)
         emulator.receive(b'ECHO OFF\r\nFORM 4.3 P " " U3 " " CS4 #r #n\r\nSEND\r\n')
         await asyncio.sleep(1.0)
-        message = said[-1]
+        message = bytes_sent[-1]
         assert message[:13] == b" 998.000 hPa "
         assert int(message[13:17], 16) == sum(message[:13])
 

@@ -40,12 +40,12 @@ def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], **settings: Any
 
 def test_frames() -> None:
     async def test() -> None:
-        said: list[bytes] = []
+        bytes_sent: list[bytes] = []
         emulator = VentusEmulator(lambda fraction: None)
-        emulator.attach(said.append)
+        emulator.attach(bytes_sent.append)
         emulator.receive(b"#W23,123.456\n#R23\n#R37\n#X\n#R99\n#W31,5\n#R31\n")
         await asyncio.sleep(0.1)
-        assert b"".join(said) == b"#R23,123.456\n#R37,3\n#R31,0\n"
+        assert b"".join(bytes_sent) == b"#R23,123.456\n#R37,3\n#R31,0\n"
 
     run_virtual(test())
 

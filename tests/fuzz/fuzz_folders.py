@@ -177,9 +177,9 @@ class Room:
                 )
         before = _outside(place)
         words = [self._word(word, inside, rng) for word in one.command.words]
-        with _captured() as said:
+        with _captured() as reported:
             code = run(words)
-        return "; ".join(_wrong(one, code, said(), before, _outside(place)))
+        return "; ".join(_wrong(one, code, reported(), before, _outside(place)))
 
     def _word(self, word: str, inside: Path, rng: random.Random) -> str:
         places = {
@@ -205,13 +205,13 @@ class Room:
 def _wrong(
     one: Case,
     code: int,
-    said: tuple[str, str],
+    reported: tuple[str, str],
     before: dict[str, tuple[int, int]],
     after: dict[str, tuple[int, int]],
 ) -> Iterator[str]:
     import unicodedata
 
-    out, err = said
+    out, err = reported
     if code not in _CODES:
         yield f"exit {code}"
     if any(
@@ -321,15 +321,15 @@ def work(first: int, last: int, root: Path, good: Path, only: str | None) -> Non
 Outcome = tuple[Counter[str], list[tuple[int, str, str]], float]
 
 
-def campaign(first: int, last: int, only: str | None = None, say: object = print) -> Outcome:
+def campaign(first: int, last: int, only: str | None = None, report: object = print) -> Outcome:
     """Cases in worker processes; counts by command, what was wrong,
     and the greatest memory in MB.
     """
     with tempfile.TemporaryDirectory(prefix="membrane-fuzz-good-") as good:
-        return _campaign(first, last, only, good, say)
+        return _campaign(first, last, only, good, report)
 
 
-def _campaign(first: int, last: int, only: str | None, good: str, say: object) -> Outcome:
+def _campaign(first: int, last: int, only: str | None, good: str, report: object) -> Outcome:
     counts: Counter[str] = Counter()
     found: list[tuple[int, str, str]] = []
     peak_mb = 0.0
@@ -356,23 +356,23 @@ def _campaign(first: int, last: int, only: str | None, good: str, say: object) -
                         continue
                     counts[name] += 1
                     if message["peak_mb"] > max(peak_mb, 300) + 20:
-                        say(f"{message['done']} {name}: peak {message['peak_mb']:.0f} MB")  # type: ignore[operator]
+                        report(f"{message['done']} {name}: peak {message['peak_mb']:.0f} MB")  # type: ignore[operator]
                     peak_mb = max(peak_mb, message["peak_mb"])
                     seconds[name] += message["cpu_s"]
                     if message["wrong"]:
                         found.append((message["done"], name, message["wrong"]))
-                        say(f"{message['done']} {name}: {message['wrong']}")  # type: ignore[operator]
+                        report(f"{message['done']} {name}: {message['wrong']}")  # type: ignore[operator]
                     if message["took_s"] > CASE_S / 3:
-                        say(f"{message['done']} {name}: took {message['took_s']} s")  # type: ignore[operator]
+                        report(f"{message['done']} {name}: took {message['took_s']} s")  # type: ignore[operator]
                     at = message["done"] + 1
                     if at % 500 == 0:
-                        say(f"{at} cases, peak {peak_mb:.0f} MB, {len(found)} wrong")  # type: ignore[operator]
+                        report(f"{at} cases, peak {peak_mb:.0f} MB, {len(found)} wrong")  # type: ignore[operator]
             if worker.returncode:
                 found.append((at, name, f"the worker died with {worker.returncode}"))
-                say(f"{at} {name}: the worker died with {worker.returncode}")  # type: ignore[operator]
+                report(f"{at} {name}: the worker died with {worker.returncode}")  # type: ignore[operator]
                 at += 1
     for name, count in sorted(counts.items()):
-        say(f"{name:20} {count:6} cases, {1e3 * seconds[name] / count:6.0f} ms each")  # type: ignore[operator]
+        report(f"{name:20} {count:6} cases, {1e3 * seconds[name] / count:6.0f} ms each")  # type: ignore[operator]
     return counts, found, peak_mb
 
 

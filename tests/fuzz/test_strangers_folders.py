@@ -31,7 +31,7 @@ from membrane_ctrl.run_files.table_specs import TICKS
 from tests.support.peak_memory import peak_mb, reset_peak
 
 HOSTILE = "\x1b]0;owned\x07\x9b2J\r\u202e[/red]"
-Said = pytest.CaptureFixture[str]
+Captured = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +61,10 @@ def secret(tmp_path: Path) -> Path:
     return path
 
 
-def refused(said: Said, *words: str) -> str:
+def refused(capsys: Captured, *words: str) -> str:
     """A command ends with exit 2 and one line, which is returned."""
     assert run(list(words)) == 2
-    lines = [line for line in said.readouterr().err.splitlines() if not line.startswith("note: ")]
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note: ")]
     assert len(lines) == 1
     assert lines[0].isprintable()
     return lines[0]
@@ -122,7 +122,7 @@ def test_a_planted_link_takes_no_file_of_the_user(
     ],
 )
 def test_a_linked_folder_is_refused_in_one_line(
-    folder: Path, secret: Path, name: str, words: tuple[str, ...], code: int, capsys: Said
+    folder: Path, secret: Path, name: str, words: tuple[str, ...], code: int, capsys: Captured
 ) -> None:
     aim = secret.parent / "mine"
     aim.mkdir()
@@ -161,7 +161,7 @@ def test_a_folder_that_the_user_names_may_be_a_link(folder: Path, tmp_path: Path
     ],
 )
 def test_what_is_no_plain_file_is_noted_and_not_waited_for(
-    folder: Path, secret: Path, name: str, what: str, capsys: Said
+    folder: Path, secret: Path, name: str, what: str, capsys: Captured
 ) -> None:
     path = folder / name
     path.unlink()
@@ -182,7 +182,7 @@ def test_what_is_no_plain_file_is_noted_and_not_waited_for(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_small_part_that_would_be_gigabytes(folder: Path, capsys: Said) -> None:
+def test_a_small_part_that_would_be_gigabytes(folder: Path, capsys: Captured) -> None:
     path = folder / "ticks" / "ticks-0000.parquet"
     zeros = pa.array(np.zeros(20_000_000, np.int8))
     table = pa.table(
@@ -198,7 +198,7 @@ def test_a_small_part_that_would_be_gigabytes(folder: Path, capsys: Said) -> Non
     assert peak_mb() - before_mb < 300
 
 
-def test_words_in_no_alphabet_are_not_read(folder: Path, capsys: Said) -> None:
+def test_words_in_no_alphabet_are_not_read(folder: Path, capsys: Captured) -> None:
     path = folder / "shapes" / "shapes-0000.parquet"
     table = pq.read_table(path)
     binary = pa.array([b"fr\xff\xfe\xfdes"] * table.num_rows)
@@ -212,7 +212,7 @@ def test_words_in_no_alphabet_are_not_read(folder: Path, capsys: Said) -> None:
     capsys.readouterr()
 
 
-def test_tables_of_other_kinds_are_no_tables(folder: Path, capsys: Said) -> None:
+def test_tables_of_other_kinds_are_no_tables(folder: Path, capsys: Captured) -> None:
     """Words where numbers belong, a column twice, lists of nothing: said, and the run is shown
     without.
     """
@@ -240,7 +240,7 @@ def test_tables_of_other_kinds_are_no_tables(folder: Path, capsys: Said) -> None
     ids=["dotted", "quoted", "deep", "digits", "long"],
 )
 def test_toml_that_would_take_all_there_is(
-    folder: Path, sets: Path, text: str, why: str, capsys: Said
+    folder: Path, sets: Path, text: str, why: str, capsys: Captured
 ) -> None:
     for path, words in (
         (folder / "config.toml", ("replay", str(folder))),
@@ -263,7 +263,9 @@ def test_toml_that_would_take_all_there_is(
     ],
     ids=["deep", "depth", "many", "digits"],
 )
-def test_json_that_would_take_all_there_is(folder: Path, text: str, why: str, capsys: Said) -> None:
+def test_json_that_would_take_all_there_is(
+    folder: Path, text: str, why: str, capsys: Captured
+) -> None:
     (folder / "summary.json").write_text(text)
     with (folder / "events.jsonl").open("a") as file:
         file.write(text + ("\n{}{}\n" if why.startswith("events.jsonl: 1") else "\n"))
@@ -273,7 +275,7 @@ def test_json_that_would_take_all_there_is(folder: Path, text: str, why: str, ca
     assert why in capsys.readouterr().out
 
 
-def test_a_picture_of_twenty_thousand_by_twenty_thousand(sets: Path, capsys: Said) -> None:
+def test_a_picture_of_twenty_thousand_by_twenty_thousand(sets: Path, capsys: Captured) -> None:
     folder = sets / "0000"
     path = folder / "x_sin_1.png"
     data = bytearray(path.read_bytes())
@@ -300,7 +302,7 @@ def test_other_pictures_are_measured_before_they_are_decoded(suffix: str) -> Non
             decoded_image(data[:end], cv2.IMREAD_GRAYSCALE)
 
 
-def test_a_camera_of_more_pixels_than_there_is_memory(sets: Path, capsys: Said) -> None:
+def test_a_camera_of_more_pixels_than_there_is_memory(sets: Path, capsys: Captured) -> None:
     rewrite(
         sets / "0000" / "capture.toml",
         lambda tables: tables["camera"].update(width_px=16_000, height_px=12_000),
@@ -308,7 +310,7 @@ def test_a_camera_of_more_pixels_than_there_is_memory(sets: Path, capsys: Said) 
     assert "exceed the limit of 300 million" in refused(capsys, "measure", str(sets / "0000"))
 
 
-def test_many_unknown_keys_are_left_out_in_one_go(folder: Path, capsys: Said) -> None:
+def test_many_unknown_keys_are_left_out_in_one_go(folder: Path, capsys: Captured) -> None:
     with (folder / "config.toml").open("a") as file:
         file.write("[more]\n" + "".join(f"k{number} = 1\n" for number in range(20_000)))
         file.write("".join(f"[t{number}]\n" for number in range(3_000)))
@@ -323,7 +325,7 @@ def test_many_unknown_keys_are_left_out_in_one_go(folder: Path, capsys: Said) ->
 @pytest.mark.parametrize(
     "where", ["../secret.png", "/{}", "up/../../secret.png", "link.png", "sub/x.png", "a\0b", ""]
 )
-def test_a_frame_outside_the_set_is_refused(sets: Path, where: str, capsys: Said) -> None:
+def test_a_frame_outside_the_set_is_refused(sets: Path, where: str, capsys: Captured) -> None:
     folder = sets / "0000"
     shutil.copy(folder / "white.png", sets / "secret.png")
     (folder / "link.png").symlink_to(sets / "secret.png")
@@ -334,7 +336,7 @@ def test_a_frame_outside_the_set_is_refused(sets: Path, where: str, capsys: Said
     assert "is outside the set's folder" in refused(capsys, "measure", str(folder))
 
 
-def test_a_frame_that_is_a_link_within_the_set_is_no_picture(sets: Path, capsys: Said) -> None:
+def test_a_frame_that_is_a_link_within_the_set_is_no_picture(sets: Path, capsys: Captured) -> None:
     folder = sets / "0000"
     (folder / "x_sin_0.png").rename(folder / "other.png")
     (folder / "x_sin_0.png").symlink_to("other.png")
@@ -349,13 +351,13 @@ def test_a_reference_beside_the_set_still_anchors_it(sets: Path) -> None:
     assert run(["measure", str(sets / "0001")]) == 0
 
 
-def test_a_height_map_is_of_the_sets_own_folder(sets: Path, capsys: Said) -> None:
+def test_a_height_map_is_of_the_sets_own_folder(sets: Path, capsys: Captured) -> None:
     grid = {"s_x_mm": [-300.0, 300.0], "s_y_mm": [-300.0, 300.0], "file": "../../../../etc/passwd"}
     change = {"screen": {"height_map": grid}}
     rewrite(sets / "0000" / "capture.toml", lambda tables: tables["geometry"].update(change))
-    said = refused(capsys, "measure", str(sets / "0000"))
-    assert "not beside capture.toml" in said
-    assert ":x:0" not in said
+    refusal = refused(capsys, "measure", str(sets / "0000"))
+    assert "not beside capture.toml" in refusal
+    assert ":x:0" not in refusal
 
 
 # ----------------------------------------------------------------------------------------------------------  # noqa: E501
@@ -363,7 +365,7 @@ def test_a_height_map_is_of_the_sets_own_folder(sets: Path, capsys: Said) -> Non
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_no_control_byte_of_a_run_is_printed(folder: Path, capsys: Said) -> None:
+def test_no_control_byte_of_a_run_is_printed(folder: Path, capsys: Captured) -> None:
     events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
     for event in events:
         event.pop("crc32", None)
@@ -416,7 +418,7 @@ def test_a_formula_in_a_frames_name_is_no_formula(sets: Path) -> None:
 
 
 def test_a_folder_that_may_not_be_looked_into_costs_its_line(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Said
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
 ) -> None:
     (folder.parent / "closed").mkdir()
     exists = Path.exists
@@ -443,7 +445,7 @@ def _closed(read: Callable[..., Any]) -> Callable[..., Any]:
     return guarded
 
 
-def test_half_a_pair_of_a_letter_is_written_all_the_same(folder: Path, capsys: Said) -> None:
+def test_half_a_pair_of_a_letter_is_written_all_the_same(folder: Path, capsys: Captured) -> None:
     with (folder / "annotations.jsonl").open("a") as file:
         file.write('{"kind": "mark", "mono_s": 1, "text": "\\ud800"}\n')
     for words in (("report",), ("runs", "show"), ("export", "--format", "csv")):

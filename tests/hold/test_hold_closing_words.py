@@ -25,10 +25,10 @@ def words(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> str:
 def test_a_folder_that_is_gone_is_not_offered(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = words(tmp_path / "run", capsys)
-    assert "removed or moved" in said
-    assert "rerun" not in said
-    assert "are readable" not in said
+    captured = words(tmp_path / "run", capsys)
+    assert "removed or moved" in captured
+    assert "rerun" not in captured
+    assert "are readable" not in captured
 
 
 def test_a_recreated_folder_states_when_it_begins(

@@ -49,11 +49,11 @@ def outputs(*events: Event) -> TickOutputs:
 
 @contextmanager
 def keeper(
-    folder: Path, told: list[Event], asked: list[Command] | None = None
+    folder: Path, recorded: list[Event], asked: list[Command] | None = None
 ) -> Iterator[LockKeeper]:
     store = LockStore([folder])
     storage = LockStorage(store, DEVICES, tuple(store.find_locks(DEVICES)))
-    with LockKeeper(storage, told.append, [].append if asked is None else asked.append) as made:
+    with LockKeeper(storage, recorded.append, [].append if asked is None else asked.append) as made:
         yield made
 
 

@@ -256,9 +256,9 @@ def test_a_page_is_there_during_and_after_a_killed_hold_and_a_hold_outlives_it(
             link = str(find_service(logs))
             services.append(wait_for_one_service(logs))
             hold.send_signal(signal.SIGINT)
-            _, said = hold.communicate(timeout=120.0)
+            _, output = hold.communicate(timeout=120.0)
             assert hold.returncode in (Exit.DONE, Exit.INTERRUPTED)
-            assert f"page:       {link}" in said
+            assert f"page:       {link}" in output
             assert services[-1].is_running()
     finally:
         for each in services:
@@ -284,13 +284,13 @@ def test_a_hold_names_why_its_page_is_gone(tmp_path: Path) -> None:
         until(lambda: "is a directory" in _read(logs / LOG_NAME))
         until(lambda: not services_of(logs))
         hold.send_signal(signal.SIGINT)
-        _, said = hold.communicate(timeout=120.0)
-    lines = [each for each in said.splitlines() if each.startswith("no page:")]
+        _, output = hold.communicate(timeout=120.0)
+    lines = [each for each in output.splitlines() if each.startswith("no page:")]
     assert "is a directory" in lines[0], "at once"
     line = lines[-1]
     assert line.startswith("no page:    its service has ended: ")
     assert line.endswith("cannot be written (is a directory)")
-    assert "page:       http" not in said, "no link that nobody answers"
+    assert "page:       http" not in output, "no link that nobody answers"
 
 
 def _read(path: Path) -> str:

@@ -96,8 +96,8 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
             ("cause", "seen", "limit", "remedy"), "\N{LOUDLY CRYING FACE}" * 10_000
         )
         supervisor.record_event(from_dict({"kind": "fault", "name": "tick_error", **texts}))
-        (told,) = reader.drain()
-    assert json.loads(told)["name"] == "tick_error"
+        (messages,) = reader.drain()
+    assert json.loads(messages)["name"] == "tick_error"
 
 
 async def test_an_unreadable_shape_is_reported_once_and_the_hold_continues() -> None:

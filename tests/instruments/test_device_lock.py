@@ -54,10 +54,10 @@ def refused(device: str) -> str:
 def test_another_process_is_named_with_its_number_and_words(
     device: str, other: subprocess.Popen[str]
 ) -> None:
-    said = refused(device)
-    assert said.startswith(f"{device}: in use by process {other.pid} (")
-    assert "stop that first" in said
-    assert said.isprintable()
+    refusal = refused(device)
+    assert refusal.startswith(f"{device}: in use by process {other.pid} (")
+    assert "stop that first" in refusal
+    assert refusal.isprintable()
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
@@ -93,9 +93,9 @@ def test_of_several_devices_none_is_kept_when_one_is_refused(device: str) -> Non
 
 
 def test_many_that_are_refused_do_not_wait(device: str, other: subprocess.Popen[str]) -> None:
-    said = {refused(device) for _ in range(200)}
-    assert len(said) == 1
-    assert str(other.pid) in said.pop()
+    refusal = {refused(device) for _ in range(200)}
+    assert len(refusal) == 1
+    assert str(other.pid) in refusal.pop()
 
 
 @pytest.mark.parametrize(

@@ -126,12 +126,12 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
     assert not re.search("https?:|<script|<link", page)
     figure = json.loads((tmp_path / "result.json").read_text())["figure"]
     depth = 3400 - np.sqrt(3400**2 - 475**2)
-    told = figure["numbers"]["power_um"]["value"]
-    assert told == pytest.approx(
+    power_um = figure["numbers"]["power_um"]["value"]
+    assert power_um == pytest.approx(
         1e3 * (figure["numbers"]["sphere_sag_mm"]["value"] - depth), abs=1e-6
     )
     number, value = 'data-label="number"', 'data-label="value"'  # for a phone, one cell a line
-    assert f"<td {number}>power_um</td><td {value}>{told:.6g}</td>" in page
+    assert f"<td {number}>power_um</td><td {value}>{power_um:.6g}</td>" in page
     shown = re.findall(r"<img alt=\"(\w+)\"|<pre>|class=\"(verdict \w+)\"", page)
     assert [name or mark for name, mark in shown][:3] == ["verdict good", "figure", "residual"]
     assert page.index('alt="figure"') < page.index("power_um") < page.index("<pre>")
@@ -319,8 +319,8 @@ def test_a_geometry_that_cannot_be_is_refused_with_the_file_that_states_it(
     )
     rewrite(capture_set, lambda t: t["geometry"].update(alpha_deg=alpha_deg))
     assert run(["measure", str(capture_set)]) == 2
-    (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith(
+    (output,) = capsys.readouterr().err.splitlines()
+    assert output.startswith(
         f"membrane-ctrl: {capture_set / 'capture.toml'}: geometry.alpha_deg: the pattern ("
     )
 
@@ -389,10 +389,10 @@ def test_a_rim_within_the_stated_sigmas_leaves_the_set_ok_and_uncalibrated(
 ) -> None:
     rewrite(capture_set, lambda table: table["geometry"].update(a_mm=2640.0))
     assert measured(capture_set, tmp_path / "result")[0] == 0
-    said = capsys.readouterr().out
-    assert said.startswith("verdict   ok\n")
-    assert "geometry  uncalibrated: " in said
-    assert "membrane-ctrl calibrate" in said
+    output = capsys.readouterr().out
+    assert output.startswith("verdict   ok\n")
+    assert "geometry  uncalibrated: " in output
+    assert "membrane-ctrl calibrate" in output
     known = json.loads((tmp_path / "result/result.json").read_text())["geometry_known"]
     assert known["state"] == "uncalibrated"
     assert 1.0 < known["rim_sigmas"] < 2.0
@@ -410,9 +410,9 @@ def test_a_rim_that_no_stated_sigma_explains_contradicts_the_geometry(
 
     rewrite(capture_set, misstate)
     assert measured(capture_set, tmp_path / "result")[0] == 0
-    said = capsys.readouterr().out
-    assert said.startswith("verdict   degraded: the rim is ")
-    assert "check the camera's pose" in said
+    output = capsys.readouterr().out
+    assert output.startswith("verdict   degraded: the rim is ")
+    assert "check the camera's pose" in output
     known = json.loads((tmp_path / "result/result.json").read_text())["geometry_known"]
     assert known["state"] == "contradicted"
 
@@ -436,12 +436,12 @@ def test_what_is_no_facet_file(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 def test_error_bars(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert measured(made / "0000", tmp_path)[0] == 0
-    said = capsys.readouterr().out
-    assert "from noise" in said
-    assert "largest: principal_x_px" in said
+    output = capsys.readouterr().out
+    assert "from noise" in output
+    assert "largest: principal_x_px" in output
     assert (
         "geometry  uncalibrated: no sigma is stated for any input; data-sheet defaults apply"
-        in said
+        in output
     )
     details = json.loads((tmp_path / "details.json").read_text())["sag_sigma_um"]
     sigma = np.load(tmp_path / "sigma.npz")
@@ -509,7 +509,7 @@ def test_a_set_of_several_periods(several: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "output"),
     [
         (lambda table: table.update(kind="fringes", reference="../0"), "its own period_mm"),
         (lambda table: [row.pop("period_mm", None) for row in table["frames"]], "appears twice"),
@@ -530,7 +530,7 @@ def test_a_bad_set_of_several_periods(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     change: Callable[[dict[str, Any]], object],
-    said: str,
+    output: str,
 ) -> None:
     folder = tmp_path / "set"
     folder.mkdir()
@@ -538,4 +538,4 @@ def test_a_bad_set_of_several_periods(
     rewrite(folder, change)
     assert run(["measure", str(folder)]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert said in line
+    assert output in line

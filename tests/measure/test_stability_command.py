@@ -172,10 +172,12 @@ def test_runs_repeat_and_do_not_take_their_results_for_sets(
     spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["stability", str(spoiled), "--trials", "20"]) == 0
-    said = capsys.readouterr()
-    assert "4 of 4 used" in said.out
-    assert "no pairs" in said.out  # of ten minutes
-    assert "no sigma is stated for any input" in said.out  # where the geometry's sigmas come from
+    printed = capsys.readouterr()
+    assert "4 of 4 used" in printed.out
+    assert "no pairs" in printed.out  # of ten minutes
+    assert (
+        "no sigma is stated for any input" in printed.out
+    )  # where the geometry's sigmas come from
     code, second = analysed(spoiled, tmp_path / "again", "--json")
     assert code == 0
     assert json.loads(capsys.readouterr().out) == second
@@ -205,9 +207,9 @@ def test_bad_sets_are_counted_and_named(
         "rejected",
         "ok",
     ]
-    said = capsys.readouterr().err
-    assert "skipped 0001" in said
-    assert "skipped 0002" in said
+    printed = capsys.readouterr().err
+    assert "skipped 0001" in printed
+    assert "skipped 0002" in printed
 
 
 def test_a_set_with_one_bad_frame_is_used_and_counted(spoiled: Path, tmp_path: Path) -> None:
@@ -230,11 +232,11 @@ def test_two_sizes(spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     table["camera"]["width_px"] = 300
     path.write_text(tomli_w.dumps(table))
     assert run(["stability", str(spoiled), "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1
-    assert "0002" in said[0]
-    assert "300 x 170" in said[0]
-    assert "204 x 170" in said[0]
+    printed = capsys.readouterr().err.strip().splitlines()
+    assert len(printed) == 1
+    assert "0002" in printed[0]
+    assert "300 x 170" in printed[0]
+    assert "204 x 170" in printed[0]
     assert not (tmp_path / "out").exists()
 
 
@@ -264,9 +266,9 @@ def test_bad_usage(
     (spoiled.parent / "empty").mkdir()
     (spoiled / "0000" / "result").mkdir()
     assert run(["stability", str(spoiled.parent / arguments[0]), *arguments[1:]]) == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1
-    assert text in said[0]
+    printed = capsys.readouterr().err.strip().splitlines()
+    assert len(printed) == 1
+    assert text in printed[0]
 
 
 def test_a_folder_that_cannot_be_written(

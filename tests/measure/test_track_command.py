@@ -74,7 +74,7 @@ def edited(demo: Path, tmp_path: Path, change: Callable[[str], str]) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ('file = "t_00001.png"', 'file = "../full/white.png"', "outside the set's folder"),
         ('file = "t_00001.png"', 'file = "t_00000.png"', "is given for 2 frames"),
@@ -100,7 +100,7 @@ def edited(demo: Path, tmp_path: Path, change: Callable[[str], str]) -> Path:
     ],
 )
 def test_an_invalid_set_is_refused_in_one_line(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, message: str
 ) -> None:
     def change(text: str) -> str:
         assert old in text, text[:800]
@@ -108,7 +108,7 @@ def test_an_invalid_set_is_refused_in_one_line(
 
     assert run(["track", str(edited(demo, tmp_path, change))]) == 2
     shown = capsys.readouterr().err.strip().splitlines()
-    assert said in shown[-1], shown
+    assert message in shown[-1], shown
     assert len(shown) <= 2
     assert not (tmp_path / "track/result").exists()
 

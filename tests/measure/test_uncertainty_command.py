@@ -64,9 +64,9 @@ def test_a_set(
     analysed: Callable[..., dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = analysed("--json", "--trials", "400")
-    said = capsys.readouterr()
-    assert json.loads(said.out) == table
-    assert "no sigma is stated for any input" in said.err  # the set does not state its sigmas
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == table
+    assert "no sigma is stated for any input" in printed.err  # the set does not state its sigmas
     assert table["schema"] == "membrane-uncertainty/1"
     assert table["rmse_um"]["mean"] == pytest.approx(
         262, rel=0.15
@@ -124,8 +124,8 @@ def test_stated_sigmas_and_a_covariance(
         + '[covariance]\nnames = ["a_mm", "b_mm"]\nmatrix = [[4.0, 3.9], [3.9, 4.0]]\n'
         + EXACT
     )
-    alike = analysed("--geometry", str(geometry))
-    assert opposite["rmse_um"]["mean"] < 0.5 * alike["rmse_um"]["mean"]
+    common = analysed("--geometry", str(geometry))
+    assert opposite["rmse_um"]["mean"] < 0.5 * common["rmse_um"]["mean"]
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -225,7 +225,7 @@ def test_dask_is_not_installed(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "printed"),
     [
         (
             SHORT + '[covariance]\nnames = ["a_mm"]\nmatrix = [[1.0, 2.0]]\n',
@@ -243,14 +243,14 @@ def test_dask_is_not_installed(
     ],
 )
 def test_bad_geometry(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, printed: str
 ) -> None:
     geometry = tmp_path / "geometry.toml"
     geometry.write_text(text)
     options = ["--geometry", str(geometry), "--out", str(tmp_path / "out")]
     assert run(["uncertainty", str(made / "0000"), *options]) == 2
     line = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said in line
+    assert printed in line
     assert not (tmp_path / "out").exists()
 
 

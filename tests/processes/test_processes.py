@@ -48,11 +48,11 @@ def test_a_child_that_does_not_obey_is_killed(number: signal.Signals) -> None:
 def test_a_signal_that_comes_while_a_child_is_started_is_not_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    class ToldError(Exception):
+    class SignalledError(Exception):
         """By the handler."""
 
-    def tell(number: int, frame: object) -> None:
-        raise ToldError
+    def raise_signalled(number: int, frame: object) -> None:
+        raise SignalledError
 
     child = Child("sleeps", "time:sleep", (60.0,), nice=0)
     start = SpawnProcess.start
@@ -64,9 +64,9 @@ def test_a_signal_that_comes_while_a_child_is_started_is_not_lost(
         )  # to this thread: another one would take it, now or somewhat later
 
     monkeypatch.setattr(SpawnProcess, "start", start_while_signalled)
-    before = signal.signal(signal.SIGTERM, tell)
+    before = signal.signal(signal.SIGTERM, raise_signalled)
     try:
-        with pytest.raises(ToldError):
+        with pytest.raises(SignalledError):
             child.start()
     finally:
         signal.signal(signal.SIGTERM, before)

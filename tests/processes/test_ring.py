@@ -176,7 +176,7 @@ def test_a_slot_that_is_never_complete_costs_one_message_and_blocks_no_reader() 
 
 
 @pytest.mark.parametrize(
-    "told",
+    "ring_address",
     [
         RingAddress("", 8, 16),
         RingAddress("", 4, 8),
@@ -184,9 +184,9 @@ def test_a_slot_that_is_never_complete_costs_one_message_and_blocks_no_reader() 
         RingAddress("", 2**40, 16),
     ],
 )
-def test_another_ring_than_the_named_one_is_refused(told: RingAddress) -> None:
+def test_another_ring_than_the_named_one_is_refused(ring_address: RingAddress) -> None:
     with open_ring(4, 16) as address, pytest.raises(RingError):
-        RingReader(replace(told, name=address.name))
+        RingReader(replace(ring_address, name=address.name))
 
 
 def test_a_reader_refuses_or_reads_whatever_the_memory_holds() -> None:

@@ -226,9 +226,11 @@ def test_a_removed_run_folder_is_created_again_and_reported(tmp_path: Path, how:
         for number in (1, 2):
             bench.second(number)
         bench.recorder.finish(in_haste=True)
-        said = [report["message"] for report in bench.reports if report["kind"] == "recorder_error"]
+        messages = [
+            report["message"] for report in bench.reports if report["kind"] == "recorder_error"
+        ]
         what = f"{run_dir} was removed or moved; a new one starts at 1.0 s"
-        assert said == [f"{what}, without the earlier data"]
+        assert messages == [f"{what}, without the earlier data"]
         assert "recorder_recovered" not in bench.kinds()
         assert times_s(bench) == [1, 2]
     assert config_file.load_toml(run_dir / "config.toml", Config) == config

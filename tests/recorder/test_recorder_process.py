@@ -298,8 +298,10 @@ def test_a_writer_that_dies_is_reported_and_the_recording_continues(feed: Feed) 
         ("rows_lost", "table_rows_lost", "events_lost", "input_ticks_lost", "restarts"), 0
     )
     assert account["tables"]["ticks"] == len(list((run_dir / "ticks").glob("ticks-*")))
-    said = {"errors": 1, "partial": False, "folder_replaced_s": None}
-    assert account == {"segments": account["segments"], "tables": account["tables"]} | said | lost
+    expected = {"errors": 1, "partial": False, "folder_replaced_s": None}
+    assert (
+        account == {"segments": account["segments"], "tables": account["tables"]} | expected | lost
+    )
     assert has_footer(run_dir / "test-001.rrd")
     # the batch that met the full disk is in the new file, whole
     time_s, _ = scalars(run_dir / "test-001.rrd", "/loop/error")

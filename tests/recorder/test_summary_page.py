@@ -26,10 +26,10 @@ def page(summary: Summary, status: RunStatus) -> dict[str, str]:
 
 
 def test_before_anything_happened() -> None:
-    told = page(Summary.for_config(Config()), RunStatus())
-    assert told["not started"] == "-"
-    assert told["faults"] == "none"
-    assert "mean error" not in told
+    text = page(Summary.for_config(Config()), RunStatus())
+    assert text["not started"] == "-"
+    assert text["faults"] == "none"
+    assert "mean error" not in text
 
 
 def test_figures_are_those_of_the_summary() -> None:
@@ -45,14 +45,14 @@ def test_figures_are_those_of_the_summary() -> None:
     status = RunStatus(why="inside +-2 µm | so far").after_event(
         events.CommandTaken("gains", "ann", "", value=60.0, loop=gains), 20.0
     )
-    told = page(summary, status)
+    text = page(summary, status)
     held = summary.as_dict({}, {})["held"]
-    assert told["hold"] == "inside ±2 µm / so far"
-    assert told["std of 1 s means, true centre"] == f"{held['std_um']:.3g} µm"
-    assert told["1 s means within ±2 µm"] == "100 %"
+    assert text["hold"] == "inside ±2 µm / so far"
+    assert text["std of 1 s means, true centre"] == f"{held['std_um']:.3g} µm"
+    assert text["1 s means within ±2 µm"] == "100 %"
     assert np.isclose(held["held_s"], 19.0, atol=0.1)
-    assert told["held"] == "0:00:19"
-    assert (told["faults"], told["last fault"]) == ("1", "board_fault")
-    assert told["shape cycles"] == "1, 1 rejected"
-    assert told["geometry"] == "0f93, bench.toml, calibrated 2026-11-21"
-    assert told["gains"].startswith("Kp 0.8 1/s, Ti 6.5 s, Td 0 s; on trial, reverted in 50 s")
+    assert text["held"] == "0:00:19"
+    assert (text["faults"], text["last fault"]) == ("1", "board_fault")
+    assert text["shape cycles"] == "1, 1 rejected"
+    assert text["geometry"] == "0f93, bench.toml, calibrated 2026-11-21"
+    assert text["gains"].startswith("Kp 0.8 1/s, Ti 6.5 s, Td 0 s; on trial, reverted in 50 s")

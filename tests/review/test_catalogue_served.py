@@ -76,7 +76,7 @@ def test_other_programs_read_the_catalogue_on_this_machine_until_it_is_ended(
     with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         url = next(line for line in process.stderr if "rerun+http" in line).split()[-1]
-        told = json.loads(
+        served = json.loads(
             subprocess.check_output([sys.executable, "-c", CLIENT, url], text=True, timeout=60)
         )
         family = [
@@ -94,8 +94,8 @@ def test_other_programs_read_the_catalogue_on_this_machine_until_it_is_ended(
     assert places == {"127.0.0.1"}
     assert not list(tmp_path.iterdir())
     assert not any(each.is_running() for each in family)
-    assert told["seconds"] == 360
-    rows = {row.pop("rerun_segment_id")[:8]: row for row in told["rows"]}
+    assert served["seconds"] == 360
+    rows = {row.pop("rerun_segment_id")[:8]: row for row in served["rows"]}
     night = {
         name.removeprefix("property:run:"): cell[0]
         for name, cell in rows["20261122"].items()

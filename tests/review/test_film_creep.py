@@ -21,7 +21,7 @@ def chain(rng: np.random.Generator, time_s: np.ndarray) -> np.ndarray:
 
 def test_the_interval_of_tomorrow_holds_the_truth() -> None:
     """Weeks of a film loaded an hour before, with noise that lasts for hours; 95 % intervals."""
-    rng, z, sure = np.random.default_rng(5), [], 0
+    rng, z, significant = np.random.default_rng(5), [], 0
     for _ in range(16):
         days = rng.uniform(3, 30)
         time_s = 3600 + np.linspace(0, days * DAY_S, 80)
@@ -32,10 +32,10 @@ def test_the_interval_of_tomorrow_holds_the_truth() -> None:
         both = chain(rng, np.append(time_s, time_s[-1] + DAY_S))
         creep = fit_creep(time_s, both[:-1] + noise, DAY_S)
         z.append((creep.drift - (both[-1] - both[-2])) / creep.drift_sigma)
-        sure += creep.is_certain
+        significant += creep.is_certain
     held = float(np.mean(np.abs(z) < 1.96))
     assert held > 0.8, (held, np.sqrt(np.mean(np.square(z))))
-    assert sure > 8  # the bars are not merely wide
+    assert significant > 8  # the bars are not merely wide
 
 
 def test_no_creep_is_reported_for_a_film_that_does_not_creep() -> None:

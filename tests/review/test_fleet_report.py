@@ -128,8 +128,12 @@ def test_the_page_has_the_figures_of_each_runs_own_report(lab: Path, tmp_path: P
             assert found[name][key] == table[key]
     assert [line.get("faults") for line in found.values()] == [["late"], [], None, None, None]
     assert [line.get("alarms") for line in found.values()] == [["leaky"], [], None, None, None]
-    said = [line.get("problem", "") for line in found.values()]
-    assert ["nothing to report" in said[2], "not a run" in said[3], "no such run" in said[4]] == [
+    problems = [line.get("problem", "") for line in found.values()]
+    assert [
+        "nothing to report" in problems[2],
+        "not a run" in problems[3],
+        "no such run" in problems[4],
+    ] == [
         True,
         True,
         True,

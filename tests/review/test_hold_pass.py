@@ -114,7 +114,7 @@ def test_the_limit_of_the_flow_is_that_of_the_curve_in_force(tmp_path: Path) -> 
         "refused": None,
     }
     loop = CONFIG.loop.model_dump() | {"flow_max_um_per_s": 10.0}
-    told = [
+    reports = [
         asked | {"mono_s": third_s, "loop": loop | {"pump": curve}},
         asked | {"mono_s": 1.5 * third_s, "loop": loop | {"kp_per_s": 0.5}},
         asked | {"mono_s": 1.6 * third_s, "loop": "damaged"},
@@ -122,7 +122,8 @@ def test_the_limit_of_the_flow_is_that_of_the_curve_in_force(tmp_path: Path) -> 
     ]
     with (tmp_path / "run/events.jsonl").open("a") as log:
         log.writelines(
-            json.dumps({"time_utc": "2026-11-21T18:00:00+00:00", **event}) + "\n" for event in told
+            json.dumps({"time_utc": "2026-11-21T18:00:00+00:00", **event}) + "\n"
+            for event in reports
         )
     assert analyse_run(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(
         2 / 3, abs=1e-2

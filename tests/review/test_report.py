@@ -194,8 +194,8 @@ def test_command_writes_page_and_json(
 def test_equal_runs_do_not_differ_and_unequal_ones_do(quiet_run: Path, tmp_path: Path) -> None:
     ours = analyse_run(open_run(quiet_run))
     twin = analyse_run(open_run(written(tmp_path, HOURS, seed=7, name="20261122T180000Z-twin")))
-    alike = {d.name: d.verdict_text for d in compare_analyses(ours, twin)}
-    assert alike["reading, std of 1 s"] == "no significant difference"
+    verdicts = {d.name: d.verdict_text for d in compare_analyses(ours, twin)}
+    assert verdicts["reading, std of 1 s"] == "no significant difference"
     rows, shapes = night(7, HOURS, "gusty", [])
     rows[:, COLUMN["displacement_um"]] *= 1.5
     write_run(tmp_path / "20261123T180000Z-worse", iter([(rows, shapes)]))

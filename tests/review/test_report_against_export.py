@@ -73,7 +73,7 @@ def means(time_s: np.ndarray, values: np.ndarray, window_s: int) -> tuple[np.nda
 def test_windows(folder: Path, report: dict[str, Any], name: str) -> None:
     for place, window_s in enumerate((1, 4, 60)):
         _, mean_um = means(*errors(folder)[name], window_s)
-        said = report[name]["windows"][place]
+        reported = report[name]["windows"][place]
         expected = {
             "count": mean_um.size,
             "mean_um": mean_um.mean(),
@@ -82,19 +82,21 @@ def test_windows(folder: Path, report: dict[str, Any], name: str) -> None:
             "p99_7_um": np.quantile(np.abs(mean_um), 0.997),
             "in_band": (np.abs(mean_um) <= report["band_um"]).mean(),
         }
-        assert {key: said[key] for key in expected} == pytest.approx(expected, rel=1e-6, abs=1e-9)
+        assert {key: reported[key] for key in expected} == pytest.approx(
+            expected, rel=1e-6, abs=1e-9
+        )
 
 
 def test_slope_and_its_interval(folder: Path, report: dict[str, Any]) -> None:
     middle_s, mean_um = means(*errors(folder)["true"], 1)
     hours = middle_s / 3600
     (rate, _), covariance = np.polyfit(hours, mean_um, 1, cov=True)
-    said = report["true"]["drift_um_per_hour"]
-    assert said["per_hour"] == pytest.approx(rate, abs=1e-7)
+    reported = report["true"]["drift_um_per_hour"]
+    assert reported["per_hour"] == pytest.approx(rate, abs=1e-7)
     # the means of a second are correlated over some seconds, so the interval is wider than that of
     # independent ones
     independent = 2 * 1.96 * np.sqrt(covariance[0, 0])
-    assert independent < said["high"] - said["low"] < 6 * independent
+    assert independent < reported["high"] - reported["low"] < 6 * independent
 
 
 def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -134,17 +136,17 @@ def area(folder: Path) -> np.ndarray:
 def test_figure_at_the_points_over_the_area_and_between_pairs(
     folder: Path, report: dict[str, Any]
 ) -> None:
-    shapes, said = columns(folder, "shapes"), report["shape"]
+    shapes, reported = columns(folder, "shapes"), report["shape"]
     coeffs = np.column_stack([shapes[f"z{j}_um"] for j in NOLL_INDICES])
-    assert said["used"] == len(coeffs)
+    assert reported["used"] == len(coeffs)
     for name, (x, y) in POINTS.items():
         height_um = coeffs @ zernike(np.array([x]), np.array([y]))[:, 0]
-        assert said["points_sd_um"][name] == pytest.approx(height_um.std(), rel=1e-6)
+        assert reported["points_sd_um"][name] == pytest.approx(height_um.std(), rel=1e-6)
     terms = area(folder)
-    assert said["mean_sd_um"] == pytest.approx(
+    assert reported["mean_sd_um"] == pytest.approx(
         (coeffs @ terms).std(axis=0, ddof=1).mean(), rel=0.01
     )
-    for pair, cycles in zip(said["pairs"], (15, 150), strict=True):
+    for pair, cycles in zip(reported["pairs"], (15, 150), strict=True):
         change_um = (coeffs[cycles:] - coeffs[:-cycles]) @ terms
         assert (pair["pairs"], pair["lag_s"]) == (
             len(change_um),

@@ -53,7 +53,7 @@ DOORS = [
 def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = written(tmp_path_factory.mktemp("layer"), 0.1, DOORS)
     with (folder / "events.jsonl").open("a") as file:
-        for at_s, told in (
+        for at_s, texts in (
             (200.0, {"kind": "command", "command": "pause"}),
             (210.0, {"kind": "command", "command": "hold", "refused": "no"}),
             (250.0, {"kind": "pump", "scale": 1.05, "sigma": 0.1, "correction": 1.0}),
@@ -68,7 +68,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ),
             (850.0, {"kind": "pump", "scale": 0.82, "sigma": 0.04, "correction": 0.95}),
         ):
-            file.write(json.dumps({"mono_s": at_s, **told}) + "\n")
+            file.write(json.dumps({"mono_s": at_s, **texts}) + "\n")
     return folder
 
 
@@ -112,8 +112,8 @@ def test_lines_stand_where_something_happened_and_are_named_with_its_size(
     assert door[0].endswith(" Pa")
     (lost,) = layer["/found/lines/laser_lost"]["SeriesLines:names"]
     assert lost == ["laser lost, 4 s"]
-    told = [text for (text,) in layer["/found"]["TextLog:text"]]
-    assert [text[9:22] for text in told] == ["pressure step", "pressure step", "laser lost, 4"]
+    texts = [text for (text,) in layer["/found"]["TextLog:text"]]
+    assert [text[9:22] for text in texts] == ["pressure step", "pressure step", "laser lost, 4"]
     assert (
         len(layer["/marks/pause"]["Scalars:scalars"])
         == len(layer["/marks/fault"]["Scalars:scalars"])

@@ -69,15 +69,18 @@ def week(
     (run / "config.toml").write_text(
         "[pump]\ncurve_fraction = [0, 1]\ncurve_um_per_s = [0, 6]\n" + devices
     )
-    told: list[dict[str, object]] = [
+    logged: list[dict[str, object]] = [
         {"kind": "pump", "scale": 9.0, "sigma": 0.1, "correction": 1.0}
     ]
     if curve:
         gains = LoopConfig().model_dump() | {"pump": json.loads(curve)}
-        told.append({"kind": "command", "command": "gains", "who": "eve", "why": "", "loop": gains})
-    told.append({"kind": "pump", "scale": scale, "sigma": sigma, "correction": 1.0})
+        logged.append(
+            {"kind": "command", "command": "gains", "who": "eve", "why": "", "loop": gains}
+        )
+    logged.append({"kind": "pump", "scale": scale, "sigma": sigma, "correction": 1.0})
     lines = [
-        {"time_utc": f"2026-10-0{number}T12:00:00+00:00", "mono_s": 0.0, **event} for event in told
+        {"time_utc": f"2026-10-0{number}T12:00:00+00:00", "mono_s": 0.0, **event}
+        for event in logged
     ]
     (run / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (run / "summary.json").write_text(
@@ -104,17 +107,17 @@ def test_a_pump_that_wears_over_the_weeks_is_reported(tmp_path: Path) -> None:
     ]  # the later run is not known yet
     assert [round(each.leak_um_per_s, 3) for each in seen] == [1.1, 1.2, 1.3]
     assert [each.started_utc.day for each in seen] == [1, 2, 3]
-    said = (
+    advice = (
         "the pump gives 20 % less than in 20261001T120000Z-week (+- 4 %): check it, then `tune "
         "pump`"
     )
-    assert explain_pump_change(seen, 0.12) == said
+    assert explain_pump_change(seen, 0.12) == advice
     assert explain_pump_change(seen, 0.25) == ""
     page = render_history(seen, 0.12)
-    assert said in page
+    assert advice in page
     assert "0.800 ± 0.030" in page
     assert "<svg" in page
-    assert said not in render_history(seen, 0.25)
+    assert advice not in render_history(seen, 0.25)
     assert explain_pump_change([], 0.12) == ""
 
 
@@ -122,10 +125,10 @@ def test_a_change_within_its_error_or_of_another_curve_is_none(tmp_path: Path) -
     week(tmp_path, 1, 1.0, sigma=0.1)
     vague = pump_history(week(tmp_path, 2, 0.8, sigma=0.1))
     assert explain_pump_change(vague, 0.12) == ""
-    anew = pump_history(week(tmp_path, 3, 0.98, curve=TWICE))
-    assert [round(each.scale, 3) for each in anew] == [0.5, 0.4, 0.98]
-    assert [each.same_curve for each in anew] == [False, False, True]
-    assert explain_pump_change(anew, 0.12) == ""
+    new_curve = pump_history(week(tmp_path, 3, 0.98, curve=TWICE))
+    assert [round(each.scale, 3) for each in new_curve] == [0.5, 0.4, 0.98]
+    assert [each.same_curve for each in new_curve] == [False, False, True]
+    assert explain_pump_change(new_curve, 0.12) == ""
 
 
 def test_the_catalogue_lists_and_filters(logs: Path) -> None:

@@ -111,13 +111,13 @@ def test_a_fault_of_many_lines_is_shown_in_one(tmp_path: Path) -> None:
     assert str(file.read()).count("first second") == 1
 
 
-def make(folder: Path, told: list[Event]) -> FaultLatch:
+def make(folder: Path, recorded: list[Event]) -> FaultLatch:
     return FaultLatch(
         LatchedFile(folder),
         ResumeLog(folder),
         "run-7",
         lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC),
-        told.append,
+        recorded.append,
     )
 
 

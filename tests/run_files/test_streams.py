@@ -106,7 +106,7 @@ def test_low_orders_have_the_variances_of_their_cycle(tmp_path: Path) -> None:
 
 
 def test_lines_are_vertical_and_of_their_kind() -> None:
-    told: list[dict[str, Any]] = [
+    events: list[dict[str, Any]] = [
         {"kind": "command", "command": "setpoint", "mono_s": 2.0},
         {"kind": "command", "command": "vent", "mono_s": 3.0, "refused": "not now"},
         {"kind": "command", "command": "resume", "mono_s": 4.0},
@@ -116,7 +116,7 @@ def test_lines_are_vertical_and_of_their_kind() -> None:
         {"kind": "fault", "mono_s": 9.0},
         {"kind": "why", "mono_s": 8.0},
     ]
-    timed = [(line["mono_s"], from_dict(line)) for line in told]
+    timed = [(line["mono_s"], from_dict(line)) for line in events]
     found = {stream.path: (time_s, values[:, 0]) for stream, time_s, values in mark_lines(timed)}
     assert {path: sorted(set(np.round(time_s, 6))) for path, (time_s, _) in found.items()} == {
         "/marks/setpoint": [2.0],

@@ -34,7 +34,7 @@ class Site:
         tokens: TokenBook | None = None,
     ) -> None:
         self.seen: list[WebUser] = []
-        self.said = ""  # to the last request
+        self.answer = ""  # to the last request
         self._gate = with_login(self._app, accounts, address, "key", tokens)
 
     async def _app(self, scope: Any, receive: Any, send: Any) -> None:
@@ -69,7 +69,7 @@ class Site:
 
         await self._gate(scope, receive, send)
         first = sent[0]
-        self.said = b"".join(message.get("body", b"") for message in sent).decode()
+        self.answer = b"".join(message.get("body", b"") for message in sent).decode()
         answered: dict[str, str] = {}
         for name, value in first.get("headers", ()):
             if value.startswith(b"membrane_ctrl=") or name.decode() not in answered:
@@ -91,9 +91,9 @@ async def test_the_link_lets_in_and_its_session_stays() -> None:
     accounts = Accounts({})
     site = Site(accounts)
     assert (await site.ask())[0] == 401
-    assert "this link is wrong" not in site.said.lower()
+    assert "this link is wrong" not in site.answer.lower()
     status, headers = await site.ask(query="key=wrong")
-    assert (status, "This link is wrong, or of another user." in site.said) == (401, True)
+    assert (status, "This link is wrong, or of another user." in site.answer) == (401, True)
     assert headers["referrer-policy"] == "same-origin", (
         "with none, browsers send the login form's origin as null"
     )

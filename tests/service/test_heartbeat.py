@@ -92,8 +92,8 @@ def test_a_failure_is_printed_once_without_the_address(
         monitor.status = 200
         heartbeat.step(3.0, "x")
         finish(heartbeat)
-    said = capsys.readouterr().err.splitlines()
-    assert said == ["heartbeat: url: refused with status 404", "heartbeat: url: works again"]
+    error_lines = capsys.readouterr().err.splitlines()
+    assert error_lines == ["heartbeat: url: refused with status 404", "heartbeat: url: works again"]
 
 
 def test_a_monitor_that_hangs_delays_nobody() -> None:

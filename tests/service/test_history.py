@@ -82,20 +82,20 @@ def test_a_month_is_thinned_and_keeps_its_extremes() -> None:
 
 def test_marks_are_the_feeds_and_those_of_the_runs_before(tmp_path: Path) -> None:
     origin = datetime.fromtimestamp(NOW_S - 600.0, UTC)
-    told = [(0.0, {"kind": "started"})]
+    events = [(0.0, {"kind": "started"})]
     for at_s, text in (
         (-700.0 + 600.0, "too early"),
         (100.0, "door"),
         (550.0, "seen by the feed, too"),
     ):
-        told.append(
+        events.append(
             (at_s, {"kind": "command", "command": "mark", "who": "anna", "why": "", "text": text})
         )
     run = tmp_path / f"{origin:%Y%m%dT%H%M%SZ}-night"
     run.mkdir()
     stamped = [
         {"time_utc": (origin + timedelta(seconds=at_s)).isoformat(), "mono_s": at_s} | line
-        for at_s, line in told
+        for at_s, line in events
     ]
     (run / "events.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in stamped))
     (tmp_path / "20260101T000000Z-torn").mkdir()

@@ -79,8 +79,8 @@ async def test_a_command_that_arrives_after_its_time_is_refused_by_the_hold(tmp_
 
         asked = {"do": "hold", "why": "bridge: mqtt"}
         late = SendLimits(time.monotonic() + 2.0, refusal)
-        said = await asyncio.to_thread(feed.ask, asked, late)
-        assert "hold refused: hold came 58" in said.text
+        answer = await asyncio.to_thread(feed.ask, asked, late)
+        assert "hold refused: hold came 58" in answer.text
         assert run.asked == []
 
 
@@ -91,14 +91,14 @@ async def test_a_command_is_not_sent_after_its_deadline_or_another_decision(tmp_
             (limits(-0.1), "the hold answered too late"),
             (limits(2.0, "latch came meanwhile"), "hold refused: latch came meanwhile"),
         ):
-            said = await asyncio.to_thread(feed.ask, {"do": "hold"}, given)
-            assert message in said.text
-            assert not said.done
+            answer = await asyncio.to_thread(feed.ask, {"do": "hold"}, given)
+            assert message in answer.text
+            assert not answer.done
         other = feed_of("another-run", tmp_path / "control.sock")
-        said = await asyncio.to_thread(other.ask, {"do": "hold"}, limits(2.0))
-        assert "another run is listening now" in said.text
-        said = await asyncio.to_thread(other.ask, {"do": "stop"}, limits(-5.0, "no"))
-        assert said == Outcome.succeeded("stop"), "a safety command has no conditions"
+        answer = await asyncio.to_thread(other.ask, {"do": "hold"}, limits(2.0))
+        assert "another run is listening now" in answer.text
+        answer = await asyncio.to_thread(other.ask, {"do": "stop"}, limits(-5.0, "no"))
+        assert answer == Outcome.succeeded("stop"), "a safety command has no conditions"
         assert [command.kind for command in run.asked] == ["stop"]
 
 

@@ -54,8 +54,8 @@ async def test_a_hold_is_followed_asked_and_found_again(tmp_path: Path) -> None:
             assert feed.seen.name == "the-run"
             assert feed.seen.status["row"]["error_um"] == ROW.error_um
             assert feed.seen.role == "tune"
-            said = await asyncio.to_thread(feed.ask, {"do": "pause", "why": "web: anna"})
-            assert said == Outcome.succeeded("pause")
+            answer = await asyncio.to_thread(feed.ask, {"do": "pause", "why": "web: anna"})
+            assert answer == Outcome.succeeded("pause")
             assert [(command.kind, command.why) for command in run.asked] == [
                 ("pause", "web: anna")
             ]
@@ -129,11 +129,11 @@ async def test_a_command_for_the_last_run_does_not_reach_the_next(tmp_path: Path
     feed = HoldFeed(Where(socket=tmp_path / "control.sock"))
     feed.seen = dataclasses.replace(feed.seen, name="an-earlier-run")
     async with port_run(tmp_path) as run:
-        said = await asyncio.to_thread(feed.ask, {"do": "pause"})
-        assert "another run" in said.text
+        answer = await asyncio.to_thread(feed.ask, {"do": "pause"})
+        assert "another run" in answer.text
         assert run.asked == []
-        said = await asyncio.to_thread(feed.ask, {"do": "stop"})
-        assert said == Outcome.succeeded("stop"), "whatever runs there becomes safe"
+        answer = await asyncio.to_thread(feed.ask, {"do": "stop"})
+        assert answer == Outcome.succeeded("stop"), "whatever runs there becomes safe"
 
 
 async def test_without_a_hold_the_answer_states_it(tmp_path: Path) -> None:

@@ -80,9 +80,9 @@ def test_a_program_has_its_own_session_and_not_the_services_priority(
         options = StartOptions(standby=True, clear_faults=True)
         starter.start_hold("lab", "anna", options).result()
         wait_for_end(starter)
-        said = (tmp_path / "logs" / LOG_NAME).read_text()
+        log_text = (tmp_path / "logs" / LOG_NAME).read_text()
         words = f"hold --logs {tmp_path / 'logs'} --name lab --standby --clear-faults"
-        assert said == f"-m membrane_ctrl {words} --config {file} True {own}\n"
+        assert log_text == f"-m membrane_ctrl {words} --config {file} True {own}\n"
         assert starter.failure == ""
 
 

@@ -55,8 +55,8 @@ async def check_bridge(where: Where, run: PortRun) -> None:
         assert values["error_um"] == ROW.error_um
         assert set(values) == {each.name for each in TABLE}
         late = SendLimits(time.monotonic() - 1.0)
-        said = await asyncio.to_thread(feed.ask, {"do": "hold"}, late)
-        assert "answered too late" in said.text
+        reply = await asyncio.to_thread(feed.ask, {"do": "hold"}, late)
+        assert "answered too late" in reply.text
         before = len(run.asked)
         flood = [asyncio.create_task(bridge.ask("mqtt", "shape_on")) for _ in range(150)]
         await asyncio.sleep(0)
@@ -81,8 +81,8 @@ async def test_a_person_and_another_service_reach_a_hold_through_its_service(
 
         async def ctl(*words: str) -> tuple[int, str, str]:
             code = await asyncio.to_thread(command, ["ctl", *words, "--host", url])
-            said = capsys.readouterr()
-            return code, said.out, said.err
+            reply = capsys.readouterr()
+            return code, reply.out, reply.err
 
         try:
             async with asyncio.timeout(120.0):
@@ -100,8 +100,8 @@ async def test_a_person_and_another_service_reach_a_hold_through_its_service(
             assert code == Exit.BAD_INPUT
             code, _, err = await ctl("stop", "--why", "from afar")
             assert (code, err.startswith("stop: done")) == (Exit.DONE, True)
-            said = [(each.kind, each.who, each.why) for each in run.asked]
-            assert [each for each in said if each[0] != "manual"] == [
+            reply = [(each.kind, each.who, each.why) for each in run.asked]
+            assert [each for each in reply if each[0] != "manual"] == [
                 ("setpoint", "token:ops", "test"),
                 ("stop", "token:ops", "from afar"),
             ]

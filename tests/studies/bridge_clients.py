@@ -36,7 +36,7 @@ def lines(path: Path) -> list[Line]:
     ]
 
 
-class Told:
+class LineLog:
     """Appends JSON lines with their time to a file."""
 
     def __init__(self, path: Path) -> None:
@@ -50,19 +50,19 @@ class Told:
 # failed.
 
 
-def _sweeps(tell: Told, read: Read) -> None:
-    tell(ready=True)  # its libraries are loaded
+def _sweeps(record: LineLog, read: Read) -> None:
+    record(ready=True)  # its libraries are loaded
     while True:
         try:
             made_s = list(read())
         except Exception as error:  # whatever the library raises: the client goes on
-            tell(failed=f"{type(error).__name__}: {error}"[:200])
+            record(failed=f"{type(error).__name__}: {error}"[:200])
         else:
-            tell(names=len(made_s), oldest_s=round(time.time() - min(made_s), 3))
+            record(names=len(made_s), oldest_s=round(time.time() - min(made_s), 3))
         time.sleep(SWEEP_S)
 
 
-def _mqtt(tell: Told, ports: dict[str, int]) -> None:
+def _mqtt(record: LineLog, ports: dict[str, int]) -> None:
     from datetime import datetime
 
     import aiomqtt
@@ -85,10 +85,10 @@ def _mqtt(tell: Told, ports: dict[str, int]) -> None:
         return [made_s for name in NAMES if name in newest]
 
     threading.Thread(target=lambda: asyncio.run(follow()), daemon=True).start()
-    _sweeps(tell, read)
+    _sweeps(record, read)
 
 
-def _opcua(tell: Told, ports: dict[str, int]) -> None:
+def _opcua(record: LineLog, ports: dict[str, int]) -> None:
     from asyncua import ua
     from asyncua.sync import Client
 
@@ -117,10 +117,10 @@ def _opcua(tell: Told, ports: dict[str, int]) -> None:
                 open_one.pop().tloop.stop()
             raise
 
-    _sweeps(tell, read)
+    _sweeps(record, read)
 
 
-def _ca(tell: Told, ports: dict[str, int]) -> None:
+def _ca(record: LineLog, ports: dict[str, int]) -> None:
     """Channel Access, in pure Python."""
     os.environ.update(EPICS_CA_ADDR_LIST="127.0.0.1", EPICS_CA_AUTO_ADDR_LIST="NO")
     os.environ["EPICS_CA_SERVER_PORT"] = str(ports["ca"])
@@ -128,10 +128,12 @@ def _ca(tell: Told, ports: dict[str, int]) -> None:
 
     context = Context(timeout=2.0)
     pvs = context.get_pvs(*(f"mirror:{name}" for name in NAMES))
-    _sweeps(tell, lambda: [pv.read(timeout=2.0, data_type="time").metadata.timestamp for pv in pvs])
+    _sweeps(
+        record, lambda: [pv.read(timeout=2.0, data_type="time").metadata.timestamp for pv in pvs]
+    )
 
 
-def _pva(tell: Told, _: dict[str, int]) -> None:
+def _pva(record: LineLog, _: dict[str, int]) -> None:
     # as in a lab; through a TCP name server it would look again every 10 s only
     # (benchmarks/interfaces/epics_return.py)
     os.environ.setdefault("EPICS_PVA_ADDR_LIST", "127.0.0.1")
@@ -139,10 +141,10 @@ def _pva(tell: Told, _: dict[str, int]) -> None:
     from p4p.client.thread import Context
 
     context, names = Context("pva"), [f"mirror:{name}" for name in NAMES]
-    _sweeps(tell, lambda: [value.timestamp for value in context.get(names, timeout=2.0)])
+    _sweeps(record, lambda: [value.timestamp for value in context.get(names, timeout=2.0)])
 
 
-def _bare(tell: Told, _: dict[str, int]) -> None:
+def _bare(record: LineLog, _: dict[str, int]) -> None:
     """A loop of the hold's rate that does nothing: how late it is, and what it misses, every ten
     seconds.
     """
@@ -155,7 +157,7 @@ def _bare(tell: Told, _: dict[str, int]) -> None:
         skipped = int(late_s * RATE_HZ)
         missed, deadline_s = missed + skipped, deadline_s + skipped / RATE_HZ
         if len(late_ms) == round(10 * RATE_HZ):
-            tell(late_ms=late_ms, missed=missed)
+            record(late_ms=late_ms, missed=missed)
             late_ms, missed = [], 0
 
 
@@ -164,4 +166,4 @@ PARTS = {"mqtt": _mqtt, "opcua": _opcua, "ca": _ca, "pva": _pva, "bare": _bare}
 
 if __name__ == "__main__":
     FOLDER, KIND, PORTS = sys.argv[1:]
-    PARTS[KIND](Told(Path(FOLDER, f"{KIND}.jsonl")), json.loads(PORTS))
+    PARTS[KIND](LineLog(Path(FOLDER, f"{KIND}.jsonl")), json.loads(PORTS))

@@ -231,19 +231,26 @@ def bench_answer(seed: int, resolution: float = 0.25) -> dict[str, Any]:
             try:
                 one = measured_errors(path, drawn.world.mirror, truth, points_mm)
             except CommandError as error:
-                said = str(error).replace(folder, "")
-                answer["sets"].append({"verdict": "refused", "reason": said, "flagged": []})
+                reason = str(error).replace(folder, "")
+                answer["sets"].append({"verdict": "refused", "reason": reason, "flagged": []})
                 continue
             except Exception:
                 last = traceback.format_exc().splitlines()[-1]
                 answer["sets"].append({"verdict": "crash", "reason": last, "flagged": []})
                 continue
-            said = {"verdict": one.verdict, "reason": one.reason, "flagged": list(one.flagged)}
-            said |= {"geometry": one.geometry}
+            verdict_row = {
+                "verdict": one.verdict,
+                "reason": one.reason,
+                "flagged": list(one.flagged),
+            }
+            verdict_row |= {"geometry": one.geometry}
             if one.error_um is not None and one.sigma_um is not None:
-                said |= {"error_um": one.error_um.tolist(), "sigma_um": one.sigma_um.tolist()}
+                verdict_row |= {
+                    "error_um": one.error_um.tolist(),
+                    "sigma_um": one.sigma_um.tolist(),
+                }
                 found.append(one)
-            answer["sets"].append(said)
+            answer["sets"].append(verdict_row)
     if len(found) == len(places_um):
         first, second = found
         assert first.error_um is not None

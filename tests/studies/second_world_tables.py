@@ -256,8 +256,8 @@ def _worst_tables(given: list[dict[str, Any]]) -> str:
     degraded = [one for one in given if one["sets"][0]["verdict"] == "degraded"]
     ranked = sorted(degraded, key=lambda one: -sigmas_off(one["sets"][0]))
     for one in [each for each in ranked if sigmas_off(each["sets"][0]) > FAR][:WORST]:
-        off, said = sigmas_off(one["sets"][0]), _cell(one["sets"][0]["reason"])
-        lines.append(f"| {one['seed']} | {off:.1f} sigma | {_planted(one)} | degraded: {said} |")
+        off, stated = sigmas_off(one["sets"][0]), _cell(one["sets"][0]["reason"])
+        lines.append(f"| {one['seed']} | {off:.1f} sigma | {_planted(one)} | degraded: {stated} |")
     for is_right, text, one in refusals(given):
         if is_right is not True:
             verdict = one["sets"][0]["verdict"]

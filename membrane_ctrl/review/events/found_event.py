@@ -23,17 +23,17 @@ class FoundEvent:
     size: float  # in `unit`
     unit: str
     confidence: (
-        float  # 1 minus the probability that noise alone looks like this somewhere in the run
+        float  # 1 minus the confidence that noise alone looks like this somewhere in the run
     )
 
 
 def event_around(
-    kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float
+    kind: str, table: Level, row: int, half_s: float, size: float, unit: str, confidence: float
 ) -> FoundEvent:
     """An event with a time range of several detection windows around it."""
     time_s = float(table["time_s"][row])
     return FoundEvent(
-        kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure
+        kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, confidence
     )
 
 

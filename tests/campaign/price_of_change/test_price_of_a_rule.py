@@ -103,5 +103,5 @@ def test_the_evidence_that_a_person_must_write_is_missed(source: ChangedSource) 
     gaps = (
         "import safety_case as s; print([g for g in s.find_gaps(s.load_case()) if 'gas_hot' in g])"
     )
-    said = source.run_python("-c", f"import sys; sys.path.insert(0, 'tests/safety_case'); {gaps}")
-    assert f"rule {RULE}: enforces no constraint" in said
+    output = source.run_python("-c", f"import sys; sys.path.insert(0, 'tests/safety_case'); {gaps}")
+    assert f"rule {RULE}: enforces no constraint" in output

@@ -151,8 +151,8 @@ def test_crossed_fringes_are_what_traced_rays_see(film: FilmShape, gamma: float,
     counts = 0.02 * full + 0.9 * 0.78 * full * light * (
         1 - 0.15 * away / away.max()
     ) * hits.on_film(500.0)
-    sure = np.abs(np.hypot(hits.x_mm, hits.y_mm) - 500.0) > 1.0
-    assert np.abs(picture.ravel() - counts)[sure].max() < 0.51 + 2e-5 * full
+    clear_of_rim = np.abs(np.hypot(hits.x_mm, hits.y_mm) - 500.0) > 1.0
+    assert np.abs(picture.ravel() - counts)[clear_of_rim].max() < 0.51 + 2e-5 * full
 
 
 def test_noise_of_crossed_fringes_is_as_configured_and_new_in_each_row_and_picture(

@@ -209,9 +209,9 @@ def test_faults_hit_the_named_frames_and_no_other(tmp_path: Path, spec: Simulati
 def test_a_run_is_one_full_set_and_fringes_that_lean_on_it(
     tmp_path: Path, spec: SimulationSpec
 ) -> None:
-    told: list[int] = []
-    simulate_run(tmp_path, replace(spec, motion=Motion(10.0, 2.0)), 3, 4.0, told.append)
-    assert told == [1, 2, 3]
+    warnings: list[int] = []
+    simulate_run(tmp_path, replace(spec, motion=Motion(10.0, 2.0)), 3, 4.0, warnings.append)
+    assert warnings == [1, 2, 3]
     assert sorted(folder.name for folder in tmp_path.iterdir()) == ["0000", "0001", "0002"]
     tables = [_toml(tmp_path / f"{number:04d}") for number in range(3)]
     assert [table["kind"] for table in tables] == ["full", "fringes", "fringes"]
