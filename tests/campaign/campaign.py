@@ -165,7 +165,8 @@ def document(results: list[Result], story_results: list[StoryResult]) -> str:
         "fault, in which every safe "
         "level times out, and then through a stop.",
         "",
-        f"**{len(results)} runs and {len(story_results)} stories, {len(violations)} violations of an "
+        f"**{len(results)} runs and {len(story_results)} stories, "
+        f"{len(violations)} violations of an "
         "invariant.**",
         "",
         "A cell shows the deepest safe level, the first cause that was named, and the "

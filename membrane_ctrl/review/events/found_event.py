@@ -23,7 +23,7 @@ class FoundEvent:
     size: float  # in `unit`
     unit: str
     confidence: (
-        float  # 1 minus the confidence that noise alone looks like this somewhere in the run
+        float  # 1 minus the probability that noise alone looks like this somewhere in the run
     )
 
 
