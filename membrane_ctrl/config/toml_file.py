@@ -84,15 +84,30 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 def _describe_cause(message: str, text: str) -> str:
     """Return the parser's message, with the usual cause for two that do not name it: tomllib has no
-    codes.
+    codes, so that the line of the file itself decides.
     """
     found = re.search(r"at line (\d+)", message)
-    line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
+    if not found:
+        return message
+    lines = [line.strip() for line in text.split("\n")]
+    at = int(found[1]) - 1
+    line = lines[at]
     if number := re.search(r"=\s*([-+]?\d+),(\d+)\s*(#|$)", line):
         return f"{message}: a number has a decimal point; write {number[1]}.{number[2]}"
-    if "overwrite" in message or "twice" in message:
+    if _is_repeated(lines, at):
         return f"{message}: {line} comes twice"
     return message
+
+
+def _is_repeated(lines: list[str], at: int) -> bool:
+    """Whether a line's table was begun before, or its key was set before in the same table."""
+    line = lines[at]
+    if line.startswith("["):
+        return line in lines[:at]
+    begins = [number for number, other in enumerate(lines[:at]) if other.startswith("[")]
+    table = lines[max(begins, default=-1) + 1 : at]
+    key = line.partition("=")[0].strip()
+    return any(other.partition("=")[0].strip() == key for other in table)
 
 
 def _has_too_many_parts(line: str) -> bool:

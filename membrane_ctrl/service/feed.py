@@ -264,21 +264,23 @@ class HoldFeed:
         self._events.clear()
         return RunEventsReader(read_newest_lines(self.folder), reader)
 
-    def _take(self, message: Message, greeting: Message, rings: dict[str, ring.RingReader]) -> None:
+    def _take(
+        self, streamed: Message, greeting: Message, rings: dict[str, ring.RingReader]
+    ) -> None:
         if self._log is not None:
             for line in self._log.read_new():
                 self._note_event(line)
-        elif "event" in message:
-            self._note_event(message["event"])
-        if "status" in message:
+        elif "event" in streamed:
+            self._note_event(streamed["event"])
+        if "status" in streamed:
             self.seen = replace(
                 self.seen,
                 role=str(greeting["role"]),
-                status=message["status"],
+                status=streamed["status"],
                 seen_s=time.monotonic(),
                 problem="",
             )
-            self._take_ticks(message["status"].get("row") or {}, rings.get("telemetry"))
+            self._take_ticks(streamed["status"].get("row") or {}, rings.get("telemetry"))
             self._take_figures(rings.get("shapes"))
         self.seen = replace(self.seen, events=tuple(self._events))
 

@@ -33,6 +33,7 @@ logs = "{_STATE}/logs"
 configurations = "{_CONFIGURATIONS}"
 units = true
 """
+_UNIT_SYNTAX = frozenset(" \t\"'\\%$")  # characters with a meaning in a line of a unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +85,7 @@ def install_units(root: Path, program: Path) -> list[Path]:
     DeviceError
         A file cannot be written, or a command of the system failed.
     """
-    text = str(program)
-    if not program.is_absolute() or any(character in text for character in " \t\"'\\%$"):
+    if not program.is_absolute() or not _UNIT_SYNTAX.isdisjoint(str(program)):
         raise errors.InputError(f"{program}: a unit needs an absolute path without spaces")
     is_system = root == Path("/")
     if is_system:
