@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_statement import (
 )
 from membrane_ctrl.model import acquisition_events, errors, events, shape_estimate
 from membrane_ctrl.run_files.run_config import read_config
-from membrane_ctrl.run_files.run_folder import is_run
+from membrane_ctrl.run_files.run_lookup import is_run
 
 
 def make_geometry_event(

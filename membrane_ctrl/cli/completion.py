@@ -15,7 +15,7 @@ def complete_run(context: typer.Context, incomplete: str) -> list[str]:
 
     Without a match the shell completes a path.
     """
-    from membrane_ctrl.run_files.run_folder import is_run
+    from membrane_ctrl.run_files.run_lookup import is_run
 
     logs = find_logs(context) or _LOGS
     with contextlib.suppress(OSError):

@@ -183,7 +183,7 @@ def film(
     """Determine the film's pre-strain, Poisson ratio and stiffness from sets; from runs,
     its creep.
     """
-    from membrane_ctrl.run_files.run_folder import is_run
+    from membrane_ctrl.run_files.run_lookup import is_run
 
     if all(is_run(folder) for folder in folders):
         from membrane_ctrl.review.statistics.film_run import film_run_command

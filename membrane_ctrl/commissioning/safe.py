@@ -17,6 +17,7 @@ from firmware_iface.roles import BenchReading, LinkError
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.instruments import (
     bench,
+    bench_connection,
     device_claim,
     device_names,
     lock_keys,
@@ -83,7 +84,7 @@ async def _stop_pump(devices: DevicesConfig) -> _Stopped:
         return await _stop_instrument(devices)
     board = bench.make_pump_board(devices, devices.board)
     try:
-        identity = await bench.retry_connecting(board.identify, devices.board)
+        identity = await bench_connection.retry_connecting(board.identify, devices.board)
         await board.stop()
         reading = await board.read()
     except LinkError as error:
@@ -97,7 +98,7 @@ async def _stop_instrument(devices: DevicesConfig) -> _Stopped:
     """Stop the pump alone: an unplugged laser must not keep it running."""
     pump = role_drivers.make_role_devices(devices).pump
     try:
-        await bench.retry_connecting(pump.open, "pump")
+        await bench_connection.retry_connecting(pump.open, "pump")
         await pump.set_pump(0.0)
         fraction = await pump.pump_fraction()
     except LinkError as error:
@@ -124,7 +125,7 @@ async def _after_a_run(devices: DevicesConfig) -> str:
         return (await _stop_instrument(devices)).words
     board = bench.make_pump_board(devices, devices.board)
     try:
-        identity = await bench.retry_connecting(board.identify, devices.board)
+        identity = await bench_connection.retry_connecting(board.identify, devices.board)
         if identity.map_version == 1:
             await board.stop()
         return _describe_reading(devices, await _read_stopped_board(board, devices.watchdog_s))

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import re
 
-from membrane_ctrl.controller.commands import DOWN, SAME_AS
+from membrane_ctrl.controller.command_precedence import DOWN
+from membrane_ctrl.controller.commands import SAME_AS
 
 SAFETY: frozenset[str] = frozenset(DOWN)
 

@@ -4,12 +4,10 @@ The control port checks the role, the tick the state.
 """
 
 import math
-from collections.abc import Collection, Iterable
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.command import Command, CommandRule, Kind
 from membrane_ctrl.controller.state_sets import MOVING
-from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.telemetry import State
 
 AT_START = "command line"  # sender of the first commands
@@ -22,10 +20,6 @@ MEMORY_MAX_S = 1e5  # of the shape loop, as in the configuration
 # bridges and in the recorded inputs. Either name is accepted wherever a command is named.
 SAME_AS: dict[str, Kind] = {"lock": "latch"}
 
-# Within one tick these come first, in this order: the safest wins
-DOWN: tuple[Kind, ...] = ("latch", "vent", "stop", "lower")
-# these can lift the mirror and are not obeyed in the same tick
-_OVERRULED: frozenset[str] = frozenset({"hold", "manual", "tune", "resume", "ack", "unlock"})
 
 ANY = frozenset(State)
 RUNNING = MOVING | {State.STANDBY, State.CHECK}
@@ -80,22 +74,6 @@ TABLE: dict[Kind, CommandRule] = {
 }
 
 
-def sort_commands(commands: Iterable[Command]) -> list[Command]:
-    """Commands of a tick, safest first, the others in order of arrival."""
-    return sorted(
-        commands,
-        key=lambda command: DOWN.index(command.kind) if command.kind in DOWN else len(DOWN),
-    )
-
-
-def explain_overruled(command: Command, obeyed: Collection[str]) -> str:
-    """Refusal naming the command of the same tick that overrules this one; empty if none does."""
-    winner = next((kind for kind in DOWN if kind in obeyed), "")
-    if command.kind not in _OVERRULED or not winner:
-        return ""
-    return f"{winner} came at the same time and takes precedence; send again"
-
-
 def explain_refusal(command: Command, state: State, config: Config) -> str:
     """Why a command cannot be executed now; empty if it can."""
     if command.kind == "resumed" or command.kind == "latched":
@@ -143,37 +121,3 @@ def explain_refusal(command: Command, state: State, config: Config) -> str:
     if command.kind == "capture" and not config.shape.enabled:
         return "no shape measurement in this run: [shape] enabled = false"
     return ""
-
-
-def make_command_event(command: Command, refused: str) -> CommandTaken:
-    """The event of a command: its sender, reason and settings, and why it was refused (empty: it
-    was not).
-    """
-    spec, experiment = command.experiment, None
-    if spec is not None:
-        experiment = spec.model_dump(exclude=None if spec.steps else {"steps"})
-    return CommandTaken(
-        command=command.kind,
-        who=command.who,
-        why=command.why,
-        value=_or_none(command.value),
-        text=command.text or None,
-        loop=_list_settings(command),
-        experiment=experiment,
-        shape_time_constant_s=_or_none(command.shape_time_constant_s),
-        setpoint_step_um=_or_none(command.setpoint_step_um),
-        refused=refused or None,
-    )
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _list_settings(command: Command) -> dict[str, object] | None:
-    """What a `gains` sets, for its event: the loop's keys, and the pump's table if that changes."""
-    if command.loop is None:
-        return None
-    return command.loop.model_dump() | (
-        {} if command.pump is None else {"pump": command.pump.model_dump()}
-    )

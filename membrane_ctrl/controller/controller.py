@@ -21,6 +21,8 @@ from membrane_ctrl.control.gain_limits import limit_gains
 from membrane_ctrl.control.pump_response import PumpResponse, apply_response
 from membrane_ctrl.controller import (
     centre_estimation,
+    command_event,
+    command_precedence,
     commands,
     gains_trial,
     hold_status,
@@ -342,7 +344,7 @@ class Controller:
         self._answers = []
         self._clear_mask = 0
         obeyed: set[str] = set()
-        for command in commands.sort_commands(inputs.commands):
+        for command in command_precedence.sort_commands(inputs.commands):
             if self._handle_command(command, obeyed, events):
                 obeyed.add(command.kind)
         if self._gains.is_overdue(context.now_s):
@@ -354,14 +356,14 @@ class Controller:
     ) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""
         refused = (
-            commands.explain_overruled(command, obeyed)
+            command_precedence.explain_overruled(command, obeyed)
             or locks.refuse_while_locked(command, self._context.locks)
             or commands.explain_refusal(command, self.state, self._present_config)
             or self._refuse_by_condition(command)
             or self._begin_experiment(command)
         )
         self._answers.append((command.number, refused))
-        events.append(commands.make_command_event(command, refused))
+        events.append(command_event.make_command_event(command, refused))
         if not refused:
             self._execute_command(command, events)
         return not refused

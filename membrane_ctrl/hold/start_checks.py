@@ -10,7 +10,8 @@ from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.controller import cross_check, interlocks, safe_levels
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.lock_keeper import LockStorage
-from membrane_ctrl.instruments.bench import connect_bench, make_bench, require_separate_ports
+from membrane_ctrl.instruments.bench import make_bench, require_separate_ports
+from membrane_ctrl.instruments.bench_connection import connect_bench
 from membrane_ctrl.instruments.lock_keys import list_device_keys
 from membrane_ctrl.instruments.lock_store import LockStore, require_unlocked
 from membrane_ctrl.model import errors, telemetry

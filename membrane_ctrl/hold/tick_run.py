@@ -23,7 +23,7 @@ from membrane_ctrl.hold.lock_keeper import LockKeeper
 from membrane_ctrl.hold.start_checks import BoardAtStart
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.hold.systemd_notify import SystemdNotify
-from membrane_ctrl.instruments.bench import connect_bench
+from membrane_ctrl.instruments.bench_connection import connect_bench
 from membrane_ctrl.model import errors, events, run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.lock import Lock

@@ -1,8 +1,6 @@
 """Makes the bench of the configured devices, and connects it."""
 
-import asyncio
-from collections.abc import Awaitable, Callable, Hashable
-from typing import TypeVar
+from collections.abc import Hashable
 
 from firmware_iface import interlocks, role_bench, roles, settings
 from firmware_iface.drivers.pump_board import PumpBoard
@@ -13,14 +11,7 @@ from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import interlock_sources
 from membrane_ctrl.instruments.device_names import host_addresses, serial_name
 from membrane_ctrl.instruments.role_drivers import make_role_devices
-from membrane_ctrl.model.errors import DeviceError, InputError
-
-# A booting board or a starting network gets this long before the command gives up
-_PATIENCE_S = 5.0
-_PAUSE_S = 0.25
-_LAPSE_S = 1.0  # beyond the longest life of an abandoned claim
-
-T = TypeVar("T")
+from membrane_ctrl.model.errors import InputError
 
 
 def make_bench(devices: DevicesConfig, observe: bool = False) -> roles.Bench:
@@ -95,31 +86,3 @@ def _device_of_link(link: str) -> Hashable:
         host, port = plain
         return frozenset(host_addresses(host)), port
     return serial_name(str(plain))
-
-
-async def connect_bench(bench: roles.Bench, devices: DevicesConfig) -> roles.BenchIdentity:
-    """Open the bench; retry while a device is absent, fail at once if it is the wrong device.
-
-    Raises DeviceError, naming the device and the problem in one line.
-    """
-    # a bench of roles names the role itself
-    return await retry_connecting(bench.open, devices.board or "devices")
-
-
-async def retry_connecting(attempt: Callable[[], Awaitable[T]], where: str) -> T:
-    """Repeat an attempt to connect, as in `connect_bench`."""
-    loop = asyncio.get_running_loop()
-    begin_s, patience_s = loop.time(), _PATIENCE_S
-    failure = ""
-    while True:
-        try:
-            return await attempt()
-        except roles.LinkError as error:
-            if not (isinstance(error, roles.LinkWaitsError) and failure):
-                failure = str(error).removeprefix(f"{where}: ")
-            # a killed program's claim lapses with its watchdog
-            if isinstance(error, roles.DeviceBusyError):
-                patience_s = max(patience_s, error.lapses_in_s + _LAPSE_S)
-            if isinstance(error, roles.DeviceRefusedError) or loop.time() > begin_s + patience_s:
-                raise DeviceError(f"{where}: {failure}") from None
-        await asyncio.sleep(_PAUSE_S)

@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.model import errors, file_checksums, files, plain_json, telemetry
-from membrane_ctrl.run_files import event_log, inputs_file, run, run_config, run_folder, table_specs
+from membrane_ctrl.run_files import (
+    event_log,
+    inputs_file,
+    run,
+    run_config,
+    run_lookup,
+    table_specs,
+)
 from membrane_ctrl.run_files.summary import Summary
 from membrane_ctrl.run_files.table_store.reader import TableReader
 from membrane_ctrl.run_files.table_store.spec import JOURNAL_SUFFIX
@@ -232,7 +239,7 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
 
 def _all_rows(run_dir: Path) -> Iterator[telemetry.Rows]:
     """Every tick of the tables."""
-    if not run_folder.is_run(run_dir):
+    if not run_lookup.is_run(run_dir):
         return
     for block in run.open_run(run_dir).tick_blocks(telemetry.FIELDS):
         yield np.column_stack([block[name] for name in telemetry.FIELDS])

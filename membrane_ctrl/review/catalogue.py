@@ -14,7 +14,7 @@ from membrane_ctrl.run_files import (
     event_log,
     retention,
     run_config,
-    run_folder,
+    run_lookup,
     summary_file,
     table_specs,
 )
@@ -188,7 +188,7 @@ def list_run_folders(logs_dir: Path) -> list[Path]:
 def may_be_run(folder: Path) -> bool:
     """Whether a folder is a run, as far as can be seen."""
     try:
-        return run_folder.is_run(folder)
+        return run_lookup.is_run(folder)
     except OSError:  # unreadable: unknown whether it is a run
         return True
 

@@ -25,8 +25,8 @@ from membrane_ctrl.run_files import (
     levels,
     named_tables,
     run_config,
-    run_folder,
     run_head,
+    run_lookup,
     shapes,
     summary_file,
     table_specs,
@@ -388,7 +388,7 @@ def open_run(path: str | Path) -> Run:
 
     Raises InputError if there is no such folder, or it contains nothing of a run.
     """
-    folder = run_folder.find_folder(Path(path))
+    folder = run_lookup.find_folder(Path(path))
     notes: list[str] = []
     head = run_head.read_run_head(folder, notes)
     log = event_log.read_events(folder, notes)

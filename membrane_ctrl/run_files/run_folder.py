@@ -88,22 +88,3 @@ def _make_unwritable_error(folder: Path, error: OSError) -> errors.DeviceError:
     return errors.DeviceError(
         f"{folder}: cannot be written ({reason}); give a writable folder with --logs DIR"
     )
-
-
-def find_folder(path: Path) -> Path:
-    """The run's folder, given a path to it or into it. Raises InputError if it is not a run."""
-    folder = path.parent if path.is_file() else path
-    if not folder.exists():
-        raise errors.InputError(f"{path}: no such run; `membrane-ctrl runs` lists the runs")
-    if not is_run(folder):
-        raise errors.InputError(
-            f"{path}: not a run: it contains neither events.jsonl nor a table of ticks"
-        )
-    return folder.resolve()
-
-
-def is_run(folder: Path) -> bool:
-    """Whether a folder contains anything of a run."""
-    return folder.is_dir() and (
-        (folder / "events.jsonl").exists() or any(folder.glob("ticks/ticks-*"))
-    )

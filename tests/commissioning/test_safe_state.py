@@ -184,7 +184,7 @@ def test_without_a_latch_a_running_program_is_left_alone(bench: Bench) -> None:
 def test_a_missing_hold_and_board_give_one_line(
     tmp_path: Path, unused_tcp_port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.05)
+    monkeypatch.setattr("membrane_ctrl.instruments.bench_connection._PATIENCE_S", 0.05)
     devices = DevicesConfig(board=f"tcp://127.0.0.1:{unused_tcp_port}")
     config = Config(devices=devices, recording=RecordingConfig(logs_dir=str(tmp_path)))
     with pytest.raises(DeviceError, match=r"no connection.*; cut the pump's power if it runs"):
@@ -263,7 +263,7 @@ def test_a_running_hold_is_locked_and_that_is_enough_where_it_alone_has_the_pump
     capsys: pytest.CaptureFixture[str],
     answer: dict[str, object],
 ) -> None:
-    monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.05)
+    monkeypatch.setattr("membrane_ctrl.instruments.bench_connection._PATIENCE_S", 0.05)
     hold = Hold(tmp_path / "control.sock", answer)
     if answer["ok"]:
         assert make_safe(composed(tmp_path), "lab.toml") == 0

@@ -15,7 +15,8 @@ from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.controller.command import Command, Kind
-from membrane_ctrl.controller.commands import DOWN, TABLE, sort_commands
+from membrane_ctrl.controller.command_precedence import DOWN, sort_commands
+from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.state_sets import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs

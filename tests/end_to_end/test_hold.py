@@ -279,7 +279,7 @@ def test_a_full_disk_is_refused_before_anything_exists(tmp_path: Path) -> None:
 def test_an_address_without_a_device_is_a_device_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.3)
+    monkeypatch.setattr("membrane_ctrl.instruments.bench_connection._PATIENCE_S", 0.3)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -16,7 +16,8 @@ from firmware_iface.register_map import list_known_maps, load_default_map
 from membrane_ctrl.config.schema import Config, DevicesConfig, ResumeConfig
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.start_checks import BoardAtStart, identify_board, open_latched_fault
-from membrane_ctrl.instruments.bench import connect_bench, make_bench
+from membrane_ctrl.instruments.bench import make_bench
+from membrane_ctrl.instruments.bench_connection import connect_bench
 from membrane_ctrl.model.errors import DeviceError, FindingsError
 from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile, ResumeLog
 from tests.worlds.faulty_board import PumpBoardEmulator
@@ -146,8 +147,8 @@ def test_a_latched_fault_that_cannot_be_cleared_is_refused_in_one_line(tmp_path:
 async def test_an_unreachable_board_is_reported_with_the_reason(
     monkeypatch: pytest.MonkeyPatch, unused_tcp_port: int
 ) -> None:
-    monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.05)
-    monkeypatch.setattr("membrane_ctrl.instruments.bench._PAUSE_S", 0.0)
+    monkeypatch.setattr("membrane_ctrl.instruments.bench_connection._PATIENCE_S", 0.05)
+    monkeypatch.setattr("membrane_ctrl.instruments.bench_connection._PAUSE_S", 0.0)
     devices = DevicesConfig(board=f"tcp://127.0.0.1:{unused_tcp_port}")
     with pytest.raises(DeviceError) as caught:
         await connect_bench(make_bench(devices), devices)

@@ -13,7 +13,7 @@ from urllib.parse import parse_qs, urlsplit
 import httpx
 import pytest
 
-from membrane_ctrl.controller.commands import make_command_event
+from membrane_ctrl.controller.command_event import make_command_event
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.web.gains_views import parse_setting
 from tests.hold.test_page_service import services_of

@@ -15,7 +15,7 @@ from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control import pump_curve
 from membrane_ctrl.model import events
 from membrane_ctrl.model.run_status import RunStatus
-from membrane_ctrl.run_files import event_log, run_config, run_folder, summary_file
+from membrane_ctrl.run_files import event_log, run_config, run_lookup, summary_file
 from membrane_ctrl.run_files.event_log import LoggedEvent
 from membrane_ctrl.run_files.run import origin_of
 
@@ -65,7 +65,7 @@ def pump_history(newest: Path) -> list[PumpSeen]:
     folders = [folder for folder in sorted(newest.parent.iterdir()) if folder.name <= newest.name]
     for folder in reversed(folders[-_LOOKED_BACK:]):
         with contextlib.suppress(OSError):
-            if folder.name.startswith(".") or not run_folder.is_run(folder):
+            if folder.name.startswith(".") or not run_lookup.is_run(folder):
                 continue
             log = event_log.read_events(folder, [])
             config = run_config.read_config(folder, [])

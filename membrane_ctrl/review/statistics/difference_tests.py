@@ -12,7 +12,7 @@ from scipy import special, stats
 
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.review.statistics.drift import correlation_time, correlation_times
-from membrane_ctrl.review.statistics.window_means import group_starts
+from membrane_ctrl.review.statistics.second_sums import group_starts
 
 _BLOCK_S = 300.0  # length of a block that counts as independent
 _LEAST_BLOCKS = 8  # a short run is cut into this many

@@ -11,7 +11,11 @@ import numpy as np
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import Column, IntArray, Singles
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.review.statistics import held_time, window_means, without_feedforward
+from membrane_ctrl.review.statistics import (
+    held_time,
+    second_sums,
+    without_feedforward,
+)
 from membrane_ctrl.review.statistics.pump_activity import PumpActivity, PumpSums
 from membrane_ctrl.run_files import hold_parts, run_statistics
 from membrane_ctrl.run_files.run import Run
@@ -57,7 +61,7 @@ class HoldPass:
     # (`TRUE`): rows of sums are the error (`ERROR`) and what the feed-forward kept away
     # (`KEPT_AWAY`: of the true
     # centre, if known)
-    seconds: tuple[window_means.SecondsOf, window_means.SecondsOf]
+    seconds: tuple[second_sums.SecondsOf, second_sums.SecondsOf]
     raw_reading: run_statistics.Moments
     raw_true: run_statistics.Moments
     raw_in_band: float  # share of settled readings within the band
@@ -91,7 +95,7 @@ class _Collector:
         size = max(0, math.ceil((span_s[1] - span_s[0]) / self._period_s) + 2)
         self._reading = np.full(size, np.nan, dtype=np.float32)
         self._true = np.full(size, np.nan, dtype=np.float32)
-        self._seconds = window_means.SecondSums(2), window_means.SecondSums(2)
+        self._seconds = second_sums.SecondSums(2), second_sums.SecondSums(2)
         self._raw_reading = run_statistics.Moments()
         self._raw_true = run_statistics.Moments()
         reach_um = _HISTOGRAM_BANDS * self._band_um

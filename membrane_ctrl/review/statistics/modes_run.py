@@ -26,7 +26,7 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.colours import DIVERGING_MAP
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.run_files.run import open_run
-from membrane_ctrl.run_files.run_folder import is_run
+from membrane_ctrl.run_files.run_lookup import is_run
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

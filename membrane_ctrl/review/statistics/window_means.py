@@ -5,13 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.model.arrays import AnyArray, Column, IntArray, Singles
+from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.review.statistics.second_sums import Counts, Seconds, group_starts
 from membrane_ctrl.run_files.run_statistics import count_least_ticks
-
-# A month has millions: single precision, which counts ticks exactly.
-Seconds = AnyArray
-Counts = Singles
-SecondsOf = tuple[Seconds, Counts, Column]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,48 +23,6 @@ class WindowStatistics:
     max_um: float
     p99_7_um: float
     in_band: float  # share within the band
-
-
-def group_starts(number: AnyArray) -> IntArray:
-    """Starts of the runs of equal numbers."""
-    return np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
-
-
-class SecondSums:
-    """Sums over whole seconds of the run, of several series at once,
-    from blocks in order of time.
-    """
-
-    def __init__(self, series: int) -> None:
-        self._parts: list[SecondsOf] = []
-        self._series = series
-
-    def add(self, time_s: Column, values: Column) -> None:
-        """Take in (n,) times and (series, n) values, all finite or NaN together."""
-        if not time_s.size:
-            return
-        second = np.floor(time_s + 1e-9).astype(np.int32)
-        starts = group_starts(second)
-        counts = np.diff(np.append(starts, time_s.size)).astype(np.float32)
-        self._parts.append((second[starts], counts, np.add.reduceat(values, starts, axis=1)))
-
-    def result(self) -> SecondsOf:
-        """(k,) seconds with ticks, (k,) numbers of ticks, (series, k) sums."""
-        if not self._parts:
-            return (
-                np.empty(0, dtype=np.int32),
-                np.empty(0, dtype=np.float32),
-                np.empty((self._series, 0)),
-            )
-        second, counts, sums = (
-            np.concatenate(parts, axis=-1) for parts in zip(*self._parts, strict=True)
-        )
-        starts = group_starts(second)  # two blocks may share a second
-        return (
-            second[starts],
-            np.add.reduceat(counts, starts),
-            np.add.reduceat(sums, starts, axis=1),
-        )
 
 
 def window_means(
