@@ -1,4 +1,4 @@
-"""Connects the devices of a bench; retries while one is absent or another program has claimed it."""
+"""Connects the devices of a bench; retries while one is absent or claimed by another program."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
