@@ -24,7 +24,14 @@ from membrane_ctrl.commissioning.guide.session_state import CONFIGURATION
 from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port.ctl import Where
-from membrane_ctrl.instruments import bench, device_claim, device_names, lock_keys, lock_store
+from membrane_ctrl.instruments import (
+    bench,
+    bench_connection,
+    device_claim,
+    device_names,
+    lock_keys,
+    lock_store,
+)
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.sessions.live_hold import HoldLink, live_hold
 
@@ -68,7 +75,7 @@ class RealBench:
 
     async def _act(self, devices: DevicesConfig, action: Action[T]) -> T:
         made = bench.make_bench(devices)
-        identity = await bench.connect_bench(made, devices)
+        identity = await bench_connection.connect_bench(made, devices)
         loop = asyncio.get_running_loop()
         try:
             return await action(OpenBench(made, identity, asyncio.sleep, loop.time))
