@@ -51,10 +51,15 @@ _WARM_UP_INTEGRAL_TIMES = 2.0
 _WORSE_SIGMAS = 2.0
 _WORSE_SHARE = 1.05
 _CORRELATED = 0.33
+# An identified response that the prediction speaks for by so many standard deviations is doubted
+# only beyond a larger correlation: figures show that of the weather as well.
+_CORRELATED_IDENTIFIED = 0.5
+_BETTER_SIGMAS = 2.0
 # After a trial the PI stays unless it is worse by so many standard deviations: what began the trial
-# speaks for it.
+# speaks for it. If the laser's noise hides a difference of so many, the camera decides.
 _TRIAL_SPANS = 12
 _RETURNS_SIGMAS = 1.0
+_HIDDEN_SIGMAS = 2.0
 _FALL_BACK_S = 600.0
 _FALL_BACK_MOST_S = 6 * 3600.0
 _DOUBLINGS_MOST = 10
@@ -134,8 +139,8 @@ class ProcessValueState(StateNode):
     trusted_until_s : float
         Until then the PI is not tried again.
     trials : int
-    estimate_error : MeanSquare or None
-        Of the estimate's loop before the trial.
+    estimate_error, estimate_error_by_camera : MeanSquare or None
+        Of the estimate's loop before the trial, by the laser and by the camera; None without one.
     mount_mean : LowPass
         Mean of the laser's mount in the last minute; NaN without a camera.
     apart_um : float
@@ -153,11 +158,13 @@ class ProcessValueState(StateNode):
     trusted_until_s: float = -math.inf
     trials: Count = 0
     estimate_error: MeanSquare | None = None
+    estimate_error_by_camera: MeanSquare | None = None
     mount_mean: LowPass = field(default_factory=LowPass)
     apart_um: float = math.nan
     noticed: bool = False
     prediction: PredictedPiState = field(default_factory=PredictedPiState)
     comparison: LoopComparisonState = field(default_factory=LoopComparisonState)
+    comparison_by_camera: LoopComparisonState = field(default_factory=LoopComparisonState)
     innovations: InnovationTestState = field(default_factory=InnovationTestState)
     correlation: ErrorCorrelationState = field(default_factory=ErrorCorrelationState)
 
@@ -181,6 +188,7 @@ class ProcessValueChoice:
     ) -> None:
         self.memory = memory or ProcessValueState()
         self._comparison = LoopComparison(self.memory.comparison)
+        self._comparison_by_camera = LoopComparison(self.memory.comparison_by_camera)
         self._innovations = InnovationTest(self.memory.innovations)
         self._loop = loop
         self._pump = pump
@@ -322,6 +330,7 @@ class ProcessValueChoice:
                 return []
             if self._may_be_worse(errors):
                 memory.estimate_error = errors.own
+                memory.estimate_error_by_camera = self._find_error_by_camera()
                 memory.apart_um = apart_um
                 memory.tries_pi = True
         return []
@@ -339,7 +348,16 @@ class ProcessValueChoice:
         excess = errors.excess
         worse = excess.um2 > (1.0 - 1.0 / _WORSE_SHARE) * errors.own.um2
         predicted = worse and excess.um2 > _WORSE_SIGMAS * excess.sigma_um2
-        return predicted or self._correlation.largest > _CORRELATED
+        better = excess.um2 < -_BETTER_SIGMAS * excess.sigma_um2
+        correlated = _CORRELATED
+        if better and self._estimator.pump_response == "identified":
+            correlated = _CORRELATED_IDENTIFIED
+        return predicted or self._correlation.largest > correlated
+
+    def _find_error_by_camera(self) -> MeanSquare | None:
+        """Error of the present loop as the camera shows it; None if it has not for long enough."""
+        errors = self._comparison_by_camera.errors
+        return None if errors is None else errors.own
 
     def _compare_loops(self, facts: ProcessValueFacts) -> None:
         """Add this tick's reading to the comparison."""
@@ -348,6 +366,12 @@ class ProcessValueChoice:
         if math.isnan(memory.compares_from_s):
             warm_up_s = _WARM_UP_S + _WARM_UP_INTEGRAL_TIMES * self._loop.ti_s
             memory.compares_from_s = facts.now_s + warm_up_s
+        if not facts.held_by_optics:
+            self._comparison_by_camera.reset()
+        elif facts.now_s >= memory.compares_from_s:
+            assert facts.estimate is not None  # the optics hold it
+            by_camera_um = facts.setpoint_um - facts.estimate.um
+            self._comparison_by_camera.step(by_camera_um, by_camera_um, facts.dt_s)
         if not memory.follows_estimate:
             if facts.now_s >= memory.compares_from_s:
                 self._comparison.step(error_um, error_um, facts.dt_s)
@@ -366,6 +390,7 @@ class ProcessValueChoice:
     def _stop_comparing(self) -> None:
         self._prediction.stop()
         self._comparison.reset()
+        self._comparison_by_camera.reset()
         self.memory.compares_from_s = math.nan
 
     def _end_trial(self, facts: ProcessValueFacts) -> list[Event]:
@@ -378,8 +403,7 @@ class ProcessValueChoice:
         doublings = min(memory.trials, _DOUBLINGS_MOST)
         until_s = facts.now_s + min(_FALL_BACK_S * 2.0**doublings, _FALL_BACK_MOST_S)
         memory.trials += 1
-        sigma_um2 = math.hypot(errors.own.sigma_um2, estimate_error.sigma_um2)
-        if errors.own.um2 - estimate_error.um2 > _RETURNS_SIGMAS * sigma_um2:
+        if self._is_pi_worse(errors.own, estimate_error):
             memory.trusted_until_s = until_s
             self._correlation.reset()
             return []
@@ -391,6 +415,17 @@ class ProcessValueChoice:
             "The loop follows the laser"
         )
         return [Maintenance(NOTICE, message)]
+
+    def _is_pi_worse(self, pi_error: MeanSquare, estimate_error: MeanSquare) -> bool:
+        """Whether a trial speaks against the PI: by the laser, and where that shows no clear
+        difference, by the camera.
+        """
+        lead = _count_sigmas(pi_error, estimate_error)
+        by_camera = self._find_error_by_camera()
+        before_by_camera = self.memory.estimate_error_by_camera
+        if abs(lead) < _HIDDEN_SIGMAS and by_camera is not None and before_by_camera is not None:
+            lead = _count_sigmas(by_camera, before_by_camera)
+        return lead > _RETURNS_SIGMAS
 
     def _explain_worse(self) -> str:
         """What errors, sensors and innovations show of the cause."""
@@ -411,6 +446,12 @@ class ProcessValueChoice:
     def _end_notice(self, why: str) -> list[Event]:
         self.memory.noticed = False
         return [MaintenanceOver(NOTICE, why)]
+
+
+def _count_sigmas(larger: MeanSquare, smaller: MeanSquare) -> float:
+    """By how many standard deviations the first mean square is larger."""
+    sigma_um2 = math.hypot(larger.sigma_um2, smaller.sigma_um2)
+    return (larger.um2 - smaller.um2) / sigma_um2 if sigma_um2 > 0.0 else 0.0
 
 
 def _root(mean_square_um2: float) -> float:

@@ -11,7 +11,7 @@ import pytest
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.config.schema import Config, ShapeConfig, StatesConfig, leave_to_start
 from membrane_ctrl.control.centre_estimate import CentreEstimate, Sensor, SensorView
-from membrane_ctrl.control.loop_comparison import MeanSquare
+from membrane_ctrl.control.loop_comparison import LoopErrors, MeanSquare
 from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.process_value import (
     NOTICE,
@@ -164,6 +164,59 @@ def test_the_notice_gives_a_limit_where_the_noise_hides_the_error() -> None:
     choice.run(120.0, FACTS)
     (notice,) = (event for event in choice.events if isinstance(event, Maintenance))
     assert "moved by less than 0.22 µm with the estimate" in notice.message
+
+
+@pytest.mark.parametrize(
+    ("pump_response", "correlation", "excess_um2", "tried"),
+    [
+        ("identified", 0.4, -0.03, False),
+        ("identified", 0.4, -0.01, True),  # the prediction does not decide
+        ("identified", 0.55, -0.03, True),
+        ("stated", 0.4, -0.03, True),
+        ("stated", 0.3, -0.03, False),
+        ("identified", 0.0, 0.03, True),
+    ],
+)
+def test_an_identified_response_is_doubted_less_where_the_prediction_speaks_for_it(
+    pump_response: str, correlation: float, excess_um2: float, tried: bool
+) -> None:
+    estimator = ESTIMATOR.model_copy(update={"pump_response": pump_response})
+    choice = ProcessValueChoice(LOOP, PumpConfig(), estimator)
+    choice.memory.correlation.samples = 1000
+    choice.memory.correlation.products_um2 = [1.0, 0.0, -correlation, 0.0, 0.0, 0.0]
+    errors = LoopErrors(MeanSquare(0.05, 0.01), MeanSquare(excess_um2, 0.01))
+    assert choice._may_be_worse(errors) == tried
+
+
+@pytest.mark.parametrize(
+    ("pi_um", "camera", "returns"), [(0.5, True, True), (0.5, False, False), (0.05, True, False)]
+)
+def test_the_camera_ends_a_trial_that_the_laser_does_not_decide(
+    pi_um: float, camera: bool, returns: bool
+) -> None:
+    """The noise of the laser is 3 µm: it shows no difference of either sign."""
+    rng = np.random.default_rng(3)
+    choice = Choice()
+
+    def run(seconds: float, error_um: float) -> None:
+        until_s = choice.now_s + seconds
+        while choice.now_s < until_s:
+            um = error_um * math.sin(choice.now_s)
+            laser_um = um + 3.0 * float(rng.standard_normal())
+            estimate = replace(ESTIMATE, um=um)
+            choice.run(
+                DT_S, replace(FACTS, estimate=estimate, laser_um=laser_um, held_by_optics=camera)
+            )
+
+    run(150.0, 0.1)
+    memory = choice.choice.memory
+    memory.estimate_error = MeanSquare(0.01, 0.5)
+    memory.estimate_error_by_camera = choice.choice._find_error_by_camera()
+    assert (memory.estimate_error_by_camera is not None) == camera
+    memory.tries_pi = True
+    choice.choice._stop_comparing()  # as the change of the loop does
+    run(150.0, pi_um)
+    assert (choice.codes[-1] == "response_known") == returns
 
 
 def test_any_number_of_trials_keeps_the_longest_fall_back() -> None:
