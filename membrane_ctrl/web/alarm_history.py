@@ -15,10 +15,11 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.model.event_base import Event
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.standing_fault import standing_fault_after
-from membrane_ctrl.review import catalogue, run_times
+from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.formatting import format_span
 from membrane_ctrl.run_files.event_log import LoggedEvent
 from membrane_ctrl.run_files.run import open_run
+from membrane_ctrl.web.run_end import find_end_s
 
 _RUNS_MOST = 20  # newest
 _ALARMS_MOST = 200
@@ -77,8 +78,7 @@ def _list_alarms(logs: Path, _turn: float) -> list[PastAlarm]:
         with suppress(OSError, ValueError, errors.CommandError):  # one damaged run hides no other
             run = open_run(folder)
             began_s = run.origin_utc.timestamp()
-            end_s = began_s + run_times.end_s(run) if run.summary else math.nan
-            found += find_alarms(run.log, began_s, end_s, folder.name)
+            found += find_alarms(run.log, began_s, find_end_s(run), folder.name)
     return sorted(found, key=lambda alarm: alarm.began_s, reverse=True)[:_ALARMS_MOST]
 
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.model import errors
-from membrane_ctrl.review import catalogue, run_times
+from membrane_ctrl.review import catalogue
 from membrane_ctrl.run_files.annotations import add_mark
 from membrane_ctrl.run_files.run import Run, open_run
+from membrane_ctrl.web.run_end import find_end_s
 
 NOW_S = 3.0  # a later moment is the present: the hold itself records the mark
 
@@ -51,9 +52,8 @@ def _find_run(logs: Path, utc_s: float) -> Run | None:
     for folder in reversed(catalogue.list_run_folders(logs)):
         with suppress(OSError, ValueError, errors.CommandError):
             run = open_run(folder)
-            began_s = run.origin_utc.timestamp()
-            if began_s > utc_s:
+            if run.origin_utc.timestamp() > utc_s:
                 continue
-            ended_s = began_s + run_times.end_s(run) if run.summary else math.inf
-            return run if utc_s <= ended_s else None
+            ended_s = find_end_s(run)
+            return run if math.isnan(ended_s) or utc_s <= ended_s else None
     return None

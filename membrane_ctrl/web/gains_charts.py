@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.web.chart_axes import GREY, make_axis
+from membrane_ctrl.web.chart_axes import GREY, Options, stack_panels
 
 if TYPE_CHECKING:  # it takes seconds to import, and the service may never need it
     from tuning.explore.crossings import Crossing
@@ -27,7 +27,6 @@ _SENSITIVITY_MOST = 2.5
 _LOWEST_HERTZ = 1e-3
 CHARTS = ("bode", "responses", "noise", "nyquist")
 
-Options = dict[str, Any]
 Points = list[list[float]]
 
 
@@ -74,7 +73,7 @@ def make_gains_charts(
     step = _lines(names, lambda name: _points(found[name].time_s, found[name].step_um), 0)
     load = _lines(names, lambda name: _points(found[name].time_s, found[name].load_um), 1)
     return {
-        "bode": _stack(
+        "bode": stack_panels(
             names,
             ("frequency, Hz", hertz),
             (
@@ -86,7 +85,7 @@ def make_gains_charts(
                 ),
             ),
         ),
-        "responses": _stack(
+        "responses": stack_panels(
             names,
             ("time, s", {"type": "value", "min": 0}),
             (
@@ -94,7 +93,7 @@ def make_gains_charts(
                 (f"leak +{load_um_per_s:g} µm/s: centre, µm", {"scale": True}, load),
             ),
         ),
-        "noise": _stack(
+        "noise": stack_panels(
             names,
             ("frequency, Hz", hertz),
             (
@@ -121,42 +120,9 @@ def _make_nyquist(names: Sequence[str], found: Mapping[str, Curves]) -> Options:
         "data": [{"coord": [-1, 0]}],
     }
     real = ("real part of L", {"type": "value", "min": -3, "max": 1})
-    options = _stack(names, real, (("imaginary part of L", {"min": -2, "max": 1}, lines),))
+    options = stack_panels(names, real, (("imaginary part of L", {"min": -2, "max": 1}, lines),))
     options["tooltip"] = {"show": False}
     return options
-
-
-def _stack(
-    names: Sequence[str],
-    horizontal: tuple[str, Options],
-    panels: Sequence[tuple[str, Options, list[Options]]],
-) -> Options:
-    """Panels above each other with a common horizontal axis and cursor."""
-    title, axis = horizontal
-    count = len(panels)
-    height = 80.0 / count - 3.0
-    grids, x_axes, y_axes, series = [], [], [], []
-    for place, (y_title, y_axis, lines) in enumerate(panels):
-        top = 8.0 + place * (height + 5.0)
-        grids.append({"left": 64, "right": 16, "top": f"{top:.1f}%", "height": f"{height:.1f}%"})
-        is_lowest = place == count - 1
-        x_axis = {**make_axis(title if is_lowest else "", 26), **axis, "gridIndex": place}
-        if not is_lowest:
-            x_axis["axisLabel"] = {"show": False}
-        x_axes.append(x_axis)
-        y_axes.append({"type": "value", **make_axis(y_title, 46), **y_axis, "gridIndex": place})
-        series += lines
-    return {
-        "animation": False,
-        "aria": {"enabled": True},
-        "legend": {"data": list(names), "top": 0, "textStyle": {"color": GREY}},
-        "grid": grids,
-        "axisPointer": {"link": [{"xAxisIndex": "all"}]},
-        "tooltip": {"trigger": "axis", "confine": True},
-        "xAxis": x_axes,
-        "yAxis": y_axes,
-        "series": series,
-    }
 
 
 def _lines(names: Sequence[str], points: Any, panel: int) -> list[Options]:
