@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # A test starts hundreds of processes: without bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: hold test paper board board-fuzz board-hold rest lint types kernels fast real_time unit shake docs notebooks pictures bench benches campaign fuzz mutants generate clean
+.PHONY: hold test paper board board-fuzz board-hold rest lint types kernels fast real_time unit shake docs notebooks pictures bench benches campaign fuzz mutants generate container release-check clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml requirements.lock
@@ -107,6 +107,12 @@ generate: $(STAMP)  ## the files made from registers.toml, the tables of safety,
 
 notebooks: $(STAMP)  ## runs docs/notebooks and stores what they print and draw
 	$(BIN)/python -m tests.support.notebooks
+
+container: $(STAMP)  ## the image of the Containerfile; WAY=chroot where containers cannot be built
+	packaging/container.sh $(or $(WAY),image)
+
+release-check: $(STAMP)  ## the release checklist: tests, campaign, mutants, licences, vulnerabilities, build; hours
+	$(BIN)/python -m tests.support.release_check
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache

@@ -90,3 +90,23 @@ def init(
     from membrane_ctrl.commissioning.first_config import write_first_config
 
     return write_first_config(file, twin, ask=typer.get_text_stream("stdin").isatty() and not twin)
+
+
+@config_app.command()
+def upgrade(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Configuration to upgrade.")],
+    write: Annotated[
+        bool, typer.Option("--write", help="Write it; the former file stays as FILE.former.")
+    ] = False,
+) -> int:
+    """Rename the keys that later releases have renamed; shows the difference."""
+    from membrane_ctrl.config.upgrade import CHANGED_KEYS, upgrade_file
+
+    difference = upgrade_file(file, write)
+    if not difference:
+        print(f"{file}: every key is that of this release ({len(CHANGED_KEYS)} changed so far)")
+        return 0
+    print(difference)
+    if not write:
+        print(f"nothing is written; `membrane-ctrl config upgrade --write {file}` writes it")
+    return 0

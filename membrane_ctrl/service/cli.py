@@ -25,7 +25,9 @@ def install(
         Path | None, typer.Option(help="Path of membrane-ctrl for the units; this one by default.")
     ] = None,
 ) -> None:
-    """Write the units of the service and of its holds, make their user, and start the service."""
+    """Write the units of service and holds, access rules for devices and real-time limits; make the
+    user; start the service.
+    """
     from membrane_ctrl.service.units import install_units, own_program
 
     for path in install_units(root, program or own_program()):
@@ -34,7 +36,7 @@ def install(
 
 @app.command()
 def uninstall(root: RootOption = Path("/")) -> None:
-    """Stop the service and remove its units; configurations, runs and user stay."""
+    """Stop the service and remove its units, rules and limits; configurations and runs stay."""
     from membrane_ctrl.service.units import remove_units
 
     for path in remove_units(root):

@@ -1,12 +1,14 @@
-"""The units of systemd: one for the service, one for each hold, and the rule that lets the service
-start holds.
+"""What an installation adds to the system: the units of the service and of each hold, the rule that
+lets the service start holds, access to instruments and cameras, and real-time limits.
 
-They are written from the files in `examples/`, with the path of this program and its user.
+The files are written from the files in `examples/`, with the path of this program and its user.
 """
 
 from __future__ import annotations
 
+import grp
 import pwd
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -26,7 +28,12 @@ _TARGETS = {
     SERVICE_UNIT: "etc/systemd/system",
     HOLD_UNIT: "etc/systemd/system",
     "50-membrane-ctrl.rules": "etc/polkit-1/rules.d",
+    "70-membrane-ctrl.rules": "etc/udev/rules.d",
+    "50-membrane-ctrl-limits.conf": "etc/security/limits.d",
+    "50-membrane-ctrl-sysctl.conf": "etc/sysctl.d",
 }
+# Groups of serial ports and GPIO lines, and of cameras
+_DEVICE_GROUPS = ("dialout", "video")
 _SETTINGS = "service.toml"
 _SETTINGS_TEXT = f"""# Settings of the service (docs/how-to/service.md).
 logs = "{_STATE}/logs"
@@ -64,7 +71,8 @@ def list_files(root: Path, program: Path) -> list[InstalledFile]:
 
 
 def install_units(root: Path, program: Path) -> list[Path]:
-    """Write units, rule and, if there are none, settings; make the user; start the service.
+    """Write units, rules, limits and, if there are none, settings; make the user; start the
+    service.
 
     Parameters
     ----------
@@ -103,12 +111,13 @@ def install_units(root: Path, program: Path) -> list[Path]:
         written.append(file.path)
     if is_system:
         _run(["systemctl", "daemon-reload"])
+        _apply_device_rules()
         _run(["systemctl", "enable", "--now", SERVICE_UNIT])
     return written
 
 
 def remove_units(root: Path) -> list[Path]:
-    """Stop the service and remove units and rule; configurations, runs and user stay.
+    """Stop the service and remove units, rules and limits; configurations, runs and user stay.
 
     Returns
     -------
@@ -137,6 +146,7 @@ def remove_units(root: Path) -> list[Path]:
                 removed.append(path)
     if is_system:
         _run(["systemctl", "daemon-reload"])
+        _apply_device_rules()
     return removed
 
 
@@ -146,12 +156,25 @@ def own_program() -> Path:
 
 
 def _make_user() -> None:
-    """Make the user of service and holds, unless there is one."""
+    """Make the user of service and holds, unless there is one, with access to the devices."""
     try:
         pwd.getpwnam(USER)
     except KeyError:
         words = ["--system", "--user-group", "--home-dir", _STATE, "--shell", "/usr/sbin/nologin"]
         _run(["useradd", *words, USER])
+    there = {group.gr_name for group in grp.getgrall()}
+    for name in _DEVICE_GROUPS:
+        if name in there:
+            _run(["usermod", "--append", "--groups", name, USER])
+
+
+def _apply_device_rules() -> None:
+    """Apply the rules of udev and the socket buffers to the running system, where it has them."""
+    if shutil.which("udevadm"):
+        _run(["udevadm", "control", "--reload"])
+        _run(["udevadm", "trigger", "--subsystem-match=tty", "--subsystem-match=video4linux"])
+    if shutil.which("sysctl"):
+        _run(["sysctl", "--system"])
 
 
 def _run(words: Sequence[str]) -> str:

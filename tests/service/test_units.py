@@ -14,10 +14,13 @@ from membrane_ctrl.config.toml_file import load_toml
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.service import cli
 from membrane_ctrl.service.hold_starter import options_file
-from membrane_ctrl.service.units import HOLD_UNIT, SERVICE_UNIT, USER, install_units
+from membrane_ctrl.service.units import HOLD_UNIT, SERVICE_UNIT, USER, install_units, remove_units
 
 UNITS = "etc/systemd/system"
 RULES = "etc/polkit-1/rules.d/50-membrane-ctrl.rules"
+DEVICE_RULES = "etc/udev/rules.d/70-membrane-ctrl.rules"
+LIMITS = "etc/security/limits.d/50-membrane-ctrl-limits.conf"
+SYSCTL = "etc/sysctl.d/50-membrane-ctrl-sysctl.conf"
 SETTINGS = "etc/membrane-ctrl/service.toml"
 PROGRAM = Path("/srv/mirror/bin/membrane-ctrl")
 
@@ -54,6 +57,27 @@ def test_what_is_written_fits_together(tmp_path: Path) -> None:
         ("membrane-hold@../x.service", False),
     ):
         assert (re.search(pattern[1], unit) is not None) is allowed, unit
+
+
+def test_devices_are_open_to_the_groups_of_the_unit(tmp_path: Path) -> None:
+    install_units(tmp_path, PROGRAM)
+    rules = (tmp_path / DEVICE_RULES).read_text()
+    groups = set(re.findall(r'GROUP="(\w+)"', rules))
+    unit = unit_of(tmp_path / UNITS / HOLD_UNIT)
+    assert groups == set(unit["SupplementaryGroups"].split())
+    for line in rules.splitlines():
+        assert line.startswith("#") or ("==" in line and re.search(r'[A-Z}]="', line)), line
+    limits = (tmp_path / LIMITS).read_text()
+    assert f"@{USER} - rtprio {unit['LimitRTPRIO']}" in limits
+    assert f"@{USER} - memlock unlimited" in limits
+    assert "net.core.rmem_max" in (tmp_path / SYSCTL).read_text()
+
+
+def test_a_removal_leaves_only_the_settings(tmp_path: Path) -> None:
+    install_units(tmp_path, PROGRAM)
+    remove_units(tmp_path)
+    left = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert left == [tmp_path / SETTINGS]
 
 
 def test_an_update_keeps_the_settings_and_removal_keeps_them_too(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
 
 _WHO = "commission"
 _HELD_LEAST_SHARE = 0.99  # of the sag: limits.displacement_min_um while the mirror is filled
+_FULL_SHARE = 0.01  # of the sag: the mirror is at its depth
 _REPORT_S = 600.0  # between two lines of progress
 _LAW_PA = 2.0  # least squares: a gauge's error is a share of its reading, but not below this
 
@@ -162,8 +163,9 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
         "check thickness, modulus, diameter, and the units of laser and gauge",
     )
     context.note("gauge zero by the fit", f"{zero_pa:+.1f} Pa")
-    context.note("pressure at the full depth", f"{pressures_pa[-1]:.1f} Pa")
-    context.set_keys("optics.mirror", pressure_pa=round(float(pressures_pa[-1]), 1))
+    context.note("pressure at the last depth", f"{pressures_pa[-1]:.1f} Pa")
+    if abs(points[-1].sag_mm - context.facts.sag_mm) < _FULL_SHARE * context.facts.sag_mm:
+        context.set_keys("optics.mirror", pressure_pa=round(float(pressures_pa[-1]), 1))
 
 
 def measure_leak(context: StageContext) -> None:
