@@ -57,6 +57,9 @@ _SWITCH_SHARE = 0.5
 _SWITCH_RANGE_S = (1.0, 2.0)
 # Readings count from here on: until then the vent may still be closing.
 _VENT_CLOSED_S = 1.0
+# By this much the film's speed with the pump off may differ from that of the part `off`, in which
+# the gas of an earlier hold may still have arrived.
+_STILL_SIGMA_UM_PER_S = 1.0
 # Dead time and lag together are known well enough at this standard deviation, or share of them.
 _RESPONSE_SIGMA_S = 0.08
 _RESPONSE_SIGMA_SHARE = 0.2
@@ -372,7 +375,7 @@ class ActuatorTest:
                 memory.switches,
                 memory.noise_um,
                 memory.off_um_per_s,
-                memory.off_sigma_um_per_s,
+                math.hypot(memory.off_sigma_um_per_s, _STILL_SIGMA_UM_PER_S),
                 self._expected_um_per_s,
             )
             if self._is_response_known() or not self._has_time_to_switch():
