@@ -321,6 +321,20 @@ def test_a_change_counts_noise_that_has_its_own_row_once() -> None:
     assert grown == pytest.approx(0.04 * square, rel=0.2)
 
 
+def test_two_limits_of_one_unknown_cancel_in_a_change() -> None:
+    """What may hide in the light is the same in both sets, whatever the limit of each."""
+    effect_mm = 1e-3 * np.random.default_rng(2).standard_normal((ZERNIKE_TERMS, 1))
+
+    def budget_of(limit: float, is_limit: bool) -> Budget:
+        source = Source("second_image", "", limit, limit * effect_mm, is_limit=is_limit)
+        return Budget((source,), 0.95)
+
+    change_mm2 = budget_of(3.0, True).change_covariance(budget_of(1.0, True))
+    assert np.trace(change_mm2) == pytest.approx(0.0, abs=1e-15)
+    found_mm2 = budget_of(3.0, False).change_covariance(budget_of(1.0, True))
+    assert np.trace(found_mm2) == pytest.approx(4 * float(np.sum(effect_mm**2)))
+
+
 def _cube(seed: int) -> dict[str, int]:
     return {"seed": seed, "cube": seed**3}
 

@@ -38,6 +38,7 @@ from tests.worlds.second_optics import (
     Stated,
     World,
     Wrinkles,
+    drawn_errors,
     ramp_motion,
 )
 
@@ -51,6 +52,8 @@ OWN_ROWS = (
     "film_law",
     "film_waves",
     "film_x_to_y_um",
+    "film_corrected",
+    "film_patches_um",
     "film_seen_um",
     "vertex_um",
     "blur_px",
@@ -59,6 +62,7 @@ OWN_ROWS = (
     "slope_urad",
     "noise_adu",
     "image_lag_share",
+    "image_lag_noise",
     "moment_um",
     "second_image",
 )
@@ -87,6 +91,11 @@ class Plant:
         Of a random cause.
     own_rows : bool
         Whether the planted set itself measures the sigma; else the rows are those of the sound set.
+    displacement_um : float
+        Of the film from the laser's reference.
+    on_drawn_benches : bool
+        Whether each trial is on a bench with random errors, of which the sound set has the same:
+        for a row that states what errors of the bench make of the cause.
     """
 
     rows: tuple[str, ...]
@@ -97,6 +106,7 @@ class Plant:
     trials: int = 1
     own_rows: bool = True
     displacement_um: float = 0.0
+    on_drawn_benches: bool = False
 
 
 @dataclass(frozen=True)
@@ -154,19 +164,21 @@ PLANTS = (
         trials=4,
     ),
     Plant(
-        ("film_x_to_y_um", "film_seen_um", "vertex_um", "moment_um"),
+        ("film_x_to_y_um", "film_patches_um", "film_seen_um", "vertex_um"),
         "film 50 µm deeper in y, no laser",
         effects=lambda _: replace(STILL, laser=False, film_motion_um=_later(50.0)),
     ),
     Plant(
-        ("film_x_to_y_um", "film_seen_um", "vertex_um", "moment_um"),
+        ("film_x_to_y_um", "film_patches_um", "film_seen_um", "vertex_um"),
         "film 5 µm deeper in y, no laser",
         effects=lambda _: replace(STILL, laser=False, film_motion_um=_later(5.0)),
     ),
     Plant(
-        ("film_x_to_y_um", "film_um"),
-        "film 50 µm deeper in y, with laser",
+        ("film_corrected", "film_um"),
+        "film 50 µm deeper in y, with laser, benches off at random",
         effects=lambda _: replace(STILL, film_motion_um=_later(50.0)),
+        trials=4,
+        on_drawn_benches=True,
     ),
     Plant(
         ("film_um",),
@@ -175,10 +187,11 @@ PLANTS = (
         trials=4,
     ),
     Plant(
-        ("film_um",),
-        "film moves by 20 µm RMS from frame to frame, with laser",
+        ("film_corrected", "film_um"),
+        "film moves by 20 µm RMS from frame to frame, with laser, benches off at random",
         effects=lambda seed: replace(STILL, film_motion_um=_walk(seed, 20.0)),
         trials=4,
+        on_drawn_benches=True,
     ),
     Plant(
         ("light_relative",),
@@ -219,12 +232,12 @@ PLANTS = (
         effects=lambda _: replace(STILL, panel=Panel(gamma=1.6, gamma_by_angle=0.3)),
     ),
     Plant(
-        ("image_lag_share",),
+        ("image_lag_share", "image_lag_noise"),
         "the previous picture is 1 % of a frame",
         effects=lambda _: replace(STILL, panel=Panel(previous_share=0.01)),
     ),
     Plant(
-        ("image_lag_share",),
+        ("image_lag_share", "image_lag_noise"),
         "the previous picture is 5 % of a frame",
         effects=lambda _: replace(STILL, panel=Panel(previous_share=0.05)),
     ),
@@ -270,6 +283,7 @@ PLANTS = (
         film=Mirror(wrinkles=Wrinkles(5.0)),
     ),
 )
+BY_DESCRIPTION = {plant.description: plant for plant in PLANTS}
 
 
 def compare(plant: Plant, resolution: float = 0.25) -> Comparison:
@@ -282,6 +296,13 @@ def compare(plant: Plant, resolution: float = 0.25) -> Comparison:
         effects = plant.effects(trial)
         if effects.psf_px:
             effects = replace(effects, psf_px=effects.psf_px * 4 * resolution)
+        if plant.on_drawn_benches:
+            errors = drawn_errors(np.random.default_rng((78, trial)))
+            bench = Bench.paper(resolution).changed(errors)
+            scale = 1 + errors["laser_relative"]
+            effects = replace(effects, laser_scale=scale)
+            still = replace(STILL, laser_scale=scale)
+            _, sound_error_mm = _measured(mirror, bench, still, trial, plant.displacement_um)
         measured, error_mm = _measured(mirror, bench, effects, trial, plant.displacement_um)
         squares.append(_mean_square_um2(_take_represented(error_mm - sound_error_mm)))
         if plant.film:

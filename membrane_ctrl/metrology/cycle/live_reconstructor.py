@@ -407,12 +407,15 @@ class LiveReconstructor:
                 patterns[slot] = replace(patterns[slot], shift_rad=float(shift))
         stack = self._stack_without_frames(tuple(patterns))
         some = image_lag.choose_lag_bins(state.index)
-        means = self._take_means(state.index[some])
+        bins = state.index[some]
+        means = self._take_means(bins)
         # Saturated bins are known of the sinusoids; other frames do not need them.
-        is_saturated = self._binner.saturated.ravel()[state.index[some]] > 0
+        is_saturated = self._binner.saturated.ravel()[bins] > 0
         levels = ClipLevels(self._binner.white_adu)
         sample = Binned(self._bin_px, means, np.broadcast_to(is_saturated, means.shape), levels)
-        self._lag = image_lag.find_image_lag(stack, sample, state.accepted[:, 0, some])
+        places_px = np.stack([self._grid.column_px[bins], self._grid.row_px[bins]])
+        phase_rad = state.accepted[:, 0, some]
+        self._lag = image_lag.find_image_lag(stack, sample, phase_rad, places_px)
         if self._lag.corrected:
             binned = self._mean_of_bins(self._binner.sums[: self._slots.count])
             corrected = image_lag.remove_image_lag(stack, binned, self._lag)

@@ -87,6 +87,18 @@ class FullResult:
     ) -> FloatArray:
         """Variance (2,) of an x and of a y slope of one pixel.
 
+        The parameters are those of `screen_variance_mm2`.
+        """
+        gain = slope_noise.slope_per_screen(
+            Geometry.from_config(optics), self.surface.radius_mm, self.surface.sag_mm
+        )
+        return np.asarray(gain @ self.screen_variance_mm2(optics, shifts_rad, noise_adu))
+
+    def screen_variance_mm2(
+        self, optics: OpticsConfig, shifts_rad: list[FloatArray], noise_adu: float
+    ) -> FloatArray:
+        """Variance (2,) of the screen point that one pixel sees, along x and y.
+
         Parameters
         ----------
         optics : OpticsConfig
@@ -102,10 +114,7 @@ class FullResult:
             mm_per_rad * phase_steps.phase_sigma_rad(steps_rad, noise_adu, swing_adu)
             for steps_rad in shifts_rad
         ]
-        gain = slope_noise.slope_per_screen(
-            Geometry.from_config(optics), self.surface.radius_mm, self.surface.sag_mm
-        )
-        return np.asarray(gain @ np.square(sigma_mm))
+        return np.square(sigma_mm)
 
     def height_mm(self) -> FloatArray:
         """Height above the vertex (m, m) on `grid.axis_mm`: the fit plus its residual; NaN where

@@ -31,7 +31,7 @@ _SAMPLED_PX = 96_000
 _SEVERAL_RAD = 6.0
 _SMOOTH_ORDER = 4  # powers of the smooth deviations over the mirror with several fringes
 _FLAT_ORDER = 1  # with fewer: a constant alone
-_COLUMNS_ORDER = 2  # of the polynomials of `SampledBins.smooth_columns`
+_COLUMNS_ORDER = 4  # of the polynomials of `SampledBins.smooth_columns`
 # Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred µm, stay
 # inside.
 _EDGE_RAD = 0.5
@@ -57,12 +57,15 @@ class SampledBins:
         Predicted absolute phases of x and y, with the film at its mean displacement.
     sensitivity_rad_per_um : (2, n) array
         Change of the phases per µm of displacement.
+    places_px : (2, n) array
+        Columns and rows of the bins' centres in the picture.
     """
 
     index: IntArray
     light: FloatArray
     phase_rad: FloatArray
     sensitivity_rad_per_um: FloatArray
+    places_px: FloatArray
 
     def thin_to(self, enough: int = _SAMPLE) -> "SampledBins":
         """Return every k-th bin, so that at least `enough` of them stay."""
@@ -75,17 +78,19 @@ class SampledBins:
             self.light[which],
             self.phase_rad[:, which],
             self.sensitivity_rad_per_um[:, which],
+            self.places_px[:, which],
         )
 
     def smooth_columns(self) -> FloatArray:
-        """Polynomials (k, n) in the phases, which are about proportional to the place on the
-        mirror; the constant first.
+        """Polynomials (k, n) in the place in the picture, which is about proportional to that on
+        the mirror; the constant first.
 
-        Light and contrast of one frame may differ over the mirror by these.
+        Light and contrast of one frame may differ over the mirror by these. The phases are no
+        measure of the place: at the rim of a deep bowl they hardly change with it.
         """
-        spread_rad = np.maximum(self.phase_rad.std(axis=1), _TINY)
-        centred_rad = self.phase_rad - self.phase_rad.mean(axis=1)[:, None]
-        u, v = centred_rad / spread_rad[:, None]
+        spread_px = np.maximum(self.places_px.std(axis=1), _TINY)
+        centred_px = self.places_px - self.places_px.mean(axis=1)[:, None]
+        u, v = centred_px / spread_px[:, None]
         orders = range(_COLUMNS_ORDER + 1)
         powers = [(p, q) for p in orders for q in range(_COLUMNS_ORDER + 1 - p)]
         return np.stack([u**p * v**q for p, q in powers])

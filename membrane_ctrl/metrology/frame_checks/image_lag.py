@@ -12,7 +12,7 @@ darker: panels rarely rise as fast as they fall. The medians over the frames are
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -51,6 +51,7 @@ _LEAST_AMPLITUDE = 1e-9  # instead of a division by zero
 # standard error of a median over that of a mean.
 _SIGMA_OVER_MAD = 1.4826
 _MEDIAN_OVER_MEAN = 1.25
+_LEAST_SHOWN = 10.0  # a frame whose share is less certain than the usual by this factor is left out
 _SCATTER_OF_ONE = 0.1  # assumed relative scatter of the shares if only one frame shows them
 
 # Share of the previous picture and its standard uncertainty, as one frame shows them.
@@ -71,12 +72,19 @@ class ImageLag:
         Standard uncertainty of their mean; NaN if the set cannot show it.
     corrected : bool
         Whether the frames were corrected for it.
+    noise : float
+        The part of `sigma` that follows from the noise of the pixels.
+    scatter : (k,) array
+        The parts of `sigma` that single frames add, because what they show differs from the others;
+        at the same place for the same frame, first where frames rise, then where they fall.
     """
 
     rise: float
     fall: float
     sigma: float
     corrected: bool = False
+    noise: float = 0.0
+    scatter: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def unknown(cls) -> "ImageLag":
@@ -121,8 +129,8 @@ def estimate_image_lag(
     smooth = scene.smooth_columns()
 
     # The shares that each frame shows.
-    rises: list[ShareOfFrame] = []
-    falls: list[ShareOfFrame] = []
+    rises: dict[int, ShareOfFrame] = {}
+    falls: dict[int, ShareOfFrame] = {}
     for frame in range(len(stack.patterns)):
         previous = stack.frame_before(frame)
         if previous < 0 or {frame, previous} & set(excluded):
@@ -131,23 +139,29 @@ def estimate_image_lag(
             continue  # a picture without a pattern acts as a change of the light
         columns, sure = _own_columns(stack, scene, frame, smooth)
         usable = sure & ~clipped[frame] & ~clipped[previous]
-        rises_of_frame, falls_of_frame = _fit_previous(
+        rise_of_frame, fall_of_frame = _fit_previous(
             means[frame], means[previous], columns * scene.light, usable
         )
-        rises += rises_of_frame
-        falls += falls_of_frame
+        if rise_of_frame is not None:
+            rises[frame] = rise_of_frame
+        if fall_of_frame is not None:
+            falls[frame] = fall_of_frame
     if not rises or not falls:
         return ImageLag.unknown()
 
     # Their medians over the frames.
-    rise, rise_sigma = _combine_frames(rises)
-    fall, fall_sigma = _combine_frames(falls)
-    sigma = math.hypot(rise_sigma, fall_sigma) / math.sqrt(2)
+    count_frames = len(stack.patterns)
+    rise, rise_noise, rise_scatter = _combine_frames(rises, count_frames)
+    fall, fall_noise, fall_scatter = _combine_frames(falls, count_frames)
+    noise = math.hypot(rise_noise, fall_noise) / math.sqrt(2)
+    scatter = np.concatenate([rise_scatter, fall_scatter]) / math.sqrt(2)
+    sigma = math.hypot(noise, float(np.linalg.norm(scatter)))
     if len(rises) == 1:  # one frame has no scatter: only the difference of the shares is evidence
         sigma = math.hypot(sigma, rise - fall)
     if sigma > _UNKNOWN_SIGMA:
         return ImageLag.unknown()
-    return ImageLag(rise, fall, math.hypot(sigma, _FLOOR_SIGMA))
+    sigma = math.hypot(sigma, _FLOOR_SIGMA)
+    return ImageLag(rise, fall, sigma, noise=math.hypot(noise, _FLOOR_SIGMA), scatter=scatter)
 
 
 def is_worth_removing(lag: ImageLag) -> bool:
@@ -179,7 +193,13 @@ def add_image_lag(removed: ImageLag, found: ImageLag) -> ImageLag:
     model_sigma = math.hypot(
         _TRANSITIONS * share, _ASYMMETRY * (rise - fall), _SECOND_ORDER * share**2
     )
-    return ImageLag(rise, fall, math.hypot(found.sigma, model_sigma), corrected=True)
+    return replace(
+        found,
+        rise=rise,
+        fall=fall,
+        sigma=math.hypot(found.sigma, model_sigma),
+        corrected=True,
+    )
 
 
 def remove_image_lag(stack: FrameStack, binned: Binned, lag: ImageLag) -> Binned:
@@ -218,7 +238,9 @@ def choose_lag_bins(index: IntArray) -> IntArray:
     return np.arange(0, index.size, max(1, index.size // _LIVE_BINS))
 
 
-def find_image_lag(stack: FrameStack, binned: Binned, phase_rad: FloatArray) -> ImageLag:
+def find_image_lag(
+    stack: FrameStack, binned: Binned, phase_rad: FloatArray, places_px: FloatArray
+) -> ImageLag:
     """Find the shares of a live cycle, whose phases are known.
 
     Parameters
@@ -227,6 +249,8 @@ def find_image_lag(stack: FrameStack, binned: Binned, phase_rad: FloatArray) -> 
         The cycle, and its frames as means over n bins.
     phase_rad : (2, n) array
         Absolute phases of the bins, to some hundredths of a radian.
+    places_px : (2, n) array
+        Columns and rows of the bins in the picture.
     """
     x_frames = stack.sinusoids(AXES[0])
     mean_of_steps = stack.weights(x_frames)[0]
@@ -237,7 +261,7 @@ def find_image_lag(stack: FrameStack, binned: Binned, phase_rad: FloatArray) -> 
         # The light is the mean of the x steps, in the frames as corrected so far.
         x_means = corrected.means[x_frames].reshape(len(x_frames), -1)
         light = np.tensordot(mean_of_steps, x_means, axes=1)
-        scene = SampledBins(index, light, phase_rad, np.zeros_like(phase_rad))
+        scene = SampledBins(index, light, phase_rad, np.zeros_like(phase_rad), places_px)
         found = estimate_image_lag(stack, corrected, scene, ())
         lag = add_image_lag(lag, found)
         if not lag.corrected or not is_worth_another_round(found):
@@ -331,16 +355,18 @@ def _own_columns(
     if pattern.period_mm:  # another period: its phase is not among those of the scene
         return smooth, ~every_bin
     psi_rad = phase_rad + pattern.shift_rad
+    # The contrast may vary slowly over the mirror, as that of a panel that is seen at an angle.
     fundamental = np.stack([np.cos(psi_rad), np.sin(psi_rad)])
+    slow_contrast = smooth[1:] * fundamental[0]
     cosines = np.stack([np.cos(n * psi_rad) for n in _HARMONICS])
     sines = np.stack([np.sin(n * psi_rad) for n in _HARMONICS])
-    columns = np.concatenate([smooth[:1], fundamental, smooth[1:], cosines, sines])
+    columns = np.concatenate([smooth[:1], fundamental, smooth[1:], slow_contrast, cosines, sines])
     return columns, every_bin
 
 
 def _fit_previous(
     seen: FloatArray, previous: FloatArray, columns: FloatArray, usable: BoolArray
-) -> tuple[list[ShareOfFrame], list[ShareOfFrame]]:
+) -> tuple[ShareOfFrame | None, ShareOfFrame | None]:
     """Fit one frame by its own pattern, and by the change from the previous frame.
 
     Parameters
@@ -354,13 +380,11 @@ def _fit_previous(
 
     Returns
     -------
-    rises, falls : lists of (share, sigma)
-        One entry each where the frame rises, and where it falls; empty if it cannot show that.
+    rise, fall : (share, sigma) or None
+        Where the frame rises, and where it falls; None if it cannot show that.
     """
-    rises: list[ShareOfFrame] = []
-    falls: list[ShareOfFrame] = []
     if np.count_nonzero(usable) < _LEAST_BINS:
-        return rises, falls
+        return None, None
     columns, seen = columns[:, usable], seen[usable]
 
     # The frame's own pattern alone. Normal equations: the columns have length 1 and are far from
@@ -378,7 +402,7 @@ def _fit_previous(
     least_power = _LEAST_DETERMINED * np.sum(ways**2, axis=1) + 1e-12 * float(own @ own)
     is_determined = power > least_power
     if not is_determined.any():
-        return rises, falls
+        return None, None
 
     # Least squares for the shares; the rest gives their noise.
     free = free[is_determined]
@@ -388,20 +412,36 @@ def _fit_previous(
     sigmas = np.sqrt(np.mean(rest**2) * np.diag(inverse))
     determined = list(zip(shares.tolist(), sigmas.tolist(), strict=True))
     rise_is_determined, fall_is_determined = is_determined
-    if rise_is_determined:
-        rises = determined[:1]
-    if fall_is_determined:
-        falls = determined[-1:]
-    return rises, falls
+    rise = determined[0] if rise_is_determined else None
+    fall = determined[-1] if fall_is_determined else None
+    return rise, fall
 
 
-def _combine_frames(found: list[ShareOfFrame]) -> ShareOfFrame:
-    """Median of the frames' shares, and its uncertainty from their noise and scatter."""
-    shares, sigmas = np.array(found).T
+def _combine_frames(
+    found: dict[int, ShareOfFrame], count_frames: int
+) -> tuple[float, float, FloatArray]:
+    """Median of the frames' shares, its noise, and what each frame's scatter adds to its
+    uncertainty (count_frames,).
+
+    Frames that hardly show the share beside their own pattern are left out.
+    """
+    frames = np.array(list(found))
+    shares, sigmas = np.array(list(found.values())).T
+    is_shown = sigmas <= _LEAST_SHOWN * np.median(sigmas)
+    frames, shares, sigmas = frames[is_shown], shares[is_shown], sigmas[is_shown]
     share = float(np.median(shares))
-    count = math.sqrt(len(found))
-    scatter = _SCATTER_OF_ONE * abs(share)
-    if len(found) > 1:
-        deviation = float(np.median(np.abs(shares - share)))
-        scatter = _MEDIAN_OVER_MEAN * _SIGMA_OVER_MAD * deviation / count
-    return share, math.hypot(float(np.median(sigmas)) / count, scatter)
+    noise = float(np.median(sigmas)) / math.sqrt(shares.size)
+    scatter = np.zeros(count_frames)
+    if shares.size == 1:
+        scatter[frames] = _SCATTER_OF_ONE * abs(share)
+        return share, noise, scatter
+
+    # The frames' deviations, of which outliers count as much as the usual ones, scaled to the
+    # uncertainty of a median.
+    deviations = shares - share
+    usual = _SIGMA_OVER_MAD * float(np.median(np.abs(deviations)))
+    deviations = np.clip(deviations, -usual, usual)
+    length = max(float(np.linalg.norm(deviations)), _LEAST_AMPLITUDE)
+    sigma = _MEDIAN_OVER_MEAN * usual / math.sqrt(shares.size)
+    scatter[frames] = deviations * (sigma / length)
+    return share, noise, scatter

@@ -501,8 +501,9 @@ def _attempt_fit(
     screen_mm = tracer.predict_screen(state.points, state.surface)
     predicted_rad = screen_mm / mm_per_rad(optics.pattern) + centre_phase_rad(optics.pattern)
     light = view.light.reshape(-1)[state.index]
+    places_px = np.stack([bench.grid.column_px, bench.grid.row_px])[:, state.index]
     scene = frame_evidence.SampledBins(
-        state.index, light, predicted_rad, state.sensitivity_rad_per_um
+        state.index, light, predicted_rad, state.sensitivity_rad_per_um, places_px
     )
     return _Attempt(view, phase_rad, tracer, state, scene)
 

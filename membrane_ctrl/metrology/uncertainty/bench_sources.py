@@ -1,7 +1,7 @@
 """Sources of error that belong to the bench: its geometry, glass, air, temperature and vertex."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -127,7 +127,7 @@ def disturbed_source(
 
 
 def film_source(
-    bench: TrialBench, sigmas_um: tuple[float, ...], description: str, paired: bool
+    bench: TrialBench, sigmas_um: Sequence[float] | FloatArray, description: str, paired: bool
 ) -> Source:
     """The row for motion of the film from the x frames to the y frames that is not corrected.
 
@@ -135,7 +135,7 @@ def film_source(
     ----------
     bench : TrialBench
         Some points of the set.
-    sigmas_um : tuple of float
+    sigmas_um : (k,) floats
         Independent parts of the motion.
     description : str
         Description of the row.
@@ -144,7 +144,7 @@ def film_source(
     """
     half_mm = moves_mm(bench) * np.array([[0.5], [-0.5]])
     per_um = bench.solve(bench.geometry(), half_mm, linear=True) - bench.surface.parameters
-    sigma_um = math.hypot(*sigmas_um)
+    sigma_um = float(np.linalg.norm(sigmas_um))
     return Source(
         "film_x_to_y_um",
         description,

@@ -42,6 +42,9 @@ class Source:
         Whether two sets have the same error in the same column: it cancels in a change.
     noise_mm2 : float
         Sum of squares of noise in effects that the set shows: the noise has a row of its own.
+    is_limit : bool
+        Whether `sigma` is a limit of something unknown that all sets of a bench share: in a change
+        the lower of two limits holds for both.
     """
 
     name: str
@@ -51,6 +54,7 @@ class Source:
     common: bool = True
     paired: bool = True
     noise_mm2: float = 0.0
+    is_limit: bool = False
 
     @property
     def known_mm(self) -> FloatArray:
@@ -70,9 +74,15 @@ class Source:
             return [self.known_mm]
         if not (self.paired and earlier.paired):
             return [self.known_mm, earlier.known_mm]
+        own_mm = self.effects_mm
+        earlier_mm = earlier.effects_mm
+        if self.is_limit and earlier.is_limit:
+            lower = min(self.sigma, earlier.sigma)
+            own_mm = own_mm * (lower / max(self.sigma, _TINY))
+            earlier_mm = earlier_mm * (lower / max(earlier.sigma, _TINY))
         difference = replace(
             self,
-            effects_mm=self.effects_mm - earlier.effects_mm,
+            effects_mm=own_mm - earlier_mm,
             noise_mm2=self.noise_mm2 + earlier.noise_mm2,
         )
         return [difference.known_mm]

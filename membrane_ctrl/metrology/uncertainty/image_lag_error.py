@@ -17,16 +17,27 @@ from membrane_ctrl.model.arrays import FloatArray
 _SAYS = "what each frame still shows of the previous picture"
 
 
-def image_lag_source(
+def image_lag_sources(
     bench: TrialBench, stack: FrameStack, used: tuple[list[int], list[int]], lag: ImageLag
-) -> Source:
-    """Return the row of the budget; without an estimate its uncertainty is 0, and so stated."""
-    sigma = lag.remaining_sigma if math.isfinite(lag.remaining_sigma) else 0.0
+) -> list[Source]:
+    """Return the rows of the budget; without an estimate their uncertainty is 0, and so stated.
+
+    The panel has the same share in all sets of a bench, and what the model of the share or the
+    light over the mirror adds to single frames is also the same: two sets share it frame by frame.
+    They do not share the noise.
+    """
+    left = lag.remaining_sigma if math.isfinite(lag.remaining_sigma) else 0.0
     effect = image_lag_effect(bench, stack, used)
-    # The panel has the same share in all sets of a bench, but each set estimates it.
-    return Source(
-        "image_lag_share", _SAYS, sigma, sigma * effect[:, None], common=False, paired=False
-    )
+    of_frames = lag.scatter
+    noise = lag.noise if left else 0.0
+    rest = math.sqrt(max(left**2 - noise**2 - float(of_frames @ of_frames), 0.0))
+    shared = np.outer(effect, [rest, *of_frames])
+    own = (noise * effect)[:, None]
+    description = "noise of the share of the previous picture"
+    return [
+        Source("image_lag_share", _SAYS, left, shared, common=False),
+        Source("image_lag_noise", description, noise, own, common=False, paired=False),
+    ]
 
 
 def image_lag_of_cycles(bench: TrialBench, shifts_rad: FloatArray, lag: ImageLag) -> FloatArray:

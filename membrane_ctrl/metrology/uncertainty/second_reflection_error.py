@@ -11,9 +11,11 @@ from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.model.arrays import FloatArray
 
 _SAYS = "second image of the screen, by another reflecting surface"
-# Of the smallest share that is found, in sigmas; the RMS of the sine of an unknown place
+# Largest share that may hide, in sigmas; any smaller one is as likely, which has this standard
+# uncertainty over the largest (JCGM 100, 4.3.7)
 _HIDDEN_SIGMAS = 3.0
-_RMS_SINE = 0.7
+_UNIFORM = 1 / math.sqrt(3)
+_RMS_SINE = 0.7  # of an unknown place
 
 
 def second_reflection_source(bench: TrialBench, seen: SecondReflection) -> Source:
@@ -22,7 +24,7 @@ def second_reflection_source(bench: TrialBench, seen: SecondReflection) -> Sourc
     A set that cannot show a second image has a row of 0.
     """
     sigma = seen.sigma if math.isfinite(seen.sigma) else 0.0
-    share = seen.share if seen.is_found else _HIDDEN_SIGMAS * sigma
+    share = seen.share if seen.is_found else _UNIFORM * _HIDDEN_SIGMAS * sigma
     scale = screen_scale.mm_per_rad(bench.optics.pattern)
     effects = []
     for axis in range(2):
@@ -32,7 +34,9 @@ def second_reflection_source(bench: TrialBench, seen: SecondReflection) -> Sourc
         effects.append(solved - bench.surface.parameters)
     if seen.is_found:  # one image: its effects on x and y belong together
         effects = [effects[0] + effects[1]]
-    return Source("second_image", _SAYS, share, np.stack(effects, axis=1))
+    return Source(
+        "second_image", _SAYS, share, np.stack(effects, axis=1), is_limit=not seen.is_found
+    )
 
 
 def _phase_error(phase: FloatArray, seen: SecondReflection, axis: int) -> FloatArray | float:

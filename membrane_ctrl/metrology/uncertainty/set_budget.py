@@ -19,10 +19,11 @@ from membrane_ctrl.metrology.uncertainty import (
     residual_patches,
     trial_bench,
 )
+from membrane_ctrl.metrology.uncertainty.corrected_motion_error import SensitivityError
 from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_sources
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
-from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_source
+from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_sources
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
@@ -33,12 +34,9 @@ from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.metrology.uncertainty.unseen_motion import UnseenMotion, estimate_unseen_motion
 
 _BLUR_UM = 0.5  # RMS of the height beyond which a picture is out of focus
-# What the correction for the film's motion leaves: the fringes' error in the film's place at a
-# frame, a share of the motion within an axis, and a share of that from x to y (a lens of a data
-# sheet is 1 % off).
+# What the correction for the film's motion from frame to frame leaves, besides a share of the motion
+# by the geometry: the fringes' error in the film's place.
 _FRINGES_UM = 0.1
-_WITHIN_SHARE = 0.05
-_X_TO_Y_SHARE = 0.02
 
 
 @dataclass(frozen=True)
@@ -106,8 +104,15 @@ def assemble_budget(
     motion = FilmMotion.from_set(checked)
     unseen = None
     if not math.isfinite(motion.x_to_y_sigma_um):
-        unseen = estimate_unseen_motion(bench, spread)
+        of_pixel_mm2 = full.screen_variance_mm2(optics, shifts, noise_adu)
+        unseen = estimate_unseen_motion(bench, spread, of_pixel_mm2 / checked.binned.bin_px**2)
     film_rows, doubts = _film_rows(bench, motion, unseen)
+    film_um = math.hypot(motion.moved_um, motion.noise_um)
+    if motion.is_worth_correcting:
+        error = SensitivityError.from_spread(bench, spread, sigmas.laser_relative)
+        film_um = math.hypot(_FRINGES_UM, error.relative * motion.moved_um, motion.noise_um)
+        x_um, y_um = (float(of_axis_um.mean()) for of_axis_um in motion.motion_um)
+        film_rows.append(error.source(bench, x_um, y_um))
     moment = moment_source(checked, motion, unseen, optics.mirror.radius_mm)
     moment_rows = [] if moment is None else [moment]
 
@@ -129,7 +134,6 @@ def assemble_budget(
     # One row for each input.
     slope_variance = full.slope_variance(optics, shifts, noise_adu)
     light = math.hypot(frame_effects.LIGHT, checked.light_left)
-    film_um = _left_film_um(motion)
     sources = [
         *bench_sources.geometry_sources(bench, spread, widening),
         *bench_sources.bench_sources(bench, sigmas),
@@ -140,7 +144,7 @@ def assemble_budget(
         blur,
         *frame_effects.frame_sources(bench, optics, shifts, film_um, light),
         second_reflection_source(bench, checked.second),
-        image_lag_source(bench, checked.stack, checked.view.used, checked.lag),
+        *image_lag_sources(bench, checked.stack, checked.view.used, checked.lag),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
     whole = budget.Budget(tuple(sources), disc, PairMotion.from_bench(bench))
@@ -189,13 +193,6 @@ def _vertex_source(
     return bench_sources.vertex_source(bench, math.hypot(noise_um, scale_um), description)
 
 
-def _left_film_um(motion: FilmMotion) -> float:
-    """1 sigma of the film's motion that is left in the phases of the frames."""
-    if motion.is_worth_correcting:
-        return math.hypot(_FRINGES_UM, _WITHIN_SHARE * motion.moved_um, motion.noise_um)
-    return math.hypot(motion.moved_um, motion.noise_um)
-
-
 def _film_rows(
     bench: TrialBench, motion: FilmMotion, unseen: UnseenMotion | None
 ) -> tuple[list[budget.Source], list[str]]:
@@ -211,21 +208,29 @@ def _film_rows(
         Motion by the fringes alone, of a set without a laser.
     """
     if unseen is None:
-        x_um, y_um = motion.motion_um
-        share_left = _X_TO_Y_SHARE if motion.is_worth_correcting else 1.0
-        left_um = share_left * float(x_um.mean() - y_um.mean())
+        left_um = 0.0
+        if not motion.is_worth_correcting:
+            x_um, y_um = motion.motion_um
+            left_um = float(x_um.mean() - y_um.mean())
         sigma_um = math.hypot(motion.x_to_y_sigma_um, left_um)
         description = "motion of the film from x to y, by the laser"
         return [bench_sources.film_source(bench, (sigma_um,), description, paired=False)], []
 
-    # Without a laser: the motion and the geometry's part of its error, which sets share; the noise
-    # of the fringes, which they do not.
+    # Without a laser: the motion, with the parts of its error that sets share (the geometry, and
+    # slopes that patches of the mirror leave); the noise of the fringes, which they do not.
     description = "motion of the film from x to y, without a laser"
     sigmas_um = (unseen.moved_um, unseen.shared_um)
     source = bench_sources.film_source(bench, sigmas_um, description, paired=True)
+    description = "slopes of patches of the mirror that look like motion of the film from x to y"
+    by_patch = bench_sources.film_source(bench, unseen.patches_um, description, paired=True)
+    noise_mm2 = float(np.sum(by_patch.effects_mm**2)) * unseen.noise_share
     description = "noise of the fringes that show the film's motion from x to y"
     noise = bench_sources.film_source(bench, (unseen.noise_um,), description, paired=False)
-    rows = [source, replace(noise, name="film_seen_um")]
+    rows = [
+        source,
+        replace(by_patch, name="film_patches_um", noise_mm2=noise_mm2),
+        replace(noise, name="film_seen_um"),
+    ]
     if not unseen.is_significant:
         return rows, []
     doubt = (

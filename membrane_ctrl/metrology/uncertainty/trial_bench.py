@@ -241,10 +241,15 @@ def moved_film(bench: TrialBench, displacement_um: float) -> TrialBench:
     return replace(there, screen_mm=predicted_mm(there, bench.geometry(), surface))
 
 
-def moves_mm(bench: TrialBench) -> FloatArray:
-    """Change (2, n) of the screen points per µm of the film's displacement."""
-    tracer, points = traced_points(bench, bench.geometry().geometry)
-    return film_motion.sensitivity_mm_per_um(tracer, points, bench.surface)
+def moves_mm(bench: TrialBench, there: bench_poses.BenchGeometry | None = None) -> FloatArray:
+    """Change (2, n) of the screen points per µm of the film's displacement.
+
+    `there` is another bench than the nominal one.
+    """
+    if there is None:
+        there = bench.geometry()
+    tracer, points = traced_points(bench, there.geometry)
+    return film_motion.sensitivity_mm_per_um(tracer, points, bench.surface) / there.pitch
 
 
 def predicted_mm(

@@ -12,12 +12,13 @@ from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.uncertainty import trial_bench
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
-from membrane_ctrl.model.arrays import IntArray
+from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 _PRIOR_UM = 1000.0  # 1 sigma of the film's motion without a laser, before the fringes are used
-_PATCHES = 12  # along a side of the picture: patches are coarser than fringes
+_PATCHES = 12  # across the mirror: patches are coarser than fringes
 _SURE_SIGMAS = 4.0  # beyond this the film moved
 _STEP_MM = 0.01  # of a parameter, for the derivatives
+_TINY = 1e-300  # instead of a division by zero
 _ROUNDS = 3  # of least squares, each with the scatter that the former one leaves
 
 
@@ -32,12 +33,16 @@ class UnseenMotion:
     sigma_um : float
         Its standard uncertainty.
     noise_um : float
-        The part of `sigma_um` that another set of the bench does not share.
+        The part of `sigma_um` that follows from the noise of the pixels.
+    patches_um : (patches,) array
+        What the residuals of each patch of the mirror add to the displacement. The patches are
+        those of the mirror, whatever was seen: two sets of a bench have the same ones.
     """
 
     moved_um: float
     sigma_um: float
     noise_um: float
+    patches_um: FloatArray
 
     @property
     def is_significant(self) -> bool:
@@ -45,12 +50,20 @@ class UnseenMotion:
         return abs(self.moved_um) > _SURE_SIGMAS * self.sigma_um
 
     @property
+    def noise_share(self) -> float:
+        """Share of the patches' sum of squares that the noise of the pixels explains."""
+        return min(self.noise_um**2 / max(float(np.sum(self.patches_um**2)), _TINY), 1.0)
+
+    @property
     def shared_um(self) -> float:
         """The part of `sigma_um` that follows from the bench's geometry."""
-        return math.sqrt(max(self.sigma_um**2 - self.noise_um**2, 0.0))
+        of_patches_um2 = (1 - self.noise_share) * float(np.sum(self.patches_um**2))
+        return math.sqrt(max(self.sigma_um**2 - self.noise_um**2 - of_patches_um2, 0.0))
 
 
-def estimate_unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenMotion:
+def estimate_unseen_motion(
+    bench: TrialBench, spread: GeometrySpread, noise_mm2: FloatArray
+) -> UnseenMotion:
     """Estimate the film's motion between the x and the y frames from the fringes.
 
     Least squares for the surface's parameters, all inputs of the geometry with their prior, and the
@@ -62,6 +75,8 @@ def estimate_unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenM
         n points of the set, with their residuals.
     spread : GeometrySpread
         Covariance of the geometry.
+    noise_mm2 : (2,) array
+        Variance of a screen point, along x and y, from the noise of the pixels.
 
     Returns
     -------
@@ -98,25 +113,30 @@ def estimate_unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenM
         variance = float(np.mean((left - inputs @ answer) ** 2))
         covariance = np.linalg.inv(gram / variance + np.eye(inputs.shape[1]))
         answer = covariance @ (inputs.T @ left) / variance
-    noise = float((covariance @ (gram / variance) @ covariance)[-1, -1])
+    scatter = float((covariance @ (gram / variance) @ covariance)[-1, -1])
 
     # Uneven light and a response that is not straight leave residuals that neighbours share: what
     # patches contribute to the motion scatters by more than that of independent points.
-    shares = (covariance[-1] @ inputs.T / variance * (left - inputs @ answer)).reshape(2, -1)
+    weights = (covariance[-1] @ inputs.T / variance).reshape(2, -1)
+    parts = weights * (left - inputs @ answer).reshape(2, -1)
     patch = _assign_patches(bench)
-    of_patches = sum(float(np.sum(np.bincount(patch, share) ** 2)) for share in shares)
-    beyond_noise = max(of_patches - noise, 0.0)
+    of_patches = np.concatenate([np.bincount(patch, part, _PATCHES**2) for part in parts])
+    beyond_scatter = max(float(np.sum(of_patches**2)) - scatter, 0.0)
+    noise = float(noise_mm2 @ np.sum(weights**2, axis=1))
     return UnseenMotion(
         moved_um=_PRIOR_UM * float(answer[-1]),
-        sigma_um=_PRIOR_UM * float(math.sqrt(covariance[-1, -1] + beyond_noise)),
-        noise_um=_PRIOR_UM * float(math.sqrt(noise + beyond_noise)),
+        sigma_um=_PRIOR_UM * float(math.sqrt(covariance[-1, -1] + beyond_scatter)),
+        noise_um=_PRIOR_UM * math.sqrt(noise),
+        patches_um=_PRIOR_UM * of_patches,
     )
 
 
 def _assign_patches(bench: TrialBench) -> IntArray:
-    """Number (n,) of the patch of the picture that each point is in."""
-    rows_and_columns = [
-        np.int64((_PATCHES - 1e-6) * (place_px - place_px.min()) / np.ptp(place_px))
-        for place_px in (bench.row_px, bench.column_px)
-    ]
-    return np.asarray(np.ravel_multi_index(rows_and_columns, (_PATCHES, _PATCHES)))
+    """Number (n,) of the patch of the mirror that each point is in."""
+    geometry = bench.geometry().geometry
+    rays = geometry.rays(bench.column_px, bench.row_px)
+    on_film_mm = geometry.pinhole_mm[:, None] + bench.t_mm * rays
+    reach_mm = bench.optics.mirror.analysis_radius_mm
+    in_patches = (on_film_mm[:2] / reach_mm + 1) / 2 * _PATCHES
+    column, row = np.clip(in_patches.astype(int), 0, _PATCHES - 1)
+    return np.asarray(row * _PATCHES + column)

@@ -8,7 +8,14 @@ from __future__ import annotations
 
 import pytest
 
-from tests.studies.second_world_budget import PLANTS, Comparison, Plant, compare, sound_rows
+from tests.studies.second_world_budget import (
+    BY_DESCRIPTION,
+    PLANTS,
+    Comparison,
+    Plant,
+    compare,
+    sound_rows,
+)
 
 EIGHTH = 0.125
 QUICK = (
@@ -21,19 +28,18 @@ QUICK = (
     "glass_mm 1",
     "air_k_per_m 0.5",
 )
-BY_NAME = {plant.description: plant for plant in PLANTS}
 
 
 @pytest.mark.parametrize("name", QUICK)
 def test_a_stated_sigma_is_the_error_that_its_cause_plants(name: str) -> None:
-    found = compare(BY_NAME[name], EIGHTH)
+    found = compare(BY_DESCRIPTION[name], EIGHTH)
     assert found.caused_um > 0
     assert found.agrees, f"stated {found.stated_um:.4g}, caused {found.caused_um:.4g} µm"
 
 
 def test_a_film_that_moved_within_a_set_without_a_laser_is_covered() -> None:
     """The sigma also counts what the fringes cannot show: it is wider than the error."""
-    found = compare(BY_NAME["film 50 µm deeper in y, no laser"], EIGHTH)
+    found = compare(BY_DESCRIPTION["film 50 µm deeper in y, no laser"], EIGHTH)
     assert 0 < found.caused_um < 1.5 * found.stated_um
     assert found.stated_um < 2.0 * found.caused_um
 
