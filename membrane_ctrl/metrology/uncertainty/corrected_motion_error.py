@@ -37,7 +37,7 @@ class SensitivityError:
         """Errors by the geometry's spread and by the laser's scale."""
         moved_mm = moves_mm(bench)
         errors_mm = [laser_relative * moved_mm]
-        for change in spread.root().T:
+        for change in spread.covariance_root().T:
             there = bench.geometry(spread.names, change)
             errors_mm.append(moves_mm(bench, there) - moved_mm)
         return cls(moved_mm, np.stack(errors_mm))

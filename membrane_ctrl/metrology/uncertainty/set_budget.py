@@ -34,8 +34,8 @@ from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.metrology.uncertainty.unseen_motion import UnseenMotion, estimate_unseen_motion
 
 _BLUR_UM = 0.5  # RMS of the height beyond which a picture is out of focus
-# What the correction for the film's motion from frame to frame leaves, besides a share of the motion
-# by the geometry: the fringes' error in the film's place.
+# What the correction for the film's motion from frame to frame leaves, besides a share of the
+# motion by the geometry: the fringes' error in the film's place.
 _FRINGES_UM = 0.1
 
 
