@@ -39,8 +39,8 @@ def test_slopes_of_patches_that_look_like_motion_cancel_in_a_change(tmp_path: Pa
     second = measured_set(tmp_path / "second", panel, laser=False, sensor=noisy, seed=2)
     before = {source.name: source for source in first.budget.sources}
     own = next(source for source in second.budget.sources if source.name == "film_patches_um")
-    effects_mm = np.concatenate(own.change(before["film_patches_um"]), axis=1)
-    change_um = second.budget.sizes(effects_mm @ effects_mm.T)["height_rms_um"]
+    effects_mm = np.concatenate(own.list_change_effects(before["film_patches_um"]), axis=1)
+    change_um = second.budget.compute_sigmas_um(effects_mm @ effects_mm.T)["height_rms_um"]
     assert row_um(second, "film_patches_um") > 0.2
     assert change_um < 0.25 * row_um(second, "film_patches_um")
 
