@@ -64,7 +64,7 @@ class GeometryStatement:
     ) -> "GeometryStatement":
         """Judge by what the uncertainty rests on, by the rim and by the slopes."""
         state = GeometryState.UNCALIBRATED
-        if slopes.contradicts or (rim is not None and rim.contradicts):
+        if slopes.contradicts_bench or (rim is not None and rim.contradicts):
             state = GeometryState.CONTRADICTED
         elif known_by is KnownBy.CALIBRATION:
             state = GeometryState.CALIBRATED
@@ -76,7 +76,9 @@ class GeometryStatement:
         found = []
         if self.rim is not None and self.rim.contradicts:
             found.append(f"{self.rim.describe()}: {GeometryState.CONTRADICTED.next_step}")
-        if self.slopes.contradicts:
+        if self.slopes.contradicts and self.slopes.harmonics is not None:
+            found.append(f"{self.slopes.describe()}: {self.slopes.harmonics.describe()}")
+        elif self.slopes.contradicts:
             found.append(
                 f"{self.slopes.describe()}: cause unknown; it looks like a camera, screen or lens "
                 "that is not as stated, or like light from a second reflection"

@@ -10,6 +10,7 @@ from membrane_ctrl.metrology.figure.pixel_figure import FullResult
 from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM, FilmMotion
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.phase import screen_scale
+from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.uncertainty import (
     bench_sources,
@@ -26,6 +27,7 @@ from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_sources
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
+from membrane_ctrl.metrology.uncertainty.response_harmonics import find_response_harmonics
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
 from membrane_ctrl.metrology.uncertainty.second_reflection_error import second_reflection_source
 from membrane_ctrl.metrology.uncertainty.set_moment import moment_source
@@ -123,6 +125,10 @@ def assemble_budget(
         rim = measure_rim_misfit(bench, spread, outline)
         widening = rim.widening
     slopes = measure_slope_misfit(bench, spread, full.grid, full.residual_mm)
+    used = [len(frames) for frames in checked.view.used]
+    taken = [len(checked.stack.sinusoids(axis)) for axis in AXES]
+    exponent = checked.response.exponent
+    slopes = replace(slopes, harmonics=find_response_harmonics(bench, used, taken, exponent))
 
     # Blur. It follows from the contrast and the slopes of the fitted surface: if these are not
     # those of a surface, the contrast shows no blur.

@@ -13,6 +13,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
+from membrane_ctrl.metrology.uncertainty.response_harmonics import ResponseHarmonics
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
@@ -37,15 +38,23 @@ class SlopeMisfit:
         Their RMS over patches of 1/40 of the analysis' diameter.
     explained_urad : float
         What the geometry's stated uncertainty and the light explain, 1 sigma.
+    harmonics : ResponseHarmonics or None
+        Waves of the response that explain them; None: they do not.
     """
 
     seen_urad: float
     explained_urad: float
+    harmonics: ResponseHarmonics | None = None
 
     @property
     def contradicts(self) -> bool:
         """Whether no stated uncertainty explains them."""
         return self.seen_urad > _CONTRADICTING_SIGMAS * self.explained_urad
+
+    @property
+    def contradicts_bench(self) -> bool:
+        """Whether an error of the bench may be their cause."""
+        return self.contradicts and self.harmonics is None
 
     @property
     def unusable(self) -> bool:

@@ -18,5 +18,5 @@ def test_a_sharp_set_that_contradicts_its_bench_is_not_called_blurred(tmp_path: 
     truth = drawn.world.write_set(tmp_path / "set", place_um)
     found = measured_errors(tmp_path / "set", drawn.world.mirror, truth, np.zeros((2, 1)))
     assert found.verdict == "rejected"
-    assert "cause unknown" in found.reason
+    assert "the response of panel and camera is not linear" in found.reason
     assert "blurred" not in found.reason
