@@ -306,16 +306,32 @@ def parse_tcp_url(url: str) -> tuple[str, int]:
 def extract_reply(
     received_bytes: bytes, unit_id: int, function_code: int, answer_bytes: int, what: str
 ) -> bytes | None:
-    """The PDU of a whole reply, None while bytes are missing.
+    """Return the PDU of a whole reply; None while bytes are missing.
 
     The length is known beforehand: silences between bytes, by which RTU frames are delimited on the
-    wire, do not survive the buffers of adapters and kernels. Raises LinkError (another unit,
-    function, length or CRC).
+    wire, do not survive the buffers of adapters and kernels.
+
+    Parameters
+    ----------
+    received_bytes : bytes
+        So far; at least one.
+    unit_id, function_code : int
+        Of the request.
+    answer_bytes : int
+        Length of the answer to the request, with unit and CRC.
+    what : str
+        The request, for messages.
+
+    Raises
+    ------
+    LinkError
+        Another unit, function, length or CRC.
     """
     if received_bytes[0] != unit_id:
         raise LinkError(f"{what}: answer from unit {received_bytes[0]}, expected unit {unit_id}")
     if len(received_bytes) < 3:
         return None
+    # An exception has a length of its own
     if received_bytes[1] == function_code | modbus_link.EXCEPTION_FLAG:
         length = _EXCEPTION_BYTES
     elif received_bytes[1] == function_code:
@@ -324,6 +340,7 @@ def extract_reply(
         raise LinkError(
             f"{what}: answer has function code {received_bytes[1]}, expected {function_code}"
         )
+    # The device counts its bytes of data: they must be as many as were requested
     data_bytes = answer_bytes - 5
     if (
         length == answer_bytes

@@ -67,6 +67,7 @@ def watch_run(
         closing(ring.RingReader(spec.telemetry)) as telemetry,
         closing(ring.RingReader(spec.events)) as events,
     ):
+        # The service sends; this process does so only without one
         alarms = RunAlarms(spec.config, sent_log, senders, WITHOUT_SERVICE_S, clock.now)
         while True:
             lives = (
@@ -79,9 +80,11 @@ def watch_run(
                 break
             report(child_events.Alive(_IDLE_S))
             time.sleep(_LOOK_S)
+        # The run has ended, or its process has died: report that, then send what is due
         alarms.end_patience()
         if not alarms.has_ended:
             alarms.report_orphan()
+        # A network that does not answer must not keep the process for ever
         give_up_s = clock.now() + _LAST_S
         alarms.send_due()
         while not alarms.is_done and clock.now() < give_up_s:

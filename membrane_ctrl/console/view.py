@@ -86,15 +86,28 @@ def level_bar(fraction: float, width: int, style: str = "cyan") -> Text:
 
 
 def signed_bars(values: Sequence[float], full: float, band: float, rows: int = 1) -> list[Text]:
-    """Draw a history as bars above and below a common zero: `rows` lines for either side, from the
-    top.
+    """Draw a history as bars above and below a common zero.
 
-    `full` is the value of a full-height bar; bars beyond `band` are red, the others green. NaN is a
-    gap, zero the thinnest upward bar.
+    Parameters
+    ----------
+    values : sequence of float
+        NaN is a gap, zero the thinnest upward bar.
+    full : float
+        Value of a bar of full height.
+    band : float
+        Bars beyond it are red, the others green.
+    rows : int
+        Lines for either side.
+
+    Returns
+    -------
+    list of Text
+        From the top.
     """
     lines = [Text() for _ in range(2 * rows)]
     for value in values:
         colour = "green" if abs(value) <= band else "red"
+        # Height in eighths of a line; a value other than NaN is visible
         eighths = 0
         if math.isfinite(value):
             eighths = min(8 * rows, max(1, math.ceil(8 * rows * abs(value) / full)))

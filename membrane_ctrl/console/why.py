@@ -106,8 +106,21 @@ def explain_next_step(
     locks: Sequence[Lock] = (),
     latched: str = "",
 ) -> str:
-    """How to continue from a state that waits for a person, empty in others; `ctl` begins a command
-    for this run.
+    """Return how to continue from a state that waits for a person; empty in others.
+
+    Parameters
+    ----------
+    row : TelemetryRow
+        The newest tick.
+    paused : bool
+    ctl : str
+        Begin of a command to this run.
+    keys : bool
+        The console reads keys: their names are added.
+    locks : sequence of Lock
+        The first one is to be removed first.
+    latched : str
+        A fault that is still latched in standby; empty without one.
     """
     state = State(int(row.state))
     if locks:

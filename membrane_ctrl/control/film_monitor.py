@@ -164,11 +164,21 @@ class FilmMonitor:
         self.memory.start_afresh()
 
     def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
-        """Process one tick and return both readings if they contradict each other. NaN without a
-        good reading.
+        """Process one tick; return both readings in words if they contradict each other.
 
-        `trim_um` is the shape loop's addition to the setpoint: the laser's drift as seen by the
-        camera.
+        Parameters
+        ----------
+        dt_s : float
+            Since the last tick.
+        laser_um, gauge_pressure_pa : float
+            Readings; NaN without a good one.
+        trim_um : float
+            The shape loop's addition to the setpoint: drift of the laser as the camera shows it.
+
+        Returns
+        -------
+        str
+            Empty if they agree.
         """
         # Both or none: two means that started together do not differ because of the film's motion.
         if not (math.isfinite(laser_um) and math.isfinite(gauge_pressure_pa)):
@@ -189,6 +199,7 @@ class FilmMonitor:
             self._taut or root**3 > TAUT_PA
         ):
             return ""
+        # Within minutes, an hour and a day: a slow drift is small within minutes
         spans = (
             (self._minutes, memory.minutes),
             (self._hour, memory.hour),
@@ -198,6 +209,7 @@ class FilmMonitor:
             since.find_contradiction(kept, laser_um, trim_um, root, sag_um, dt_s)
             for since, kept in spans
         ]
+        # Hysteresis: a notice ends at a smaller share than it begins
         threshold = DRIFTING_OVER_SHARE if memory.drifting else DRIFTING_SHARE
         memory.drifting = memory.day.share > threshold
         return next(filter(None, contradictions), "")

@@ -82,20 +82,36 @@ class ReadingNoise(StateNode):
         dt_s: float,
         walks: tuple[tuple[LearnedFactor, float], ...],
     ) -> None:
-        """Take an innovation in standard deviations, and the share of its variance that is the
-        state's.
+        """Take an innovation: one step along the slope of the log-likelihood.
 
-        `walks`: what moves the state, and its part in that; none for a sensor that does not lead.
+        An innovation has two tests. Its square is to be 1: `size` is the slope of the
+        log-likelihood by the variance. Its product with the past innovations is to be 0: `runs` is
+        positive if the filter follows too slowly, i.e. if the walks are assumed too small.
+
+        Parameters
+        ----------
+        innovation : float
+            In standard deviations.
+        share : float
+            Share of the innovation's variance that is the state's; the rest is the reading's noise.
+        dt_s : float
+            Since the last reading.
+        walks : tuple of (LearnedFactor, float)
+            What moves the state, and its part in that; empty for a sensor that does not lead.
         """
+        # Old readings lose their weight; an outlier counts as `_LIMIT` at most
         forget = min(1.0, dt_s / _MEMORY_S)
         innovation, known = min(max(innovation, -_LIMIT), _LIMIT), share / 8
         size, runs = (innovation**2 - 1) / 2, math.sqrt(known) * innovation * self.past
         # change of the innovations' variance with the noise, both as logarithms
         by_noise = 1 - share / 2
+        # Only the sensor that leads shows whether its innovations are white
         leads = bool(walks)
         information = by_noise**2 / 2 + leads * known
         self.level.learn(by_noise * size - leads * runs, information, forget, _READING_BOUND)
+        # The walks grow with `runs`, the noise of readings shrinks with it
         for walk, part in walks:
             slope = part * (share / 2 * size + runs)
             walk.learn(slope, part**2 * (share**2 / 8 + known), forget, _WALK_BOUND)
+        # Past innovations as the filter carries them on: each moves the state by its gain
         self.past = (1 - share) * self.past + math.sqrt(share * (2 - share)) * innovation

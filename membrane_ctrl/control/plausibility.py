@@ -213,10 +213,18 @@ class PlausibilityCheck:
         estimate: ShapeEstimate | None,
         blind: bool = False,
     ) -> FaultySensor:
-        """Process one tick of a held mirror; NaN without a good reading; the estimate only in its
-        tick of arrival.
+        """Process one tick of a held mirror, and return the sensor that two others contradict.
 
-        `blind`: the last one is old. A camera that saw nothing of what moved is not accused of it.
+        Parameters
+        ----------
+        dt_s : float
+            Since the last tick.
+        displacement_um, gauge_pa : float
+            Readings of laser and gauge; NaN without a good one.
+        estimate : ShapeEstimate or None
+            Only in its tick of arrival.
+        blind : bool
+            The last figure is old: a camera that saw nothing of a motion is not blamed for it.
         """
         memory = self.memory
         # 1. One smoothed mean for each sensor; a figure counts over the time since the last one

@@ -106,10 +106,20 @@ class ShapeLoop:
         settled: bool,
         distrust: Reason = NO_REASON,
     ) -> ShapeOutput:
-        """One tick.
+        """Process one tick, and return the trim.
 
-        The estimate is given only when new; `settled`: the inner loop holds its setpoint;
-        `distrust`: why the camera must not be used, if so.
+        Parameters
+        ----------
+        now_s, dt_s : float
+            The run's clock, and the time since the last tick.
+        estimate : ShapeEstimate or None
+            Only when new.
+        displacement_um : float
+            The laser's, µm; NaN without a valid reading.
+        settled : bool
+            The inner loop holds its setpoint.
+        distrust : Reason
+            Why the camera must not be used, if so.
         """
         # 1. Since when the inner loop has held its setpoint: older figures do not count
         if not settled:

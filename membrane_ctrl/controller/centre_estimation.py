@@ -136,6 +136,7 @@ class CentreEstimation:
                 self._mount_drift.start(0.0)  # a resumed hold judges the optics by itself
             return []
         laser_um = math.nan if consistency.laser_fault_text else context.observer.moving_laser_um
+        # Start at the best displacement known; without one, wait
         if self._filter is None:
             start_um = last.filtered_um if math.isfinite(last.filtered_um) else seen_um
             if not math.isfinite(start_um):
@@ -144,10 +145,12 @@ class CentreEstimation:
         if self._is_anchor(inputs.estimate):
             # another anchor shows the same film up to a micrometre higher or lower
             self._filter.relock()
+        # Which figure, if any, the filter may use in this tick
         figure = self._select_figure(
             self._filter, figures.accepted, context.dt_s, shape, consistency
         )
         reading = inputs.reading
+        # A camera mount that grows with temperature changes the measured sag
         self._camera_mount.step(
             weather_limits.discard_impossible_weather(math.nan, reading.air_temperature_c)[1]
             if reading
@@ -156,6 +159,7 @@ class CentreEstimation:
         )
         if self._filter.frames < LOCK_FRAMES:
             self._camera_mount.lock()
+        # Predict, then correct with each sensor that has a new value
         readings = CentreReadings(
             now_s=inputs.now_s,
             flow_um_per_s=flow_um_per_s,
@@ -170,6 +174,8 @@ class CentreEstimation:
         self.memory.estimate = estimate = self._filter.step(readings, context.dt_s)
         self._note_blindness(inputs.now_s)
         context.trim_um = estimate.mount_um
+        # Report what has changed: sensors in use, growth of the camera's mount, drift of the
+        # laser's mount
         events = [
             *self._report_sensors_in_use(inputs.now_s, estimate.jumped),
             *self._report_mount_growth(),
@@ -181,6 +187,7 @@ class CentreEstimation:
             context.dt_s,
             has_laser=self._follows_sensor(Sensor.LASER),
         )
+        # The error of the mount's growth is common to all figures: no averaging reduces it
         if self._follows_sensor(Sensor.OPTICS):
             sigma_um = math.hypot(estimate.sigma_um, self._camera_mount.sigma_um)
             self.memory.estimate = replace(estimate, sigma_um=sigma_um)

@@ -399,6 +399,7 @@ def judge_ranges(config: Config, board: BenchIdentity, findings: ConfigFindings)
     laser = devices.displacement if devices is not None else None
     gauge = devices.roles().get("gauge_pressure") if devices is not None else None
     stated_um = stated_pa = (-math.inf, math.inf)
+    # Ranges as the configuration states them
     if isinstance(laser, ModbusMapConfig):
         stated_um = laser.limits or laser.value
     elif isinstance(laser, Optoncdt1420Config) and laser.range_mm is not None:
@@ -409,9 +410,11 @@ def judge_ranges(config: Config, board: BenchIdentity, findings: ConfigFindings)
         )
     if isinstance(gauge, ModbusMapConfig):
         stated_pa = gauge.limits or gauge.value
+    # The narrower one of these and of the sensor's own
     low_um = max(min(stated_um), board.displacement_range_um[0])
     high_um = min(max(stated_um), board.displacement_range_um[1])
     full_pa = min(max(stated_pa), board.gauge_range_pa[1])
+    # A limit beyond the range never trips
     why, remedy = (
         f"can never trip: the laser's range is {low_um:g} .. {high_um:g} µm",
         "change it, or move the laser",

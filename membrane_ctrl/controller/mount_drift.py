@@ -70,24 +70,35 @@ class MountDrift:
         dt_s: float,
         has_laser: bool,
     ) -> list[Event]:
-        """Follow the mount; returns the notice once the limit is passed, which only `start` takes
-        back.
+        """Follow the laser's mount; return the notice once it has drifted beyond the limit.
 
-        `jumped`: the sensors of which the estimate has found a jump in this tick; `has_laser`: the
-        estimate follows the laser. Optics that jump again and again lead the estimate away in steps
-        that each look like a knock; they are left out as well.
+        Only `start` takes the notice back.
+
+        Parameters
+        ----------
+        mount_um : float
+            Displacement of the mount, from the estimate.
+        jumped : collection of Sensor
+            Sensors of which the estimate has found a jump in this tick.
+        now_s, dt_s : float
+            The run's clock, and the time since the last tick.
+        has_laser : bool
+            Whether the estimate follows the laser.
         """
         memory = self.memory
         moved_um = mount_um - memory.last_um
         memory.last_um = mount_um
         if memory.beyond_limit:
             return []
+        # Optics that jump again and again lead the estimate away in steps that each look like a
+        # knock: they are left out
         if Sensor.OPTICS in jumped:
             memory.optics_jumps.add(now_s, _OPTICS_JUMPS_MAX)
             if memory.optics_jumps.too_many(now_s, _OPTICS_JUMPS_MAX):
                 memory.beyond_limit = True
                 message = _UNSTEADY_MESSAGE if has_laser else _UNSTEADY_ALONE_MESSAGE
                 return [Maintenance("optics_unsteady", message)]
+        # A knock of the laser moves its mount at once, and is no drift
         laser_jumped = Sensor.LASER in jumped
         memory.jump_left_s = _JUMP_TAKES_S if laser_jumped else max(0.0, memory.jump_left_s - dt_s)
         if memory.jump_left_s == 0.0:

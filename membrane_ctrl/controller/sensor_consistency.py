@@ -164,8 +164,20 @@ class SensorConsistency:
     def compare_sensors(
         self, inputs: TickInputs, state: State, dt_s: float, held: HoldStatus
     ) -> list[Event]:
-        """Observe a tick and return its new events; judges only a held mirror."""
+        """Observe a tick and return its new events.
+
+        Parameters
+        ----------
+        inputs : TickInputs
+        state : State
+            Before the tick; sensors are compared only in states of `ESTIMATED`.
+        dt_s : float
+            Since the last tick.
+        held : HoldStatus
+            Readings, setpoint and pump of the held mirror.
+        """
         laser_um, gauge_pa = held.laser_um, held.gauge_pressure_pa
+        # A new setpoint or bleed changes the gas that the film usually takes
         if held.setpoint_um != self.memory.setpoint_um:
             self.memory.setpoint_um = held.setpoint_um
             self._health.setpoint_moved()
@@ -178,17 +190,20 @@ class SensorConsistency:
         self.memory.laser_missing_s = min(
             max(self.memory.laser_missing_s + change_s, 0.0), _MISSING_MAX_S
         )
+        # Two sensors: laser (or optics) and gauge, in each state
         self._compare_with_gauge(state, dt_s, held)
         events = self._report_doubtful_sag(state) + self._notice_drift(state)
         events += self._watch_redundancy(inputs.now_s, state, held)
         if state not in state_sets.ESTIMATED:
             return events + self._reset_comparisons()
+        # While the setpoint moves, the loss of gas says nothing about the film
         moves = state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um
         if moves:
             self.memory.growth.note_ramp()
             self.memory.gas_excess = ""
         self._note_figure(held.figure)
         events += self._judge_weather(inputs, dt_s)
+        # Three sensors: which one do the other two contradict?
         blind = not inputs.now_s - self.memory.camera_s <= self._fresh_s
         faulty = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
         self.memory.laser_fault_s = (
@@ -208,6 +223,7 @@ class SensorConsistency:
         if faulty == FaultySensor.LASER and self.memory.faulty_sensor != FaultySensor.LASER:
             self.memory.laser_verdicts.add(inputs.now_s, _VERDICTS_MAX)
         events += self._judge_sensor(faulty)
+        # At rest at the setpoint: excess gas, and the health of the film over days
         if moves or state == State.SETTLE:
             return events
         self.memory.gas_excess = self.memory.growth.step(

@@ -111,6 +111,7 @@ async def identify_board(
         cross_check.require_sound(config, options.source, identity)
         if options.clear_faults:
             await bench.clear_faults(ALL_FAULTS)
+        # A closed interlock circuit and no latched fault: the hold may start
         reading = await bench.read()
         if not options.standby:
             _require_closed(config, reading)

@@ -141,6 +141,7 @@ class Supervisor:
         self.ticks += 1
         # of the last tick, which this one's lateness is due to
         wait_ms = self._waits.take_wait_ms()
+        # Read: one sample of all sensors; without an answer, the tick has no reading
         if not self._link_up:
             await self._reconnect()
         reading = await self._read() if self._link_up else None
@@ -149,6 +150,7 @@ class Supervisor:
             if not self._link_error:
                 self._link_failures.note_success(now_s)
             self._link_error = ""
+        # What else the tick may know: children, the twin's truth, commands since the last tick
         if now_s >= self._next_watch_s:
             self._next_watch_s = now_s + _CHILD_WATCH_S
             self._run_guarded("children", self._report_children)
@@ -171,11 +173,14 @@ class Supervisor:
             truth_displacement_um=truth_um,
             truth_laser_bias_um=bias_um,
         )
+        # Decide
         outputs = self._controller.tick(inputs)
+        # Write, before anything is recorded: the write feeds the board's watchdog
         self._vent_fraction = outputs.command.vent_fraction
         if outputs.clear_mask:
             await self._clear_board(outputs.clear_mask)
         await self._write(outputs.command)
+        # Record, and inform those who follow the ticks; none of them can stop the tick
         self._record_tick(inputs, outputs)
         for event in outputs.events:
             self.record_event(event)

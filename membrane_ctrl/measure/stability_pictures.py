@@ -38,8 +38,20 @@ def draw_stability(
     points: Mapping[str, tuple[float, float]],
     heights_um: FloatArray,
 ) -> None:
-    """Draw the paper's figure: point heights (sets, points) over time, and the map of standard
-    deviations.
+    """Draw the paper's figure: heights of the points over time, and the map of standard deviations.
+
+    Parameters
+    ----------
+    path : Path
+        The picture's file.
+    axis_mm : (n,) array
+        Of the map, in x and y.
+    sd_um : (n, n) array
+        Standard deviation of the height; NaN outside the area.
+    time_s : (sets,) array
+    points : mapping of str to (float, float)
+        Name and place of each point.
+    heights_um : (sets, points) array
     """
     figure = Figure(figsize=(12, 2.2 * max(2, len(points))), layout="constrained")
     grid = figure.add_gridspec(len(points), 2, width_ratios=(1.4, 1))

@@ -207,10 +207,25 @@ def compute_slopes(
     reading: YReading = YReading.HEIGHT_OF_POINT,
     y_geometry: PaperGeometry | None = None,
 ) -> FloatArray:
-    """Slopes (2, n) in x and y of points (3, n) that see the screen at `screen_mm` (2, n).
+    """Return the slopes in x and y of points that see the screen, by the paper's equations.
 
-    Without `rays` the projection is not corrected. `y_geometry` is that of the y equations, if it
-    is not that of x: an error that acts in one axis only.
+    Parameters
+    ----------
+    geometry : PaperGeometry
+    points_mm : (3, n) array
+        x, y and height of the points.
+    screen_mm : (2, n) array
+        What they see, in coordinates of the screen.
+    rays : Reflection or None
+        Rays for the correction of the projection; None: not corrected.
+    reading : YReading
+        How the y equations are read.
+    y_geometry : PaperGeometry, optional
+        Of the y equations, if it is not that of x: an error that acts in one axis only.
+
+    Returns
+    -------
+    (2, n) array
     """
     x_mm, y_mm, height_mm = points_mm
     screen_x_mm, screen_y_mm = screen_mm

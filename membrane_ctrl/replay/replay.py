@@ -136,6 +136,7 @@ def replay_record(
     found = Replay()
     same_past, remembered = True, False
     for item in record:
+        # After a gap, the controller's memory differs from that of the run
         if isinstance(item, Gap):
             if item.time_s <= to_s:
                 found.gaps.append(item)
@@ -143,6 +144,8 @@ def replay_record(
             continue
         if item.inputs.now_s > to_s or found.finished is not None:
             break
+        # A snapshot replaces the memory: at the beginning of a part, and after a gap. In between it
+        # must equal the replayed memory
         if not found.ticks:
             found.begin_s = item.inputs.now_s
             if item.tick > 1 and item.snapshot:
@@ -154,6 +157,7 @@ def replay_record(
                 same_past, remembered = True, True
         elif item.snapshot and found.state_differences is None:
             found.state_differences = _compare_state(item, controller, comparison)
+        # Run the tick, and compare its outputs if the memory is that of the run
         outputs = _run_tick(controller, item, remembered)
         found.ticks += 1
         found.last_s = item.inputs.now_s

@@ -80,9 +80,17 @@ def find_expired(
     keep_days: float | None,
     now_utc: datetime,
 ) -> list[tuple[OldRun, str]]:
-    """Which of the runs (oldest first) to delete, and why; the newest three are never too old.
+    """Return the runs to delete, each with the reason.
 
-    The bytes of the present run count, but it stays. None means no limit.
+    Parameters
+    ----------
+    runs : sequence of OldRun
+        Oldest first; the newest three are never too old.
+    present_bytes : int
+        Of the present run: they count, but it stays.
+    keep_gb, keep_days : float or None
+        `recording.keep_gb` and `keep_days`; None: no limit.
+    now_utc : datetime
     """
     total = present_bytes + sum(run.size_bytes for run in runs)
     expired: list[tuple[OldRun, str]] = []

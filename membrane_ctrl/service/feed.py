@@ -345,15 +345,30 @@ class Series:
 def history(
     feed: HoldFeed, logs: Path | None, signal: str, span_s: float, now_s: float | None = None
 ) -> Series:
-    """The last `span_s` seconds of a signal of `SIGNALS`, in at most `_POINTS_MAX` windows; without
-    a hold, those before the end of the newest run.
+    """Return the last seconds of a signal, in at most `_POINTS_MAX` windows.
 
-    `logs` is the folder of the runs, None if it is on another machine: then only the last hour is
-    known.
+    Without a hold, the seconds end with the newest run.
+
+    Parameters
+    ----------
+    feed : HoldFeed
+    logs : Path or None
+        Folder of the runs; None if it is on another machine: then only the last hour is known.
+    signal : str
+        One of `SIGNALS`.
+    span_s : float
+    now_s : float, optional
+        UTC at which they end.
+
+    Raises
+    ------
+    ValueError
+        The signal is unknown.
     """
     if signal not in SIGNALS:
         raise ValueError(f"{signal}: none of {', '.join(SIGNALS)}")
     begin_s = (feed.until_s if now_s is None else now_s) - span_s
+    # The last hour is in memory; what was before is in the runs' files
     live = _of_feed(feed, signal, begin_s)
     if span_s <= _LIVE_S and live.utc_s.size and live.utc_s[0] <= begin_s + 2.0:
         return thinned(live, span_s)

@@ -220,6 +220,7 @@ def live_hold(
     """
     socket = socket_path(where)
     until_s = time.monotonic() + (_STARTS_S if wait else 0.0)
+    # A run that starts: first its socket appears, then its mirror is held
     while wait and not socket.exists() and time.monotonic() < until_s:
         time.sleep(_POLL_S)
     client = PortClient.unix(socket, lambda text: print(f"notice: {text}", file=sys.stderr))

@@ -44,16 +44,33 @@ def make_multisine(
     fastest_rad_per_s: float = 6.0,
     tones: int = 12,
 ) -> Pattern:
-    """Sines evenly spaced in the logarithm of frequency, of equal excursion up to the pump's room.
+    """Return sines evenly spaced in the logarithm of frequency, of equal excursion of the centre.
 
     Phases by Schroeder (1970), -pi n (n - 1) / N, which keep the peak low.
+
+    Parameters
+    ----------
+    around : OperatingPoint
+        Room of the pump, and limit of the excursion.
+    gain : float
+        Speed of the centre over the flow.
+    slowest_rad_per_s, fastest_rad_per_s : float
+    tones : int
+        Number of sines.
+
+    Returns
+    -------
+    Pattern
+        Flow over time, added to the holding flow.
     """
     w = np.geomspace(slowest_rad_per_s, fastest_rad_per_s, tones)
     phases = -math.pi * np.arange(tones) * np.arange(1, tones + 1) / tones
     amplitudes = np.sqrt(w)  # flow between equal flow and equal excursion
+    # Flow and excursion over the slowest period, for their peaks
     time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
     flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
     way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
+    # As large as the pump's room and the limit of the excursion allow
     scale = min(
         min(operating_point.require_room(around)) / np.abs(flow).max(),
         _SHARE * around.limit_um / (gain * np.abs(way).max()),

@@ -23,11 +23,13 @@ def find_excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -
     it.
     """
     time_s, error_um = level["time_s"], level["mean_error_um"]
+    # Seconds beyond the band, without those that a fault, a pause or a ramp explains
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
     paused = np.isnan(level["mean_leak_um_per_s"])  # a loop that waits has no estimate of the leak
     setpoint_um = error_um + level["mean_displacement_um"]
     ramped = np.abs(mean_differences(setpoint_um, RAMP_HALF_S, 1)) > band_um
     out &= ~widen_flags((level["fault"] > 0) | paused | ramped, BACK_S)
+    # and without those that a known event explains
     for event in known:
         if event.kind in _TIMED_TO_MINUTES:
             from_s = event.start_s

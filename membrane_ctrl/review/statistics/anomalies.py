@@ -46,9 +46,29 @@ def find_anomalies(
     found: Sequence[FoundEvent],
     shape: shape_review.ShapeReview | None,
 ) -> tuple[Anomaly, ...]:
-    """All anomalies of a part of a run, the gravest first."""
+    """Return all anomalies of a part of a run, the gravest first.
+
+    Parameters
+    ----------
+    run : Run
+    part_s : (float, float)
+        Begin and end of the part.
+    ticks : HoldPass
+        Statistics of one pass over the settled hold.
+    reading, true : ErrorSeries or None
+        Of the error in the loop, and of the twin's true error; None without such ticks.
+    leak_um_per_s : float
+        Mean loss of gas, as speed of the centre.
+    tracking_share : float
+        Share of the hold in which the shape loop tracked.
+    found : sequence of FoundEvent
+        Steps, glitches and losses that no rule reported.
+    shape : ShapeReview or None
+        None without enough figures.
+    """
     anomalies = [Anomaly("incomplete recording", note) for note in run.notes]
     anomalies += _list_faults(run, part_s)
+    # The hold itself: was it reached, and how large is its error?
     if reading is None:
         anomalies.append(
             Anomaly("never settled", "no tick counts as held: there are no hold statistics")
@@ -57,6 +77,7 @@ def find_anomalies(
     if series is not None:
         anomalies += _judge_error(series)
     anomalies += _judge_ticks(ticks)
+    # The pump: can it lower the mirror, and does it stay off its limits?
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
         leak = f"a leak of {leak_um_per_s:.2f} µm/s leaves the pump no way to lower"
         anomalies.append(Anomaly("too tight", leak))
@@ -64,6 +85,7 @@ def find_anomalies(
     if saturated_share > _SATURATED_MOST:
         saturation = f"{100 * saturated_share:.1f} % of ticks at a limit of the flow"
         anomalies.append(Anomaly("saturation", saturation))
+    # The shape loop: a short interruption of a long hold does not count
     untracked_s = (1 - tracking_share) * ticks.hold_s
     has_lost_time = tracking_share < _TRACKING_LEAST and untracked_s > _UNTRACKED_MOST_S
     if run.config.shape.enabled and has_lost_time:
@@ -74,6 +96,7 @@ def find_anomalies(
         anomalies.append(Anomaly("shape loop", tracked))
     if shape is not None:
         anomalies += _judge_shape(shape)
+    # What the review itself has found, by frequency
     counts = Counter(event.kind for event in found)
     anomalies += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
     return tuple(anomalies)

@@ -135,11 +135,25 @@ def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> 
 
 
 def welch_p(a: Column, b: Column, offset: float = 0.0, correlated: bool = False) -> float:
-    """Welch's t test of two sets of blocks; correlated ones count for fewer. `offset` as in
-    `mean_p`.
+    """Return the probability of means this different between equal sets of blocks: Welch's t test.
+
+    Parameters
+    ----------
+    a, b : (n,), (m,) arrays
+        Values of the blocks.
+    offset : float
+        Standard deviation of the difference that is common to all blocks of a run.
+    correlated : bool
+        Blocks that follow each other are correlated, and count for fewer.
+
+    Returns
+    -------
+    float
+        NaN for fewer than three blocks.
     """
     if min(a.size, b.size) < _LEAST_TESTED:
         return math.nan
+    # The variance of the difference: of both means and of the offset
     variance, weights = offset**2, 0.0
     for part in (a, b):
         size = float(part.size)

@@ -48,17 +48,36 @@ class ErrorSeries:
 
 
 def describe_error(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
+    """Return the statistics of one error over the settled hold.
+
+    Parameters
+    ----------
+    run : Run
+    ticks : HoldPass
+        One pass over the hold.
+    which : int
+        `READING` (the error in the loop) or `TRUE` (that of the twin's centre).
+
+    Returns
+    -------
+    ErrorSeries or None
+        None if no tick has such an error.
+    """
     rate_hz, band_um = run.config.loop.rate_hz, run.config.limits.band_um
     second, counts, sums = ticks.seconds[which]
     moments = ticks.raw_reading if which == READING else ticks.raw_true
     if not moments.count:
         return None
+    # Means over windows, for their statistics and the drift
     means = {w: window_means(second, counts, sums[ERROR], w, rate_hz) for w in WINDOWS_S}
+    # All ticks on an even grid from the first value to the last, for the spectrum; short gaps are
+    # bridged
     grid = ticks.reading_um if which == READING else ticks.true_um
     grid = fill_short_gaps(
         grid[_places_before_first(grid) : grid.size - _places_before_first(grid[::-1])],
         round(FILLED_S * rate_hz),
     )
+    # Lengths of the Allan deviation: powers of two, up to a quarter of the hold
     longest = max(1, min(grid.size // 4, round(_ALLAN_LONGEST_S * rate_hz)))
     lengths = 2 ** np.arange(int(np.log2(longest)) + 1)
     minutes = ticks.hold_s >= _SLOPE_MINUTES_FROM_S

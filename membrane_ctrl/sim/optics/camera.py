@@ -112,12 +112,24 @@ class OpticsRenderer:
         gain: float = 1.0,
         time_s: float = 0.0,
     ) -> Pixels:
-        """The picture of what is shown, (H, W), at a displacement; `gain` is the exposure over the
-        nominal one.
+        """Return the picture of what is shown.
 
-        `out` (as of `make_blank_picture`) is filled and returned; otherwise a new array is made.
-        The vibrations are those of `time_s`. Raises ValueError if the pattern is unknown or `out`
-        has another shape or type.
+        Parameters
+        ----------
+        shown : Pattern or PanelPicture
+        displacement_um : float
+            Of the mirror's centre.
+        out : (H, W) array, optional
+            As of `make_blank_picture`: it is filled and returned; otherwise a new array is made.
+        gain : float
+            Exposure over the nominal one.
+        time_s : float
+            Of the exposure: the vibrations are those of this time.
+
+        Raises
+        ------
+        ValueError
+            The pattern is unknown, or `out` has another shape or type.
         """
         camera = self.optics.camera
         picture = out

@@ -107,11 +107,23 @@ def pattern_sequence(
     shifts_rad: tuple[float, ...] = (),
     coarser_mm: tuple[float, ...] = (),
 ) -> list[Pattern]:
-    """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white,
-    black.
+    """Return the patterns of a set in the order in which they are shown.
 
-    The kind is "full", "fringes" (sinusoids alone) or "frequencies" (sinusoids, and those of the
-    periods `coarser_mm`), else ValueError; `shifts_rad` one a step, empty: 2 pi k / N.
+    Parameters
+    ----------
+    kind : str
+        "full" (sinusoids and Gray bits of x, then of y, white, black), "fringes" (sinusoids
+        alone) or "frequencies" (sinusoids, and those of the coarser periods).
+    config : PatternConfig
+    shifts_rad : tuple of float
+        Phase shift of each step; empty: 2 pi k / N.
+    coarser_mm : tuple of float
+        Further periods.
+
+    Raises
+    ------
+    ValueError
+        The kind is unknown.
     """
     if kind not in ("full", "fringes", "frequencies"):
         raise ValueError(f"kind = {kind!r} must be full, fringes or frequencies")
