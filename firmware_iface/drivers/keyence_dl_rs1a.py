@@ -73,7 +73,7 @@ class KeyenceDlRs1a(line_link.LineDriver):
         """
         await self._link.close()
         self._gate = step_gate.StepGate(self._config.step_max_um)
-        return await self._opened(self._identify)
+        return await self._open_port(self._identify)
 
     async def _identify(self) -> roles.DeviceIdentity:
         every = await self._link.query("M0", _ALL, _ALL_CHARS)

@@ -56,7 +56,9 @@ class Mks937b(line_link.LineDriver):
         """
         await self._link.close()
         self._reset_step_gate()
-        return await self._opened(self._begin, ";FF")  # ends what an earlier program left half sent
+        return await self._open_port(
+            self._begin, ";FF"
+        )  # ends what an earlier program left half sent
 
     async def _begin(self) -> roles.DeviceIdentity:
         config = self._config

@@ -77,7 +77,7 @@ class VaisalaPtb330(line_link.LineDriver):
         self._newest = BarometerMessage(math.nan, -1, "")
         self._newest_s = -math.inf
         self._down = None
-        identity = await self._opened(self._begin, "\r\nS\r\nECHO OFF\r\n")
+        identity = await self._open_port(self._begin, "\r\nS\r\nECHO OFF\r\n")
         self._task = asyncio.create_task(self._keep_reading(), name="barometer")
         return identity
 

@@ -59,7 +59,7 @@ class Ventus(line_link.LineDriver):
         """
         await self._link.close()
         # off at once, also when nothing else works; a stream would never leave the line quiet
-        return await self._opened(self._begin, f"\n#W{ENABLE},{_OFF}\n#W{STREAM},0\n")
+        return await self._open_port(self._begin, f"\n#W{ENABLE},{_OFF}\n#W{STREAM},0\n")
 
     async def _begin(self) -> roles.DeviceIdentity:
         about = await self._write_and_read({}, DEVICE_TYPE, FIRMWARE, FIRMWARE_MINOR)

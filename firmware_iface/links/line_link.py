@@ -59,15 +59,15 @@ class LineLink:
         incomplete; more than `longest` characters are no answer. Raises LinkError (no answer of
         this form in time), LinkDownError (the line is gone).
         """
-        fence = self._question(self._fence.command, self._fence.answer, self._fence.longest)
+        fence = self._make_question(self._fence.command, self._fence.answer, self._fence.longest)
         received_bytes = await self._exchange.ask(
-            self._question(command, answer, longest), self._timeout_s, fence
+            self._make_question(command, answer, longest), self._timeout_s, fence
         )
         found = answer.fullmatch(received_bytes.decode("ascii"))
         assert found is not None  # `extract_answer` matched it
         return found
 
-    def _question(self, command: str, answer: re.Pattern[str], longest: int) -> Question:
+    def _make_question(self, command: str, answer: re.Pattern[str], longest: int) -> Question:
         what = f"{self.name}: {command.splitlines()[-1]}"
 
         def extract_answer(received_bytes: bytes) -> bytes | None:
@@ -100,7 +100,7 @@ class LineDriver:
     def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence) -> None:
         self._link = LineLink(port, end, timeout_s, fence)
 
-    async def _opened(
+    async def _open_port(
         self, begin: Callable[[], Awaitable[DeviceIdentity]], greeting: str = ""
     ) -> DeviceIdentity:
         """Open the port and begin; the port is closed again when that fails."""

@@ -217,7 +217,7 @@ class GuardedModbusRtu:
     async def _transact(
         self, pdu: bytes, answer_bytes: int, what: str, repeats: bool = False
     ) -> bytes:
-        question = self._question(pdu, answer_bytes, what, repeats=repeats)
+        question = self._make_question(pdu, answer_bytes, what, repeats=repeats)
         reply = await self._bus.exchange.ask(
             question, self._timeout_s, self._fence_question(), self._unit_id
         )
@@ -229,7 +229,7 @@ class GuardedModbusRtu:
         if not self._fence:
             return None
         pdu = struct.pack(">BHH", modbus_link.DIAGNOSTICS, 0, self._bus.find_token())
-        return self._question(
+        return self._make_question(
             pdu,
             _WRITE_BYTES,
             f"{self.name}: echo test after a loss (function 8)",
@@ -237,7 +237,7 @@ class GuardedModbusRtu:
             repeats=True,
         )
 
-    def _question(
+    def _make_question(
         self,
         pdu: bytes,
         answer_bytes: int,

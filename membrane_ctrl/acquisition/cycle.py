@@ -111,9 +111,7 @@ class ShapeCycle:
         return CycleDone(estimate, pause_s(self._full_rejected_in_a_row - REJECTED_IN_A_ROW + 1))
 
     def prepare_next(self) -> None:
-        """Do ahead what the next figure needs: not while it is waited for. That cycle tells of a
-        failure.
-        """
+        """Precompute for the next figure, between cycles; a failure is reported by that cycle."""
         with suppress(stage_errors.StageError), stage_errors.convert_stage_errors("reconstruction"):
             self._reconstructor.prepare()
 

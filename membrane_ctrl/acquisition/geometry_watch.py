@@ -98,29 +98,29 @@ class GeometryWatch:
         if known is not None:
             residual = DriftMonitor(known.slope_residual_urad, known.slope_noise_urad)
             self._monitors = residual, RingMonitor(np.array(known.ring_um))
-        self._said = False
+        self._is_reported = False
 
     def noise_urad(self, estimate: shape_estimate.ShapeEstimate) -> float:
         """The camera noise's share of a cycle's residual."""
         return noise_urad(
             self._geometry,
-            self._surface(estimate),
+            self._make_surface(estimate),
             self._sigma_mm_adu / estimate.modulation_median_adu,
         )
 
     def check_estimate(self, estimate: shape_estimate.ShapeEstimate) -> events.Event | None:
-        """Returns a notice when a new calibration becomes due, and when no longer."""
+        """Return a notice when a new calibration becomes due, and when it is no longer due."""
         if self._monitors is None or estimate.verdict == "rejected" or estimate.kind == "track":
             return None
         residual, ring = self._monitors
         residual.add(estimate.slope_residual_urad, self.noise_urad(estimate))
-        ring.add(self._surface(estimate))
+        ring.add(self._make_surface(estimate))
         description = ring.description or residual.description
-        if bool(description) == self._said:
+        if bool(description) == self._is_reported:
             return None
-        self._said = not self._said
-        news = events.Maintenance if self._said else events.MaintenanceOver
-        return news("calibrate", description or "the geometry fits again")
+        self._is_reported = not self._is_reported
+        event_type = events.Maintenance if self._is_reported else events.MaintenanceOver
+        return event_type("calibrate", description or "the geometry fits again")
 
-    def _surface(self, estimate: shape_estimate.ShapeEstimate) -> Surface:
+    def _make_surface(self, estimate: shape_estimate.ShapeEstimate) -> Surface:
         return Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, self._radius_mm)

@@ -115,7 +115,7 @@ class Bridge:
 
         def note(done: asyncio.Future[Outcome]) -> None:
             if not answer.done():
-                answer.set_result(self._noted(by, name, done.result()))
+                answer.set_result(self._note_outcome(by, name, done.result()))
 
         if outcome.done():
             note(outcome)
@@ -127,7 +127,7 @@ class Bridge:
         """End what is under way."""
         await self._lanes.close()
 
-    def _noted(self, by: str, name: str, outcome: Outcome) -> str:
+    def _note_outcome(self, by: str, name: str, outcome: Outcome) -> str:
         """Note an outcome as the value `answer`; refusals of a flood do not replace a safety
         command's answer.
         """
@@ -141,7 +141,7 @@ class Bridge:
         return answer
 
     def _report_late(self, outcome: Outcome) -> None:
-        answer = self._noted("late", outcome.command, outcome)
+        answer = self._note_outcome("late", outcome.command, outcome)
         for listener in self.late_listeners:
             listener(answer)
 
@@ -159,21 +159,21 @@ class Bridge:
         if not allowed:
             raise ValueError(f"{name} refused: needs the role {action.role}")
         why = f"bridge: {by}, {who}" if who else f"bridge: {by}"
-        asked = request(action, why, self._text(action, name, given))
+        asked = request(action, why, self._make_argument_text(action, name, given))
         asked["on_behalf"] = {"via": "bridge", "name": by, "role": role}
         return asked
 
-    def _text(self, action: ActionButton, name: str, given: Any) -> str:
+    def _make_argument_text(self, action: ActionButton, name: str, given: Any) -> str:
         """The number or text of a command as `request` accepts it. Raises ValueError."""
         if action.asks == "number":
             return _number_text(action, given)
         if not action.asks:
             return ""
         if isinstance(given, bytes):
-            given = _decoded(given, name)
+            given = _decode_payload(given, name)
         text = str(given)
         if is_safety_command(name):
-            return _cleaned(text)
+            return _remove_unprintable(text)
         if (
             len(text.encode("utf-8", "replace")) > TEXT_BYTES
         ):  # the port would drop a client that sends too much
@@ -186,7 +186,7 @@ def _number_text(action: ActionButton, given: Any) -> str:
     finite number.
     """
     if isinstance(given, bytes):
-        given = _decoded(given[: TEXT_BYTES + 1], str(action.do))
+        given = _decode_payload(given[: TEXT_BYTES + 1], str(action.do))
     if isinstance(given, str):
         if len(given.encode("utf-8", "replace")) > TEXT_BYTES:
             raise ValueError(f"{action.do} refused: longer than {TEXT_BYTES} bytes")
@@ -205,7 +205,7 @@ def _number_text(action: ActionButton, given: Any) -> str:
     return repr(number)
 
 
-def _decoded(payload: bytes, name: str) -> str:
+def _decode_payload(payload: bytes, name: str) -> str:
     """A payload as text. Raises ValueError for one that is no UTF-8, unless the command makes the
     mirror safe.
     """
@@ -217,7 +217,7 @@ def _decoded(payload: bytes, name: str) -> str:
         raise ValueError(f"{name} refused: the payload is not text in UTF-8") from None
 
 
-def _cleaned(text: str) -> str:
+def _remove_unprintable(text: str) -> str:
     """The printable part of a safety command's text: a bad text must not refuse the command."""
     printable = "".join(c if c.isprintable() else "?" for c in text[:TEXT_BYTES])
     return printable.encode("utf-8", "replace")[:TEXT_BYTES].decode("utf-8", "ignore")

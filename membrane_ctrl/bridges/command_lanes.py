@@ -159,10 +159,10 @@ class CommandLanes:
             waiting = self._ordinary.popleft()
             if waiting.answered:  # refused while it waited
                 continue
-            limits = SendLimits(waiting.deadline_s, self._overtaking(waiting.kind))
+            limits = SendLimits(waiting.deadline_s, self._make_overtaken_check(waiting.kind))
             waiting.answer(await self._send_on_thread(waiting.request, limits))
 
-    def _overtaking(self, kind: str) -> Callable[[], str]:
+    def _make_overtaken_check(self, kind: str) -> Callable[[], str]:
         """A function that returns whether a safety command has come since now."""
         count = self._safety_count
 

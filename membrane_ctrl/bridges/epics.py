@@ -42,7 +42,7 @@ async def serve(config: EpicsConfig, bridge: Bridge) -> None:
 async def _serve_records(config: EpicsConfig, bridge: Bridge) -> None:
     async with bridge.opening:
         await asyncio.to_thread(require_unserved, f"{bridge.settings.name}:state", config.ca_port)
-        records = _opened(config, bridge)
+        records = _start_ioc(config, bridge)
     print(
         f"epics: {config.host}, CA {config.ca_port}, PVA {config.pva_port}",
         file=sys.stderr,
@@ -55,7 +55,7 @@ async def _serve_records(config: EpicsConfig, bridge: Bridge) -> None:
         for name, value in bridge.values().items():
             record = records[name]
             if value is not None:
-                record.set(_fitting(value))
+                record.set(_shorten_text(value))
             else:
                 record.set_alarm(
                     alarm.INVALID_ALARM, alarm.COMM_ALARM if not live else alarm.UDF_ALARM
@@ -63,7 +63,7 @@ async def _serve_records(config: EpicsConfig, bridge: Bridge) -> None:
         await asyncio.sleep(bridge.settings.period_s)
 
 
-def _opened(config: EpicsConfig, bridge: Bridge) -> dict[str, Any]:
+def _start_ioc(config: EpicsConfig, bridge: Bridge) -> dict[str, Any]:
     """Start the IOC, which takes seconds; returns the records of the published values."""
     _require_free(config)
     addresses = {"EPICS_CAS_INTF_ADDR_LIST": config.host, "EPICS_PVAS_INTF_ADDR_LIST": config.host}
@@ -84,7 +84,7 @@ def _opened(config: EpicsConfig, bridge: Bridge) -> dict[str, Any]:
     builder.SetDeviceName(bridge.settings.name)
     records = {each.name: _record(builder, each) for each in TABLE}
     for do, action in bridge.commands.items():
-        _command(builder, bridge, do, action, records["answer"])
+        _make_command_record(builder, bridge, do, action, records["answer"])
     builder.LoadDatabase()
     with tempfile.TemporaryDirectory() as folder:
         rules = Path(folder) / "rules.acf"
@@ -106,7 +106,7 @@ def _require_free(config: EpicsConfig) -> None:
             ) from None
 
 
-def _fitting(value: Value) -> Value:
+def _shorten_text(value: Value) -> Value:
     """A text that fits its record."""
     if isinstance(value, str):
         return value.encode()[: _TEXT_BYTES - 1].decode("utf-8", "ignore")
@@ -120,13 +120,15 @@ def _record(builder: Any, published: Published) -> Any:
     return builder.aIn(published.name, EGU=published.unit, PREC=_DIGITS, DESC=description)
 
 
-def _command(builder: Any, bridge: Bridge, do: str, action: ActionButton, answer: Any) -> None:
+def _make_command_record(
+    builder: Any, bridge: Bridge, do: str, action: ActionButton, answer: Any
+) -> None:
     """The record `do:COMMAND`: a number, a text, or any write at all; a put ends once the answer is
     there.
     """
 
     async def obey(value: object) -> None:
-        answer.set(_fitting(await bridge.ask("epics", do, value if action.asks else "")))
+        answer.set(_shorten_text(await bridge.ask("epics", do, value if action.asks else "")))
 
     common = {"on_update": obey, "always_update": True, "ASG": "COMMAND", "DESC": action.label}
     if action.asks == "number":

@@ -69,7 +69,7 @@ async def serve(config: MqttConfig, bridge: Bridge) -> None:
         try:
             connection.result()
         except* (aiomqtt.MqttError, OSError) as group:
-            reasons = _leaves(group)
+            reasons = _list_exceptions(group)
             broker.note_failure(reasons)
             printed = printed and time.monotonic() - began_s < _STEADY_S
             if not printed:
@@ -93,11 +93,11 @@ async def _wait_for_end(connection: asyncio.Task[None]) -> None:
         raise
 
 
-def _leaves(group: BaseExceptionGroup[BaseException]) -> list[BaseException]:
+def _list_exceptions(group: BaseExceptionGroup[BaseException]) -> list[BaseException]:
     """The exceptions of a group and of the groups in it."""
     found: list[BaseException] = []
     for error in group.exceptions:
-        found += _leaves(error) if isinstance(error, BaseExceptionGroup) else [error]
+        found += _list_exceptions(error) if isinstance(error, BaseExceptionGroup) else [error]
     return found
 
 
@@ -108,7 +108,7 @@ class Broker:
         self._config = config
         self._name = name
         self._password = _read(config.password_file)
-        self._context = _context(config)
+        self._make_tls_context = _make_tls_context(config)
         self._version = aiomqtt.ProtocolVersion.V5
         self.claim = OwnerClaim.of_this_process()
         self.where = f"{config.host}:{config.port}"
@@ -140,7 +140,7 @@ class Broker:
             protocol=self._version,
             properties=properties,
             will=will,
-            tls_context=self._context,
+            tls_context=self._make_tls_context,
             keepalive=_KEEPALIVE_S,
             timeout=_ANSWER_S,
             queue_type=cast(type[Inbox], make_queue),
@@ -167,7 +167,7 @@ def _read(file: str | None) -> str | None:
         raise errors.InputError(f"bridges.mqtt.password_file: {error}") from None
 
 
-def _context(config: MqttConfig) -> ssl.SSLContext | None:
+def _make_tls_context(config: MqttConfig) -> ssl.SSLContext | None:
     try:
         if config.ca_file is None:
             return None
@@ -191,11 +191,11 @@ async def _serve_connection(
 
     def handle(message: aiomqtt.Message) -> None:
         if str(message.topic) == owner_topic:
-            ownership.receive(_payload(message), message.retain)
+            ownership.receive(_get_payload_bytes(message), message.retain)
             return
         if not message.retain:
             barrier.raise_for(_command_name(message))
-        _obey(message, bridge, safety_reports)
+        _handle_command(message, bridge, safety_reports)
 
     async def publish_marker(marker: str) -> None:
         await guard.publish(f"{base}/order", marker, qos=1)
@@ -250,15 +250,15 @@ async def _publish_and_obey(
     def handle(message: aiomqtt.Message) -> None:
         topic, name = str(message.topic), _command_name(message)
         if topic == f"{base}/availability":
-            availability.receive(_payload(message))
+            availability.receive(_get_payload_bytes(message))
         elif topic == f"{base}/order":
-            barrier.receive(_payload(message))
+            barrier.receive(_get_payload_bytes(message))
         elif is_safety_command(name):
             return  # it also comes on the other connection
         elif barrier.newest and name not in MOVES_NOTHING:
             reports.add_refusal(f"{name} refused: {overtaken(barrier.newest)}")
         else:
-            _obey(message, bridge, reports)
+            _handle_command(message, bridge, reports)
 
     availability = Availability()
     reports = Reports(publish_answer, _REPORT_PAUSE_S)
@@ -330,13 +330,13 @@ async def _publish(
         await asyncio.sleep(min(_LOOK_S, max(0.0, next_s - time.monotonic())))
 
 
-def _obey(message: aiomqtt.Message, bridge: Bridge, reports: Reports) -> None:
+def _handle_command(message: aiomqtt.Message, bridge: Bridge, reports: Reports) -> None:
     """Hand a command on, or refuse it; the answer is reported in either case."""
     name = _command_name(message)
     if message.retain:  # an old command, delivered again at each connection
         reports.add_refusal(f"{name} refused: a retained message is no command")
         return
-    outcome = bridge.submit("mqtt", name, _payload(message))
+    outcome = bridge.submit("mqtt", name, _get_payload_bytes(message))
     if outcome.done():
         reports.add_refusal(outcome.result())
     else:
@@ -347,7 +347,7 @@ def _command_name(message: aiomqtt.Message) -> str:
     return str(message.topic).rpartition("/")[2]
 
 
-def _payload(message: aiomqtt.Message) -> bytes:
+def _get_payload_bytes(message: aiomqtt.Message) -> bytes:
     if isinstance(message.payload, bytes):
         return message.payload
     return b""
@@ -358,7 +358,7 @@ def discovery(bridge: Bridge, base: str) -> dict[str, Any]:
     later).
     """
     name = bridge.settings.name
-    found = {each.name: _sensor(each, name) for each in TABLE}
+    found = {each.name: _describe_sensor(each, name) for each in TABLE}
     for do, action in bridge.commands.items():
         entity: dict[str, Any] = {
             "unique_id": f"membrane_{name}_do_{do}",
@@ -386,7 +386,7 @@ def discovery(bridge: Bridge, base: str) -> dict[str, Any]:
     }
 
 
-def _sensor(each: Published, name: str) -> dict[str, Any]:
+def _describe_sensor(each: Published, name: str) -> dict[str, Any]:
     found: dict[str, Any] = {
         "platform": "sensor",
         "unique_id": f"membrane_{name}_{each.name}",

@@ -47,7 +47,7 @@ async def serve(config: OpcuaConfig, bridge: Bridge) -> None:
         server.set_server_name("membrane_ctrl")
         await _secure(server, config, bridge.settings.name)
         space = await server.register_namespace(f"urn:membrane-ctrl:{bridge.settings.name}")
-        nodes = await _nodes(server, space, bridge, users)
+        nodes = await _make_nodes(server, space, bridge, users)
         await _show(
             server, nodes, bridge
         )  # nobody may see the zeros that the variables were made with
@@ -114,10 +114,10 @@ async def _secure(server: BridgeServer, config: OpcuaConfig, name: str) -> None:
 
 async def _show(server: Server, nodes: dict[str, Node], bridge: Bridge) -> None:
     for name, value in bridge.values().items():
-        await server.write_attribute_value(nodes[name].nodeid, _data(value, bridge.live))
+        await server.write_attribute_value(nodes[name].nodeid, _make_data_value(value, bridge.live))
 
 
-async def _nodes(
+async def _make_nodes(
     server: Server, space: int, bridge: Bridge, users: dict[str, KnownUser] | None
 ) -> dict[str, Node]:
     """Make the object with its variables and methods; returns the variables by name."""
@@ -147,15 +147,17 @@ async def _nodes(
         found[each.name] = node
     # A method for each command
     for do, action in bridge.commands.items():
-        given = [_argument(action)] if action.asks else []
+        given = [_make_argument(action)] if action.asks else []
         node_id = ua.NodeId(f"{name}.do.{do}", space)
         browse_name = ua.QualifiedName(do, space)
         answer = ua.Argument(Name="answer", DataType=ua.NodeId(ua.ObjectIds.String))
-        await mirror.add_method(node_id, browse_name, _method(bridge, do, users), given, [answer])
+        await mirror.add_method(
+            node_id, browse_name, _make_method(bridge, do, users), given, [answer]
+        )
     return found
 
 
-def _argument(action: ActionButton) -> ua.Argument:
+def _make_argument(action: ActionButton) -> ua.Argument:
     number = action.asks == "number"
     kind = ua.ObjectIds.Double if number else ua.ObjectIds.String
     return ua.Argument(
@@ -165,7 +167,7 @@ def _argument(action: ActionButton) -> ua.Argument:
     )
 
 
-def _method(bridge: Bridge, do: str, users: dict[str, KnownUser] | None) -> Any:
+def _make_method(bridge: Bridge, do: str, users: dict[str, KnownUser] | None) -> Any:
     async def call(parent: ua.NodeId, *given: ua.Variant) -> list[ua.Variant] | ua.StatusCode:
         if len(given) > 1 or any(not isinstance(each.Value, float | int | str) for each in given):
             return ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
@@ -178,7 +180,7 @@ def _method(bridge: Bridge, do: str, users: dict[str, KnownUser] | None) -> Any:
     return call
 
 
-def _data(value: Value, live: bool) -> ua.DataValue:
+def _make_data_value(value: Value, live: bool) -> ua.DataValue:
     """A value with its time; without contact, texts stay, and numbers are bad."""
     at = datetime.now(UTC)
     if value is not None:

@@ -90,7 +90,7 @@ class NamedClients:
         self._verifying += 1
         try:
             async with self._one_at_a_time:
-                if await asyncio.to_thread(self._fits, name, password):
+                if await asyncio.to_thread(self._is_password_correct, name, password):
                     self._verified[name] = self._digest(name, password)
         finally:
             self._verifying -= 1
@@ -115,7 +115,7 @@ class NamedClients:
         message = f"{name}\0{password}".encode("utf-8", "surrogatepass")
         return hmac.new(self._secret, message, hashlib.sha256).digest()
 
-    def _fits(self, name: str, password: str) -> bool:
+    def _is_password_correct(self, name: str, password: str) -> bool:
         """Whether the password is that of the user; as slow for a name that does not exist."""
         known = self._users.get(name)
         return (known or self._nobody).has_password(password) and known is not None

@@ -84,7 +84,7 @@ class Procedure:
         DeviceError, RejectedError, KeyboardInterrupt
             After the mirror has moved back.
         """
-        with self.progress.catch_signals(), self._returning(session):
+        with self.progress.catch_signals(), self._move_back_at_end(session):
             self.sweep.shape_loop(False)
             times_s = self.times_s(session.head, session.missing_indices)
             for number, index in enumerate(session.missing_indices):
@@ -109,7 +109,7 @@ class Procedure:
         self.progress.print_line(f"{step}: {event.verdict}{reason}")
 
     @contextlib.contextmanager
-    def _returning(self, session: CalibrationSession) -> Iterator[None]:
+    def _move_back_at_end(self, session: CalibrationSession) -> Iterator[None]:
         """Move the mirror back at the end, also after an error or Ctrl-C, unless the hold ended."""
         try:
             yield

@@ -35,7 +35,7 @@ class AlarmRule(Section):
     """Severity in the message. Change it to critical for what must wake somebody."""
 
     @model_validator(mode="after")
-    def _sound(self) -> "AlarmRule":
+    def _check_limits(self) -> "AlarmRule":
         if self.field not in FIELDS:
             raise ValueError(
                 f"field: unknown telemetry field {self.field!r}; known: {', '.join(FIELDS)}"

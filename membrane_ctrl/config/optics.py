@@ -55,7 +55,7 @@ class HeightMapConfig(Section):
     """
 
     @model_validator(mode="after")
-    def _grid(self) -> "HeightMapConfig":
+    def _check_grid(self) -> "HeightMapConfig":
         for name, axis in (("s_x_mm", self.s_x_mm), ("s_y_mm", self.s_y_mm)):
             steps = [b - a for a, b in pairwise(axis)]
             if not (steps[0] > 0 and max(steps) - min(steps) <= _EVEN * steps[0]):
@@ -104,7 +104,7 @@ class ScreenPoseConfig(Section):
         return self.origin_mm, self.s_x, self.s_y
 
     @model_validator(mode="after")
-    def _whole(self) -> "ScreenPoseConfig":
+    def _check_complete(self) -> "ScreenPoseConfig":
         given = [value is not None for value in (self.origin_mm, self.s_x, self.s_y)]
         if any(given) and not all(given):
             raise ValueError("origin_mm, s_x and s_y belong together: give all or none")
@@ -296,7 +296,7 @@ class MirrorConfig(Section):
     """Gauge reading at displacement 0; 0: unknown. Set it for another film."""
 
     @model_validator(mode="after")
-    def _inside(self) -> "MirrorConfig":
+    def _check_radius(self) -> "MirrorConfig":
         if self.analysis_radius_mm > self.radius_mm:
             raise ValueError("analysis_radius_mm is larger than radius_mm")
         return self

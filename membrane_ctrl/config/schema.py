@@ -329,7 +329,7 @@ class Config(Section):
     bridges: BridgesConfig = BridgesConfig()
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Config":
+    def _check_consistency(self) -> "Config":
         limits = self.limits
         if limits.displacement_min_um >= limits.displacement_max_um:
             raise ValueError("limits.displacement_min_um must be below limits.displacement_max_um")

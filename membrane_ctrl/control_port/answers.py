@@ -191,11 +191,11 @@ def check(message: Message, model: type[BaseModel]) -> Message:
     try:
         model.model_validate(message)
     except ValidationError as error:
-        raise AnswerError(_described(error)) from None
+        raise AnswerError(_describe_first_error(error)) from None
     return message
 
 
-def _described(error: ValidationError) -> str:
+def _describe_first_error(error: ValidationError) -> str:
     first = error.errors(include_url=False, include_input=False, include_context=False)[0]
     field = ".".join(str(part) for part in first["loc"])
     problem = _PROBLEMS.get(first["type"]) or first["msg"][:1].lower() + first["msg"][1:]

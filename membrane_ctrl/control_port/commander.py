@@ -82,7 +82,7 @@ class Commander:
         """
         if self.session is not None and self.session.id == connection:
             return ""
-        if not take_over and (refusal := self._refusal(who, now_s)):
+        if not take_over and (refusal := self._explain_refusal(who, now_s)):
             return refusal
         self.session = None
         self._holder = who
@@ -93,7 +93,7 @@ class Commander:
         """Give command to a session; returns why not, or an empty text."""
         if self.session is not None and self.session.id == session.id:
             return ""
-        if not take_over and (refusal := self._refusal(session.who, now_s)):
+        if not take_over and (refusal := self._explain_refusal(session.who, now_s)):
             return refusal
         self.session = session
         self._holder = ""
@@ -114,7 +114,7 @@ class Commander:
         elif self._holder == who:
             self._holder = ""
 
-    def _refusal(self, who: str, now_s: float) -> str:
+    def _explain_refusal(self, who: str, now_s: float) -> str:
         """Why a client may not command; empty if it may."""
         if self.session is not None:
             return (

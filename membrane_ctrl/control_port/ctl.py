@@ -198,12 +198,12 @@ def status_lines(status: dict[str, Any]) -> list[str]:
             )
         shape = f"{status.get('shape') or '?'} {status.get('shape_reason', '')}"
         lines.append(f"  {'shape loop':{_LABEL_WIDTH}}{shape}".rstrip())
-        lines.append(f"  {'geometry':{_LABEL_WIDTH}}{_geometry(status.get('geometry'))}")
-    lines.append(f"  {'commander':{_LABEL_WIDTH}}{_commander(status)}")
+        lines.append(f"  {'geometry':{_LABEL_WIDTH}}{_describe_geometry(status.get('geometry'))}")
+    lines.append(f"  {'commander':{_LABEL_WIDTH}}{_name_commander(status)}")
     return lines
 
 
-def _commander(status: dict[str, Any]) -> str:
+def _name_commander(status: dict[str, Any]) -> str:
     session = status.get("command_session")
     if session is None:
         return str(status.get("commander") or "nobody")
@@ -211,7 +211,7 @@ def _commander(status: dict[str, Any]) -> str:
     return CommandSession(**known).describe()
 
 
-def _geometry(geometry: dict[str, Any] | None) -> str:
+def _describe_geometry(geometry: dict[str, Any] | None) -> str:
     if geometry is None:
         return "not in use yet"
     if geometry.get("message"):
@@ -237,11 +237,11 @@ def _print_watched(status: dict[str, Any], as_json: bool) -> None:
         print(json.dumps(status), flush=True)
         return
     row = status.get("row") or {}
-    shown = "  ".join(_quantity(row, name) for name in _WATCHED)
+    shown = "  ".join(_format_quantity(row, name) for name in _WATCHED)
     print(f"{status['state']:8} {shown}  {status['why']}", flush=True)
 
 
-def _quantity(row: Mapping[str, Any], name: str) -> str:
+def _format_quantity(row: Mapping[str, Any], name: str) -> str:
     """A value of a row with its label and unit, in a width that stays
     the same from line to line.
     """
@@ -277,12 +277,12 @@ def loop_keys(argument: str) -> dict[str, Any]:
     return tables
 
 
-def _printed(text: str) -> None:
+def _print_notice(text: str) -> None:
     print(f"notice: {text}", file=sys.stderr)
 
 
 def connected(
-    where: Where, notice: Callable[[str], None] = _printed, answer_s: float = ANSWER_S
+    where: Where, notice: Callable[[str], None] = _print_notice, answer_s: float = ANSWER_S
 ) -> PortClient:
     """Connect to the hold that `where` names. Raises InputError for another run, DeviceError if no
     hold answers.

@@ -34,12 +34,12 @@ def decode(line: bytes) -> Message:
     if not isinstance(message, dict):
         raise AnswerError("not a JSON object")
     budget = [_VALUES_MAX]
-    cleaned = _clean(message, "", 0, budget)
+    cleaned = _clean_value(message, "", 0, budget)
     assert isinstance(cleaned, dict)
     return cleaned
 
 
-def _clean(value: object, field: str, depth: int, budget: list[int]) -> object:
+def _clean_value(value: object, field: str, depth: int, budget: list[int]) -> object:
     """Check a value of any meaning; texts lose what a terminal would execute."""
     budget[0] -= 1
     if budget[0] < 0:
@@ -48,12 +48,14 @@ def _clean(value: object, field: str, depth: int, budget: list[int]) -> object:
         raise AnswerError(f"{field}: nested too deep")
     if isinstance(value, dict):
         return {
-            _clean_key(key, field): _clean(item, _joined(field, key), depth + 1, budget)
+            _clean_key(key, field): _clean_value(
+                item, _join_field_name(field, key), depth + 1, budget
+            )
             for key, item in value.items()
         }
     if isinstance(value, list):
         return [
-            _clean(item, _joined(field, str(place)), depth + 1, budget)
+            _clean_value(item, _join_field_name(field, str(place)), depth + 1, budget)
             for place, item in enumerate(value)
         ]
     if isinstance(value, str):
@@ -83,7 +85,7 @@ def _checked_number(value: int | float, field: str) -> int | float:
     return value
 
 
-def _joined(field: str, key: str) -> str:
+def _join_field_name(field: str, key: str) -> str:
     """The name of an inner field; a peer's own keys may appear in it, so it is kept short and
     plain.
     """

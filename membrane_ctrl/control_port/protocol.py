@@ -41,7 +41,7 @@ class RequestError(ValueError):
         self.number = number
 
 
-def _words(most_bytes: int) -> AfterValidator:
+def _make_text_check(most_bytes: int) -> AfterValidator:
     def check(text: str) -> str:
         if not text.isprintable():
             raise ValueError("only printable characters, in one line")
@@ -62,11 +62,13 @@ class OnBehalf(Section):
 
     via: Literal["page", "token", "bridge"]
     # name with which the person logged in; empty: without a login
-    account: Annotated[str, _words(WHO_BYTES - 8)] = ""
-    name: Annotated[str, _words(WHO_BYTES - 8)] = ""  # who it is, for people, if there is no login
-    session: Annotated[str, _words(WHO_BYTES)] = ""  # of that person
+    account: Annotated[str, _make_text_check(WHO_BYTES - 8)] = ""
+    name: Annotated[str, _make_text_check(WHO_BYTES - 8)] = (
+        ""  # who it is, for people, if there is no login
+    )
+    session: Annotated[str, _make_text_check(WHO_BYTES)] = ""  # of that person
     # for whom a program asks, as it states itself
-    viewer: Annotated[str, _words(WHO_BYTES - 8)] = ""
+    viewer: Annotated[str, _make_text_check(WHO_BYTES - 8)] = ""
     role: Role
 
 
@@ -78,11 +80,11 @@ class Request(Section):
     # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `claim` (command
     # for a session, this connection), `release` (give up command), `quiet` (acknowledge the alarms)
     do: RequestName
-    why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
+    why: Annotated[str, _make_text_check(WHY_BYTES)] = ""  # recorded with the command
     value: float | None = None  # `setpoint`: µm. `manual`: µm/s. `gains`: trial time, s
     # `mark`: the remark. `latch`: why the mirror is locked. `unlock`: the lock's word, which a
     # person typed. `claim`: the session's name
-    text: Annotated[str, _words(TEXT_BYTES)] = ""
+    text: Annotated[str, _make_text_check(TEXT_BYTES)] = ""
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
     pump: dict[str, Any] | None = None  # `gains`: the table `[pump]`, if it changes
     # `tune`: an `ExperimentSpec`, which states its fields
@@ -105,7 +107,7 @@ class Request(Section):
         return SAME_AS.get(do, do)
 
     @model_validator(mode="after")
-    def _complete(self) -> Request:
+    def _check_fields(self) -> Request:
         rule = TABLE.get(self.do)  # type: ignore[arg-type]
         if rule:
             needs, takes = rule.needs, rule.takes
@@ -136,7 +138,7 @@ def parse(line: bytes) -> Request:
         reason = toml_file.describe_error(error.errors(include_url=False)[0], Request).removeprefix(
             ": "
         )
-        raise RequestError(_short(reason), _number_in(line)) from None
+        raise RequestError(_shorten_reason(reason), _number_in(line)) from None
 
 
 def encode(message: dict[str, Any]) -> bytes:
@@ -155,7 +157,7 @@ def _number_in(line: bytes) -> int:
     return 0
 
 
-def _short(reason: str, most: int = 300) -> str:
+def _shorten_reason(reason: str, most: int = 300) -> str:
     """One printable line, which may quote the client."""
     clean = "".join(c if c.isprintable() else "?" for c in reason)
     if len(clean) <= most:

@@ -202,7 +202,7 @@ class Port:
         sender = sender_of(peer, request.on_behalf)
         refusal = (
             explain_missing_role(sender, request.do)
-            or self._expired(request)
+            or self._explain_expiry(request)
             or self._claim_command(session, request)
         )
         # 2. A safety command overtakes what waits on all connections
@@ -213,13 +213,13 @@ class Port:
             return self._run_errand(session, sender, request)
         # 3. The next tick executes the command, or refuses it
         try:
-            command = self._command(sender, request) if not refusal else None
+            command = self._make_command(sender, request) if not refusal else None
         except errors.InputError as error:
             refusal, command = str(error), None
         if command is None:
             self._refusals.record(sender.who, request.do, refusal, request.why)
             return {"ok": False, "refused": refusal}
-        refusal = await self._obeyed(command)
+        refusal = await self._await_outcome(command)
         if refusal:
             return {"ok": False, "refused": refusal}
         answer = {"ok": True, "state": status_table(self._status)["state"]}
@@ -243,7 +243,7 @@ class Port:
             problem = f"the disk has not confirmed it within {_STORE_S:g} s"
         return found | {"stored": not problem, "problem": problem}
 
-    def _expired(self, request: protocol.Request) -> str:
+    def _explain_expiry(self, request: protocol.Request) -> str:
         """Why the request is too old to be obeyed; empty if it is not.
         Safety commands never are.
         """
@@ -317,7 +317,7 @@ class Port:
         former = who if in_command is None else in_command.describe()
         self._record_event(port_events.CommanderChanged(None, former, why))
 
-    def _command(self, sender: Sender, request: protocol.Request) -> Command:
+    def _make_command(self, sender: Sender, request: protocol.Request) -> Command:
         """The command of a request. Raises InputError for invalid
         gains or an invalid experiment.
         """
@@ -371,7 +371,7 @@ class Port:
             raise errors.InputError(f"gains: kp_per_s = {loop.kp_per_s:g}: {weak[1]}")
         return loop
 
-    async def _obeyed(self, command: Command) -> str:
+    async def _await_outcome(self, command: Command) -> str:
         """Why the tick refused the command; empty if it executed it."""
         if self._over:
             return _OVER

@@ -42,7 +42,7 @@ class PortSession:
         """Answer requests until the peer disconnects."""
         try:
             self._connection.send(greeting)
-            await self._converse(answer, refused)
+            await self._serve_requests(answer, refused)
         except SlowReaderError as error:
             refused(self.peer.who, "", str(error))
         except RequestError as error:
@@ -53,7 +53,7 @@ class PortSession:
             self.watch(None)
             await self._connection.close()
 
-    async def _converse(self, answer: Answer, refused: Refused) -> None:
+    async def _serve_requests(self, answer: Answer, refused: Refused) -> None:
         async def answer_request(request: Request) -> dict[str, Any]:
             return await answer(self, request)
 

@@ -41,7 +41,7 @@ class UnixListener:
             self._made_folder = not path.parent.exists()
             path.parent.mkdir(parents=True, exist_ok=True)
             _remove_stale(path)
-            self.socket = _bound(path, group)
+            self.socket = _bind_socket(path, group)
         except OSError as error:
             raise DeviceError(
                 f"{path.parent}: cannot be written, and there is no control port in it "
@@ -116,7 +116,7 @@ def group_id(name: str) -> int:
         ) from None
 
 
-def _bound(path: Path, group: str | None) -> socket.socket:
+def _bind_socket(path: Path, group: str | None) -> socket.socket:
     owner = -1 if group is None else group_id(group)
     listener = socket.socket(socket.AF_UNIX)
     umask = os.umask(0o777 & ~_MODE)  # the file must never have wider permissions

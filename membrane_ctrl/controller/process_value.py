@@ -431,7 +431,7 @@ class ProcessValueChoice:
         """What errors, sensors and innovations show of the cause."""
         memory = self.memory
         error = memory.estimate_error
-        if error is not None and abs(memory.apart_um) > _root(error.um2):
+        if error is not None and abs(memory.apart_um) > _root_mean_square(error.um2):
             return (
                 f"laser and camera moved apart by {abs(memory.apart_um):.1f} µm in the minute "
                 "before: either of them may creep"
@@ -454,7 +454,7 @@ def _count_sigmas(larger: MeanSquare, smaller: MeanSquare) -> float:
     return (larger.um2 - smaller.um2) / sigma_um2 if sigma_um2 > 0.0 else 0.0
 
 
-def _root(mean_square_um2: float) -> float:
+def _root_mean_square(mean_square_um2: float) -> float:
     return math.sqrt(max(0.0, mean_square_um2))
 
 
@@ -462,5 +462,5 @@ def _describe_root(mean_square: MeanSquare) -> str:
     """A root mean square in µm; its upper limit if the laser's noise hides it."""
     margin_um2 = 2.0 * mean_square.sigma_um2
     if mean_square.um2 > margin_um2:
-        return f"{_root(mean_square.um2):.2f} µm"
-    return f"less than {_root(max(0.0, mean_square.um2) + margin_um2):.2f} µm"
+        return f"{_root_mean_square(mean_square.um2):.2f} µm"
+    return f"less than {_root_mean_square(max(0.0, mean_square.um2) + margin_um2):.2f} µm"

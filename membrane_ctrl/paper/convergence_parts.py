@@ -115,9 +115,9 @@ def compare_starts(bench: MeasuredBench) -> PartResult:
         ours_mm[name] = _solve_by_measure(bench, start.height_mm).height(x_mm, y_mm)
     reference = heights_mm["paraboloid 40 mm"]
     own = ours_mm["paraboloid 40 mm"]
-    spread_mm = max(_largest(on_map(each - reference)) for each in heights_mm.values())
-    own_spread_mm = max(_largest(on_map(each - own)) for each in ours_mm.values())
-    largest_mm = _largest(on_map(reference))
+    spread_mm = max(_find_largest(on_map(each - reference)) for each in heights_mm.values())
+    own_spread_mm = max(_find_largest(on_map(each - own)) for each in ours_mm.values())
+    largest_mm = _find_largest(on_map(reference))
     comparisons = [
         PaperStatement(
             "largest difference between the solutions after nine iterations, mm",
@@ -173,5 +173,5 @@ def _count_iterations(changes_mm: list[float]) -> int:
     return below[0] if below else 0
 
 
-def _largest(difference_mm: FloatArray) -> float:
+def _find_largest(difference_mm: FloatArray) -> float:
     return float(np.nanmax(np.abs(difference_mm)))

@@ -37,7 +37,7 @@ class _TrueRays:
 
 def compare_gradients(bench: PaperBench) -> PartResult:
     """Slopes by the paper's equations for a known film, less the film's own."""
-    axis_mm, inside, x_mm, y_mm = _aperture(bench)
+    axis_mm, inside, x_mm, y_mm = _make_aperture_grid(bench)
     true = _trace(bench, x_mm, y_mm)
 
     rows: dict[str, FloatArray] = {}
@@ -89,7 +89,10 @@ def compare_gradients(bench: PaperBench) -> PartResult:
         name: {
             f"{axis}_{kind}_urad": _without_rounding(value)
             for axis, values in zip("xy", error, strict=True)
-            for kind, value in (("rms", _rms(values)), ("max", float(np.max(np.abs(values)))))
+            for kind, value in (
+                ("rms", _compute_rms(values)),
+                ("max", float(np.max(np.abs(values)))),
+            )
         }
         for name, error in rows.items()
     }
@@ -106,7 +109,7 @@ def compare_gradients(bench: PaperBench) -> PartResult:
     return PartResult(comparisons, numbers, drawn)
 
 
-def _aperture(bench: PaperBench) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
+def _make_aperture_grid(bench: PaperBench) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
     """Axis (m,) of a map, points inside the analysed radius (m, m), and their x and y (n,)."""
     reach_mm = bench.optics.mirror.analysis_radius_mm
     axis_mm = np.linspace(-reach_mm, reach_mm, _SIDE)
@@ -145,10 +148,10 @@ def _trace(bench: PaperBench, x_mm: FloatArray, y_mm: FloatArray) -> _TrueRays:
 
 
 def _state(error_urad: FloatArray) -> str:
-    return f"RMS {_rms(error_urad):.3g}, largest {np.max(np.abs(error_urad)):.3g}"
+    return f"RMS {_compute_rms(error_urad):.3g}, largest {np.max(np.abs(error_urad)):.3g}"
 
 
-def _rms(values: FloatArray) -> float:
+def _compute_rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 

@@ -299,7 +299,7 @@ def _solve_trial(inputs: TrialInputs, trial: _Trial, reading: AngleReading) -> F
     if reading is AngleReading.PIXEL_RAYS:
         rays = _turn_about_y(rays, trial.alpha_rad)
     else:
-        fixed_mm = _meet(inputs.geometry, rays, nominal)
+        fixed_mm = _intersect_surface(inputs.geometry, rays, nominal)
     y_geometry: PaperGeometry | None = None
     y_change: SlopeChange | None = None
     if reading in (AngleReading.ANGLE_IN_X, AngleReading.ANGLE_AS_IN_X):
@@ -337,7 +337,9 @@ def _turn_about_y(rays: FloatArray, angle_rad: float) -> FloatArray:
     return turn @ rays
 
 
-def _meet(geometry: PaperGeometry, rays: FloatArray, surface: PolynomialSurface) -> FloatArray:
+def _intersect_surface(
+    geometry: PaperGeometry, rays: FloatArray, surface: PolynomialSurface
+) -> FloatArray:
     """Places (2, n) where rays meet a surface."""
     pinhole_mm = geometry.pinhole_mm[:, None]
     height_mm: FloatArray | float = 0.0

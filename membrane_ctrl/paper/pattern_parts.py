@@ -146,7 +146,7 @@ def compare_gray_table(bench: MeasuredBench) -> PartResult:
         PaperStatement(
             "K1 (GC1 to GC3), K2 (GC1 to GC4)",
             "K1 jumps where the phase does, K2 half a period away",
-            f"K1 {_join(k1)}; K2 {_join(k2)}",
+            f"K1 {_join_integers(k1)}; K2 {_join_integers(k2)}",
             Agreement.REPRODUCED
             if np.array_equal(k1, half_periods // 2) and np.array_equal(k2, (half_periods + 1) // 2)
             else Agreement.DIFFERS,
@@ -188,5 +188,5 @@ def _draw_phases(
     return {"phase of x": pictures.draw_images(maps, titles)}
 
 
-def _join(values: IntArray) -> str:
+def _join_integers(values: IntArray) -> str:
     return " ".join(str(int(value)) for value in values)

@@ -18,7 +18,7 @@ def draw_frames(frames: Sequence[AnyArray], names: Sequence[str]) -> bytes:
     columns = (len(frames) + 1) // 2
     figure, axes = new_sheet(2.2 * columns, 4.4, 2, columns)
     for cell, frame, name in zip(np.ravel(axes), frames, names, strict=True):
-        cell.imshow(_thin(frame), cmap="gray")
+        cell.imshow(_thin_image(frame), cmap="gray")
         cell.set_title(name, fontsize=8)
         cell.set_axis_off()
     return to_png(figure)
@@ -28,7 +28,7 @@ def draw_images(images: Sequence[AnyArray], titles: Sequence[str]) -> bytes:
     """Images of the camera beside each other, each with its colour bar."""
     figure, axes = new_sheet(3.4 * len(images), 3.0, 1, len(images))
     for cell, image, title in zip(np.ravel(axes), images, titles, strict=True):
-        shown = cell.imshow(_thin(image), cmap=_MAP_COLOURS, interpolation="nearest")
+        shown = cell.imshow(_thin_image(image), cmap=_MAP_COLOURS, interpolation="nearest")
         figure.colorbar(shown, ax=cell, shrink=0.8)
         cell.set_title(title, fontsize=9)
         cell.set_axis_off()
@@ -105,7 +105,7 @@ def to_png(figure: Any) -> bytes:
     return file.getvalue()
 
 
-def _thin(image: AnyArray) -> AnyArray:
+def _thin_image(image: AnyArray) -> AnyArray:
     """Every n-th pixel, so that a side has about `_THINNED`."""
     step = max(1, max(image.shape) // _THINNED)
     return image[::step, ::step]

@@ -57,7 +57,7 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
         PaperStatement(
             "of it, left by a film with this pre-strain, µm RMS",
             "initial concavity and pre-tension, not fitted",
-            f"{_rms(left_um):.1f}",
+            f"{_compute_rms(left_um):.1f}",
             Agreement.UNSTATED,
             "`membrane-ctrl film` fits the pre-strain from sets at several pressures",
         ),
@@ -68,17 +68,17 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
     numbers = {
         "edge_from_hencky_mm": edge_mm,
         "prestrain": prestrain,
-        "left_by_prestrain_um": _rms(left_um),
+        "left_by_prestrain_um": _compute_rms(left_um),
         "sag_mm": surface.sag_mm,
     }
     if isinstance(bench, PaperBench):
         error_um = 1e3 * (height_mm - bench.film.height_mm(x_mm, y_mm))
-        numbers["error_rms_um"] = _rms(error_um)
+        numbers["error_rms_um"] = _compute_rms(error_um)
         comparisons.append(
             PaperStatement(
                 "height less the truth, µm RMS and largest",
                 "",
-                f"{_rms(error_um):.2f} and {np.max(np.abs(error_um)):.2f}",
+                f"{_compute_rms(error_um):.2f} and {np.max(np.abs(error_um)):.2f}",
                 Agreement.UNSTATED,
                 "with the exact geometry: what phases and reconstruction add",
             )
@@ -99,5 +99,5 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
     return PartResult(comparisons, numbers, drawn)
 
 
-def _rms(values: FloatArray) -> float:
+def _compute_rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))

@@ -84,7 +84,7 @@ def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> SetSeries:
     live = LiveReconstructor(bench.optics, bin_px, laser_noise_um=_LASER_NOISE_UM)
     full = pattern_sequence.full_sequence(bench.optics.pattern)
     fringes = pattern_sequence.fringe_sequence(bench.optics.pattern)
-    film_um = _wander(random, len(full) + (sets - 1) * len(fringes))
+    film_um = _draw_displacements(random, len(full) + (sets - 1) * len(fringes))
     readings_um = film_um + _LASER_NOISE_UM * random.standard_normal(film_um.size)
 
     parameters_mm, middle_s, moved_um = [], [], []
@@ -315,7 +315,7 @@ def estimate_film_share_um(series: SetSeries, height_um: FloatArray) -> FloatArr
     return np.asarray(np.mean(height_um, axis=0) + np.outer(moved_um, per_um))
 
 
-def _wander(random: np.random.Generator, count: int) -> FloatArray:
+def _draw_displacements(random: np.random.Generator, count: int) -> FloatArray:
     """Displacements (count,) of a held film at each frame, µm."""
     keep = math.exp(-_FRAME_S / _CORRELATED_S)
     push = math.sqrt(1 - keep**2)

@@ -20,21 +20,21 @@ _FRINGES_CYCLE_S = 4.0
 def compare_timings(bench: MeasuredBench) -> PartResult:
     """Seconds of the paper's steps here, each also in copies of the set's frames."""
     stack = bench.stack
-    copy_s = min(_time(stack.frames.copy) for _ in range(3))
-    check_s = _time(lambda: check_set(stack, bench.optics, None))
-    pixels_s = _time(lambda: measure_pixels(bench.optics, bench.checked))
-    solve_s = _time(lambda: reconstruct_full(bench.optics, bench.checked, bench.pixels))
+    copy_s = min(_measure_time(stack.frames.copy) for _ in range(3))
+    check_s = _measure_time(lambda: check_set(stack, bench.optics, None))
+    pixels_s = _measure_time(lambda: measure_pixels(bench.optics, bench.checked))
+    solve_s = _measure_time(lambda: reconstruct_full(bench.optics, bench.checked, bench.pixels))
 
     live = LiveReconstructor(bench.optics)
     readings_um = np.zeros(len(stack.frames))
     time_s = np.arange(len(stack.frames), dtype=float)
     frames = list(stack.frames)
-    live_full_s = _time(lambda: live.measure_full(frames, time_s, readings_um))
+    live_full_s = _measure_time(lambda: live.measure_full(frames, time_s, readings_um))
     slots = pattern_sequence.FullSlots(bench.optics.pattern.steps)
     fringes = [frames[index] for part in slots.sinusoids for index in range(*part.indices(99))]
     count = len(fringes)
     live_fringes_s = min(
-        _time(lambda: live.measure_fringes(fringes, time_s[:count], readings_um[:count]))
+        _measure_time(lambda: live.measure_fringes(fringes, time_s[:count], readings_um[:count]))
         for _ in range(3)
     )
     rows = {
@@ -103,7 +103,7 @@ def compare_limitations(_: MeasuredBench) -> PartResult:
     return PartResult(comparisons, {}, {})
 
 
-def _time(run: Callable[[], object]) -> float:
+def _measure_time(run: Callable[[], object]) -> float:
     """Seconds of one run, by the clock."""
     begin_s = time.perf_counter()
     run()

@@ -61,12 +61,14 @@ def show_command(run: Path, logs: Path, json: bool) -> int:
     for each in opened.log:
         match each.event:
             case (
-                events.StateEntered(state=said)
-                | events.Fault(name=said)
-                | Mark(text=said)
-                | Ended(exit=said)
+                events.StateEntered(state=words)
+                | events.Fault(name=words)
+                | Mark(text=words)
+                | Ended(exit=words)
             ):
-                print(f"  {opened.utc(each.mono_s):%H:%M:%S}  {each.event.kind:6} {one_line(said)}")
+                print(
+                    f"  {opened.utc(each.mono_s):%H:%M:%S}  {each.event.kind:6} {one_line(words)}"
+                )
     for note in opened.notes:
         print(f"  note: {note}")
     return 0

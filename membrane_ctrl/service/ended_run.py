@@ -146,8 +146,8 @@ class EndedRun:
             lines.append(f"seen {self.fault_utc:%H:%M:%S} UTC: {self.fault.seen}{limit}")
         lines.append(f"to do: {self.remedy}")
         if self.read_utc is not None:
-            pump = _percent(self.pump_fraction)
-            vent = _percent(self.vent_fraction)
+            pump = _format_percent(self.pump_fraction)
+            vent = _format_percent(self.vent_fraction)
             lines.append(
                 f"as last read back at {self.read_utc:%H:%M:%S} UTC: pump {pump}, vent {vent}, "
                 f"state {self.state}"
@@ -155,7 +155,7 @@ class EndedRun:
         return tuple(lines)
 
 
-def _percent(fraction: float) -> str:
+def _format_percent(fraction: float) -> str:
     return f"{100 * fraction:.0f} %" if math.isfinite(fraction) else "not reported"
 
 

@@ -237,9 +237,9 @@ class HoldFeed:
         if not answer.get("ok"):
             raise errors.DeviceError(f"watch refused: {answer.get('refused')}")
         try:
-            self._take(answer, greeting, rings)
+            self._take_message(answer, greeting, rings)
             for message in client.messages():
-                self._take(message, greeting, rings)
+                self._take_message(message, greeting, rings)
                 if self._ending.is_set():
                     return
         finally:
@@ -264,7 +264,7 @@ class HoldFeed:
         self._events.clear()
         return RunEventsReader(read_newest_lines(self.folder), reader)
 
-    def _take(
+    def _take_message(
         self, streamed: Message, greeting: Message, rings: dict[str, ring.RingReader]
     ) -> None:
         if self._log is not None:
@@ -300,7 +300,7 @@ class HoldFeed:
         """Add the ticks since the last status; without a ring, the status's own."""
         utc_s = time.time()
         if reader is None:
-            self.seconds.add(utc_s, {name: _number(newest.get(name)) for name in SIGNALS})
+            self.seconds.add(utc_s, {name: _to_number(newest.get(name)) for name in SIGNALS})
             return
         rows = telemetry.unpack_rows(reader.drain())
         if len(rows):
@@ -326,7 +326,7 @@ def _is_over(run: EndedRun) -> bool:
     return (datetime.now(UTC) - last_utc).total_seconds() > _RECORDING_S
 
 
-def _number(value: object) -> float:
+def _to_number(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
 
 
@@ -378,11 +378,11 @@ def history(
         if logs is None or not logs.is_dir()
         else _of_runs(logs, signal, begin_s, float(before_s), span_s)
     )
-    return thinned(_joined([*parts, live]), span_s)
+    return thinned(_join_series([*parts, live]), span_s)
 
 
 @lru_cache(maxsize=32)  # each list opens every run of its folder
-def _entries(logs: Path, _turn: float) -> list[catalogue.RunEntry]:
+def _list_entries(logs: Path, _turn: float) -> list[catalogue.RunEntry]:
     return catalogue.list_entries(logs)
 
 
@@ -395,7 +395,7 @@ def marks(
     begin_s = (feed.until_s if now_s is None else now_s) - span_s
     found = list(feed.marks)
     if logs is not None and logs.is_dir() and begin_s < feed.met_s:
-        for entry in _entries(logs, time.monotonic() // _LISTED_S):
+        for entry in _list_entries(logs, time.monotonic() // _LISTED_S):
             start_s = entry.started_utc.timestamp()
             if not entry.marks or start_s > feed.met_s:
                 continue
@@ -419,7 +419,7 @@ def _of_runs(logs: Path, signal: str, begin_s: float, end_s: float, span_s: floa
     window_s = next((w for w in (1.0, 10.0) if span_s / w <= 4 * _POINTS_MAX), 60.0)
     names = [f"{kind}_{signal}" for kind in ("min", "mean", "max")]
     found = []
-    for entry in _entries(logs, time.monotonic() // _LISTED_S):
+    for entry in _list_entries(logs, time.monotonic() // _LISTED_S):
         start_s = entry.started_utc.timestamp()
         duration_s = entry.duration_s if math.isfinite(entry.duration_s) else 0.0
         if start_s > end_s or start_s + duration_s < begin_s:
@@ -435,7 +435,7 @@ def _of_runs(logs: Path, signal: str, begin_s: float, end_s: float, span_s: floa
     return found
 
 
-def _joined(parts: Sequence[Series]) -> Series:
+def _join_series(parts: Sequence[Series]) -> Series:
     parts = [part for part in parts if part.utc_s.size]
     if not parts:
         return Series(*(np.empty(0) for _ in range(4)))

@@ -32,11 +32,11 @@ def ask_hold(where: Where, run: str, request: Message, limits: SendLimits = NO_L
                 raise errors.DeviceError("not sent: another run is listening now; look again")
             if reason := limits.find_refusal():
                 return {"ok": False, "refused": reason}
-            request = request | _expiry(client.greeting, limits.deadline_s)
+            request = request | _make_expiry(client.greeting, limits.deadline_s)
         return client.ask(**request)
 
 
-def _expiry(greeting: Message, deadline_s: float) -> Message:
+def _make_expiry(greeting: Message, deadline_s: float) -> Message:
     """The request's time limit on the hold's clock; none for a hold
     that does not send its clock.
     """

@@ -157,8 +157,8 @@ def _cells(line: RunLine, utc: bool) -> dict[str, object]:
     return {
         "run": entry.name,
         "started": f"{started:%Y-%m-%d %H:%M}",
-        "hours": _rounded(entry.duration_s / 3600, 2),
-        "std": _rounded(entry.std_um, 3),
+        "hours": _round_finite(entry.duration_s / 3600, 2),
+        "std": _round_finite(entry.std_um, 3),
         "faults": entry.faults,
         "exit": entry.exit,
         "marks": entry.marks,
@@ -166,7 +166,7 @@ def _cells(line: RunLine, utc: bool) -> dict[str, object]:
     }
 
 
-def _rounded(value: float, digits: int) -> float | None:
+def _round_finite(value: float, digits: int) -> float | None:
     return round(value, digits) if math.isfinite(value) else None
 
 

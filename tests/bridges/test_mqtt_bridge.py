@@ -383,7 +383,7 @@ async def test_a_second_bridge_of_the_name_is_refused_and_the_first_continues(
             with pytest.raises(ExceptionGroup) as refused:
                 await second
             assert time.monotonic() - begin_s < 8.0
-        (error,) = mqtt._leaves(refused.value)
+        (error,) = mqtt._list_exceptions(refused.value)
         assert isinstance(error, DeviceError)
         assert f"the name 'mirror' is in use by another bridge (process {os.getpid()} on " in str(
             error
@@ -409,7 +409,7 @@ async def test_of_two_bridges_that_start_together_one_continues(tmp_path: Path) 
             assert len(done) == 1
             refused = done.pop().exception()
             assert isinstance(refused, ExceptionGroup)
-            assert [type(error) for error in mqtt._leaves(refused)] == [DeviceError]
+            assert [type(error) for error in mqtt._list_exceptions(refused)] == [DeviceError]
             await listener.until(lambda: "online" in listener.of("availability"))
             owners = {
                 json.loads(each)["instance"]
@@ -459,7 +459,7 @@ async def test_an_owner_that_comes_back_ends_the_bridge_that_took_its_name(tmp_p
         await send(port, "owner", older.encode())
         with pytest.raises(ExceptionGroup) as refused:
             await asyncio.wait_for(task, PATIENCE_S)
-        assert [type(error) for error in mqtt._leaves(refused.value)] == [DeviceError]
+        assert [type(error) for error in mqtt._list_exceptions(refused.value)] == [DeviceError]
 
 
 async def test_younger_claims_do_not_disturb_an_owner(tmp_path: Path) -> None:

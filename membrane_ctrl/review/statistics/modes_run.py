@@ -50,7 +50,7 @@ class SeenMode:
     def frequency_hz(self) -> float:
         """Mean, weighted by the searches' own errors."""
         return float(
-            np.average([line.frequency_hz for line in self.lines], weights=self._weights())
+            np.average([line.frequency_hz for line in self.lines], weights=self._make_weights())
         )
 
     @property
@@ -58,7 +58,7 @@ class SeenMode:
         """Standard error of the mean, from the searches' errors or from their scatter if that is
         larger.
         """
-        own = 1 / np.sqrt(np.sum(self._weights()))
+        own = 1 / np.sqrt(np.sum(self._make_weights()))
         values = [line.frequency_hz for line in self.lines]
         return float(
             max(own, np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0)
@@ -83,7 +83,7 @@ class SeenMode:
             return float(np.median(values[-ends:]) / np.median(values[:ends]) - 1)
         return 0.0
 
-    def _weights(self) -> FloatArray:
+    def _make_weights(self) -> FloatArray:
         return np.array([line.sigma_hz for line in self.lines]) ** -2.0
 
 
