@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -33,6 +34,8 @@ _SYSTEMCTL_S = 120.0  # `Type=notify`: systemctl waits for the first tick
 _LOG_BYTES_MAX = 1_000_000
 _TAIL_BYTES = 4000
 _TAIL_LINES = 5
+# ends of which the run's record states the cause
+_STATED_BY_RUN = (errors.Exit.DONE, errors.Exit.INTERRUPTED, errors.Exit.SAFETY_TRIP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +132,10 @@ class HoldStarter:
             if code is None:
                 return True
             self._process = None
-            if code not in (errors.Exit.DONE, errors.Exit.INTERRUPTED):
+            if code < 0:
+                name = signal.Signals(-code).name
+                self._failure = f"the hold was ended by {name}; its output is in {LOG_NAME}"
+            elif code not in _STATED_BY_RUN:
                 self._failure = f"the hold ended with code {code}: {self._read_tail()}"
             return False
 

@@ -71,8 +71,7 @@ class NoHoldPanel:
         self._listed = await RUN_LISTS.run(self._starter.list_configurations)
         labels = {each.name: _label(each) for each in self._listed}
         usable = [each.name for each in self._listed if not each.problem]
-        ended = self._feed.seen.ended
-        of_run = None if ended is None else find_name_of_run(ended.name, usable)
+        of_run = find_name_of_run(self._feed.seen.name, usable)
         self._choice.set_options(labels, value=of_run or next(iter(usable), None))
 
     def _look(self) -> None:

@@ -86,6 +86,26 @@ def test_a_program_has_its_own_session_and_not_the_services_priority(
         assert starter.failure == ""
 
 
+@pytest.mark.parametrize(
+    ("end", "failure"),
+    [
+        ("os.kill(os.getpid(), 9)", "the hold was ended by SIGKILL; its output is in hold.log"),
+        ("sys.exit(5)", ""),  # a fault: the record of the run states it
+    ],
+)
+def test_the_end_of_a_run_is_no_failed_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, failure: str
+) -> None:
+    program = tmp_path / "python"
+    program.write_text(f"#!{sys.executable}\nimport os, sys\n{end}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    with starter_of(tmp_path) as starter:
+        starter.start_hold("twin", "anna", StartOptions()).result()
+        wait_for_end(starter)
+        assert starter.failure == failure
+
+
 def test_a_hold_that_does_not_start_prints_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
