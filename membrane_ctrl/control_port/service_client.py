@@ -57,7 +57,11 @@ _REFUSALS = frozenset(
     }
 )
 _SIGNALS = TypeAdapter(Annotated[list[SignalAnswer], Field(max_length=1000)])
+_EVENTS = TypeAdapter(
+    Annotated[list[Annotated[str, Field(max_length=20_000)]], Field(max_length=500)]
+)
 Model = TypeVar("Model", bound=BaseModel)
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,15 +159,21 @@ class ServiceClient:
 
     def read_signals(self) -> dict[str, float | str | None]:
         """Return the values of the published signals by name. Raises as `read_state`."""
-        status, body = self._request("GET", "/api/signals")
+        signals = self._read_list("signals", _SIGNALS)
+        return {each.name: each.value for each in signals}
+
+    def read_events(self) -> tuple[str, ...]:
+        """Return the last events as sentences, oldest first. Raises as `read_state`."""
+        return tuple(self._read_list("events", _EVENTS))
+
+    def _read_list(self, what: str, model: TypeAdapter[list[Item]]) -> list[Item]:
+        status, body = self._request("GET", f"/api/{what}")
         if status != HTTPStatus.OK:
             raise self._make_refusal(status, body)
         try:
-            found = plain_json.loads(body.decode())
-            signals = _SIGNALS.validate_python(found)
+            return model.validate_python(plain_json.loads(body.decode()))
         except ValueError as error:  # a ValidationError is one
-            raise self._not_of_a_service(f"signals: {str(error).splitlines()[0]}") from None
-        return {each.name: each.value for each in signals}
+            raise self._not_of_a_service(f"{what}: {str(error).splitlines()[0]}") from None
 
     def read_user(self) -> UserAnswer:
         """Return whose token it is there, with its role. Raises as `read_state`."""

@@ -11,6 +11,7 @@ from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.service_client import ServiceAddress, ServiceClient
 from membrane_ctrl.controller.command import Role
+from membrane_ctrl.model import terminal
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_command import NO_LIMITS
 from membrane_ctrl.service.hold_seen import HoldSeen, Message
@@ -68,7 +69,10 @@ class ServiceFeed(HoldFeed):
             seen, role=self._role, status=state.status, seen_s=time.monotonic(), problem=problem
         )
         self._take_row(state)
-        if self._with_signals and state.in_contact:
+        if not self._with_signals:
+            events = tuple(terminal.one_line(line) for line in self._service.read_events())
+            self.seen = replace(self.seen, events=events)
+        elif state.in_contact:
             self._values = self._service.read_signals()
 
     def _follow(self) -> None:
@@ -82,8 +86,10 @@ class ServiceFeed(HoldFeed):
 
 
 def make_feed(where: Where, with_signals: bool = False) -> HoldFeed:
-    """Return what follows a hold, wherever it is; `with_signals`: also the published signals of a
-    hold behind a service.
+    """Return what follows a hold, wherever it is.
+
+    Of a hold behind a service, `with_signals` gets the published signals, for bridges; else the
+    events, for the page.
     """
     if where.service is None:
         return HoldFeed(where)

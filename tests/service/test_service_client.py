@@ -23,6 +23,7 @@ from membrane_ctrl.control_port.service_client import (
     read_token,
 )
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
+from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.service.access import on_behalf
 from membrane_ctrl.service.send_limits import SendLimits
 from membrane_ctrl.service.service_feed import ServiceFeed, make_feed
@@ -115,6 +116,10 @@ async def test_a_person_and_another_service_reach_a_hold_through_its_service(
                 "hold",
             )
             assert feed.logs is None, "its runs are there"
+            run.port.note_report(Mark("door opened", "anna"))
+            async with asyncio.timeout(60.0):
+                while not any("door opened" in line for line in feed.seen.events):
+                    await asyncio.to_thread(feed.follow_once)
             viewer = on_behalf(WebUser("anna", "tune"), "page 1")
             asked = {"do": "pause", "on_behalf": viewer}
             outcome = await asyncio.to_thread(feed.ask, asked)
