@@ -89,6 +89,19 @@ def test_80_ms_without_the_laser_end_no_experiment(kind: str) -> None:
         assert {round(row.pump_fraction, 6) for row in tune[1:]} <= {0.0, 0.7}
 
 
+@pytest.mark.parametrize("kind", ["relay", "doublets", "steps", "multisine", "pump_map"])
+def test_an_experiment_may_begin_in_a_tick_without_a_reading(kind: str) -> None:
+    """Its command must be a number from the first tick on: another one latches a fault."""
+    link, rig = settled([(0.0, 0.08)])
+    steps = STEPS if kind == "pump_map" else ()
+    rows, finished = rig.perform_ticks(make_spec(kind, 9.0 if kind != "pump_map" else 60.0, steps))
+    assert finished.completed, finished
+    first = next(row for row in rows if row.state == State.TUNE)
+    assert math.isnan(first.filtered_um)
+    assert all(math.isfinite(row.pump_fraction) for row in rows)
+    assert link.rows[-1].state == State.HOLD
+
+
 def test_an_experiment_whose_reading_was_lost_is_repeated_without_a_gap() -> None:
     link, rig = settled([(3.0, 4.5)])
     first = len(link.rows)

@@ -26,6 +26,7 @@ _P_MIN = 1e-4
 _BENT_SIGMAS = 5.0
 _BENT_SHARE = 0.2  # of k; the margins tolerate less
 _STRONG = 1.5  # k of a pump whose least flow may be more than the leak: it swings with any gains
+_REPEATED_MOST = 0.15  # of the readings; a sensor with steps of a quarter of its noise has 7 %
 _WORSE_MAX = 1.5  # innovation on new data relative to the fit
 
 
@@ -148,11 +149,20 @@ def _list_findings(
         coloured = f"k = {model.gain:.2f}, and the residuals are coloured (a sticking pump?)"
         refused.append(_suspect_pump(coloured))
     elif identified.whiteness_p < _P_MIN:
-        periodic = (
-            "something periodic moves the mirror or the reading, or the weather is no random walk"
-        )
-        degraded.append(FitFinding(f"the residuals are coloured: {periodic}"))
+        degraded.append(FitFinding(f"the residuals are coloured: {_explain_colour(record)}"))
     return refused, degraded
+
+
+def _explain_colour(record: Record) -> str:
+    """What may colour the residuals; the sensor first, where it repeats its readings."""
+    steps_um = np.diff(record.displacement_um[np.isfinite(record.displacement_um)])
+    repeated = float(np.mean(steps_um == 0.0)) if steps_um.size else 0.0
+    if repeated > _REPEATED_MOST:
+        return (
+            f"{repeated:.0%} of the readings repeat the one before, so that the sensor is slower "
+            "than the ticks or its steps are coarse"
+        )
+    return "something periodic moves the mirror or the reading, or the weather is no random walk"
 
 
 def find_bent_curve(record: Record, identified: Identified) -> list[FitFinding]:

@@ -37,6 +37,7 @@ def preview_loop(
     """Hold on the fitted twin in its weather, and once more without
     weather for a step of the leak.
     """
+    loop = loop.model_copy(update={"rate_hz": 1.0 / disturbance.rest.dt_s})  # of fresh readings
     true_um = _simulate_hold(
         loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s
     )

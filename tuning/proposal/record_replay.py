@@ -54,6 +54,7 @@ def replay_um(
     for the one that held. `off_um` (n,) are the record's readings less its setpoint.
     """
     bench = _ReplayBench(record, off_um, model, pump)
+    loop = loop.model_copy(update={"rate_hz": 1.0 / record.dt_s})  # that of its readings
     return (
         Rig(bench, loop, pump, bench.flow_um_per_s)
         .hold(record.duration_s - record.dt_s)

@@ -6,6 +6,7 @@ Successive records have no gap: each starts with the tick after the last one tak
 happens in between (a fit takes a second) is in the next record and not lost.
 """
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -24,6 +25,8 @@ from tuning.rigs.operating_point import make_operating_point
 from tuning.rigs.ticks_by_figures import TicksByFigures
 
 _WITHIN = 0.1  # of a tick: figures of about its time
+# Repeats for each sample of the laser up to which a tick is a reading; the fit bears them
+_REPEATS_TOLERATED = 0.35
 Progress = Callable[[float], None]  # seconds of hold recorded since the last call
 _HELD = frozenset({telemetry.State.HOLD, telemetry.State.TUNE})
 # Ticks after a command in which its experiment must begin: 10 s at 50 Hz
@@ -208,11 +211,11 @@ class HoldRig:
         """Return ticks as an evenly sampled record; a skipped tick has no reading and keeps the
         flow.
 
-        Without a laser there is a reading for each figure, and further ticks are taken until they
-        are whole ones.
+        Without a laser there is a reading for each figure, and with a laser that is slower than the
+        ticks one for each of its samples; further ticks are taken until they are whole ones.
         """
-        self._every = self._every or self._ticks_of_a_figure()
         rows = list(rows)
+        self._every = self._every or self._count_ticks_of_a_reading(rows)
         while (
             rows
             and round(
@@ -242,12 +245,18 @@ class HoldRig:
             tick = place + 1
         return Record.from_samples(self.dt_s, flows, samples).every(self._every)
 
-    def _ticks_of_a_figure(self) -> int:
-        return (
-            1
-            if self._figures is None
-            else max(1, math.ceil(self._figures.interval_s / self.dt_s - _WITHIN))
-        )
+    def _count_ticks_of_a_reading(self, rows: Sequence[telemetry.TelemetryRow]) -> int:
+        """Ticks between readings: of figures, or of a laser that is slower than the ticks and
+        repeats its samples in between.
+        """
+        if self._figures is not None:
+            return max(1, math.ceil(self._figures.interval_s / self.dt_s - _WITHIN))
+        counters = [row.sample_counter for row in rows if math.isfinite(row.sample_counter)]
+        samples = sum(after != before for before, after in itertools.pairwise(counters))
+        if not samples:
+            return 1
+        ticks_a_sample = (len(counters) - 1) / samples
+        return max(1, math.ceil(ticks_a_sample - _REPEATS_TOLERATED))
 
     def _next_held(self) -> telemetry.TelemetryRow:
         while not self._rows:

@@ -66,10 +66,12 @@ def run_verify(
     looks: list[verification.Stage] = []
     record: Record | None = None
     setpoint_um, reason = np.empty(0), ""
+    held_s = 0.0
     try:
         rig.hold(verification.find_settling_time_s(after))
         for until_s, growth_max in (*stages, (2 * stages[-1][0], stages[-1][1])):
-            more, about_um = rig.hold_about(until_s - setpoint_um.size * rig.dt_s)
+            more, about_um = rig.hold_about(until_s - held_s)
+            held_s = until_s
             record = more if record is None else record.followed_by(more)
             setpoint_um = np.concatenate((setpoint_um, about_um))
             looks.append(verification.judge_stage(record, setpoint_um, trial, growth_max))

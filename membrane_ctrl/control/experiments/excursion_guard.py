@@ -1,5 +1,6 @@
 """Ends an experiment before the mirror leaves its limit, and brings it back. Pure."""
 
+import math
 from dataclasses import dataclass, field
 
 from membrane_ctrl.control.experiments.centre_motion import CentreMotion, MotionState
@@ -91,7 +92,7 @@ class ExcursionGuard:
             self.memory.ended = found
         # The way back, until the mirror is near the centre, strays, or takes too long
         self.memory.back_s += dt_s
-        is_back = abs(off_um) < _BACK_SHARE * self._limit_um
+        is_back = math.isnan(off_um) or abs(off_um) < _BACK_SHARE * self._limit_um
         strays = abs(off_um) > _STRAYED * self._limit_um
         if is_back or strays or self.memory.back_s > _BACK_MOST_S:
             return self.memory.ended

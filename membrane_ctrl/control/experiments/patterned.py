@@ -1,5 +1,6 @@
 """An experiment that follows a given pattern of flow about the holding flow. Pure."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -47,7 +48,10 @@ class Patterned:
         if memory.time_s >= self._duration_s:
             return Finished(ExperimentEnd.COMPLETED, "done")
         self._motion.update(measurement.displacement_um, dt_s)
-        back_um_per_s = PULL_PER_S * (self._centre_um - self._motion.position_um)
+        # An experiment may begin in a tick without a reading: nothing to pull back then
+        back_um_per_s = 0.0
+        if math.isfinite(self._motion.position_um):
+            back_um_per_s = PULL_PER_S * (self._centre_um - self._motion.position_um)
         pattern_um_per_s = self._pattern(memory.time_s)
         memory.time_s += dt_s
         return self._around.within(
