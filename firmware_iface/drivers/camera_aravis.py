@@ -318,6 +318,7 @@ class AravisCamera:
             for word in ("height", "width", "pixel_format")
         )
         height_px, width_px = self._size[::-1]
+        # Another size or format would be read as a wrong picture
         if found != (height_px, width_px, self._format):
             raise roles.LinkError(
                 f"{self._name}: sent a frame of {found[1]} x {found[0]}, format {found[2]:#x}"
@@ -331,6 +332,7 @@ class AravisCamera:
             raise roles.LinkError(
                 f"{self._name}: sent {size.value} bytes instead of {count * dtype.itemsize}"
             )
+        # A view of the library's memory, copied before the buffer is used again
         memory = memoryview((ctypes.c_char * (count * dtype.itemsize)).from_address(start))
         seen: optical_roles.Pixels = np.ndarray(count, dtype, memory).reshape(height_px, width_px)
         if out is None:

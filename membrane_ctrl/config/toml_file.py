@@ -190,6 +190,7 @@ def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
     field = ".".join(str(part) for part in path)
     kind = error["type"]
     fields = {} if parent is None else parent.model_fields
+    # An unknown key: a similar one, or the table in which it belongs
     if kind == "extra_forbidden":
         key = str(error["loc"][-1])
         home = next(_find_tables_with_key(model, key), "")
@@ -198,6 +199,7 @@ def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
     inner = []
     if path and path[-1] in fields:
         inner = list_sections(fields[path[-1]].annotation)
+    # An unknown driver: the known ones
     if kind.startswith("union_tag"):
         choices = _sections_at(model, path)
         tag, known = (
@@ -208,12 +210,14 @@ def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
             f"{field}.driver: {f'{tag!r} is not known here' if tag else 'missing'}; "
             f"{suggest_word(tag, known)}"
         )
+    # Whatever our own checks or pydantic state, with the field before it
     message = error["msg"].removeprefix("Value error, ").partition(" for <class")[0]
     if kind == "value_error":  # some begin with the key
         if not field:
             return message
         join = "." if re.match(r"[a-z_0-9]+: ", message) else ": "
         return f"{field}{join}{message}"
+    # Forms that a person writes differently in TOML
     if kind == "missing":
         return f"{field}: missing; it has no default"
     if kind in ("dict_type", "model_type"):
@@ -229,6 +233,7 @@ def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
             f"{field}: {error['input']!r}: expected tcp://HOST:PORT or "
             "rtu:///dev/ttyUSB0?baud=115200"
         )
+    # All else: pydantic's message with the value
     value = error["input"]
     shown = ""
     if isinstance(value, (int, float, str, bool)):

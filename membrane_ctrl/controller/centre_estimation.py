@@ -311,11 +311,11 @@ class CentreEstimation:
             memory.sensors_changed_s = math.nan
         elif math.isnan(memory.sensors_changed_s):
             memory.sensors_changed_s = now_s
-        stands = (
+        is_unchanged = (
             not math.isnan(memory.sensors_changed_s)
             and now_s - memory.sensors_changed_s >= _STANDS_S
         )
-        if not stands and not jumped:
+        if not is_unchanged and not jumped:
             return []
         memory.reported_sensors = seeing
         memory.sensors_changed_s = math.nan

@@ -92,11 +92,13 @@ class Controller:
     ) -> None:
         self._config = config
         self.memory = memory = memory or make_first_state(config)
+        # Each part gets its own branch of the memory: nothing else is remembered
         self._gains = gains_trial.GainsTrial(memory.gains)
         present = self._present_config
         self._safety = safety.SafetyTable(config.limits, memory=memory.safety)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity, memory.shape)
         self._shape.set_memory(self._gains.present.shape_time_constant_s)
+        # A dead time and lag that the actuator test has identified replace the configured ones
         estimator = apply_response(config.estimator, memory.context.pump_response)
         self._context = TickContext(
             config=config,
@@ -110,6 +112,7 @@ class Controller:
             **collect_state_fields(memory.context),
         )
         memory.context = self._context
+        # A memory from a snapshot may be in the middle of an experiment
         if memory.context.trial_memory is not None:
             self._context.trial = trial.Trial(memory.context.trial_memory, config.loop.rate_hz)
         self._resume = resume_rule.ResumeRule(config.resume, config.limits, memory.resume)

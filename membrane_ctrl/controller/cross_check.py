@@ -141,8 +141,11 @@ def _check_resume(config: Config, findings: cross_check_plant.ConfigFindings) ->
 
 
 def _check_watchdog(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
+    """Judge the board's watchdog against ticks, lost answers and the limit of lateness."""
     devices, limits = config.devices or _TWIN_BOARD, config.limits
     tick_s, watchdog_s = 1.0 / config.loop.rate_hz, devices.watchdog_s
+    # A real bench: how long the pump runs unattended, and whether one lost answer trips the
+    # watchdog
     if config.devices is not None:
         why, most = (
             "the pump would run this long without a control process",
@@ -169,6 +172,7 @@ def _check_watchdog(config: Config, findings: cross_check_plant.ConfigFindings) 
     )
     remedy = f"set at least {2.0 / watchdog_s:g} Hz, or lengthen devices.watchdog_s"
     findings.error(2.0 * tick_s > watchdog_s, "loop.rate_hz", why, remedy)
+    # The limit of lateness must trip before the watchdog, and not on a healthy machine
     late, why = (
         "limits.lateness_max_ms",
         f"can never trip: the watchdog ({watchdog_s:g} s) trips first",
@@ -223,7 +227,9 @@ def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
 
 
 def _check_states(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
+    """Judge the times of the states: long enough to pass, short enough to protect."""
     states, limits = config.states, config.limits
+    # How long the flow may be uncontrolled
     for name, most_s in (
         ("hold_flow_max_s", _BLIND_S),
         ("ramp_down_s", _BLIND_S),
@@ -236,6 +242,7 @@ def _check_states(config: Config, findings: cross_check_plant.ConfigFindings) ->
             "the flow would be uncontrolled this long",
             f"set at most {most_s:g} s",
         )
+    # Each state needs at least the time that a sound mirror takes
     needed_s = states.check_s
     if states.actuator_test:
         needed_s = actuator_test.ActuatorTest(config.pump, True, config.loop.rate_hz).longest_s
@@ -251,12 +258,14 @@ def _check_states(config: Config, findings: cross_check_plant.ConfigFindings) ->
         why,
         "set some minutes",
     )
+    # On the way down: the read-back needs time to show that the pump stands
     seen_s = _PUMP_STANDS_S + 2.0 / config.loop.rate_hz
     why = (
         f"too short: a pump stops {_PUMP_STANDS_S:g} s after its command, and its read-back "
         "shows it a tick later"
     )
     findings.error(states.lower_timeout_s < seen_s, "states.lower_timeout_s", why, "set 3 s")
+    # Inflation: the whole way, and two bands of it
     speed_um_per_s = min(
         config.loop.setpoint_ramp_um_per_s, cross_check_plant.flow_um_per_s(config)
     )
@@ -280,12 +289,14 @@ def _check_states(config: Config, findings: cross_check_plant.ConfigFindings) ->
 
 
 def _check_limits(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
+    """Judge the limits of the displacement: each can trip, and none trips in a sound hold."""
     limits, setpoint_um = config.limits, config.loop.setpoint_um
     trim_um = config.shape.trim_max_um if config.shape.enabled else 0.0
     above_um, below_um = (
         limits.displacement_max_um - setpoint_um,
         setpoint_um - limits.displacement_min_um,
     )
+    # The setpoint moves by the trim, the mirror by the band: both must stay within the limits
     field = "shape.trim_max_um" if trim_um >= limits.band_um else "limits.band_um"
     for margin_um, side in ((above_um, "above"), (below_um, "below")):
         why = (
@@ -307,6 +318,7 @@ def _check_limits(config: Config, findings: cross_check_plant.ConfigFindings) ->
         why,
         "keep it below limits.following_error_max_um",
     )
+    # A jump must be more than a moving film and the laser's noise make in one tick
     step_um = cross_check_plant.flow_um_per_s(config) / config.loop.rate_hz
     why = f"a moving film ({step_um:.2f} µm a tick) and the laser's noise (1 µm) reach it"
     findings.error(

@@ -75,11 +75,13 @@ def flow_um_per_s(config: Config) -> float:
 
 
 def judge_pump(config: Config, findings: ConfigFindings) -> None:
+    """Judge the pump's curve against the loop and the actuator test."""
     pump, loop = config.pump, config.loop
     least = 0.0 if pump.curve_fraction else pump.dead_fraction  # of the straight line only
     why = f"must lie between dead_fraction ({least:g}) and start_fraction ({pump.start_fraction:g})"
     ordered = least <= pump.stall_fraction <= pump.start_fraction
     findings.error(not ordered, "pump.stall_fraction", why, "measure all three")
+    # The actuator test, and then the loop, must be able to start the pump
     test_fraction = max(part.pump_fraction for part in actuator_test.PARTS)
     if pump.start_fraction >= test_fraction:
         why = f"the actuator test commands {test_fraction:g}, which would not start the pump"
@@ -105,6 +107,7 @@ def judge_pump(config: Config, findings: ConfigFindings) -> None:
         findings.error(
             loop.flow_max_um_per_s <= 2.0 * least_um_per_s, "loop.flow_max_um_per_s", why, remedy
         )
+    # The flow that the loop may want, and the commands that the devices accept
     more = loop.flow_max_um_per_s > pump.flow_full_um_per_s + 1e-9
     why = f"the pump gives {pump.flow_full_um_per_s:g} µm/s (pump.flow_full_um_per_s)"
     findings.warn(more, "loop.flow_max_um_per_s", why, "measure the pump, or lower it")
@@ -181,11 +184,13 @@ def weak_gains(loop: LoopConfig) -> tuple[Severity, str] | None:
 
 
 def judge_loop(config: Config, findings: ConfigFindings) -> None:
+    """Judge gains, feed-forward, ramp, bleed and the rate of the flow."""
     loop, full_um_per_s = config.loop, flow_um_per_s(config)
     severity, why = weak_gains(loop) or ("", "")
     measure = "run `tune`, or use the default gains"
     findings.error(severity == "error", "loop.kp_per_s", why, measure)
     findings.warn(severity == "warning", "loop.kp_per_s", why, measure)
+    # Feed-forward: sign and size against physics
     for on, name, nominal in (
         (loop.feedforward_barometer, "barometer_gain_um_per_pa", _BAROMETER_UM_PER_PA),
         (loop.feedforward_temperature, "temperature_gain_um_per_k", _TEMPERATURE_UM_PER_K),
@@ -202,6 +207,7 @@ def judge_loop(config: Config, findings: ConfigFindings) -> None:
         )
         why = "more than twice the physical value: worse than no feed-forward"
         findings.error(on and share > _FEEDFORWARD_MOST, f"loop.{name}", why, remedy)
+    # What the pump can follow
     why = f"faster than the pump's {full_um_per_s:g} µm/s"
     findings.warn(
         loop.setpoint_ramp_um_per_s > full_um_per_s, "loop.setpoint_ramp_um_per_s", why, "lower it"
@@ -301,6 +307,7 @@ def judge_gauge(config: Config, findings: ConfigFindings) -> None:
         1.0 / config.loop.rate_hz,
     )
     above_um = limits.displacement_max_um - config.loop.setpoint_um
+    # The limit of pressure, and of a jump below it
     margin_pa = limits.gauge_pressure_max_pa - pressure_pa
     why = f"the mirror has {pressure_pa:g} Pa at displacement 0 (optics.mirror.pressure_pa)"
     findings.error(
@@ -314,6 +321,7 @@ def judge_gauge(config: Config, findings: ConfigFindings) -> None:
     findings.error(
         limits.gauge_step_max_pa < _STORM_PA, step, "a storm alone moves the gauge this far", least
     )
+    # A gauge that repeats its value: neither too long nor by chance
     stuck, most = "limits.gauge_stuck_s", f"set at most {_GAUGE_BLIND_S:g} s"
     findings.error(
         limits.gauge_stuck_s > _GAUGE_BLIND_S,
@@ -328,6 +336,7 @@ def judge_gauge(config: Config, findings: ConfigFindings) -> None:
         "two readings equal by chance would be a fault",
         least,
     )
+    # Laser against gauge: within minutes and an hour, then within a day
     for name, least_um, by in (
         ("laser_gauge_apart_max_um", _APART_UM, "the gauge's noise and a mount that warms up"),
         ("laser_gauge_drift_max_um", _CREEP_UM, "the creep of a fresh film"),

@@ -118,6 +118,7 @@ class Observer:
         if math.isnan(memory.last_read_s):  # ages count from the first tick
             memory.last_read_s = now_s
             memory.last_advance_s = now_s
+        # 1. Age of the last answer, and of the last one with a new sample
         if reading is not None:
             memory.last_read_s = now_s
             stamp = (reading.sample_counter, reading.device_time_s)
@@ -126,12 +127,14 @@ class Observer:
             ):
                 memory.last_advance_s = now_s
                 memory.stamp = stamp
+        # 2. The laser: a repeated sample or a jump is no reading
         uses_laser = not self._by_optics
         fresh = memory.last_advance_s == now_s
         self.repeats_sample = uses_laser and not fresh and math.isfinite(_good_quality_um(reading))
         self.laser_um = self._gate_displacement(reading, fresh=fresh and uses_laser)
         same_s = memory.laser_repeats.same_s(self.laser_um, now_s)
         self._laser_same_s = same_s if math.isfinite(self.laser_um) else 0.0
+        # 3. The figure; it replaces a missing laser if the loop may follow it
         self.figures.judge_figure(now_s, inputs.estimate, self.moving_laser_um)
         self.displacement_um = self.guard_um = self.laser_um
         self.optics_replace_laser = False
@@ -139,6 +142,7 @@ class Observer:
         self.optics_guard_um = self.figures.guard_um if may_follow else math.nan
         if may_follow and math.isnan(self.moving_laser_um):
             self._replace_laser_by_optics()
+        # 4. The gauge, without jumps that no film can cause
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         self.gauge_pressure_pa = (
             math.nan if memory.gauge_jumps.is_jump(gauge_pa, self._gauge_step_max_pa) else gauge_pa

@@ -131,7 +131,7 @@ class Event:
         return list_fields(line)
 
     @property
-    def stands(self) -> bool:
+    def opens_notice(self) -> bool:
         """Whether it opens its notice, not closes it; for kinds that may do either."""
         return bool(self.opens)
 
@@ -153,7 +153,7 @@ class Event:
     def notice_changes(self, standing: Notices) -> NoticeChanges:
         """Return the notices that it closes and opens, given those that stand."""
         subject = str(getattr(self, self._subject)) if self._subject else ""
-        if self.opens and self.stands:
+        if self.opens and self.opens_notice:
             return NoticeChanges(opened=(self._make_notice(NoticeKey(self.opens[0], subject)),))
         return NoticeChanges(closed=tuple(NoticeKey(topic, subject) for topic in self.closes))
 

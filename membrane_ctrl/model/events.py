@@ -240,7 +240,7 @@ class Plausibility(
     readings: str
 
     @property
-    def stands(self) -> bool:
+    def opens_notice(self) -> bool:
         """Whether one of them is wrong."""
         return self.faulty is not FaultySensor.NONE
 
@@ -254,12 +254,12 @@ class Plausibility(
     @property
     def level(self) -> LogLevel:
         """An agreement is no warning."""
-        if self.stands:
+        if self.opens_notice:
             return LogLevel.WARNING
         return LogLevel.INFO
 
     def _choose_template(self) -> str:
-        if self.stands:
+        if self.opens_notice:
             return self._template
         return "Laser and camera agree again[ ({readings})]"
 

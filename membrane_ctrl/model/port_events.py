@@ -26,7 +26,7 @@ class PortFailed(
     again_s: float | None = None
 
     @property
-    def stands(self) -> bool:
+    def opens_notice(self) -> bool:
         """Whether the listener failed, which ends with `PortOpen`; a failed client is gone."""
         return self.again_s is not None
 

@@ -70,7 +70,7 @@ class Ended(
     missed_ticks: int | None = None
 
     @property
-    def stands(self) -> bool:
+    def opens_notice(self) -> bool:
         """Whether neither a person nor its duration ended it."""
         return self.exit not in _ENDED_WELL
 
@@ -87,7 +87,7 @@ class _LinkReport:
     up: bool
 
     @property
-    def stands(self) -> bool:
+    def opens_notice(self) -> bool:
         """Whether it failed."""
         return not self.up
 

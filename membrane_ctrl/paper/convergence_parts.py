@@ -105,6 +105,7 @@ def compare_starts(bench: MeasuredBench) -> PartResult:
     def on_map(values: FloatArray) -> FloatArray:
         return np.where(inside, values, np.nan)
 
+    # Each start to its solution, by the paper's iteration and by that of `measure`
     heights_mm = {}
     ours_mm = {}
     curves = {}
@@ -113,6 +114,7 @@ def compare_starts(bench: MeasuredBench) -> PartResult:
         heights_mm[name] = found.surface.height_mm(x_mm.ravel(), y_mm.ravel()).reshape(x_mm.shape)
         curves[name] = (np.arange(1.0, _NINE + 1), np.array(found.changes_mm))
         ours_mm[name] = _solve_by_measure(bench, start.height_mm).height(x_mm, y_mm)
+    # The largest difference between the solutions
     reference = heights_mm["paraboloid 40 mm"]
     own = ours_mm["paraboloid 40 mm"]
     spread_mm = max(_find_largest(on_map(each - reference)) for each in heights_mm.values())

@@ -40,6 +40,7 @@ def compare_gradients(bench: PaperBench) -> PartResult:
     axis_mm, inside, x_mm, y_mm = _make_aperture_grid(bench)
     true = _trace(bench, x_mm, y_mm)
 
+    # Error of the slopes in each reading of the equations, and without their correction
     rows: dict[str, FloatArray] = {}
     for reading in YReading:
         found = compute_slopes(bench.geometry, true.points_mm, true.screen_mm, true.rays, reading)
@@ -96,6 +97,7 @@ def compare_gradients(bench: PaperBench) -> PartResult:
         }
         for name, error in rows.items()
     }
+    # Maps of the errors that are not rounding
     maps = {}
     for title, values in (
         ("x without delta theta", rows["NO_CORRECTION"][0]),

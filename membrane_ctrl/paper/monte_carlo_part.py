@@ -114,6 +114,7 @@ def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
     mirror = bench.optics.mirror
     seen = make_seen_points(bench, _POINTS)
     start = make_parabola(40.0, mirror.radius_mm)
+    # What the trials vary: geometry and screen points, from the solution of the bench
     inputs = TrialInputs(
         seen,
         solve_by_paper(bench, start, _START_ITERATIONS, _POINTS).surface,
@@ -128,6 +129,7 @@ def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
     inside = np.hypot(x_mm, y_mm) <= mirror.analysis_radius_mm
     to_height = make_height_matrix(x_mm[inside], y_mm[inside], mirror.radius_mm)
 
+    # RMSE over the trials, and as a check the sum of the single effects
     coeffs_mm = _run_everywhere(inputs, bench.options)
     heights_um = 1e3 * coeffs_mm @ to_height.T
     rmse_um = dict(zip(AngleReading, np.std(heights_um, axis=0, ddof=1), strict=True))
@@ -142,6 +144,7 @@ def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
         name: float(np.mean(np.abs(change)))
         for name, change in effects_um[AngleReading.PIXEL_RAYS].items()
     }
+    # Between two sets the geometry cancels
     pair_um = compute_pair_rmse_um(inputs, to_height, bench.options.trials)
 
     comparisons = [

@@ -26,6 +26,7 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
     mirror = bench.optics.mirror
     reach_mm = mirror.analysis_radius_mm
     surface = bench.full.surface
+    # Mean of the measured height over the azimuth
     radius_mm = np.linspace(0.0, reach_mm, _RINGS)
     angle_rad = 2 * np.pi * np.arange(_ANGLES)[:, None] / _ANGLES
     x_mm, y_mm = radius_mm * np.cos(angle_rad), radius_mm * np.sin(angle_rad)
@@ -33,6 +34,7 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
     profile_mm = height_mm.mean(axis=0)
     spread_mm = height_mm.std(axis=0)
 
+    # Hencky's film without and with a pre-strain
     rho = radius_mm / mirror.radius_mm
     hencky = FilmLaw(0.0, POISSON, STIFFNESS_N_PER_M, mirror.radius_mm).under_pressure(PRESSURE_PA)
     hencky_mm = hencky.height_mm(rho).ravel()
@@ -83,6 +85,7 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
                 "with the exact geometry: what phases and reconstruction add",
             )
         )
+    # The pictures
     axis_mm = np.linspace(-reach_mm, reach_mm, _SIDE)
     grid_x, grid_y = np.meshgrid(axis_mm, axis_mm)
     inside = np.hypot(grid_x, grid_y) <= reach_mm

@@ -135,6 +135,7 @@ def compare_stability(bench: MeasuredBench) -> PartResult:
         series = run_series(_require_simulated(bench), bench.options.sets)
     if len(series.parameters_mm) < 2:
         return report_too_few(series)
+    # Height of each set on a grid, and its standard deviation over the sets
     mirror = bench.optics.mirror
     axis_mm = np.linspace(-mirror.analysis_radius_mm, mirror.analysis_radius_mm, _SIDE)
     x_mm, y_mm = np.meshgrid(axis_mm, axis_mm)
@@ -177,6 +178,7 @@ def compare_stability(bench: MeasuredBench) -> PartResult:
         "sd_mean_um": float(np.mean(sd_um)),
         "sd_edge_um": float(np.mean(sd_um[edge])),
     }
+    # Without the part that follows the centre
     moving_um = estimate_film_share_um(series, height_um)
     if moving_um is not None:
         rest_um = np.std(height_um - moving_um, axis=0, ddof=1)
@@ -209,6 +211,7 @@ def compare_stability(bench: MeasuredBench) -> PartResult:
                 "4.3 µm",
             )
         )
+    # Pairs of sets some time apart, as in the paper
     for lag_s in _LAGS_S:
         found = compare_pairs(series, height_um, lag_s)
         if found is not None:

@@ -125,8 +125,10 @@ def read_entry(folder: Path) -> RunEntry:
     stored = summary.get("held")
     duration_s = _read_number(summary.get("duration_s"))
     held = stored if isinstance(stored, dict) else {}
+    # A run that was killed has no summary
     if not math.isfinite(duration_s):
         duration_s = _recorded_s(folder)
+    # The last learned pump and the geometry in use
     newest_first = [each.event for each in reversed(log)]
     pump = next((e for e in newest_first if isinstance(e, events.PumpLearned)), None)
     geometries = (e for e in newest_first if isinstance(e, acquisition_events.GeometryInUse))

@@ -399,7 +399,7 @@ def _watch(run: VirtualRun, bench: VirtualBench, until_s: float, way_um: float) 
                     fault, after_s = event.name, run.now_s - since_s
                 case Maintenance() if not notice:
                     notice, notice_s, notice_um = event.name, run.now_s - since_s, away_um
-                case Plausibility() if not notice and event.stands:
+                case Plausibility() if not notice and event.opens_notice:
                     notice, notice_s, notice_um = (
                         f"{event.faulty} wrong",
                         run.now_s - since_s,

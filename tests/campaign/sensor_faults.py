@@ -388,7 +388,7 @@ def _speaks(event: events.Event) -> str:
     match event:
         case events.Fault():
             return event.name
-        case events.Plausibility() if event.stands:
+        case events.Plausibility() if event.opens_notice:
             return f"sensors: {event.faulty}"
         case events.ShapeLoopState(code=ShapeCode.TRIM_LIMIT):
             return "shape: trim at its limit"

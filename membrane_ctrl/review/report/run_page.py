@@ -153,7 +153,7 @@ def _list_reported(analysis: Analysis) -> list[PageBlock]:
     reported = [
         (f"{analysis.run.utc(each.mono_s):%H:%M:%S}", each.event.sentence)
         for each in make_timeline(analysis)
-        if isinstance(each.event, Fault) or (each.event.opens and each.event.stands)
+        if isinstance(each.event, Fault) or (each.event.opens and each.event.opens_notice)
     ]
     if reported:
         blocks += [PageText("Reported by the hold:"), PageFacts(reported[:_REPORTED_MOST])]

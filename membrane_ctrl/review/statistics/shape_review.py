@@ -64,6 +64,7 @@ def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> Sha
     analysis_share : float
         Radius of the analysis area over the mirror's.
     """
+    # The settled cycles with a usable figure; all changes refer to the first
     good = shapes.select_cycles(
         held & (shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1)
     )
@@ -72,7 +73,10 @@ def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> Sha
     area = _Area(analysis_share)
     parameters = good.parameters_um()
     parameters -= parameters[0].copy()
+    # Standard deviation of the height at each pixel, from the covariance of the parameters over the
+    # cycles
     sd_um = np.sqrt(np.maximum(_quadratic_form(area.basis, np.cov(parameters.T)), 0.0))
+    # Height of the monitored points over time, and the sag by camera and by laser
     x, y = (np.array([point[axis] for point in POINTS.values()]) for axis in (0, 1))
     points = parameters @ make_height_basis(x, y)
     sag_um = good.sag_um - good.sag_um[0]
