@@ -86,7 +86,7 @@ def test_a_command_runs_without_home_or_account(tmp_path: Path) -> None:
         "getpass.getuser = nameless\n"
         "from membrane_ctrl.model.account import account_name\n"
         "assert account_name().isdigit()\n"
-        "from membrane_ctrl.metrology.numerics.grouped_sums import sums_by\n"
+        "from membrane_ctrl.metrology.numerics.grouped_sums import sum_by_group\n"
         "from membrane_ctrl.sim.optics.film_terms import height_and_slopes\n"
     )
     environment = {
