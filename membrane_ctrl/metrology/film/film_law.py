@@ -66,11 +66,18 @@ def _universal_series() -> tuple[FloatArray, FloatArray, FloatArray]:
     square[0] = 1.0
     inverse[0] = 1.0
     for k in range(_SERIES_TERMS - 1):
+        # 4 x F'' + 8 F' + 1 / (8 F^2) = 0, for the coefficient of x^k.
         force[k + 1] = -square[k] / (32 * (k + 1) * (k + 2))
+
+        # Powers of a series with F_0 = 1: for S = F^p, (k + 1) S_(k+1) is the sum over m of
+        # (p m - (k + 1) + m) F_m S_(k+1-m). Here p = -2, and p = -1.
         m = np.arange(1, k + 2)
-        square[k + 1] = np.sum((-m - k - 1) * force[m] * square[k + 1 - m]) / (k + 1)
+        terms = (-m - k - 1) * force[m] * square[k + 1 - m]
+        square[k + 1] = np.sum(terms) / (k + 1)
         inverse[k + 1] = -force[m] @ inverse[k + 1 - m]
-    return force, np.asarray(series.polyder(force)), np.asarray(series.polyint(inverse))
+    slope = series.polyder(force)
+    integral = series.polyint(inverse)
+    return force, np.asarray(slope), np.asarray(integral)
 
 
 def _ring_strain(slackness: AnyArray, poisson: FloatArray | float) -> AnyArray:
@@ -83,23 +90,41 @@ def _ring_strain(slackness: AnyArray, poisson: FloatArray | float) -> AnyArray:
 
 
 def _normalised_sag(slackness: AnyArray) -> AnyArray:
-    """Sag / (a q^(1/3))."""
-    return np.asarray(slackness ** (-2 / 3) * series.polyval(slackness, _universal_series()[2]) / 4)
+    """Sag / (a q^(1/3)): the integral of dh/dv from the vertex to the ring, v = 1."""
+    _, _, integral = _universal_series()
+    return np.asarray(slackness ** (-2 / 3) * series.polyval(slackness, integral) / 4)
 
 
 def _invert_for_slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatArray) -> FloatArray:
     """Slackness at which a convex falling function has the wanted values.
 
     Newton's method from the left, which never overshoots; the derivative is that of a complex step.
-    Raises ValueError if a film would be slack at its ring.
+
+    Parameters
+    ----------
+    falls : callable
+        The function of the slackness, for complex numbers too.
+    wanted : (...) array
+        Its values.
+
+    Returns
+    -------
+    (...) array
+
+    Raises
+    ------
+    ValueError
+        A film would be slack at its ring.
     """
+    # From a usual film if all are slacker than that: fewer steps.
     start = _TAUTEST
     if np.all(falls(np.asarray(_USUAL)) > wanted):
         start = _USUAL
     s = np.full(np.shape(wanted), start)
     for _ in range(_NEWTON_STEPS):
         value = falls(s + 1j * COMPLEX_STEP)
-        step = (wanted - value.real) / (value.imag / COMPLEX_STEP)
+        derivative = value.imag / COMPLEX_STEP
+        step = (wanted - value.real) / derivative
         s = np.minimum(s + step, SLACKEST)
         if np.all(np.abs(step) <= 1e-15 * s):
             break
@@ -134,27 +159,54 @@ class FilmLaw:
     radius_mm: float
 
     def __post_init__(self) -> None:
-        if not np.all((np.asarray(self.poisson) >= 0) & (np.asarray(self.poisson) <= 0.5)):
+        poisson = np.asarray(self.poisson)
+        if not np.all((poisson >= 0) & (poisson <= 0.5)):
             raise ValueError(f"poisson = {self.poisson} is outside 0 .. 0.5")
         if not (np.all(np.asarray(self.stiffness_n_per_m) > 0) and self.radius_mm > 0):
             raise ValueError("stiffness_n_per_m and radius_mm must be above 0")
 
     def under_pressure(self, pressure_pa: FloatArray | float) -> "Bowl":
-        """The film under a gauge pressure above 0. Raises ValueError if it would be slack at its
-        ring.
+        """The film under a gauge pressure.
+
+        Parameters
+        ----------
+        pressure_pa : float or array
+            Above 0.
+
+        Returns
+        -------
+        Bowl
+
+        Raises
+        ------
+        ValueError
+            The film would be slack at its ring.
         """
         load = np.asarray(pressure_pa) * self.radius_mm * 1e-3 / self.stiffness_n_per_m
         return self.under_load(load)
 
     def under_load(self, load: FloatArray) -> "Bowl":
-        """The film under a load q = p a / (E t). Raises ValueError as `under`."""
+        """The film under a load q = p a / (E t). Raises ValueError as `under_pressure`."""
         wanted = np.asarray(self.prestrain / load ** (2 / 3))
         slackness = _invert_for_slackness(lambda s: _ring_strain(s, self.poisson), wanted)
         return Bowl(slackness, load, self.poisson, self.radius_mm)
 
     def with_sag(self, sag_mm: FloatArray | float) -> "Bowl":
-        """The film at a sag above 0; no stiffness is needed. Raises ValueError if it would be slack
-        at its ring.
+        """The film at a sag; no stiffness is needed.
+
+        Parameters
+        ----------
+        sag_mm : float or array
+            Above 0.
+
+        Returns
+        -------
+        Bowl
+
+        Raises
+        ------
+        ValueError
+            The film would be slack at its ring.
         """
         # With depth = sag / a, the load q^(1/3) = depth / (normalised sag) is eliminated.
         depth = np.asarray(sag_mm) / self.radius_mm
@@ -208,12 +260,14 @@ class Bowl:
         return np.asarray(2 * rho * self.slackness * self._scale_mm / force_there)
 
     def stresses(self, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Radial and hoop force per length, in E t."""
+        """Radial and hoop force per length, in E t, at rho = r / a."""
+        # N_r = E t q^(2/3) n, and N_theta = d(r N_r) / dr = N_r + 2 v dN_r/dv.
         force, slope, _ = _universal_series()
         x = self.slackness * rho**2
         scale = self.load ** (2 / 3) * np.cbrt(1 / self.slackness)
         radial = scale * series.polyval(x, force)
-        return radial, radial + 2 * scale * x * series.polyval(x, slope)
+        hoop = radial + 2 * scale * x * series.polyval(x, slope)
+        return radial, hoop
 
     @property
     def _scale_mm(self) -> FloatArray:
@@ -348,5 +402,8 @@ def _radial_powers(rho: FloatArray, power: int) -> tuple[FloatArray, FloatArray]
     table = np.eye(_WAVE_TERMS)
     value = legendre.legval(x, table)
     slope = legendre.legval(x, legendre.legder(table))
-    derivative = power * rho ** (power - 1) * value + 4 * rho ** (power + 1) * slope
-    return value * rho**power, derivative
+
+    # The product's two derivatives, with dx/drho = 4 rho.
+    of_power = power * rho ** (power - 1) * value
+    of_polynomial = 4 * rho ** (power + 1) * slope
+    return value * rho**power, of_power + of_polynomial

@@ -39,7 +39,11 @@ _WAVE_ORDERS = (
     (10, 2, 5e-5),
 )
 _WAVE_FALL = 5.0  # from one radial order to the next; a film of the law has ten
-
+# Films between which the round terms are interpolated: their number, the slackness of the first,
+# and the degree of their Legendre series.
+_FAMILY_FILMS = 240
+_TAUTEST = 1e-3
+_FAMILY_DEGREE = 40
 
 WAVES = tuple(
     Wave(first_radial_order(order) + 2 * step, sign * order, sigma_mm / _WAVE_FALL**step)
@@ -84,20 +88,32 @@ def _film_family() -> tuple[FloatArray, FloatArray]:
     to the slackest.
     """
     rows = []
-    for slackness in np.linspace(1e-3, film_law.SLACKEST, 240):
+    for slackness in np.linspace(_TAUTEST, film_law.SLACKEST, _FAMILY_FILMS):
         bowl = film_law.Bowl(np.asarray(slackness), np.ones(()), hencky_bowl.POISSON_RATIO, 1.0)
-        coef = hencky_bowl.legendre_series(bowl, 40).coef.astype(np.float64) / bowl.sag_mm
-        rows.append(coef[_FAMILY_DEGREES] / _FAMILY_RMS)
+        legendre_series = hencky_bowl.legendre_series(bowl, _FAMILY_DEGREE)
+        of_unit_sag = legendre_series.coef.astype(np.float64) / bowl.sag_mm
+        rows.append(of_unit_sag[_FAMILY_DEGREES] / _FAMILY_RMS)
     table = np.array(rows)
     return table[:, 0], table[:, 1:]
 
 
 def film_round_terms_mm(excess_mm: float, sag_mm: float) -> FloatArray:
-    """Terms of `ROUND_DEGREES` (3,) in mm of the film of this law whose excess, of unit RMS, is
-    this at this sag.
+    """Round terms beyond the fit's of a film of this law, from its excess.
 
     At a given sag every film is one number, the slackness, and so is its round figure, whatever
     makes it slack.
+
+    Parameters
+    ----------
+    excess_mm : float
+        Amplitude of the excess of unit RMS.
+    sag_mm : float
+        Sag of the film.
+
+    Returns
+    -------
+    (3,) array
+        Terms of `ROUND_DEGREES`, mm.
     """
     # The same degrees of the excess of unit RMS.
     coef = hencky_bowl.profile_legendre().coef[_FAMILY_DEGREES]

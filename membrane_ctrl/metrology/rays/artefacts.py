@@ -8,6 +8,8 @@ import numpy as np
 from membrane_ctrl.metrology.rays.height_projection import height_projection
 from membrane_ctrl.model.arrays import FloatArray
 
+_CURVATURE_STEP_PER_MM = 1e-9  # the sag is linear in so little
+
 
 @dataclass(frozen=True)
 class Artefact:
@@ -59,14 +61,12 @@ class Artefact:
     def covariance_mm2(self) -> FloatArray:
         """Covariance of `terms_mm` by curvature and form."""
         x, y, onto = height_projection()
-        step = 1e-9  # per mm: the sag is linear in so little
-        change = self._heights_mm(self.curvature_per_mm + step, x, y) - self._heights_mm(
-            self.curvature_per_mm, x, y
-        )
-        by_curvature = onto @ change / step * self.curvature_sigma_per_mm
-        return np.asarray(
-            np.outer(by_curvature, by_curvature) + self.form_sigma_mm**2 * np.eye(len(onto))
-        )
+        stated_mm = self._heights_mm(self.curvature_per_mm, x, y)
+        bent_mm = self._heights_mm(self.curvature_per_mm + _CURVATURE_STEP_PER_MM, x, y)
+        change = bent_mm - stated_mm
+        by_curvature = onto @ change / _CURVATURE_STEP_PER_MM * self.curvature_sigma_per_mm
+        by_form = self.form_sigma_mm**2 * np.eye(len(onto))
+        return np.asarray(np.outer(by_curvature, by_curvature) + by_form)
 
     def _heights_mm(
         self,
@@ -79,10 +79,17 @@ class Artefact:
         """The sphere c |P|^2 = 2 n P through the origin with the normal n, at points (n,) of the
         unit disc.
         """
-        x, y = x * self.radius_mm, y * self.radius_mm
+        x_mm = x * self.radius_mm
+        y_mm = y * self.radius_mm
+
+        # With P = (x, y, z) and n = across (-tilt_x, -tilt_y, 1): c z^2 - 2 across z + q = 0, of
+        # which the root near the origin is q / (across + root), stable for c = 0 too.
         across = 1 / math.sqrt(1 + tilt_x**2 + tilt_y**2)
-        q = curvature * (x * x + y * y) + 2 * across * (tilt_x * x + tilt_y * y)
-        return np.asarray(q / (across + np.sqrt(across**2 - curvature * q)))
+        bent = curvature * (x_mm * x_mm + y_mm * y_mm)
+        tilted = 2 * across * (tilt_x * x_mm + tilt_y * y_mm)
+        q = bent + tilted
+        root = np.sqrt(across**2 - curvature * q)
+        return np.asarray(q / (across + root))
 
 
 @dataclass(frozen=True)

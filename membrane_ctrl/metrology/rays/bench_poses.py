@@ -104,15 +104,17 @@ def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven
     count.
     """
-    in_radians = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
-    a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = values[: len(POSE)] * in_radians
+    rad_per_unit = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
+    in_radians = values[: len(POSE)] * rad_per_unit
+    a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = in_radians
     f0 = stated.pinhole_mm
     o0 = stated.screen_origin_mm
     rows = stated.screen_axes
     hinge = _hinge_axis(f0, o0)
     up = _turn_matrix(hinge, alpha)
     back = _turn_matrix(hinge, -alpha)
-    shifted_origin = (1 + b / np.linalg.norm(o0)) * o0 + x * rows[0] + y * rows[1]
+    farther_origin = (1 + b / np.linalg.norm(o0)) * o0
+    shifted_origin = farther_origin + x * rows[0] + y * rows[1]
     return Poses(
         pinhole_mm=(1 + a / np.linalg.norm(f0)) * (up @ f0),
         camera=_combine_turns(pitch, yaw, roll) @ stated.rotation @ up.T,
@@ -196,7 +198,8 @@ def _hinge_axis(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
     """
     across = np.cross(pinhole_mm, origin_mm)
     length = float(np.linalg.norm(across))
-    if length < _LEAST_SINE * float(np.linalg.norm(pinhole_mm) * np.linalg.norm(origin_mm)):
+    lengths = float(np.linalg.norm(pinhole_mm) * np.linalg.norm(origin_mm))
+    if length < _LEAST_SINE * lengths:
         raise ValueError("camera and screen are in line with the vertex: alpha is undefined")
     return across / length
 
@@ -208,7 +211,9 @@ def _combine_turns(x: Any, y: Any, z: Any) -> AnyArray:
 
 
 def _turn_matrix(axis: FloatArray, angle: Any) -> AnyArray:
-    """Rodrigues' matrix of a turn about a unit vector."""
+    """Rodrigues' matrix of a turn about a unit vector: 1 + sin w K + (1 - cos w) K^2."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross))
+    first_order = np.sin(angle) * cross
+    second_order = (1 - np.cos(angle)) * (cross @ cross)
+    return np.asarray(np.eye(3) + first_order + second_order)

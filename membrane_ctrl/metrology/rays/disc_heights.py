@@ -5,12 +5,15 @@ import numpy as np
 from membrane_ctrl.metrology.rays import surface_basis
 from membrane_ctrl.model.arrays import FloatArray
 
+_GRID = 41  # points along the diameter
+
 
 def heights_over_disc(radius: float) -> tuple[FloatArray, FloatArray]:
     """Heights (n, parameters) of a surface over a disc of some radii, and the plane's columns (n,
     3).
     """
-    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-radius, radius, 41)] * 2))
+    axis = np.linspace(-radius, radius, _GRID)
+    x, y = (a.ravel() for a in np.meshgrid(axis, axis))
     inside = np.hypot(x, y) <= radius
     x, y = x[inside], y[inside]
     return np.asarray(surface_basis.evaluate_basis(x, y)[0].T), np.stack(

@@ -68,7 +68,8 @@ def light_at(light: FloatArray, places_px: FloatArray) -> FloatArray:
     axes = [1] * (places_px.ndim - 1)
     last_px = np.array(light.shape[::-1]).reshape(2, *axes) - 1
     inside = ((places_px >= 0) & (places_px <= last_px)).all(axis=0)
-    corner_px = np.clip(np.floor(np.where(inside, places_px, 0.0)), 0, last_px - 1).astype(int)
+    whole_px = np.floor(np.where(inside, places_px, 0.0))
+    corner_px = np.clip(whole_px, 0, last_px - 1).astype(int)
     column, row = corner_px
     right, down = places_px - corner_px
 
@@ -87,6 +88,8 @@ def find_outline(
     ----------
     light : (H, W) array
         White minus black, or the fringes' mean.
+    geometry : Geometry
+        Pose and lens of the camera.
     rim_mm, rim_z_mm : float
         Radius of the rim, and the height of its plane in world (the sag).
 
@@ -97,12 +100,14 @@ def find_outline(
     """
     # The expected rim in the picture, and the lines from its middle through each of its points.
     theta = 2 * np.pi * np.arange(_POINTS) / _POINTS
-    circle = np.stack([rim_mm * np.cos(theta), rim_mm * np.sin(theta), np.full(_POINTS, rim_z_mm)])
-    expected = project_points(geometry, circle)
+    height_mm = np.full(_POINTS, rim_z_mm)
+    circle_mm = np.stack([rim_mm * np.cos(theta), rim_mm * np.sin(theta), height_mm])
+    expected = project_points(geometry, circle_mm)
     middle = expected.mean(axis=1)
     spoke = expected - middle[:, None]
     reach = np.linspace(_FROM, _TO, _SAMPLES)
-    values = light_at(light, middle[:, None, None] + spoke[:, :, None] * reach)
+    places_px = middle[:, None, None] + spoke[:, :, None] * reach
+    values = light_at(light, places_px)
 
     # On each line, the first sample with less than half the light well inside. A line that leaves
     # the picture, or begins in the dark, gives none.

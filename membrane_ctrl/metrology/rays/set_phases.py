@@ -1,5 +1,6 @@
 """One capture set for the calibration: screen points of its bins, and what is known besides."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -70,19 +71,37 @@ class SetPhases:
 
     def thin_to(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""
-        return self.subset(slice(None, None, -(-self.column_px.size // most)))
+        stride = math.ceil(self.column_px.size / most)
+        return self.subset(slice(None, None, stride))
 
     def subset(self, keep: slice | BoolArray) -> "SetPhases":
         """Some of the bins."""
         parts = {name: getattr(self, name)[..., keep] for name in _PER_POINT}
-        return replace(self, **parts, screen=None if self.screen is None else self.screen[keep])
+        screen = self.screen
+        if screen is not None:
+            screen = screen[keep]
+        return replace(self, **parts, screen=screen)
 
     def add_screen_place(self, again: "SetPhases", known: MovedScreen) -> "SetPhases":
-        """The set with the points of the same film, seen again with the screen elsewhere."""
+        """Add the points of the same film, seen again with the screen elsewhere.
+
+        Parameters
+        ----------
+        again : SetPhases
+            The set with the screen elsewhere.
+        known : MovedScreen
+            What is known of the move.
+
+        Returns
+        -------
+        SetPhases
+            With the points of both, and one more place of the screen.
+        """
         before = self.screen
         if before is None:
             before = np.zeros(self.sigma_mm.size, int)
-        screen = np.append(before, np.full(again.sigma_mm.size, len(self.moved_screens) + 1))
+        place = len(self.moved_screens) + 1
+        screen = np.append(before, np.full(again.sigma_mm.size, place))
         parts: Any = {}
         for name in _PER_POINT:
             parts[name] = np.concatenate([getattr(self, name), getattr(again, name)], -1)

@@ -86,7 +86,8 @@ class Surface:
         if not self.beyond_mm:
             return self.polynomial
         out = self.waves.copy()
-        out[: self.polynomial.shape[0], : self.polynomial.shape[1]] += self.polynomial
+        rows, columns = self.polynomial.shape
+        out[:rows, :columns] += self.polynomial
         return out
 
     @property
@@ -95,18 +96,20 @@ class Surface:
         return float(sag_gradient() @ self.parameters)
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Height in mm at points (...) in mm."""
+        """Height in mm at points (...) in mm (paper, eq. 15, with the excess)."""
         x = np.asarray(x_mm) / self.radius_mm
         y = np.asarray(y_mm) / self.radius_mm
-        bowl = series.polyval2d(x, y, self._whole)
-        return np.asarray(bowl + series.polyval(x * x + y * y, self.excess))
+        terms = series.polyval2d(x, y, self._whole)
+        excess = series.polyval(x * x + y * y, self.excess)
+        return np.asarray(terms + excess)
 
     def slopes(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """dh/dx and dh/dy."""
+        """dh/dx and dh/dy at points (...) in mm (paper, eqs. 16 and 17, with the excess)."""
         x = x_mm / self.radius_mm
         y = y_mm / self.radius_mm
         # The excess e(v), v = x^2 + y^2, has the slopes 2 e'(v) x and 2 e'(v) y.
-        excess_slope = 2 * series.polyval(x * x + y * y, series.polyder(self.excess))
+        v = x * x + y * y
+        excess_slope = 2 * series.polyval(v, series.polyder(self.excess))
         terms_x = series.polyval2d(x, y, series.polyder(self._whole, axis=0))
         terms_y = series.polyval2d(x, y, series.polyder(self._whole, axis=1))
         slope_x = (terms_x + excess_slope * x) / self.radius_mm
@@ -145,7 +148,8 @@ class Surface:
         terms = self._whole.T
         terms_x = series.polyder(terms, axis=1)
         terms_y = series.polyder(terms, axis=0)
-        out = np.stack([series.polygrid2d(axis, axis, part) for part in (terms, terms_x, terms_y)])
+        polynomials = (terms, terms_x, terms_y)
+        out = np.stack([series.polygrid2d(axis, axis, polynomial) for polynomial in polynomials])
 
         # The excess e(v), with the slopes 2 e'(v) x and 2 e'(v) y.
         v = axis**2 + axis[:, None] ** 2
@@ -187,10 +191,13 @@ def height_probe() -> FloatArray:
 
     Enough to see the largest height of such a surface to a few per cent.
     """
+    # Equal areas along the radius, the golden angle around.
     k = np.arange(512)
     rho = np.sqrt((k + 0.5) / 511.5)
     theta = k * np.pi * (3 - np.sqrt(5))
-    terms = zernike.evaluate_terms(rho * np.cos(theta), rho * np.sin(theta))
+    x = rho * np.cos(theta)
+    y = rho * np.sin(theta)
+    terms = zernike.evaluate_terms(x, y)
     excess = series.polyval(rho**2, hencky_bowl.excess_series()) / hencky_bowl.excess_rms()
     by_excess = np.outer(excess, np.eye(PARAMETERS)[-1])
     return np.asarray(terms.T @ parameter_to_coeffs() + by_excess)

@@ -89,11 +89,13 @@ def round_effect(
     answer = error @ terms_of_slopes
 
     # Effect of the slopes that are seen, and its covariance by noise and by scatter.
-    seen = answer @ rings.slope
+    seen_mm = answer @ rings.slope
     by_noise = (answer * noise**2) @ answer.T
     by_scatter = (answer * sigma**2) @ answer.T
-    noise_mm2 = float(np.trace(by_noise)) + float(np.sum(_along_sag(by_noise) ** 2))
-    return np.column_stack([seen, _along_sag(by_scatter)]), noise_mm2
+    square_of_seen = float(np.trace(by_noise))
+    square_of_sag = float(np.sum(_along_sag(by_noise) ** 2))
+    effects_mm = np.column_stack([seen_mm, _along_sag(by_scatter)])
+    return effects_mm, square_of_seen + square_of_sag
 
 
 def wave_effect(
@@ -140,12 +142,15 @@ def wave_effect(
     wave_left = (left * weights[:, None] / radius_mm)[:, terms_beyond_fit.WAVE]
     seen = patches.slopes.ravel() * weights
 
-    # Amplitudes of the waves from the slopes, by least squares with their prior.
+    # Amplitudes of the waves from the slopes, by least squares with their prior; then the error of
+    # the parameters from the amplitudes.
     scatter = max(float(np.mean(seen**2)), slope_variance)
     sigmas_mm = np.array([wave.sigma_mm for wave in terms_beyond_fit.WAVES])
-    waves = wave_left.T @ wave_left + scatter * np.diag(1 / sigmas_mm**2)
-    answer = error[:, terms_beyond_fit.WAVE] @ np.linalg.solve(waves, wave_left.T)
-    return (answer @ seen)[:, None], slope_variance * float(np.sum(answer**2))
+    normal = wave_left.T @ wave_left + scatter * np.diag(1 / sigmas_mm**2)
+    amplitudes_of_slopes = np.linalg.solve(normal, wave_left.T)
+    answer = error[:, terms_beyond_fit.WAVE] @ amplitudes_of_slopes
+    effect_mm = (answer @ seen)[:, None]
+    return effect_mm, slope_variance * float(np.sum(answer**2))
 
 
 def _absorbed_terms(
@@ -155,6 +160,8 @@ def _absorbed_terms(
     x, y = patches.places_mm / radius_mm
     _, *slopes = surface_basis.evaluate_basis(x, y)
     _, *beyond_slopes = surface_basis.evaluate_beyond_basis(x, y)
+
+    # (D^T W D)^-1 D^T W B, with B the slopes of the terms beyond, x and y together.
     products = sum(
         (own * patches.count) @ beyond.T for own, beyond in zip(slopes, beyond_slopes, strict=True)
     )
@@ -165,16 +172,20 @@ def _mean_of_rings(rings: RoundSlopes, absorbed: FloatArray, radius_mm: float) -
     """Mean radial slopes (rings, k), in radii, that the fit leaves of the round terms beyond it."""
     # Points of each ring.
     share = (np.arange(_RADII) + 0.5) / _RADII
-    radius = rings.inner_mm[:, None] + (rings.outer_mm - rings.inner_mm)[:, None] * share
+    width_mm = (rings.outer_mm - rings.inner_mm)[:, None]
+    radius = rings.inner_mm[:, None] + width_mm * share
     rho = np.repeat(radius.ravel() / radius_mm, _AZIMUTHS)
-    theta = np.tile(2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS, radius.size)
+    azimuths = 2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    theta = np.tile(azimuths, radius.size)
     cosine = np.cos(theta)
     sine = np.sin(theta)
 
     # Their radial slopes, and the means, weighted by area.
     _, own_x, own_y = surface_basis.evaluate_basis(rho * cosine, rho * sine)
     _, beyond_x, beyond_y = surface_basis.evaluate_round_basis(rho * cosine, rho * sine)
-    radial = (beyond_x - absorbed.T @ own_x) * cosine + (beyond_y - absorbed.T @ own_y) * sine
+    left_x = beyond_x - absorbed.T @ own_x
+    left_y = beyond_y - absorbed.T @ own_y
+    radial = left_x * cosine + left_y * sine
     of_radii = radial.reshape(-1, *radius.shape, _AZIMUTHS).mean(axis=-1)
     means = np.sum(of_radii * radius, axis=-1) / np.sum(radius, axis=-1)
     return np.asarray(means.T)
@@ -190,7 +201,16 @@ def _along_sag(covariance: FloatArray) -> FloatArray:
 def film_shape_sources(full: FullResult, slope_variance: FloatArray) -> tuple[budget.Source, ...]:
     """Rows of the budget for the film's round profile and for its waves.
 
-    `slope_variance` (2,) is that of an x and of a y slope from the noise.
+    Parameters
+    ----------
+    full : FullResult
+        The measured figure.
+    slope_variance : (2,) array
+        Of an x and of a y slope from the noise.
+
+    Returns
+    -------
+    two Source
     """
     grid = full.fit_grid
     inverse = full.fit.normal.inverse

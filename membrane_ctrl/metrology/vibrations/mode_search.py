@@ -66,6 +66,13 @@ _SAME = 0.004  # relative difference of frequency: two searches see one mode, wh
 # frequency has moved.
 _FAR = 0.05
 _SIMILAR = 0.8
+_MOST_OF_LEAST = 0.9  # share of the least time that the pieces must have
+_BEYOND_LAST = 1.001  # the last band ends just beyond the fastest alias
+_LEAST_EIGENVALUE = 1e-3  # of the terms' noise, over the largest: smaller ones are rounding
+_DRIFT_DEGREE = 3  # of the polynomial that counts as drift
+_MOST_DEVIATIONS = 6  # robust ones, at which terms are clipped
+_MAD_TO_SIGMA = 1.4826
+_EQUAL_RATES = 1.03  # largest over smallest rate of pieces that count as one rate
 _MEDIAN_OF_POWER = np.log(2)  # median over mean of an exponential distribution
 _GAUSSIAN_QUANTILE = 1.2816  # distance of the 10 % quantile from the median, in sigmas
 
@@ -151,8 +158,9 @@ class _Piece:
         """
         # Bands of half an octave, from below the slowest line to the fastest alias.
         slowest_hz = _LEAST_HZ / 2
-        octaves = np.log2(self.alias_hz.max() / slowest_hz)
-        edges = np.geomspace(slowest_hz, self.alias_hz.max() * 1.001, 3 + int(2 * octaves))
+        fastest_hz = self.alias_hz.max()
+        octaves = np.log2(fastest_hz / slowest_hz)
+        edges = np.geomspace(slowest_hz, fastest_hz * _BEYOND_LAST, 3 + int(2 * octaves))
         levels = []
         middles = []
         for low, high in pairwise(edges):
@@ -167,7 +175,8 @@ class _Piece:
             levels.append(np.median(power[band], axis=0) / _MEDIAN_OF_POWER)
             middles.append(np.log(np.sqrt(low * high)))
 
-        # Falling with frequency, and not below the rounding of the recorded terms.
+        # Falling with frequency, and not below the rounding of the recorded terms, whose variance
+        # is grain^2 / 12.
         rounding = np.sum(self.window**2) * _GRAIN_UM**2 / 12
         falling = np.minimum.accumulate(levels, axis=0)
         logs = np.log(np.maximum(falling, rounding))
@@ -183,10 +192,11 @@ class _Piece:
         """The terms (n, terms - 1) without the oscillations about a frequency that the projection
         `shapes` (terms - 1, terms - 1) selects.
         """
-        times = 2 * np.pi * (self.time_s - self.time_s[0])
+        # Cosines and sines at the frequency and beside it, fitted to the selected terms.
+        rad_per_hz = 2 * np.pi * (self.time_s - self.time_s[0])
         waves = []
         for offset in _REMOVED_OFFSETS:
-            phase = (frequency_hz + offset / PIECE_S) * times
+            phase = (frequency_hz + offset / PIECE_S) * rad_per_hz
             waves += [np.cos(phase), np.sin(phase)]
         base = np.column_stack(waves)
         amplitudes = np.linalg.lstsq(base, terms_um @ shapes, rcond=None)[0]
@@ -217,11 +227,14 @@ def find_modes(
     good = np.isfinite(coeffs_um).all(axis=1)
     grid_hz = np.arange(_LEAST_HZ, most_hz, 1 / (_GRID * PIECE_S))
     pieces, terms = _split_frames(time_s[good], coeffs_um[good, 1:], grid_hz)
-    if sum(piece.time_s[-1] - piece.time_s[0] for piece in pieces) < 0.9 * LEAST_S:
+    durations_s = [piece.time_s[-1] - piece.time_s[0] for piece in pieces]
+    if sum(durations_s) < _MOST_OF_LEAST * LEAST_S:
         return None
     margin = 1.0
-    if _one_rate([piece.rate_hz for piece in pieces]):
+    if _have_one_rate([piece.rate_hz for piece in pieces]):
         margin = _MARGIN
+
+    # In how many pieces each frequency is visible, and the power before any line is removed.
     visible = np.sum([~piece.blind for piece in pieces], axis=0)
     whole_power = [np.abs(spectrum) ** 2 for spectrum in _project_pieces(pieces, terms)]
     # For each piece, the frequencies whose aliases were removed with a line.
@@ -249,20 +262,28 @@ def find_modes(
             [pieces[p] for p in used],
             [noises[p][k] for p in used],
         )
-        own = shape[1:] / np.linalg.norm(shape[1:])
-        own_power = [np.abs(spectra[p] @ own) ** 2 for p in used]
+
+        # Its error: the curvature of T, or the scatter among the pieces if that is larger.
+        direction = shape[1:] / np.linalg.norm(shape[1:])
+        own_power = [np.abs(spectra[p] @ direction) ** 2 for p in used]
         sigma = max(sigma, _scatter_hz(own_power, grid_hz, k))
+
+        # A new mode, with all frequencies that the frames cannot exclude.
         is_known = any(abs(frequency - mode.frequency_hz) < _APART_HZ for mode in found)
         if not is_known:
             evidence = float(seen[k] - np.median(seen))
             rates_hz = [pieces[p].rate_hz for p in used]
-            aliases = _aliases_hz(rates_hz, frequency, most_hz) or tuple(grid_hz[rivals].tolist())
+            aliases = _aliases_hz(rates_hz, frequency, most_hz)
+            if not aliases:
+                aliases = tuple(grid_hz[rivals].tolist())
             found.append(VibrationMode(frequency, sigma, amplitude_nm, shape, evidence, aliases))
 
         # Remove its shape; if it was found before, all shapes at its frequency.
         remaining = []
         for piece, part, noise in zip(pieces, terms, noises, strict=True):
-            shapes = np.eye(own.size) if is_known else _projection_onto(own, noise[k])
+            shapes = np.eye(direction.size)
+            if not is_known:
+                shapes = _projection_onto(direction, noise[k])
             remaining.append(piece.remove_oscillations(part, frequency, shapes))
         terms = remaining
         gone = [
@@ -297,10 +318,11 @@ def _split_frames(
         blind = (alias_hz < _LEAST_HZ) | (alias_hz > rate_hz / 2 - 2 / PIECE_S)
 
         # Hann's window, which is 0 one frame beyond both ends, and the waves of the projection.
-        middle = (t[0] + t[-1]) / 2
-        half = (t[-1] - t[0]) / 2 + 1 / rate_hz
-        window = np.cos(np.pi / 2 * (t - middle) / half) ** 2
-        waves = np.exp(-2j * np.pi * grid_hz[:, None] * (t - t[0]))
+        middle_s = (t[0] + t[-1]) / 2
+        half_s = (t[-1] - t[0]) / 2 + 1 / rate_hz
+        window = np.cos(np.pi / 2 * (t - middle_s) / half_s) ** 2
+        from_first_s = t - t[0]
+        waves = np.exp(-2j * np.pi * grid_hz[:, None] * from_first_s)
         pieces.append(_Piece(t, rate_hz, window, waves, alias_hz, blind))
         terms.append(_without_drift(t, coeffs_um[frames]))
     return pieces, terms
@@ -329,20 +351,23 @@ def _find_runs(time_s: FloatArray) -> list[slice]:
     ends = np.union1d(rate_changes, gaps)
     pieces = []
     for first, last in pairwise([0, *(ends + 1), time_s.size]):
-        lasts_s = time_s[last - 1] - time_s[first]
-        if lasts_s >= _SHORTEST * PIECE_S:
-            edges = np.linspace(first, last, max(1, round(lasts_s / PIECE_S)) + 1).astype(int)
+        duration_s = time_s[last - 1] - time_s[first]
+        if duration_s >= _SHORTEST * PIECE_S:
+            count = max(1, round(duration_s / PIECE_S))
+            edges = np.linspace(first, last, count + 1).astype(int)
             pieces += [slice(a, b) for a, b in pairwise(edges)]
     return pieces
 
 
 def _without_drift(time_s: FloatArray, terms_um: FloatArray) -> FloatArray:
     """Terms less a cubic, clipped at six robust deviations."""
-    base = np.column_stack([np.linspace(-1, 1, time_s.size) ** power for power in range(4)])
+    place = np.linspace(-1, 1, time_s.size)
+    base = np.column_stack([place**power for power in range(_DRIFT_DEGREE + 1)])
     cubic = base @ np.linalg.lstsq(base, terms_um, rcond=None)[0]
     rest = terms_um - cubic
-    spread = np.maximum(1.4826 * np.median(np.abs(rest), axis=0), _GRAIN_UM)
-    return np.asarray(np.clip(rest, -6 * spread, 6 * spread))
+    deviation = _MAD_TO_SIGMA * np.median(np.abs(rest), axis=0)
+    most = _MOST_DEVIATIONS * np.maximum(deviation, _GRAIN_UM)
+    return np.asarray(np.clip(rest, -most, most))
 
 
 def _compute_evidence(
@@ -358,15 +383,21 @@ def _compute_evidence(
     # other one.
     power = np.sum(np.abs(white) ** 2, axis=2)
     quiet = white[power <= np.median(power, axis=0)]
-    values, vectors = np.linalg.eigh(np.real(quiet.conj().T @ quiet) / len(quiet))
-    kept = values > 1e-3 * values[-1]
+    covariance = np.real(quiet.conj().T @ quiet) / len(quiet)
+    values, vectors = np.linalg.eigh(covariance)
+
+    # Combinations of terms whose noise is independent and of unit variance. A blind piece shows
+    # nothing.
+    kept = values > _LEAST_EIGENVALUE * values[-1]
     independent = (white @ vectors[:, kept]) / np.sqrt(values[kept])
-    independent[np.stack([piece.blind for piece in pieces], axis=1)] = 0
+    is_blind = np.stack([piece.blind for piece in pieces], axis=1)
+    independent[is_blind] = 0
 
     # Real and imaginary parts of all pieces are rows of one matrix; the largest eigenvalue of its
     # square is the power of the best common shape.
     parts = np.concatenate([independent.real, independent.imag], axis=1)
-    return np.asarray(np.linalg.eigvalsh(parts @ parts.transpose(0, 2, 1))[:, -1])
+    squares = parts @ parts.transpose(0, 2, 1)
+    return np.asarray(np.linalg.eigvalsh(squares)[:, -1])
 
 
 def _compute_threshold(seen: FloatArray, frequencies: int) -> float:
@@ -396,7 +427,8 @@ def _find_likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]
     best = int(np.argmax(seen))
     inner = seen[1:-1]
     near = seen[best] - max(_EQUALLY_LIKELY, _LEAKED * seen[best])
-    peaks = 1 + np.flatnonzero((inner >= seen[:-2]) & (inner > seen[2:]) & (inner > near))
+    is_peak = (inner >= seen[:-2]) & (inner > seen[2:])
+    peaks = 1 + np.flatnonzero(is_peak & (inner > near))
     apart = round(_APART_HZ * _GRID * PIECE_S)
     candidates = [best, *(int(k) for k in peaks if abs(k - best) > apart)]
 
@@ -412,15 +444,16 @@ def _find_likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]
     return likeliest, sorted(rivals)
 
 
-def _one_rate(rates_hz: list[float]) -> bool:
-    return max(rates_hz) < 1.03 * min(rates_hz)
+def _have_one_rate(rates_hz: list[float]) -> bool:
+    """Whether all pieces have the same frame rate, so that they have the same aliases."""
+    return max(rates_hz) < _EQUAL_RATES * min(rates_hz)
 
 
 def _aliases_hz(rates_hz: list[float], frequency_hz: float, most_hz: float) -> tuple[float, ...]:
     """All aliases of a frequency that pieces of one rate alone show: others may be blind to the
     true one.
     """
-    if not _one_rate(rates_hz):
+    if not _have_one_rate(rates_hz):
         return ()
     rate_hz = float(np.mean(rates_hz))
     alias_hz = abs(frequency_hz - rate_hz * round(frequency_hz / rate_hz))
@@ -438,12 +471,15 @@ def _refine_frequency(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[fl
     step = grid_hz[1] - grid_hz[0]
     if not 0 < k < seen.size - 1:
         return float(grid_hz[k]), float(step)
+    # T is a log likelihood: its second derivative is minus the inverse of the variance.
     before, here, after = seen[k - 1 : k + 2]
     bend = before - 2 * here + after
     if bend >= 0:
         return float(grid_hz[k]), float(step)
     offset = float(np.clip((before - after) / (2 * bend), -1, 1))
-    return float(grid_hz[k] + offset * step), float(step / np.sqrt(-bend))
+    frequency_hz = grid_hz[k] + offset * step
+    sigma_hz = step / np.sqrt(-bend)
+    return float(frequency_hz), float(sigma_hz)
 
 
 def _compute_shape(
