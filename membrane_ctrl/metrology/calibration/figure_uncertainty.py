@@ -22,34 +22,86 @@ from membrane_ctrl.model.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Propagated:
-    """Standard deviations that come from the geometry and the laser."""
+    """Standard deviations that come from the geometry and the laser.
 
-    height_rms_um: float  # over the analysed disc; the figure is the height without its best plane
+    Attributes
+    ----------
+    height_rms_um, figure_rms_um : float
+        Over the analysed disc; the figure is the height without its best plane.
+    sag_um : float
+        Of the rim above the vertex.
+    zernike_um : (terms,) array
+        In Noll's order; 2 and 3 are the tilt.
+    """
+
+    height_rms_um: float
     figure_rms_um: float
-    sag_um: float  # of the rim above the vertex
-    zernike_um: FloatArray  # (terms,) in Noll's order; 2 and 3 are the tilt
+    sag_um: float
+    zernike_um: FloatArray
 
 
 def surface_response(solution: Solution, index: int) -> FloatArray:
-    """d surface / d (optical parameters, vertex' height), (parameters, OPTICAL + 1), of one set."""
+    """Change of the surface that a fit gives, by a change of the bench.
+
+    Parameters
+    ----------
+    solution : Solution
+        The calibration.
+    index : int
+        Number of the set.
+
+    Returns
+    -------
+    (parameters, OPTICAL + 1) array
+        dq / dg = -(J_q^T W J_q)^-1 J_q^T W J_g, with g the optical parameters and the height of the
+        vertex; mm per unit of the parameter.
+    """
     sums = solution.equations[index].sums
-    order = [
-        *range(forward_model.LOCAL, forward_model.LOCAL + bench_poses.OPTICAL),
-        PARAMETERS,
-    ]
-    return np.asarray(-np.linalg.solve(sums[:PARAMETERS, :PARAMETERS], sums[:PARAMETERS, order]))
+    first = forward_model.LOCAL
+    columns = [*range(first, first + bench_poses.OPTICAL), PARAMETERS]
+    own = sums[:PARAMETERS, :PARAMETERS]
+    mixed = sums[:PARAMETERS, columns]
+    return np.asarray(-np.linalg.solve(own, mixed))
 
 
 def surface_covariance(solution: Solution, index: int) -> FloatArray:
-    """Covariance (parameters, parameters) in mm^2 of the parameters of one set's surface."""
+    """Covariance of the surface's parameters that a figure like that of one set has.
+
+    Parameters
+    ----------
+    solution : Solution
+        The calibration.
+    index : int
+        Number of the set.
+
+    Returns
+    -------
+    (parameters, parameters) array
+        In mm^2, of the geometry's and the laser's errors.
+    """
     response = surface_response(solution, index)
+    by_geometry = response[:, :-1]
     geometry = solution.covariance[: bench_poses.OPTICAL, : bench_poses.OPTICAL]
     vertex = response[:, -1] * solution.problem.references.laser_sigma_um * 1e-3
-    return np.asarray(response[:, :-1] @ geometry @ response[:, :-1].T + np.outer(vertex, vertex))
+    return np.asarray(by_geometry @ geometry @ by_geometry.T + np.outer(vertex, vertex))
 
 
 def propagate_to_figure(solution: Solution, index: int, analysis_radius_mm: float) -> Propagated:
-    """Propagate to the quantities of a figure like that of one set."""
+    """Propagate to the quantities of a figure like that of one set.
+
+    Parameters
+    ----------
+    solution : Solution
+        The calibration.
+    index : int
+        Number of the set.
+    analysis_radius_mm : float
+        Radius of the disc over which heights are averaged.
+
+    Returns
+    -------
+    Propagated
+    """
     covariance = surface_covariance(solution, index)
     heights, plane = heights_over_disc(analysis_radius_mm / solution.problem.radius_mm)
     flat = remove_plane(heights, plane)
@@ -64,6 +116,7 @@ def propagate_to_figure(solution: Solution, index: int, analysis_radius_mm: floa
 
 def seat_sigmas(solution: Solution, index: int) -> FloatArray:
     """Standard deviations (3,) of a turned mirror's seat: place of its axis, mm, and turn, rad."""
+    # The set's own share of the error, and that of the common unknowns.
     local = forward_model.LOCAL
     sums = solution.equations[index].sums
     own = np.linalg.inv(sums[:local, :local])
@@ -81,4 +134,6 @@ def sag_um(covariance: FloatArray) -> float:
 
 
 def _rms_um(heights: FloatArray, covariance: FloatArray) -> float:
-    return 1e3 * float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", heights, covariance, heights))))
+    """RMS over the points of the standard deviation of heights (n, parameters)."""
+    variances_mm2 = np.einsum("ij,jk,ik->i", heights, covariance, heights)
+    return 1e3 * float(np.sqrt(np.mean(variances_mm2)))

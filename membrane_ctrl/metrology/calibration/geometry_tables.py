@@ -36,25 +36,54 @@ _LENS = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1",
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a geometry, as `[calibration]` states it."""
+    """Origin of a geometry, as `[calibration]` states it.
+
+    Attributes
+    ----------
+    date_utc : str
+    sets : tuple of str
+        Names of the capture sets.
+    screen_residual_um : float
+        Median over the sets of the RMS of seen minus predicted screen points.
+    slope_residual_urad : float
+        Median over the sets of the RMS that `measure` states with this geometry: the reference for
+        a drift.
+    slope_noise_urad : float
+        Share of the camera's noise in it.
+    condition : float
+        See `weak_combinations.condition_number`.
+    notes : tuple of str
+        Findings of the calibration.
+    """
 
     date_utc: str
     sets: tuple[str, ...]
-    screen_residual_um: (
-        float  # median over the sets of the RMS of seen minus predicted screen points
-    )
-    # Median over the sets of the RMS that `measure` states with this geometry: the reference for a
-    # drift
+    screen_residual_um: float
     slope_residual_urad: float
-    slope_noise_urad: float  # share of the camera's noise in it
-    condition: float  # see `propagate.condition_number`
-    notes: tuple[str, ...] = ()  # findings of the calibration
+    slope_noise_urad: float
+    condition: float
+    notes: tuple[str, ...] = ()
 
 
 def make_geometry_tables(
     solution: Solution, optics: OpticsConfig, origin: Origin
 ) -> dict[str, Any]:
-    """The content of `geometry.toml`; `optics` is the stated bench."""
+    """Make the content of `geometry.toml`.
+
+    Parameters
+    ----------
+    solution : Solution
+        The calibration.
+    optics : OpticsConfig
+        The stated bench.
+    origin : Origin
+        Where the numbers come from.
+
+    Returns
+    -------
+    dict
+        The tables of the module's text.
+    """
     free = [bench_parameters.NAMES.index(name) for name in solution.free_names]
 
     # Geometry, its covariance in the general form, and the parameters as solved.
@@ -103,9 +132,7 @@ def make_geometry_tables(
 
 
 def calibrated_geometry(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
-    """The calibrated geometry in the general form; the screen's
-    height map is the stated bench's.
-    """
+    """The calibrated geometry in the general form, with the height map of the stated screen."""
     reference = {"reference_displacement_um": solution.problem.references.reference_um}
     return general_form(solution.bench.geometry, optics).model_copy(update=reference)
 
@@ -114,7 +141,9 @@ def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
     """A geometry as two poses; the height map and the reference displacement are the stated
     bench's.
     """
-    stated = optics.geometry.screen
+    height_map = None
+    if optics.geometry.screen is not None:
+        height_map = optics.geometry.screen.height_map
     right, down, forward = (_to_vector(row) for row in geometry.rotation)
     return GeometryConfig(
         reference_displacement_um=optics.geometry.reference_displacement_um,
@@ -126,7 +155,7 @@ def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
             s_x=_to_vector(geometry.screen_s_x),
             s_y=_to_vector(geometry.screen_s_y),
             bow_mm=geometry.face.bow_per_mm * BOW_RADIUS_MM**2,
-            height_map=None if stated is None else stated.height_map,
+            height_map=height_map,
         ),
     )
 
@@ -141,23 +170,25 @@ def general_covariance(solution: Solution) -> FloatArray:
     geometry = solution.bench.geometry
     columns = []
     for turn in bench_poses.pose_derivatives(solution.problem.stated, solution.values):
-        turns = (
-            _turn_vector(geometry.rotation.T @ turn.camera),
-            _turn_vector(geometry.screen_axes.T @ turn.screen),
-        )
-        columns.append(np.concatenate([turn.pinhole_mm, turns[0], turn.origin_mm, turns[1]]))
+        camera_turn = _turn_vector(geometry.rotation.T @ turn.camera)
+        screen_turn = _turn_vector(geometry.screen_axes.T @ turn.screen)
+        changes = [turn.pinhole_mm, camera_turn, turn.origin_mm, screen_turn]
+        columns.append(np.concatenate(changes))
     poses = np.stack(columns, axis=1)
+
+    # From the free parameters to the general form: the poses by their derivatives, the others
+    # unchanged.
     optional = [bench_parameters.NAMES.index(name) for name in _list_free_options(solution)]
-    used = [*range(len(bench_parameters.POSE)), *optional]
-    matrix = np.eye(
-        len(poses) + len(optional), len(used), k=len(bench_parameters.POSE) - len(poses)
-    )
-    matrix[: len(poses), : len(bench_parameters.POSE)] = poses
+    general_poses, stated_poses = poses.shape
+    used = [*range(stated_poses), *optional]
+    matrix = np.eye(general_poses + len(optional), len(used), k=stated_poses - general_poses)
+    matrix[:general_poses, :stated_poses] = poses
     covariance = matrix @ solution.covariance[np.ix_(used, used)] @ matrix.T
     return np.asarray((covariance + covariance.T) / 2)
 
 
 def _list_free_options(solution: Solution) -> list[str]:
+    """Names of the optional parameters that were free."""
     return [
         parameter.name
         for parameter in bench_parameters.OPTIONAL
@@ -166,10 +197,11 @@ def _list_free_options(solution: Solution) -> list[str]:
 
 
 def _turn_vector(cross: FloatArray) -> FloatArray:
-    return (
-        -np.array([cross[2, 1] - cross[1, 2], cross[0, 2] - cross[2, 0], cross[1, 0] - cross[0, 1]])
-        / 2
-    )
+    """Small turn w (3,) from minus its cross-product matrix (3, 3), which is antisymmetric."""
+    x = cross[2, 1] - cross[1, 2]
+    y = cross[0, 2] - cross[2, 0]
+    z = cross[1, 0] - cross[0, 1]
+    return -np.array([x, y, z]) / 2
 
 
 def _to_vector(values: FloatArray) -> Vector3:

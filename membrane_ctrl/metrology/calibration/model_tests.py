@@ -38,10 +38,14 @@ _CREEP_SIGMA_MM = 1.0
 _LEAST_TO_CREEP = 3  # sets
 _LASER_SIGMA = 1.0  # of its scale when the optics alone determine it
 _DETERMINED = 1e-10  # eigenvalue, of scaled equations, from which on a combination is determined
+_SMALLEST_SQUARE = 1e-300  # keeps the scale of an unknown that nothing depends on finite
 
 
 def _is_significant(fall: float, freedom: int) -> bool:
-    """Whether noise hardly ever causes as large a fall of the sum of squares."""
+    """Whether noise hardly ever causes as large a fall of the sum of squares.
+
+    With good data the fall is a chi-square of so many degrees of freedom.
+    """
     return bool(chi2.sf(fall, freedom) < SIGNIFICANCE)
 
 
@@ -264,7 +268,8 @@ def _free_screen_moves(solution: solver.Solution, k: int) -> FloatArray:
     ):
         # The rows of the stated move, which were added to the normal equations.
         stated, sigmas = known.make_prior(laser_sigma_um)[:, places]
-        stated_rows = np.hstack([np.eye(places.size), (stated - move[places])[:, None]])
+        off = stated - move[places]
+        stated_rows = np.hstack([np.eye(places.size), off[:, None]])
         stated_rows /= sigmas[:, None]
         own = np.append(places, len(sums) - 1)
         without_stated = sums.copy()
@@ -294,8 +299,12 @@ def find_camera_bumps(solution: solver.Solution) -> tuple[CameraBump, ...]:
 
 
 def find_mount_creep(solution: solver.Solution) -> MountCreep | None:
-    """Whether camera or screen crept from the first set to the last, and what changed most; None if
-    not sure.
+    """Find whether camera or screen crept from the first set to the last.
+
+    Returns
+    -------
+    MountCreep or None
+        With what changed most; None if it is not significant, or there are too few sets.
     """
     count = len(solution.states)
     if count < _LEAST_TO_CREEP:
@@ -366,10 +375,8 @@ def leave_set_out(solution: solver.Solution, index: int) -> solver.Solution:
     problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
     linear = tuple(solution.equations[k] for k in keep)
     sigmas = problem.sigmas
-    moved = solver.solve_step(
-        np.sum([each.eliminate_surface() for each in linear], axis=0) + solution.prior_sums(sigmas),
-        sigmas,
-    )
+    of_sets = np.sum([each.eliminate_surface() for each in linear], axis=0)
+    moved = solver.solve_step(of_sets + solution.prior_sums(sigmas), sigmas)
     common = solution.common + moved.delta
     return replace(
         solution,
@@ -401,12 +408,19 @@ def move_to_solution(solution: solver.Solution) -> solver.Solution:
 
 
 def _reduce_equations(solution: solver.Solution) -> list[FloatArray]:
+    """Equations of the common unknowns alone, (COMMON + 1, squared), one for each set."""
     return [each.eliminate_surface() for each in solution.equations]
 
 
 def film_rise(solution: solver.Solution, film: set_state.FilmModel) -> float:
-    """By how much the sum of squares of a solution with a free film
-    rises if the film is like that.
+    """Rise of the sum of squares if the film follows a law.
+
+    Parameters
+    ----------
+    solution : Solution
+        With a free film.
+    film : FilmModel
+        The law.
     """
     bound = _change_film_rows(
         solution, lambda _, state: (1.0, reference_rows.film_rows(state.surface, film))
@@ -454,11 +468,13 @@ def _change_film_rows(
     changed = list(solution.equations)
     for k in solution.problem.film_sets:
         sign, rows = rows_of(solution.problem.sets[k], solution.states[k])
-        changed[k] = replace(changed[k], sums=changed[k].sums + sign * rows.T @ rows)
+        sums = changed[k].sums + sign * rows.T @ rows
+        changed[k] = replace(changed[k], sums=sums)
     return replace(solution, equations=tuple(changed))
 
 
 def _sum_squares(sums: FloatArray, solution: solver.Solution) -> float:
+    """Least sum of squares of the sets' sums with what is known besides."""
     sigmas = solution.problem.sigmas
     return solver.solve_step(sums + solution.prior_sums(sigmas), sigmas).squares
 
@@ -470,14 +486,15 @@ def _fit_alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
     free = np.flatnonzero(np.append(sigmas > 0, np.ones(others, bool)))
     matrix = reduced[np.ix_(free, free)]
     right = reduced[free, -1]
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), _SMALLEST_SQUARE))
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
 
     # Least squares over the combinations that the set determines.
     is_determined = values > _DETERMINED
     along = vectors.T @ (right * scale)
     explained = np.sum(along[is_determined] ** 2 / values[is_determined])
-    return float(reduced[-1, -1] - explained), int(np.count_nonzero(is_determined))
+    least_squares = float(reduced[-1, -1] - explained)
+    return least_squares, int(np.count_nonzero(is_determined))
 
 
 def _with_more(sums: FloatArray, columns: Sequence[int], share: float) -> FloatArray:

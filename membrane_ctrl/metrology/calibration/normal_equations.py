@@ -55,7 +55,17 @@ class Equations:
         return self.robust.variance
 
     def local_step(self, common_step: FloatArray) -> FloatArray:
-        """Step (LOCAL,) of the set's own unknowns that goes with one of the common ones."""
+        """Solve for the set's own unknowns, given a step of the common ones.
+
+        Parameters
+        ----------
+        common_step : (COMMON,) array
+
+        Returns
+        -------
+        (LOCAL,) array
+            A^-1 (b - B dc) of the normal equations [[A, B], [B^T, D]] (dq, dc) = (b, d).
+        """
         local = forward_model.LOCAL
         own = self.sums[:local, :local]
         mixed = self.sums[:local, local:-1]
@@ -68,8 +78,10 @@ class Equations:
         step = np.append(local_step, common_step)
         steps = []
         for sums in self.moved_screens:
-            right = sums[:moved, -1] - sums[:moved, moved:-1] @ step
-            steps.append(np.asarray(np.linalg.solve(sums[:moved, :moved], right)))
+            own = sums[:moved, :moved]
+            mixed = sums[:moved, moved:-1]
+            right = sums[:moved, -1] - mixed @ step
+            steps.append(np.asarray(np.linalg.solve(own, right)))
         return steps
 
     def eliminate_surface(self) -> FloatArray:
@@ -78,7 +90,21 @@ class Equations:
 
 
 def eliminate_first(sums: FloatArray, first: int) -> FloatArray:
-    """Schur complement over the first unknowns: D - B^T A^-1 B of [[A, B], [B^T, D]]."""
+    """Eliminate the first unknowns of normal equations.
+
+    Parameters
+    ----------
+    sums : (n, n) array
+        Normal matrix with the right side as last column and row.
+    first : int
+        Number of the unknowns to eliminate.
+
+    Returns
+    -------
+    (n - first, n - first) array
+        Schur complement D - B^T A^-1 B of [[A, B], [B^T, D]]: the equations of the others, and in
+        its last element the least sum of squares over those eliminated.
+    """
     own = sums[:first, :first]
     mixed = sums[:first, first:]
     others = sums[first:, first:]
@@ -158,7 +184,8 @@ def linearise_set(
         sums = sums + found
 
     weights = robust.weights / phases.sigma_mm**2
-    rms_mm = float(np.sqrt(np.mean(residual_mm**2 @ weights) / np.sum(weights)))
+    mean_square_mm2 = np.mean(residual_mm**2 @ weights) / np.sum(weights)
+    rms_mm = float(np.sqrt(mean_square_mm2))
     return Equations(sums, residual_mm, robust, rms_mm, tuple(moved_screens))
 
 

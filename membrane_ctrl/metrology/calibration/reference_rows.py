@@ -108,7 +108,19 @@ def reference_rows(
 
 
 def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
-    """Equations of the round terms beyond the fit's by the film's law, as `reference_rows`."""
+    """Equations of the round terms beyond the fit's by the film's law, as `reference_rows`.
+
+    Parameters
+    ----------
+    surface : Surface
+        The film at its present unknowns.
+    film : FilmModel
+        What determines these terms.
+
+    Returns
+    -------
+    (ROUND_DEGREES, LOCAL + COMMON + 1) array
+    """
     rows = _beyond_rows(surface)[terms_beyond_fit.ROUND]
     if film == "prestressed":
         # The law gives them for the surface's own excess.
@@ -124,8 +136,19 @@ def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
 
 
 def wave_rows(phases: set_phases.SetPhases, state: SetState, free: bool) -> FloatArray:
-    """The waves beyond the fit's as weighted rows [derivatives, miss]: of a film that may be
-    orthotropic, or only those of a round film whose axis is not the bench's.
+    """Equations of the waves beyond the fit's, as `reference_rows`.
+
+    Parameters
+    ----------
+    phases, state
+        The set, and values of its unknowns.
+    free : bool
+        Whether the film may be orthotropic or its ring uneven; else it has only the waves of a
+        round film whose axis is not the bench's.
+
+    Returns
+    -------
+    (waves, LOCAL + COMMON + 1) array
     """
     # Sizes of the waves; a shifted film has some of azimuthal order 1.
     waves = terms_beyond_fit.WAVES
@@ -183,7 +206,8 @@ def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
     for step, by_parameters in zip(_TILT_STEP * np.eye(2), tilt_by_parameters, strict=True):
         change_mm = artefact.terms_mm(*(tilt + step)) - expected_mm
         form[:, :PARAMETERS] -= np.outer(change_mm[2:] / _TILT_STEP, by_parameters)
-    form[:] = np.linalg.solve(np.linalg.cholesky(artefact.covariance_mm2()[2:, 2:]), form)
+    root = np.linalg.cholesky(artefact.covariance_mm2()[2:, 2:])
+    form[:] = np.linalg.solve(root, form)
 
     # Its vertex, as stated; and it does not move.
     vertex[PARAMETERS] = 1.0 / artefact.vertex_sigma_mm

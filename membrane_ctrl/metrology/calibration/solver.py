@@ -177,7 +177,11 @@ def make_prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
     form_mm = np.repeat(film_form.POWER_SIGMAS_MM, len(film_form.TURNING))
     wide = np.concatenate([sigmas, np.full(RING, _FREE_RING_MM), form_mm])
     weight = np.divide(1, wide**2, out=np.zeros(set_state.COMMON), where=wide > 0)
-    rows = np.hstack([np.diag(np.sqrt(weight)), -(np.sqrt(weight) * common)[:, None]])
+
+    # Each unknown is 0 within its sigma: rows (step) / sigma = -(present value) / sigma.
+    root = np.sqrt(weight)
+    right = -(root * common)
+    rows = np.hstack([np.diag(root), right[:, None]])
     return np.asarray(rows.T @ rows)
 
 
@@ -223,7 +227,8 @@ def solve_step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
     delta[free] = inverse @ right
     covariance = np.zeros((set_state.COMMON, set_state.COMMON))
     covariance[np.ix_(free, free)] = inverse
-    return SolverStep(delta, covariance, float(sums[-1, -1] - right @ delta[free]))
+    squares = sums[-1, -1] - right @ delta[free]
+    return SolverStep(delta, covariance, float(squares))
 
 
 def solve_calibration(

@@ -13,23 +13,34 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
 
 _ANGLES_DEG = np.arange(0.0, 360.0, 0.5)
-# squares of the misfit at another angle over those at the stated one: a wrong angle
+# An angle is wrong if the squares of the misfit at another one are less than this share of those at
+# the stated one.
 _FITS_BETTER = 0.1
-_FAR_DEG = 10.0  # apart: the stated bench does not turn a figure by as much
-_NEAR_DEG = 1.0  # apart: the same angle
+_FAR_DEG = 10.0  # difference of angles: the stated bench does not turn a figure by as much
+_NEAR_DEG = 1.0  # difference up to which two angles are the same
 
 
 @dataclass(frozen=True)
 class UnturnedFigure:
-    """A set whose figure is not that of the film in the turned mirror."""
+    """A set whose figure is not that of the film in the turned mirror.
 
-    index: int  # of the set
-    explained: float  # fall of the sum of squares, less two for each number that is freed
-    found_deg: float | None  # the angle that fits; None: no other angle fits better
+    Attributes
+    ----------
+    index : int
+        Number of the set.
+    explained : float
+        Fall of the sum of squares, less two for each number that is freed.
+    found_deg : float, optional
+        The angle that fits; None: no other angle fits better.
+    """
+
+    index: int
+    explained: float
+    found_deg: float | None
 
 
 def find_unturned_figures(solution: Solution) -> tuple[UnturnedFigure, ...]:
-    """Sets of turned mirrors whose figure did not turn as stated; only sure ones."""
+    """Sets of turned mirrors whose figure did not turn as stated; only significant ones."""
     everything = model_tests.sum_of_squares(solution)
     out = []
     for k, phases in enumerate(solution.problem.sets):
@@ -88,7 +99,8 @@ def bind_figures(solution: Solution, stated: Problem) -> Solution:
 def _free_angle(solution: Solution, index: int) -> Solution:
     """The solution without knowledge of one mirror's angle, to first order."""
     equations = list(solution.equations)
-    state, turned = solution.states[index], solution.problem.sets[index].turned
+    state = solution.states[index]
+    turned = solution.problem.sets[index].turned
     rows = turned_rows.seat_rows(turned, state)[-1:]
     equations[index] = replace(equations[index], sums=equations[index].sums - rows.T @ rows)
     return model_tests.move_to_solution(replace(solution, equations=tuple(equations)))
@@ -97,7 +109,8 @@ def _free_angle(solution: Solution, index: int) -> Solution:
 def _free_figure(solution: Solution, index: int) -> Solution:
     """The solution without the rows that turn the film's figure in one set, to first order."""
     equations = list(solution.equations)
-    state, turned = solution.states[index], solution.problem.sets[index].turned
+    state = solution.states[index]
+    turned = solution.problem.sets[index].turned
     rows = turned_rows.form_rows(turned, state, solution.common, solution.problem.references)
     equations[index] = replace(equations[index], sums=equations[index].sums - rows.T @ rows)
     return model_tests.move_to_solution(replace(solution, equations=tuple(equations)))
@@ -117,14 +130,17 @@ def find_wrong_angles(
     list of (int, float)
         Number of the set, and the angle of its figure in degrees.
     """
-    usual = [k for k in problem.film_sets if problem.sets[k].turned is None]
+    not_turned = [k for k in problem.film_sets if problem.sets[k].turned is None]
+    if not not_turned:
+        return []
     out = []
-    for k in problem.film_sets if usual else []:
+    for k in problem.film_sets:
         turned = problem.sets[k].turned
         if turned is None:
             continue
+        # The film's figure is that of the set with the nearest sag.
         sag_mm = states[k].surface.sag_mm
-        near = min(usual, key=lambda j: abs(states[j].surface.sag_mm - sag_mm))
+        near = min(not_turned, key=lambda j: abs(states[j].surface.sag_mm - sag_mm))
         of_film = states[near].surface.parameters[list(film_form.TURNING)]
         sigmas = np.ones(of_film.size)
         found_deg = _find_angle(of_film, states[k].surface, sigmas, turned.angle_deg)
@@ -135,12 +151,16 @@ def find_wrong_angles(
 
 def find_angle_of_set(freed: Solution, index: int) -> float | None:
     """The angle by which the others' figure fits the set's, if it fits far better than stated."""
-    references, state = freed.problem.references, freed.states[index]
+    references = freed.problem.references
+    state = freed.states[index]
     turned = freed.problem.sets[index].turned
     if references.form_sag_mm is None or turned is None:
         return None
+
+    # The film's figure at the sag of this set.
     form = freed.common[set_state.FORM_PLACE].reshape(film_form.POWERS, -1)
-    of_film = film_form.depth_powers(state.surface.sag_mm - references.form_sag_mm) @ form
+    deeper_mm = state.surface.sag_mm - references.form_sag_mm
+    of_film = film_form.depth_powers(deeper_mm) @ form
     sigmas = turned_rows.form_sigmas_mm(references)
     return _find_angle(of_film, state.surface, sigmas, turned.angle_deg)
 
@@ -155,14 +175,17 @@ def _find_angle(
     seen = surface.parameters[terms]
     shifts = turned_rows.shift_derivatives(surface, terms) / sigmas_mm[:, None]
 
-    def misfit(angle_deg: float) -> float:
-        left = (film_form.turn_matrix(np.radians(angle_deg)) @ of_film - seen) / sigmas_mm
-        left = left - shifts @ np.linalg.lstsq(shifts, left, rcond=None)[0]
+    def compute_misfit(angle_deg: float) -> float:
+        """Sum of squares at an angle, with the axis where it fits best."""
+        turned = film_form.turn_matrix(np.radians(angle_deg)) @ of_film
+        left = (turned - seen) / sigmas_mm
+        best_shift = np.linalg.lstsq(shifts, left, rcond=None)[0]
+        left = left - shifts @ best_shift
         return float(left @ left)
 
-    misfits = np.array([misfit(angle_deg) for angle_deg in _ANGLES_DEG])
+    misfits = np.array([compute_misfit(angle_deg) for angle_deg in _ANGLES_DEG])
     best_deg = float(_ANGLES_DEG[np.argmin(misfits)])
-    better = float(misfits.min()) < _FITS_BETTER * misfit(stated_deg)
+    better = float(misfits.min()) < _FITS_BETTER * compute_misfit(stated_deg)
     if better and _angle_between(best_deg, stated_deg) >= _NEAR_DEG:
         return best_deg
     return None

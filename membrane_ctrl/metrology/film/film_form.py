@@ -20,29 +20,50 @@ TURNING_ORDERS = tuple(abs(_ORDERS[place][1]) for place in TURNING)
 POWERS = 3  # constant, linear and quadratic in the sag
 FORM = POWERS * len(TURNING)  # numbers of a form
 _DEPTH_MM = 4.0  # unit of the sag's change
-# What any film is known to have: nothing is assumed of the constant, 50 and 5 µm by 4 mm of sag
+# 1 sigma of what any film has: nothing is assumed of the constant; 50 and 5 µm by 4 mm of sag.
 POWER_SIGMAS_MM = (10.0, 0.05, 0.005)
 
 
 def depth_powers(deeper_mm: float) -> FloatArray:
-    """Factors (POWERS,) of a form's coefficients at a change of the sag."""
+    """Factors of a form's coefficients.
+
+    Parameters
+    ----------
+    deeper_mm : float
+        Sag, less that at which the form is stated.
+
+    Returns
+    -------
+    (POWERS,) array
+        Powers 0, 1, 2 of the change, in units of 4 mm.
+    """
     return np.asarray((deeper_mm / _DEPTH_MM) ** np.arange(POWERS))
 
 
 def turn_matrix(angle_rad: float) -> FloatArray:
-    """Matrix (terms, terms) from the turning terms to those of the mirror turned by an angle.
+    """Matrix from the turning terms to those of the mirror turned by an angle.
 
-    Counter-clockwise as the camera sees the mirror: f(theta) becomes f(theta - angle).
+    Parameters
+    ----------
+    angle_rad : float
+        Counter-clockwise as the camera sees the mirror: f(theta) becomes f(theta - angle).
+
+    Returns
+    -------
+    (terms, terms) array
+        In the order of `TURNING`.
     """
     orders, same, other = _turn_parts()
-    cosine, sine = np.cos(orders * angle_rad), np.sin(orders * angle_rad)
+    cosine = np.cos(orders * angle_rad)
+    sine = np.sin(orders * angle_rad)
     return np.asarray(same * cosine[:, None] + other * sine[:, None])
 
 
 def turn_derivative(angle_rad: float) -> FloatArray:
-    """Derivative of `turn_matrix` by the angle."""
+    """Derivative (terms, terms) of `turn_matrix` by the angle, per rad."""
     orders, same, other = _turn_parts()
-    cosine, sine = orders * np.cos(orders * angle_rad), orders * np.sin(orders * angle_rad)
+    cosine = orders * np.cos(orders * angle_rad)
+    sine = orders * np.sin(orders * angle_rad)
     return np.asarray(other * cosine[:, None] - same * sine[:, None])
 
 
@@ -50,10 +71,14 @@ def turn_derivative(angle_rad: float) -> FloatArray:
 def _turn_parts() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Azimuthal orders (terms,), and which terms a turn keeps and exchanges, (terms, terms)."""
     count = len(TURNING)
-    same, other = np.eye(count), np.zeros((count, count))
+    same = np.eye(count)
+    other = np.zeros((count, count))
+    places = {_ORDERS[place]: number for number, place in enumerate(TURNING)}
     for row, place in enumerate(TURNING):
+        # A cosine becomes c cos - s sin of its pair, a sine s cos + c sin.
         n, m = _ORDERS[place]
-        partner = next(k for k, p in enumerate(TURNING) if _ORDERS[p] == (n, -m))
-        # cosine: c cos - s sin; sine: s cos + c sin
-        other[row, partner] = -1.0 if m > 0 else 1.0
+        sign = 1.0
+        if m > 0:
+            sign = -1.0
+        other[row, places[n, -m]] = sign
     return np.array(TURNING_ORDERS, float), same, other

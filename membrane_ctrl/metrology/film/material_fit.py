@@ -157,7 +157,8 @@ def fit_film(
     unknowns, covariance, size_mm = _fit_round_of_any_misfit(
         figures, radius_mm, reach, gauge, seen_mm
     )
-    law = FilmLaw(float(unknowns[0]), float(unknowns[1]), float(np.exp(unknowns[2])), radius_mm)
+    prestrain, poisson, log_stiffness = unknowns[:3]
+    law = FilmLaw(float(prestrain), float(poisson), float(np.exp(log_stiffness)), radius_mm)
     bowls = law.under_load(np.exp(unknowns[3:, None]))
     of_waves = fit_waves(figures, bowls, reach, seen_mm)
 
@@ -287,7 +288,8 @@ def _fit_round(
     noise[split:, split:] = of_gauge
     misfits = np.zeros((GROWTHS.size, *noise.shape))
     of_terms = np.diag(_FREEDOM**2)
-    misfits[:, :split, :split] = [np.kron(part, of_terms) for part in misfit_covariances(figures)]
+    for misfit, of_figures in zip(misfits, misfit_covariances(figures), strict=True):
+        misfit[:split, :split] = np.kron(of_figures, of_terms)
 
     # The prior, and the start: Hencky's film at each sag.
     known = np.append([0.0, POISSON, _LOG_STIFFNESS], np.zeros(count))
@@ -350,5 +352,6 @@ def _numerical_slopes(predict: Callable[[FloatArray], FloatArray], x: FloatArray
     for k in range(x.size):
         step = np.zeros(x.size)
         step[k] = _SLOPE_STEP
-        columns.append((predict(x + step) - predict(x - step)) / (2 * _SLOPE_STEP))
+        change = predict(x + step) - predict(x - step)
+        columns.append(change / (2 * _SLOPE_STEP))
     return np.stack(columns, axis=1)
