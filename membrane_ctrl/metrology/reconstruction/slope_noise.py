@@ -56,17 +56,21 @@ def slope_per_screen(geometry: Geometry, radius_mm: float, sag_mm: float) -> Flo
     # The camera's ray d, its reflection u = d - 2 (d n) / (n n) n, and the way to the screen.
     d = point - geometry.pinhole_mm[:, None]
     d /= np.linalg.norm(d, axis=0)
-    u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
+    d_n = np.sum(d * n, axis=0)
+    n_n = np.sum(n * n, axis=0)
+    u = d - 2 * d_n / n_n * n
     screen_normal = np.cross(geometry.screen_s_x, geometry.screen_s_y)
     to_origin = geometry.screen_origin_mm[:, None] - point
     reach_mm = (screen_normal @ to_origin) / (screen_normal @ u)
 
     # Change of the bisector's direction and of its slopes per mm along each of the screen's axes.
     bisector = u - d
+    negative_slopes = bisector[:2] / bisector[2]
     squares = np.empty((2, 2))
     for k, axis in enumerate((geometry.screen_s_x, geometry.screen_s_y)):
-        turn = (axis[:, None] - u * (axis @ u)) / reach_mm
-        slope_changes = -(turn[:2] - bisector[:2] / bisector[2] * turn[2]) / bisector[2]
+        across = axis[:, None] - u * (axis @ u)
+        turn = across / reach_mm
+        slope_changes = -(turn[:2] - negative_slopes * turn[2]) / bisector[2]
         squares[:, k] = np.mean(slope_changes**2, axis=1)
     return squares
 

@@ -30,15 +30,29 @@ MAX_ITERATIONS = 20
 
 @dataclass(frozen=True)
 class Fit:
-    """Solution and how it was reached."""
+    """Solution and how it was reached.
+
+    Attributes
+    ----------
+    surface : Surface
+    normal : NormalMatrix
+        Of the last step.
+    changes_mm : tuple of float
+        Largest change of height of each step over the disc (paper, eq. 22).
+    converged : bool
+    residual_x, residual_y : float
+        Weighted RMS of measured minus fitted slope, without unit.
+    weight_sum : float
+        Sum of the points' weights.
+    """
 
     surface: Surface
     normal: NormalMatrix
-    changes_mm: tuple[float, ...]  # largest change of height of each step over the disc
+    changes_mm: tuple[float, ...]
     converged: bool
-    residual_x: float  # weighted RMS of measured minus fitted slope (a slope, without unit)
+    residual_x: float
     residual_y: float
-    weight_sum: float  # sum of the weights
+    weight_sum: float
 
 
 def fit_surface(
@@ -50,10 +64,14 @@ def fit_surface(
     tolerance_mm: float = TOLERANCE_MM,
     max_iterations: int = MAX_ITERATIONS,
 ) -> Fit:
-    """Fit the surface to the points.
+    """Fit the surface to the points (the iteration of the paper, section 2.4).
 
     Parameters
     ----------
+    tracer : Tracer
+        The bench.
+    points : Points
+        Rays, and the screen points that they show; their lengths are moved to the surface.
     start : height function or Surface
         A height function places the points once. A Surface is the last solution: the points must
         then be on it, one or two steps are enough, and the matrix of the first one is kept.
@@ -117,8 +135,8 @@ class _Step:
 def _gauss_newton_step(
     tracer: Tracer, points: Points, surface: Surface, normal: NormalMatrix | None, newton: int
 ) -> _Step:
-    """One Gauss-Newton step, (D^T W D) delta = D^T W r (the paper's least squares of slopes, with
-    the residual r = g - D a instead of g).
+    """One Gauss-Newton step, (D^T W D) delta = D^T W r (paper, eq. 19, with the residual r = g - D
+    a instead of g, and the points' weights W).
 
     Before it, Newton steps move the points onto the surface (0: they stay).
     """

@@ -117,10 +117,20 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
 
 
 def integrate_residual(grid: ResidualGrid) -> FloatArray:
-    """Height (n, n) in mm of the residual, 0 at the vertex; NaN where nothing was measured.
+    """Integrate the residual slopes to heights, by least squares over the grid's links.
 
     Slopes do not determine the relative height of parts that are not connected (a hair across the
     mirror): each is put on the fitted surface, mean 0.
+
+    Parameters
+    ----------
+    grid : ResidualGrid
+        Residual slopes of n x n cells.
+
+    Returns
+    -------
+    (n, n) array
+        Height in mm, 0 at the vertex; NaN where nothing was measured.
     """
     # Links of each cell to its right and to its lower neighbour: 1 if both were measured.
     seen = grid.count > 0
@@ -129,7 +139,8 @@ def integrate_residual(grid: ResidualGrid) -> FloatArray:
     right[:, :-1] = seen[:, :-1] & seen[:, 1:]
     down[:-1] = seen[:-1] & seen[1:]
 
-    # Rise along each link, by the mean slope of its two cells (Southwell's model).
+    # Rise along each link, by the mean slope of its two cells (W. H. Southwell, J. Opt. Soc. Am.
+    # 70, 998 (1980)).
     slope_sum_x = grid.slope_x[:, :-1] + grid.slope_x[:, 1:]
     slope_sum_y = grid.slope_y[:-1] + grid.slope_y[1:]
     rise_x = np.zeros(seen.shape)

@@ -261,8 +261,10 @@ class FrameFitter:
         bands = shown * self.bands.waves[:, self.bands.row]
         weights = weights * self.scene.edge
         # What changes slowly counts with its mean over each cell: the matrix need not be exact.
-        slow = [planes[:, 0] for planes in (*self.jacobian, *[self._basis] * 3)]
-        matrix = np.zeros((_UNKNOWNS + len(bands),) * 2)
+        slow_planes = (*self.jacobian, self._basis, self._basis, self._basis)
+        slow = [planes[:, 0] for planes in slow_planes]
+        count = _UNKNOWNS + len(bands)
+        matrix = np.zeros((count, count))
 
         # Unknowns of the waves by each other.
         for i, j in product(range(len(slow)), repeat=2):
@@ -317,14 +319,11 @@ class FrameFitter:
         # Effect of each bin's residual on the parameters: the inverse times what changes slowly,
         # times the fringes. Bands are left out: they change the errors by a thousandth.
         gain = self._inverse[:PARAMETERS].astype(np.float32)
-        slow_planes = (*self.jacobian, *[self._basis] * 3)
-        slow = np.stack(
-            [
-                np.tensordot(gain[:, first : first + PARAMETERS], planes, 1)
-                for first, planes in zip(_STARTS, slow_planes, strict=True)
-            ],
-            axis=1,
-        )
+        slow_planes = (*self.jacobian, self._basis, self._basis, self._basis)
+        effects = []
+        for first, planes in zip(_STARTS, slow_planes, strict=True):
+            effects.append(np.tensordot(gain[:, first : first + PARAMETERS], planes, 1))
+        slow = np.stack(effects, axis=1)
         waves = self._compute_light_waves(shifts_rad, fit.surface, fit.light)[:5]
         weighted_residual = self.scene.edge * fit.weights * fit.residual_adu
         sums = self.average_in_squares(slow, waves * weighted_residual)
@@ -334,7 +333,8 @@ class FrameFitter:
         scatter = sums @ sums.T * (used / max(used - PARAMETERS, 1))
 
         # Not less than the noise of the pixels.
-        noise_over_scatter = noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(scatter)
+        of_noise = noise_adu**2 * np.diag(gain[:, :PARAMETERS])
+        noise_over_scatter = of_noise / np.diag(scatter)
         factor = np.sqrt(np.maximum(1.0, noise_over_scatter))
         return np.asarray(scatter * np.outer(factor, factor))
 
@@ -385,7 +385,8 @@ class FrameFitter:
 
         # The lower left of them, and how much belongs to the upper and right ones.
         low = np.floor(self._cells.fit_planes(place)[:, 0]).astype(int)
-        upper = np.sin(np.pi / 2 * np.clip(place - self._cells.repeat_over_bins(low), 0, 1)) ** 2
+        distance = np.clip(place - self._cells.repeat_over_bins(low), 0, 1)
+        upper = np.sin(np.pi / 2 * distance) ** 2
         (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
         side = _BLOCKS + 2
         low_square = low[1] * side + low[0]
@@ -410,8 +411,11 @@ class FrameFitter:
         # Least squares for a change of 2 pi of the phases of one axis, and none of the other.
         means = self.jacobian[:, :, 0].astype(float)
         matrix = sum(j @ j.T for j in means)
-        changes_mm = [np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1)) for j in means]
-        return np.stack([1e3 * change_mm for change_mm in changes_mm])
+        changes_um = []
+        for j in means:
+            of_one_period = 2 * math.pi * j.sum(axis=1)
+            changes_um.append(1e3 * np.linalg.solve(matrix, of_one_period))
+        return np.stack(changes_um)
 
 
 def _reduce_phase(phase_rad: FloatArray) -> Singles:

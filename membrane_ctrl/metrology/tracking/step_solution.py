@@ -43,7 +43,8 @@ def are_steps_separable(shifts_rad: FloatArray) -> bool:
 def _make_design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
     """Rows (..., 5) of level, cosine and sine of x, of y; phases and shifts are (2, ...)."""
     x, y = phase_rad + shifts_rad
-    return np.stack([np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)], axis=-1)
+    columns = [np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)]
+    return np.stack(columns, axis=-1)
 
 
 def solve_steps(
@@ -77,10 +78,13 @@ def solve_steps(
     design = np.empty((scene.index.size, len(fits), 5))
     rest = np.empty((scene.index.size, len(fits)))
     for k, (fit, shifts) in enumerate(zip(fits, shifts_rad, strict=True)):
+        # Maps of level and swings multiply the columns of A, of z_x and of z_y.
         phases = scene.phase_rad(fit.surface)
         maps = 1 + fit.light @ scene.basis
-        design[:, k] = _make_design(phases, shifts[:, None]) * maps[[0, 1, 1, 2, 2]].T
-        rest[:, k] = seen_adu[k] - scene.harmonics_adu(phases + shifts[:, None])
+        map_of_columns = maps[[0, 1, 1, 2, 2]].T
+        design[:, k] = _make_design(phases, shifts[:, None]) * map_of_columns
+        harmonics_adu = scene.harmonics_adu(phases + shifts[:, None])
+        rest[:, k] = seen_adu[k] - harmonics_adu
     turned = np.swapaxes(design, 1, 2)
     solved = np.linalg.solve(turned @ design, turned @ rest[..., None])[..., 0]
     cosine = solved[:, 1::2]

@@ -69,7 +69,10 @@ class Source:
         return np.asarray(self.known_mm @ self.known_mm.T)
 
     def list_change_effects(self, earlier: "Source | None") -> list[FloatArray]:
-        """Effects on the change since an earlier set, arrays of (parameters, k) each."""
+        """Effects on the change since an earlier set, arrays of (parameters, k) each.
+
+        A paired input has the same error in both sets: only the difference of its effects counts.
+        """
         if earlier is None:
             return [self.known_mm]
         if not (self.paired and earlier.paired):
@@ -162,18 +165,29 @@ class Budget:
         """1 sigma of sag, height, figure and of the coefficients."""
         whole = self.covariance(True) + self.covariance(False)
         to_coeffs = parameter_to_coeffs()
-        coeffs = 1e3 * np.sqrt(np.maximum(np.diag(to_coeffs @ whole @ to_coeffs.T), 0.0))
-        return self.compute_sigmas_um(whole) | {"coeffs_um": coeffs.tolist()}
+        variances_mm2 = np.diag(to_coeffs @ whole @ to_coeffs.T)
+        coeffs_um = 1e3 * np.sqrt(np.maximum(variances_mm2, 0.0))
+        return self.compute_sigmas_um(whole) | {"coeffs_um": coeffs_um.tolist()}
 
     def compute_sigmas_um(self, covariance_mm2: FloatArray) -> dict[str, float]:
-        """1 sigma of the sag, and over the disc of the height and of the figure (the height without
-        its plane).
+        """Compute 1 sigma of quantities of a figure from a covariance of its parameters.
+
+        Parameters
+        ----------
+        covariance_mm2 : (parameters, parameters) array
+
+        Returns
+        -------
+        dict
+            Of the sag, and over the disc of the height and of the figure (the height without its
+            plane), in µm.
         """
-        sizes_um = {}
+        sigmas_um = {}
         for name, means in _mean_products(self.disc).items():
+            # Mean over the disc of b^T C b is the trace of C times the mean of b b^T.
             square_mm2 = float(np.sum(means * covariance_mm2))
-            sizes_um[name] = 1e3 * math.sqrt(max(square_mm2, 0.0))
-        return sizes_um
+            sigmas_um[name] = 1e3 * math.sqrt(max(square_mm2, 0.0))
+        return sigmas_um
 
 
 @lru_cache

@@ -113,7 +113,8 @@ def estimate_frame_errors(
         # which move with the film.
         differs = (amplitudes - amplitudes.mean(axis=0)) * _DIFFERS
         share_2, share_3 = relative[:, 1:].mean(axis=0)
-        harmonics_slope = -(2 * share_2 * second.imag + 3 * share_3 * third.imag) * swing * slope
+        by_phase = -(2 * share_2 * second.imag + 3 * share_3 * third.imag) * swing
+        harmonics_slope = by_phase * slope
         errors = np.einsum("kp,kpn->kn", differs, table[:, :-1]) + known_um * harmonics_slope
 
         # And thereby to the phases, by the weights of the steps.

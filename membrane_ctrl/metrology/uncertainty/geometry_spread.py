@@ -83,11 +83,23 @@ class GeometrySpread:
     @classmethod
     def from_sigmas(cls, sigmas: dict[str, float]) -> "GeometrySpread":
         """The spread of independent numbers, with one sigma for each name."""
-        return cls(tuple(sigmas), np.diag(np.square(np.array(list(sigmas.values()), float))))
+        values = np.array(list(sigmas.values()), float)
+        return cls(tuple(sigmas), np.diag(np.square(values)))
 
     def add_independent(self, sigmas: dict[str, float]) -> "GeometrySpread":
-        """This spread with independent numbers added; those already named stay."""
-        added = {n: sigma for n, sigma in sigmas.items() if n not in self.names and sigma > 0}
+        """Add independent numbers to this spread.
+
+        Parameters
+        ----------
+        sigmas : dict
+            One sigma for each name; names that the spread has, and sigmas of 0, are left out.
+
+        Returns
+        -------
+        GeometrySpread
+        """
+        new_names = [name for name in sigmas if name not in self.names]
+        added = {name: sigmas[name] for name in new_names if sigmas[name] > 0}
         other = GeometrySpread.from_sigmas(added)
         size = len(self.names)
         covariance = np.zeros((size + len(added), size + len(added)))
@@ -111,6 +123,8 @@ class GeometrySpread:
 
     def covariance_root(self) -> FloatArray:
         """Root (k, k) of the covariance: times its transpose it is the covariance."""
+        # Of the correlation, whose numbers do not depend on the units; rounding may leave an
+        # eigenvalue a little below 0.
         values, vectors = np.linalg.eigh(self.correlation())
         root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
         return np.asarray(self.sigmas[:, None] * root)
@@ -187,10 +201,27 @@ def change_geometry(
 def moved_bench(
     optics: OpticsConfig, names: tuple[str, ...], change: ArrayLike
 ) -> bench_poses.BenchGeometry:
-    """The bench with its named poses, lens, bow and pitch changed by (k,) amounts.
+    """Change a bench by named amounts.
 
-    Raises ValueError if the names belong to another form of geometry.
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench.
+    names : tuple of str
+        k numbers of its poses, lens, bow and pitch.
+    change : (k,) array
+        Amounts by which they change.
+
+    Returns
+    -------
+    BenchGeometry
+
+    Raises
+    ------
+    ValueError
+        The names belong to another form of geometry.
     """
+    # Numbers of the general form change the poses; the others are the calibration's parameters.
     amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
     general = tuple(name for name in names if name in GENERAL_NAMES)
     geometry = change_geometry(optics.geometry, general, [amounts.pop(name) for name in general])

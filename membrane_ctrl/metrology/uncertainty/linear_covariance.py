@@ -17,11 +17,22 @@ from membrane_ctrl.model.arrays import FloatArray
 
 
 def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
-    """Change (parameters, k) of the parameters in mm with each number of the geometry, by central
-    differences of one sigma.
+    """Derivatives of the surface's parameters by the numbers of the geometry.
 
-    The difference is as wide as the spread itself, so that curvature counts as it does in the
-    spread.
+    Central differences of one sigma: they are as wide as the spread itself, so that curvature
+    counts as it does in the spread.
+
+    Parameters
+    ----------
+    bench : TrialBench
+        A thinned set.
+    spread : GeometrySpread
+        k numbers and their sigmas.
+
+    Returns
+    -------
+    (parameters, k) array
+        In mm per unit of the number.
     """
     columns = []
     for k, sigma in enumerate(spread.sigmas):

@@ -12,9 +12,13 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import FloatArray
 
-_SECTORS, _GROUPS = 72, 4
-_RINGS_LEAST, _RINGS_MOST = 12, 60
+_SECTORS = 72
+_GROUPS = 4  # of interleaved sectors
+_RINGS_LEAST = 12
+_RINGS_MOST = 60
 _POINTS_A_SECTOR = 16.0  # on average: their noise is then far below their slopes
+_LEAST_RADIUS_MM = 1e-9  # a point at the centre has no radial direction
+_TINY = 1e-300  # keeps the mean of an empty cell finite
 
 
 @dataclass(frozen=True)
@@ -54,32 +58,41 @@ class RoundSlopes:
         reach_mm : float
             Outer edge of the last ring.
         """
-        rings = int(
-            np.clip(places_mm.shape[1] / _SECTORS / _POINTS_A_SECTOR, _RINGS_LEAST, _RINGS_MOST)
-        )
+        # As many rings as give each sector enough points.
+        wanted = places_mm.shape[1] / _SECTORS / _POINTS_A_SECTOR
+        rings = int(np.clip(wanted, _RINGS_LEAST, _RINGS_MOST))
+
+        # The cell of each point: its ring and its sector.
         x, y = places_mm
-        radius = np.maximum(np.hypot(x, y), 1e-9)
-        ring = np.minimum((radius / reach_mm * rings).astype(int), rings - 1)
-        sector = (np.arctan2(y, x) / (2 * np.pi) % 1.0 * _SECTORS).astype(int) % _SECTORS
+        radius_mm = np.maximum(np.hypot(x, y), _LEAST_RADIUS_MM)
+        ring = np.minimum((radius_mm / reach_mm * rings).astype(int), rings - 1)
+        turns = np.arctan2(y, x) / (2 * np.pi) % 1.0
+        sector = (turns * _SECTORS).astype(int) % _SECTORS
         cell = ring * _SECTORS + sector
+
+        # Mean radial slope of each cell.
         size = rings * _SECTORS
         total = np.bincount(cell, count, size).reshape(rings, _SECTORS)
-        radial = (slopes[0] * x + slopes[1] * y) / radius
+        radial = (slopes[0] * x + slopes[1] * y) / radius_mm
         sums = np.bincount(cell, count * radial, size).reshape(rings, _SECTORS)
         full = total > 0
-        means = np.where(full, sums / np.maximum(total, 1e-300), 0.0)
+        means = np.where(full, sums / np.maximum(total, _TINY), 0.0)
 
-        # means of every fourth sector; a ring counts if each of them was seen
+        # Means of every fourth sector; a ring counts if each of them was seen.
         groups = np.arange(_SECTORS) % _GROUPS == np.arange(_GROUPS)[:, None]
         filled = full.astype(float) @ groups.T
         of_groups = means @ groups.T / np.maximum(filled, 1.0)
         used = filled.min(axis=1) > 0
+
+        # Variance of a ring's mean, from the scatter of its four. Neighbours have about the same
+        # scatter, and four means know theirs badly: it is averaged over three rings.
         scatter = np.var(of_groups[used], axis=1, ddof=1) / _GROUPS
-        # neighbours have about the same scatter, and four means know theirs badly
-        near = np.convolve(scatter, np.ones(3), "same") / np.convolve(
-            np.ones(scatter.size), np.ones(3), "same"
-        )
-        inverse = np.where(full, 1 / np.maximum(total, 1e-300), 0.0).sum(axis=1)
+        three = np.ones(3)
+        neighbours = np.convolve(np.ones(scatter.size), three, "same")
+        near = np.convolve(scatter, three, "same") / neighbours
+
+        # Share of a point's noise in a ring's mean.
+        inverse = np.where(full, 1 / np.maximum(total, _TINY), 0.0).sum(axis=1)
         edges = reach_mm * np.arange(rings + 1) / rings
         return cls(
             edges[:-1][used],

@@ -42,10 +42,10 @@ def moment_sigma_um(
     count_frames : int
         Of the set.
     """
-    rate_um, rate_sigma_um = drift_um(frames, film_um), 0.0
-    left = []
-
     # The scatter about an even drift, and how well each axis shows the drift.
+    rate_um = drift_um(frames, film_um)
+    rate_sigma_um = 0.0
+    left = []
     for numbers, places_um in zip(frames, np.split(film_um, [len(frames[0])]), strict=True):
         from_middle = numbers - numbers.mean()
         square = float(from_middle @ from_middle)
@@ -53,7 +53,8 @@ def moment_sigma_um(
         left.append(places_um - places_um.mean() - rate_um * from_middle)
 
     # Motion beyond drift and noise.
-    uneven_um = math.sqrt(max(float(np.mean(np.concatenate(left) ** 2)) - noise_um**2, 0.0))
+    mean_square_um2 = float(np.mean(np.concatenate(left) ** 2))
+    uneven_um = math.sqrt(max(mean_square_um2 - noise_um**2, 0.0))
 
     # The mean of the sinusoids is this many frames before the middle of the set.
     later = (count_frames - 1) / 2 - float(np.concatenate(frames).mean())
@@ -69,8 +70,9 @@ def drift_um(frames: tuple[FloatArray, FloatArray], film_um: FloatArray) -> floa
     for numbers, places_um in zip(frames, np.split(film_um, [len(frames[0])]), strict=True):
         from_middle = numbers - numbers.mean()
         rates_um.append(float(from_middle @ places_um) / float(from_middle @ from_middle))
-    agree = rates_um[0] * rates_um[1] > 0
-    return min(rates_um, key=abs) if agree else 0.0
+    if rates_um[0] * rates_um[1] > 0:
+        return min(rates_um, key=abs)
+    return 0.0
 
 
 def step_sigma_um(
@@ -87,15 +89,20 @@ def step_sigma_um(
     count_frames : int
         Of the set.
     """
-    sure_um = math.sqrt(max(step_um**2 - sigma_um**2, 0.0))
+    # The step beyond its own noise.
+    true_um = math.sqrt(max(step_um**2 - sigma_um**2, 0.0))
+
+    # Share of the set's frames after the step, if it was directly before or directly after the
+    # frames between the two axes; less that of the sinusoids.
     before, after = sorted(frames, key=lambda numbers: float(numbers.mean()))
-    # share of the frames after the step, if it was directly before or after those in between
     shares = 1 - np.array([before.max() + 1, after.min()]) / count_frames
-    sinusoids = after.size / (before.size + after.size)
-    away = shares - sinusoids
-    # mean square over all times in between
-    mean_square = float(np.mean(away)) ** 2 + float(np.ptp(away)) ** 2 / 12
-    return sure_um * math.sqrt(mean_square)
+    share_of_sinusoids = after.size / (before.size + after.size)
+    away = shares - share_of_sinusoids
+
+    # Mean square over all times in between, which are equally likely.
+    middle = float(np.mean(away))
+    width = float(np.ptp(away))
+    return true_um * math.sqrt(middle**2 + width**2 / 12)
 
 
 def left_out_sigma_um(used: int, shown: int, laser_noise_um: float) -> float:
