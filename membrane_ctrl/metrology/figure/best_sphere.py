@@ -43,7 +43,8 @@ class Sphere:
         """Deviation (n,) in mm of points (3, n), and the unit normals (3,
         n) of the sphere there.
         """
-        # q, q n and q^2 of each point; then s, the share of the radius at which the point is.
+        # q, q n and q^2 of each point; then s, the share of the radius at which the point is. The
+        # deviation is (1 - s) / c, written so that a plane, c = 0, needs no limit.
         q = points_mm - np.array([[0.0], [0.0], [self.vertex_mm]])
         along = self.normal @ q
         square = np.einsum("in,in->n", q, q)
@@ -68,11 +69,13 @@ def best_sphere(points_mm: FloatArray) -> Sphere:
     """Sphere with the least squares of the deviations along its normal, for points (3, n)."""
     # The start: a paraboloid z = z0 + t_x x + t_y y + c (x^2 + y^2) / 2 through some of the points.
     # Its four columns are scaled to one size.
-    some = points_mm[:, :: max(1, points_mm.shape[1] // _SPHERE_POINTS)]
+    stride = max(1, points_mm.shape[1] // _SPHERE_POINTS)
+    some = points_mm[:, ::stride]
     x, y, z = some
     scale = float(np.sqrt(np.mean(x**2 + y**2)))
     columns = np.array([1.0, 1 / scale, 1 / scale, 2 / scale**2])
-    paraboloid = np.stack([np.ones_like(x), x, y, (x * x + y * y) / 2], axis=1)
+    bent = (x * x + y * y) / 2
+    paraboloid = np.stack([np.ones_like(x), x, y, bent], axis=1)
     found = columns * np.linalg.lstsq(paraboloid * columns, z, rcond=None)[0]
 
     # Gauss-Newton steps, the last one with all points.
@@ -100,7 +103,9 @@ def _sphere_step(sphere: Sphere, points_mm: FloatArray, columns: FloatArray) -> 
 
     # Derivatives of the deviation by vertex, tilts and curvature.
     by_curvature = (deviation**2 - square) / (2 * s)
-    rows = np.stack([-normals[2], normal_by_x @ q / s, normal_by_y @ q / s, by_curvature])
+    by_tilt_x = normal_by_x @ q / s
+    by_tilt_y = normal_by_y @ q / s
+    rows = np.stack([-normals[2], by_tilt_x, by_tilt_y, by_curvature])
     rows *= columns[:, None]
     step = np.linalg.lstsq(rows @ rows.T, -rows @ deviation, rcond=1e-13)[0]
     return np.asarray(columns * step)

@@ -51,12 +51,14 @@ def power_spectrum(found: Figure, axis_mm: FloatArray, aperture_mm: float) -> Po
     share = np.minimum(r / aperture_mm, 1)
     window = np.where(r < aperture_mm, np.cos(np.pi / 2 * share) ** 2, 0.0)
 
-    # The deviation under it, without its weighted mean, and the density of its waves.
+    # The deviation under it, without its weighted mean, and the density of its waves, for which the
+    # window's power is undone.
     step_mm = float(axis_mm[1] - axis_mm[0])
     deviation = np.where(np.isfinite(found.deviation_um), found.deviation_um, found.smooth_um)
     mean = np.sum(window * deviation) / np.sum(window)
     transform = np.fft.rfft2(window * (deviation - mean))
-    density = np.abs(transform) ** 2 * step_mm**2 / np.sum(window**2)
+    window_power = np.sum(window**2)
+    density = np.abs(transform) ** 2 * step_mm**2 / window_power
 
     # The ring of each wave, by its frequency in any direction.
     along_x = np.fft.rfftfreq(axis_mm.size, step_mm)
@@ -69,9 +71,10 @@ def power_spectrum(found: Figure, axis_mm: FloatArray, aperture_mm: float) -> Po
     count = np.bincount(ring)
     is_sampled = np.arange(count.size) * width < 0.5 / step_mm
     known = np.flatnonzero((count > 0) & is_sampled)[1:]
-    ring_mean = (np.bincount(ring, density.ravel()) / np.maximum(count, 1))[known]
+    means = np.bincount(ring, density.ravel()) / np.maximum(count, 1)
+    ring_mean = means[known]
 
     # Neighbours in the plane share what the window smears: fewer are independent.
-    independent = np.sum(window**2) ** 2 / (window.size * np.sum(window**4))
+    independent = window_power**2 / (window.size * np.sum(window**4))
     sigma = ring_mean / np.sqrt(np.maximum(count[known] * independent, 1.0))
     return PowerSpectrum(width * known.astype(np.float64), ring_mean, sigma)

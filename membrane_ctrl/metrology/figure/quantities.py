@@ -99,7 +99,17 @@ class FigureOf:
         self._rings = _Rings(r, max(2, min(_RINGS, len(axis) // 4)))
 
     def __call__(self, seen: SurfaceMap) -> Figure:
-        """The figure of a surface."""
+        """Evaluate the figure of a surface.
+
+        Parameters
+        ----------
+        seen : SurfaceMap
+            On the grid, and with the measured cells, of the first one.
+
+        Returns
+        -------
+        Figure
+        """
         mask = self._mask
         points = seen.points()
 
@@ -179,7 +189,9 @@ class _Rings:
         by_upper = self._sum_by_knot(self._share**2)
         diagonal = by_lower + np.append(0.0, by_upper[:-1])
         beside = self._sum_by_knot(self._share * (1 - self._share))[:-1]
-        self._normal = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        above_diagonal = np.diag(beside, 1)
+        below_diagonal = np.diag(beside, -1)
+        self._normal = np.diag(diagonal) + above_diagonal + below_diagonal
 
     def _sum_by_knot(self, values: FloatArray) -> FloatArray:
         """Sum of values by their lower knot, (knots,)."""
@@ -190,7 +202,9 @@ class _Rings:
         right = self._sum_by_knot((1 - self._share) * values)
         right[1:] += self._sum_by_knot(self._share * values)[:-1]
         knots = np.linalg.lstsq(self._normal, right, rcond=1e-10)[0]
-        return np.asarray((1 - self._share) * knots[self._low] + self._share * knots[self._low + 1])
+        from_lower = (1 - self._share) * knots[self._low]
+        from_upper = self._share * knots[self._low + 1]
+        return np.asarray(from_lower + from_upper)
 
 
 def _compute_spot(
@@ -214,9 +228,10 @@ def _compute_spot(
     rate = (across @ normals) * (2 * along / (2 * along * along - 1))
     start = across @ points_mm - rate * (axis @ points_mm)
 
-    # Both from the middle of the rays; the least sum of squares.
+    # Both from the middle of the rays; the least sum of squares |A + B f|^2 is at f = -A B / B B.
     rate -= rate.mean(axis=1, keepdims=True)
     start -= start.mean(axis=1, keepdims=True)
-    focus_mm = -float(np.sum(start * rate) / max(np.sum(rate * rate), 1e-300))
+    square_of_rate = max(np.sum(rate * rate), 1e-300)
+    focus_mm = -float(np.sum(start * rate) / square_of_rate)
     spot_x, spot_y = start + rate * focus_mm
     return focus_mm, np.hypot(spot_x, spot_y)

@@ -84,14 +84,26 @@ class Cells:
         return self.offset.swapaxes(0, 1).reshape(2, -1)
 
     def sum_cells(self, values: AnyArray) -> AnyArray:
-        """Sums (..., N) over the cells, of values of bins (..., n)."""
+        """Sum values of bins over the cells.
+
+        Parameters
+        ----------
+        values : (..., n) array
+
+        Returns
+        -------
+        (..., N) array
+        """
         lead = values.shape[:-1]
         blocks = len(self.offset)
         of_blocks = values.reshape(*lead, blocks, CELL_BINS, BLOCK_CELLS).sum(axis=-2)
         return np.asarray(of_blocks.reshape(*lead, blocks * BLOCK_CELLS))
 
     def sum_moments(self, values: AnyArray) -> AnyArray:
-        """Sums (..., 3, N) over the cells, of values of bins (..., n) times 1 and their offsets."""
+        """Sums (..., 3, N) over the cells, of values of bins (..., n) times 1 and their offsets.
+
+        These are the right-hand side of a least squares for a plane in each cell.
+        """
         by_offset = [self.sum_cells(values * offset) for offset in self._offsets]
         return np.stack([self.sum_cells(values), *by_offset], axis=-2)
 
@@ -109,7 +121,18 @@ class Cells:
         return np.asarray(mean + along_u * u + along_v * v)
 
     def fit_planes(self, values: AnyArray) -> Singles:
-        """The planes (..., 3, N) that fit values of bins (..., n) best."""
+        """Fit a plane to the values of each cell's bins.
+
+        Parameters
+        ----------
+        values : (..., n) array
+
+        Returns
+        -------
+        (..., 3, N) array
+            Mean, and slopes along columns and rows, of each cell.
+        """
+        # Normal equations of each cell, kept regular where all bins are in one row.
         basis = np.stack([np.ones_like(self._offsets[0]), *self._offsets])
         normal = self.sum_moments(basis)
         normal[[1, 2], [1, 2]] += _LEAST_SQUARE

@@ -32,7 +32,10 @@ def _compute_light(rows, base, light, response, begin):  # type: ignore[no-untyp
     `rows` holds 5 rows of BLOCK_BINS: the changes of phi_x and phi_y, and the factors of A, B_x and
     B_y. They are replaced by 6 rows of derivatives.
     """
-    one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
+    # Literals of double precision would make every operation double.
+    one = np.float32(1)
+    two = np.float32(2)
+    half = np.float32(0.5)
     for k in range(BLOCK_BINS):
         p = begin + k
 
@@ -43,8 +46,9 @@ def _compute_light(rows, base, light, response, begin):  # type: ignore[no-untyp
         swing_x = light[1, p] * rows[3 * BLOCK_BINS + k]
         swing_y = light[2, p] * rows[4 * BLOCK_BINS + k]
 
-        # What the response adds to the fringes, and the slope of that, with the shade u from 0 to
-        # 1: sum of r_j (u^(j + 2) - u), j from 0.
+        # What the response adds to the shade u, from 0 to 1, and the slope of that by u: the sum
+        # of r_j (u^(j + 2) - u), j from 0, which is 0 at black and at white. The shade of crossed
+        # fringes is 1/2 + (cos x + cos y) / 4.
         shade = half + half * half * (cx + cy)
         power = shade
         slope = np.float32(0)
@@ -53,11 +57,14 @@ def _compute_light(rows, base, light, response, begin):  # type: ignore[no-untyp
             slope += response[j] * (np.float32(j + 2) * power - one)
             power *= shade
             bent += response[j] * (power - shade)
+
+        # Both axes share it equally, so that each phase also changes the other axis' fringes, by
+        # the slope.
         cx = cx + two * bent
         cy = cy + two * bent
         steeper = half * (swing_x + swing_y) * slope
 
-        # Derivatives by both phases, level and swings; and the light itself.
+        # Derivatives by both phases, level and swings; and the light A + B_x cos x + B_y cos y.
         rows[k] = -(swing_x + steeper) * sx
         rows[BLOCK_BINS + k] = -(swing_y + steeper) * sy
         rows[2 * BLOCK_BINS + k] = light[0, p]
@@ -71,14 +78,17 @@ def _weigh_derivatives(rows, edge, gain, seen, reach, begin):  # type: ignore[no
     """Turn what `_compute_light` leaves into e w r times the derivatives (5 rows), then `out` of
     `light_left` (4 rows).
     """
-    zero, one = np.float32(0), np.float32(1)
+    zero = np.float32(0)
+    one = np.float32(1)
     for k in range(BLOCK_BINS):
+        # The residual: what the frame shows, less the light with the gain of its row.
         p = begin + k
         shown = rows[5 * BLOCK_BINS + k]
         r = seen[p] - gain[p] * shown
 
         # The weight: 1 up to a share of the reach, then falling to 0 at the reach.
-        far = max(abs(r) / reach[p] - _FULL_WEIGHT, zero) / (one - _FULL_WEIGHT)
+        beyond = max(abs(r) / reach[p] - _FULL_WEIGHT, zero)
+        far = beyond / (one - _FULL_WEIGHT)
         far = far if reach[p] > zero else one
         w = (one - min(far, one) ** 2) ** 2
 
@@ -118,7 +128,8 @@ def light_waves(base, light, slow, offset, response, changes, shifts, out):  # t
     planes = np.empty(3 * BLOCK_CELLS, np.float32)
     for b in range(offset.shape[0]):
         _compute_block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
-        out[:, b * BLOCK_BINS : (b + 1) * BLOCK_BINS] = rows.reshape(6, BLOCK_BINS)
+        begin = b * BLOCK_BINS
+        out[:, begin : begin + BLOCK_BINS] = rows.reshape(6, BLOCK_BINS)
 
 
 @compile_kernel
@@ -165,9 +176,12 @@ def light_left(  # type: ignore[no-untyped-def]
 
     # A block of bins at a time: its light, its residual, and the sums for the right-hand side.
     for b in range(offset.shape[0]):
+        begin = b * BLOCK_BINS
         _compute_block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
-        _weigh_derivatives(rows, edge, gain, seen, reach, b * BLOCK_BINS)
-        out[:, b * BLOCK_BINS : (b + 1) * BLOCK_BINS] = rows.reshape(9, BLOCK_BINS)[5:]
+        _weigh_derivatives(rows, edge, gain, seen, reach, begin)
+        out[:, begin : begin + BLOCK_BINS] = rows.reshape(9, BLOCK_BINS)[5:]
+
+        # J^T W r: the moments of each row over the cells, times the planes of its parameters.
         for k in range(5):
             first = _FIRST_PLANE[k]
             sums = right[max(k - 1, 0)]

@@ -96,7 +96,8 @@ def make_scene(
 
     # Rays of the bins, traced to the surface.
     grid = bin_grid.BinGrid(tracer.geometry, camera, bin_px)
-    points = ray_tracing.Points.from_rays(grid.rays[:, index], np.zeros((2, index.size)))
+    no_screen_mm = np.zeros((2, index.size))
+    points = ray_tracing.Points.from_rays(grid.rays[:, index], no_screen_mm)
     tracer.place_on_shape(points, shape.height)
     bias_mm = grid.averaging_bias_mm(tracer, points, shape, index)
     position_mm = tracer.position_mm(points)
@@ -108,7 +109,8 @@ def make_scene(
     distances = ndimage.distance_transform_edt(padded)[1:-1, 1:-1]
     from_edge = distances.reshape(-1)[index]
     rising = np.minimum(from_edge / (_FADES * fringe_bins), 1)
-    taper = (np.sin(rising * math.pi / 2) ** 2 * counted).astype(np.float32)
+    fading = np.sin(rising * math.pi / 2) ** 2
+    taper = (fading * counted).astype(np.float32)
     return CrossedScene(
         tracer=tracer,
         surface=shape,
@@ -282,16 +284,20 @@ def _measure_response(
     for axis, used in enumerate(checked.view.used):
         phases = traced_mm[axis] / mm_per_rad + screen_scale.centre_phase_rad(optics.pattern)
         for frame in used:
+            light_adu = checked.binned.means[frame].reshape(-1)[index]
             shown.append((1 + np.cos(phases + stack.patterns[frame].shift_rad)) / 2)
-            seen.append((checked.binned.means[frame].reshape(-1)[index] - low) / (high - low))
-        levels.append(_without_harmonics(np.mean(seen[-len(used) :], axis=0), phases))
+            seen.append((light_adu - low) / (high - low))
+        mean_of_axis = np.mean(seen[-len(used) :], axis=0)
+        levels.append(_without_harmonics(mean_of_axis, phases))
     v = np.concatenate(shown)
     y = np.concatenate(seen)
 
-    # Least squares for y - v = sum c_k (v^k - v).
+    # Least squares for y - v = sum c_k (v^k - v); a response that is nearly straight counts as
+    # straight.
     columns = np.stack([v**k - v for k in RESPONSE_POWERS])
     solved = np.linalg.solve(columns @ columns.T, columns @ (y - v))
-    deviation = solved @ np.stack([_SHADES**k - _SHADES for k in RESPONSE_POWERS])
+    at_shades = np.stack([_SHADES**k - _SHADES for k in RESPONSE_POWERS])
+    deviation = solved @ at_shades
     response = straight
     if np.abs(deviation).max() > _STRAIGHT:
         response = solved
