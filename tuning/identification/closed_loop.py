@@ -23,7 +23,17 @@ SLOWEST_RAD_PER_S = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """A controller: K in 1/s, times in s; the filter precedes all three terms."""
+    """Gains of a controller.
+
+    Attributes
+    ----------
+    kp_per_s : float
+        K.
+    ti_s, td_s : float
+        Ti and Td.
+    filter_s : float
+        Tf of the filter, which precedes all three terms.
+    """
 
     kp_per_s: float
     ti_s: float
@@ -37,12 +47,8 @@ class Gains:
 
     def round_to_four_digits(self) -> Gains:
         """To four digits: more mean nothing, and people copy them."""
-        return Gains(
-            *(
-                float(f"{value:.4g}")
-                for value in (self.kp_per_s, self.ti_s, self.td_s, self.filter_s)
-            )
-        )
+        values = (self.kp_per_s, self.ti_s, self.td_s, self.filter_s)
+        return Gains(*(float(f"{value:.4g}") for value in values))
 
     def applied_to(self, loop: LoopConfig) -> LoopConfig:
         """The loop with these gains, validated. Raises pydantic.ValidationError outside the
@@ -58,25 +64,54 @@ def make_frequencies(dt_s: float, points: int = 400) -> Series:
 
 
 def compute_pump_response(model: PlantModel, w_rad_per_s: Series, dt_s: float) -> ComplexArray:
-    """From commanded flow to speed of the centre, without the leak."""
+    """Compute the response from commanded flow to the speed of the centre, without the leak.
+
+    Parameters
+    ----------
+    model : PlantModel
+        k, theta and T.
+    w_rad_per_s : (n,) array
+        Angular frequencies.
+    dt_s : float
+        Sample time h.
+
+    Returns
+    -------
+    (n,) complex array
+        j w P.
+    """
     s = 1j * w_rad_per_s
-    return np.asarray(
-        model.gain * np.exp(-s * (model.dead_time_s + dt_s / 2)) / (1 + s * model.lag_s)
-    )
+    delay_s = model.dead_time_s + dt_s / 2
+    delayed = model.gain * np.exp(-s * delay_s)
+    return np.asarray(delayed / (1 + s * model.lag_s))
 
 
 def compute_controller_response(gains: Gains, w_rad_per_s: Series) -> ComplexArray:
-    """From error to commanded flow."""
+    """Compute the response (n,) from error to commanded flow, C F."""
     s = 1j * w_rad_per_s
-    return np.asarray(
-        gains.kp_per_s * (1 + 1 / (s * gains.ti_s) + s * gains.td_s) / (1 + s * gains.filter_s)
-    )
+    three_terms = 1 + 1 / (s * gains.ti_s) + s * gains.td_s
+    return np.asarray(gains.kp_per_s * three_terms / (1 + s * gains.filter_s))
 
 
 def compute_loop_response(
     gains: Gains, model: PlantModel, w_rad_per_s: Series, dt_s: float
 ) -> ComplexArray:
-    """L."""
+    """Compute the response of the open loop.
+
+    Parameters
+    ----------
+    gains : Gains
+    model : PlantModel
+    w_rad_per_s : (n,) array
+        Angular frequencies.
+    dt_s : float
+        Sample time of the loop.
+
+    Returns
+    -------
+    (n,) complex array
+        L = C F P.
+    """
     integrator = 1 / (1j * w_rad_per_s)
     return (
         compute_controller_response(gains, w_rad_per_s)

@@ -78,14 +78,30 @@ class ExperimentRig(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Experiments:
-    """Raw results of the experiments."""
+    """Raw results of the experiments.
 
-    around: operating_point.OperatingPoint  # holding flow, laser noise, limits
-    record: Record  # relays, the holds between, doublets, without a gap
-    relays_s: float  # duration of the relays with the holds after them
-    pulses_s: tuple[float, float]  # start and end of the longest doublets
-    finished: Finished  # how the last relay ended
-    held: Record | None = None  # the hold before them; None if read from a file
+    Attributes
+    ----------
+    around : OperatingPoint
+        Holding flow, laser noise, limits.
+    record : Record
+        Relays, the holds between, doublets, without a gap.
+    relays_s : float
+        Duration of the relays with the holds after them.
+    pulses_s : (float, float)
+        Start and end of the longest doublets.
+    finished : Finished
+        How the last relay ended.
+    held : Record, optional
+        The hold before them; None if read from a file.
+    """
+
+    around: operating_point.OperatingPoint
+    record: Record
+    relays_s: float
+    pulses_s: tuple[float, float]
+    finished: Finished
+    held: Record | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,27 +147,51 @@ def make_spec(
 def run_experiments(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FULL) -> Experiments:
     """Hold, relay and doublets on a rig that holds its mirror.
 
-    What was stopped is kept, and repeated while too little is known; `judge` sees a jump that
-    stopped it.
+    What was stopped is kept, and repeated while too little is known; `judge_fit` detects a jump
+    that stopped it.
 
-    Raises ExperimentError if the relays were stopped before they lasted as long as one; ValueError
-    if the pump has no room about the holding flow: the mirror is too tight or too leaky.
+    Parameters
+    ----------
+    rig : ExperimentRig
+        The rig.
+    limit_um : float
+        Excursion at which an experiment is stopped.
+    plan : Plan
+        How long the parts last.
+
+    Returns
+    -------
+    Experiments
+
+    Raises
+    ------
+    ExperimentError
+        The relays were stopped before they lasted as long as one.
+    ValueError
+        The pump has no room about the holding flow: the mirror is too tight or too leaky.
     """
     if plan.settle_s:
         rig.hold(plan.settle_s)
     held = rig.hold(plan.quiet_s)
     around = rig.around(held, limit_um)
-    operating_point.require_room(
-        around
-    )  # without room a relay would only report that it was stopped
+    # Without room a relay would only report that it was stopped.
+    operating_point.require_room(around)
+
+    # Relays for the gain; then doublets, as large as that gain allows, for the dead time. A pump
+    # whose curve is bent gets none: its map comes first.
     relays, finished = _run_relays(rig, around, plan)
     found = identify_plant(relays)
-    around, gain = replace(around, late_s=found.model.delay_s), found.model.gain
+    around = replace(around, late_s=found.model.delay_s)
+    gain = found.model.gain
+    rounds = plan.doublets
+    if find_bent_curve(relays, found):
+        rounds = 0
     whole = relays
     longest_s = (relays.duration_s, relays.duration_s)
-    for _ in range(0 if find_bent_curve(relays, found) else plan.doublets):
+    for _ in range(rounds):
         latest, ended = rig.perform(make_spec("doublets", around, plan.doublets_s, gain))
-        gain *= 1.0 if ended.completed else _LESS
+        if not ended.completed:
+            gain *= _LESS
         if latest.duration_s > longest_s[1] - longest_s[0]:
             longest_s = (whole.duration_s, whole.duration_s + latest.duration_s)
         whole = whole.followed_by(latest, rig.hold(_BETWEEN_S))
@@ -184,31 +224,39 @@ def _run_relays(
     for _ in range(plan.relays):
         relay, finished = rig.perform(make_spec("relay", around, plan.relay_s))
         relay = relay.followed_by(rig.hold(_BETWEEN_S))
-        done = relay if done is None else done.followed_by(relay)
+        if done is None:
+            done = relay
+        else:
+            done = done.followed_by(relay)
         if finished.end is ExperimentEnd.NO_RESPONSE:
             otherwise = f"{finished.reason}; if that is not the cause, {MAP_THE_PUMP}"
             raise ExperimentError(otherwise, pump_suspected=True)
         try:
             found = identify_plant(done)
-        except ValueError:  # too short to tell
+        except ValueError:  # too short for a fit
             continue
+
+        # A relay that ended early: by a jump, after which the record begins again; by a pump that
+        # is too strong; or by weather, which does not matter.
         if not finished.completed and found.largest_residual > JUMP_SIGMAS:
             done = None
             continue
         if not finished.completed and _is_too_strong(found):
             raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}", pump_suspected=True)
         around = replace(around, late_s=found.model.delay_s)
-        if _has_enough(done, plan) and (
-            found.sigma.gain <= _GAIN_SIGMA * found.model.gain or find_bent_curve(done, found)
-        ):
+        is_gain_known = found.sigma.gain <= _GAIN_SIGMA * found.model.gain
+        if _has_enough(done, plan) and (is_gain_known or find_bent_curve(done, found)):
             break
     if done is None or not _has_enough(done, plan):
-        stopped_near = finished.end is ExperimentEnd.STOPPED_BY_GUARD
-        raise ExperimentError(finished.reason + (f": {LARGER_LIMIT}" if stopped_near else ""))
+        reason = finished.reason
+        if finished.end is ExperimentEnd.STOPPED_BY_GUARD:
+            reason = f"{reason}: {LARGER_LIMIT}"
+        raise ExperimentError(reason)
     return done, finished
 
 
 def _has_enough(relays: Record, plan: Plan) -> bool:
+    """Whether the relays together lasted as long as one."""
     return relays.duration_s >= plan.relay_s
 
 

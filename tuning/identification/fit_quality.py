@@ -12,17 +12,18 @@ from tuning.identification.two_gains import fit_two_gains
 
 MAP_THE_PUMP = "run `tune pump`"
 LARGER_LIMIT = "repeat `tune characterise` with a larger --limit-um"
-_LOST_MAX = 0.01
-# an error of k beyond +-20 % (2 sigma) changes Ms and variance by more than designs differ
+_LOST_MAX = 0.01  # share of the readings
+# An error of k beyond +-20 % (2 sigma) changes Ms and variance by more than designs differ.
 _GAIN_SIGMA_MAX = 0.10
 _GAIN_SIGMA_GOOD = 0.03
+# Error of the delay, in s or as a share of the delay: a loop with a long delay is slow, and
+# tolerates a larger error.
 _DELAY_SIGMA_MAX_S = 0.1
-# or of the delay: the loop is as slow as its delay is long, and as tolerant
 _DELAY_SIGMA_SHARE = 0.1
 _UNANSWERED = 5.0  # k below this many standard errors: the pump's effect is lost in the weather
 JUMP_SIGMAS = 8.0  # of 10^4 residuals none is beyond 5
-_P_MIN = 1e-4
-# sound benches show up to 2.7 in 192 sessions, pumps that saturate at 0.6 of the command 9
+_P_MIN = 1e-4  # of a statistical test
+# Sound benches show up to 2.7 in 192 sessions, pumps that saturate at 0.6 of the command 9.
 _BENT_SIGMAS = 5.0
 _BENT_SHARE = 0.2  # of k; the margins tolerate less
 _STRONG = 1.5  # k of a pump whose least flow may be more than the leak: it swings with any gains
@@ -67,13 +68,29 @@ class Validation:
 
 
 def validate_fit(identified: Identified, fresh: Record, settle_s: float = 2.0) -> Validation:
-    """Predict a fresh record with a fitted model, without the noise filter's start-up."""
-    errors = compute_prediction_errors(
-        fresh,
-        identified.model,
-        identified.noise,
-        identified.pressure_gain_um_per_pa if fresh.has_barometer else 0.0,
-    )[round(settle_s / fresh.dt_s) :]
+    """Predict a fresh record with a fitted model.
+
+    Parameters
+    ----------
+    identified : Identified
+        The fit.
+    fresh : Record
+        Data that were not used for it.
+    settle_s : float
+        Start-up of the noise's filter, which does not count.
+
+    Returns
+    -------
+    Validation
+    """
+    pressure_gain_um_per_pa = 0.0
+    if fresh.has_barometer:
+        pressure_gain_um_per_pa = identified.pressure_gain_um_per_pa
+    all_errors = compute_prediction_errors(
+        fresh, identified.model, identified.noise, pressure_gain_um_per_pa
+    )
+    start = round(settle_s / fresh.dt_s)
+    errors = all_errors[start:]
     change = np.diff(fresh.flow_um_per_s)[-errors.size :]
     return Validation(
         float(errors.std() / identified.innovation_um),
@@ -85,7 +102,21 @@ def validate_fit(identified: Identified, fresh: Record, settle_s: float = 2.0) -
 def judge_fit(
     record: Record, identified: Identified, validation: Validation | None = None
 ) -> FitQuality:
-    """Verdict on a record and its fit."""
+    """Judge a record and its fit.
+
+    Parameters
+    ----------
+    record : Record
+        The data.
+    identified : Identified
+        The fit to them.
+    validation : Validation, optional
+        Its prediction of other data.
+
+    Returns
+    -------
+    FitQuality
+    """
     refused, degraded = _list_findings(record, identified)
     if validation is not None and validation.innovation_ratio > _WORSE_MAX:
         worse = (
@@ -101,9 +132,11 @@ def judge_fit(
         degraded.append(
             FitFinding("new residuals still follow the flow: repeat with the doublets experiment")
         )
-    verdict: Literal["ok", "degraded", "refused"] = (
-        "refused" if refused else "degraded" if degraded else "ok"
-    )
+    verdict: Literal["ok", "degraded", "refused"] = "ok"
+    if refused:
+        verdict = "refused"
+    elif degraded:
+        verdict = "degraded"
     findings = (*refused, *degraded)
     texts = tuple(finding.text for finding in findings)
     return FitQuality(verdict, texts, any(finding.pump_suspected for finding in findings))
@@ -171,6 +204,8 @@ def find_bent_curve(record: Record, identified: Identified) -> list[FitFinding]:
     least = max(_BENT_SIGMAS * found.difference_sigma, _BENT_SHARE * identified.model.gain)
     if abs(found.above - found.below) < least:
         return []
-    what = "the pump saturates" if found.above < found.below else "the pump stalls at small flows"
+    cause = "the pump stalls at small flows"
+    if found.above < found.below:
+        cause = "the pump saturates"
     gains = f"k = {found.below:.2f} below the holding flow and {found.above:.2f} above"
-    return [_suspect_pump(f"{what} ({gains})")]
+    return [_suspect_pump(f"{cause} ({gains})")]

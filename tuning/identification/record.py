@@ -70,7 +70,9 @@ class Record:
         """Duration of each time without a reading."""
         is_lost = np.concatenate(([False], ~np.isfinite(self.displacement_um), [False]))
         edges = np.flatnonzero(np.diff(is_lost.astype(int)))
-        return [float(samples) * self.dt_s for samples in edges[1::2] - edges[::2]]
+        begins = edges[::2]
+        ends = edges[1::2]
+        return [float(samples) * self.dt_s for samples in ends - begins]
 
     def cut(self, start_s: float, stop_s: float) -> Record:
         """The samples from `start_s` up to, but excluding, `stop_s`."""
@@ -96,7 +98,9 @@ class Record:
         good = np.isfinite(self.displacement_um)
         if not good.any():
             raise ValueError("no reading of the mirror in the record")
-        return np.interp(np.arange(len(self)), np.flatnonzero(good), self.displacement_um[good])
+        ticks = np.arange(len(self))
+        ticks_with_reading = np.flatnonzero(good)
+        return np.interp(ticks, ticks_with_reading, self.displacement_um[good])
 
     def sha256(self) -> str:
         """Hash of the data, which identifies the origin of gains."""

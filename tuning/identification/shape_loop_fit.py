@@ -24,9 +24,8 @@ from tuning.identification.record import Series
 from tuning.rigs.hold_rig import HoldRig
 
 STEP_UM = 5.0
-# of each level; the ramp, the loop's recovery, and a cycle started earlier
-_LEVEL_S = 60.0
-_SETTLE_S = 12.0
+_LEVEL_S = 60.0  # of each level
+_SETTLE_S = 12.0  # before it: the ramp, the loop's recovery, and a cycle started earlier
 TYPICAL_S = 3 * (_LEVEL_S + _SETTLE_S)
 _LATE_S = 15.0  # that a level may take longer on a busy machine
 LEAST_CYCLES = 8
@@ -34,23 +33,43 @@ LEAST_CYCLES = 8
 _CYCLES_MIN = 10.0
 _TAU_MAX_S = 3600.0
 _APART_MAX = 0.2  # of the figure's response: beyond it the camera sees something else than the sag
+# Variance of (high - mean of the two low levels), over the mean variance of a level.
+_VARIANCE_OF_STEP = 1.5
 
 
 @dataclass(frozen=True, slots=True)
 class ShapeLoopFit:
-    """Result of the fit."""
+    """Result of the fit.
 
-    sensitivity: Series  # (terms,): change of the coefficients per µm of sag, and standard errors
-    sensitivity_sigma: Series  # (terms,)
-    agreement: (
-        float  # cosine between it and the one assumed, piston left out; 1 is the same direction
-    )
-    scale: float  # sag by deflectometry per µm of laser reading
-    sigma_um: float  # noise of a cycle
-    cycle_s: float  # between results
-    drift_um_per_sqrt_h: float  # between laser and deflectometry
-    drift_seen: bool  # otherwise no drift was seen, and the figure is its upper bound
-    time_constant_s: float  # proposed for `shape.time_constant_s`
+    Attributes
+    ----------
+    sensitivity, sensitivity_sigma : (terms,) arrays
+        Change of the coefficients per µm of sag, and its standard errors.
+    agreement : float
+        Cosine between it and the assumed one, piston left out; 1 is the same direction.
+    scale : float
+        Sag by deflectometry per µm of laser reading.
+    sigma_um : float
+        Noise of a cycle.
+    cycle_s : float
+        Time between results.
+    drift_um_per_sqrt_h : float
+        Between laser and deflectometry.
+    drift_seen : bool
+        Whether a drift is significant; else the figure is its upper bound.
+    time_constant_s : float
+        Proposed for `shape.time_constant_s`.
+    """
+
+    sensitivity: Series
+    sensitivity_sigma: Series
+    agreement: float
+    scale: float
+    sigma_um: float
+    cycle_s: float
+    drift_um_per_sqrt_h: float
+    drift_seen: bool
+    time_constant_s: float
 
 
 def run_step_experiment(rig: HoldRig) -> list[list[ShapeEstimate]]:
@@ -79,33 +98,57 @@ def run_step_experiment(rig: HoldRig) -> list[list[ShapeEstimate]]:
 def fit_shape_loop(
     levels: Sequence[Sequence[ShapeEstimate]], steady: Sequence[ShapeEstimate], assumed: Series
 ) -> ShapeLoopFit:
-    """Sensitivity from the levels (low, high, low), noise and drift from these and the shapes of a
-    steady hold.
+    """Fit the shape loop.
 
-    `assumed` (terms,) is the controller's sensitivity. Raises ValueError if there are too few
-    shapes.
+    Parameters
+    ----------
+    levels : three sequences of ShapeEstimate
+        Low, high, low: for the sensitivity.
+    steady : sequence of ShapeEstimate
+        Of a steady hold: with the levels, for noise and drift.
+    assumed : (terms,) array
+        The controller's sensitivity.
+
+    Returns
+    -------
+    ShapeLoopFit
+
+    Raises
+    ------
+    ValueError
+        There are too few shapes.
     """
+    # The change from the mean of the two low levels to the high one: an even drift cancels.
     means = [np.mean([shape.coeffs_um for shape in level], axis=0) for level in levels]
     laser_um = [float(np.mean([shape.displacement_um for shape in level])) for level in levels]
     step_um = laser_um[1] - (laser_um[0] + laser_um[2]) / 2
     sensitivity = (means[1] - (means[0] + means[2]) / 2) / step_um
-    scatter = np.mean(
-        [np.var([s.coeffs_um for s in level], axis=0, ddof=1) / len(level) for level in levels],
-        axis=0,
-    )
-    shapes = sorted(
-        (*steady, *(s for level in levels for s in level)), key=lambda shape: shape.time_s
-    )
+
+    # Its error, from the scatter within the levels.
+    variances = []
+    for level in levels:
+        coeffs_um = [shape.coeffs_um for shape in level]
+        variances.append(np.var(coeffs_um, axis=0, ddof=1) / len(level))
+    scatter = np.mean(variances, axis=0)
+    sensitivity_sigma = np.sqrt(_VARIANCE_OF_STEP * scatter) / abs(step_um)
+
+    # Noise and drift of sag less laser; the best time constant is sigma sqrt(T) / q.
+    of_levels = [shape for level in levels for shape in level]
+    shapes = sorted((*steady, *of_levels), key=lambda shape: shape.time_s)
     times_s, gaps_um = compute_gaps_um(shapes, assumed)
     cycle_s = float(np.median(np.diff(times_s)))
     noise = fit_local_level(gaps_um, times_s)
     best_s = noise.white * math.sqrt(cycle_s / noise.walk)
-    kept, wanted = sensitivity[1:], assumed[1:]
+
+    # Direction and size of the response, over the assumed one; without piston.
+    found = sensitivity[1:]
+    wanted = assumed[1:]
+    lengths = np.linalg.norm(found) * np.linalg.norm(wanted)
     return ShapeLoopFit(
         sensitivity=sensitivity,
-        sensitivity_sigma=np.sqrt(1.5 * scatter) / abs(step_um),
-        agreement=float(kept @ wanted / (np.linalg.norm(kept) * np.linalg.norm(wanted))),
-        scale=float(kept @ wanted / (wanted @ wanted)),
+        sensitivity_sigma=sensitivity_sigma,
+        agreement=float(found @ wanted / lengths),
+        scale=float(found @ wanted / (wanted @ wanted)),
         sigma_um=noise.white,
         cycle_s=cycle_s,
         drift_um_per_sqrt_h=math.sqrt(3600 * noise.walk),
@@ -115,18 +158,28 @@ def fit_shape_loop(
 
 
 def compute_gaps_um(shapes: Sequence[ShapeEstimate], assumed: Series) -> tuple[Series, Series]:
-    """Times, and change of sag less laser reading: the drift between the two and the noise of a
-    cycle.
+    """Compute the differences between optics and laser.
+
+    Parameters
+    ----------
+    shapes : n ShapeEstimate
+        In the order of their times.
+    assumed : (terms,) array
+        Change of the coefficients per µm of sag.
+
+    Returns
+    -------
+    times_s, gaps_um : (n,) arrays
+        Change of sag since the first shape, less the laser's reading: the drift between the two,
+        and the noise of a cycle.
     """
     first = shapes[0]
-    seen = (
-        compute_sag_change(s.coeffs_um, first.coeffs_um, s.covariance_um2, assumed).change_um
-        for s in shapes
-    )
-    gaps_um = np.array(
-        [sag_um - shape.displacement_um for sag_um, shape in zip(seen, shapes, strict=True)]
-    )
-    return np.array([shape.time_s for shape in shapes]), gaps_um
+    gaps_um = []
+    for shape in shapes:
+        change = compute_sag_change(shape.coeffs_um, first.coeffs_um, shape.covariance_um2, assumed)
+        gaps_um.append(change.change_um - shape.displacement_um)
+    times_s = np.array([shape.time_s for shape in shapes])
+    return times_s, np.array(gaps_um)
 
 
 def find_unfit_reason(found: ShapeLoopFit) -> str:
