@@ -162,4 +162,5 @@ _.beside_heading  # read by the template of a report page
     _.stated_ti_s,
     _.figure_ms,
     _.memory_locked,
+    over_min,
 )  # of events, which are written as a whole

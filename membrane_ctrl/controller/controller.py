@@ -42,6 +42,7 @@ from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.sample_rate import SampleRate
+from membrane_ctrl.controller.short_losses import ShortLossCounter
 from membrane_ctrl.controller.state import ControllerState, ReportedShape, make_first_state
 from membrane_ctrl.controller.telemetry_row import make_telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
@@ -126,6 +127,7 @@ class Controller:
             present.loop, present.pump, estimator, memory.process_value
         )
         self._sample_rate = SampleRate(memory.sample_rate)
+        self._short_losses = ShortLossCounter(memory.short_losses)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
 
@@ -505,19 +507,31 @@ class Controller:
 
     def _apply_verdict(self, verdict: safety.Verdict, events: list[Event]) -> None:
         """Enter the safe level of the verdict; every level below HOLD_FLOW latches the fault."""
-        context, levels = self._context, self._context.levels
+        levels, losses, now_s = self._context.levels, self._short_losses, self._context.now_s
+        events += losses.report_count(now_s)
         rule = verdict.rule
         if rule is None:
             if levels.safe_level == SafeLevel.HOLD_FLOW:
-                levels.clear(context.now_s)
-                events.append(Cleared(self.fault.name if self.fault else ""))
+                levels.clear(now_s)
+                if self.fault is None:
+                    events.append(Cleared(""))
+                else:
+                    cleared = Cleared(self.fault.name)
+                    events += losses.end_fault(self.fault.code, cleared, now_s)
                 self.fault = None
             return
-        if self.fault is None or (verdict.safe_level > SafeLevel.HOLD_FLOW >= levels.safe_level):
+        if verdict.safe_level > SafeLevel.HOLD_FLOW >= levels.safe_level:
             self.fault = rule
             events.append(rule.fault(verdict.seen, verdict.safe_level))
-        levels.enter(verdict.safe_level, context.now_s)
-        if levels.step(context.now_s) > SafeLevel.HOLD_FLOW and self.state != State.FAULT:
+        elif self.fault is None:
+            self.fault = rule
+            events += losses.begin_fault(rule.fault(verdict.seen, verdict.safe_level), now_s)
+        levels.enter(verdict.safe_level, now_s)
+        is_deeper = levels.step(now_s) > SafeLevel.HOLD_FLOW
+        if losses.must_list(now_s, is_deeper):
+            seen = verdict.seen if rule.code == self.fault.code else ""
+            events.append(self.fault.fault(seen, verdict.safe_level))
+        if is_deeper and self.state != State.FAULT:
             self._enter_state(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
 
     def _step_shape(self, inputs: TickInputs, events: list[Event]) -> shape_loop.ShapeOutput:

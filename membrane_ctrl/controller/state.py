@@ -20,6 +20,7 @@ from membrane_ctrl.controller.safe_levels import SafeLevelsState
 from membrane_ctrl.controller.safety import SafetyState
 from membrane_ctrl.controller.sample_rate import SampleRateState
 from membrane_ctrl.controller.sensor_consistency import SensorConsistencyState
+from membrane_ctrl.controller.short_losses import ShortLossesState
 from membrane_ctrl.controller.standstill import StandstillState
 from membrane_ctrl.controller.tick_context import TickContextState
 from membrane_ctrl.model.state_tree import Count, StateNode
@@ -54,6 +55,7 @@ class ControllerState(StateNode):
     shape_back: bool = False  # the shape loop is on again
     safety: SafetyState = field(default_factory=SafetyState)
     levels: SafeLevelsState = field(default_factory=SafeLevelsState)
+    short_losses: ShortLossesState = field(default_factory=ShortLossesState)
     resume: ResumeState = field(default_factory=ResumeState)
     observer: ObserverState = field(default_factory=ObserverState)
     standstill: StandstillState = field(default_factory=StandstillState)

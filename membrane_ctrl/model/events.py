@@ -100,6 +100,20 @@ class Cleared(
     name: str
 
 
+class ShortLosses(
+    Event,
+    kind="short_losses",
+    sentence="Fault {name} repeats: {count} times within {over_min:g} min, each for less than a "
+    "second. Such faults are counted and not listed. Do: look for the cause of the short losses",
+    level=LogLevel.WARNING,
+):
+    """Short faults repeat; one such event when that begins, then one an hour with their count."""
+
+    name: str
+    count: int
+    over_min: float
+
+
 class Resumed(
     Event, kind="resumed", sentence="Fault {name} is cleared by the resume rule", notable=True
 ):
