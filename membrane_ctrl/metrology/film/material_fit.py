@@ -13,7 +13,7 @@ the error bars instead of moving the numbers.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -24,6 +24,8 @@ from membrane_ctrl.metrology.film.film_figure import FilmFigure
 from membrane_ctrl.metrology.film.film_law import Bowl, FilmLaw
 from membrane_ctrl.metrology.film.misfit_average import (
     GROWTHS,
+    Solved,
+    average_models,
     average_over_misfits,
     misfit_covariances,
     shared_covariance,
@@ -300,30 +302,39 @@ def _fit_round(
     if is_gauged.any():
         x[2] = float(np.mean(log_q - x[3:][is_gauged]))
 
-    # Gauss-Newton. Far from the solution, the misfit that grows fastest is enough; near it, all are
-    # averaged.
-    is_far = True
-    for _ in range(_ITERATIONS):
-        finite_mm[:] = _finite_terms_mm(*make_bowls(x), reach)
-        slopes = _numerical_slopes(predict, x)
-        rest = target - predict(x)
-        tried_misfits = misfits
-        if is_far:
-            tried_misfits = misfits[-1:]
-        solved = average_over_misfits(
-            slopes, rest, noise, tried_misfits, known - x, precision, seen_mm
+    def converge(x: FloatArray, tried_misfits: FloatArray) -> tuple[FloatArray, Solved]:
+        """Gauss-Newton from the unknowns x (3 + n,) with some of the misfits: where it ends, and
+        the answer there. Raises ValueError if it does not converge.
+        """
+        for _ in range(_ITERATIONS):
+            finite_mm[:] = _finite_terms_mm(*make_bowls(x), reach)
+            slopes = _numerical_slopes(predict, x)
+            rest = target - predict(x)
+            solved = average_over_misfits(
+                slopes, rest, noise, tried_misfits, known - x, precision, seen_mm
+            )
+            sigmas = np.sqrt(np.diag(solved.covariance)[:3])
+            if np.all(np.abs(solved.mean[:3]) < _NEAR_SIGMAS * sigmas):
+                return x + solved.mean, replace(solved, mean=x + solved.mean)
+            x = x + solved.mean * _limit_step(x, solved.mean)
+        raise ValueError(
+            "no film of the law is like these figures: they are of different films, or of a "
+            "wrong geometry"
         )
-        step = solved.mean * _limit_step(x, solved.mean)
-        x = x + step
-        sigmas = np.sqrt(np.diag(solved.covariance)[:3])
-        is_near = np.all(np.abs(step[:3]) < _NEAR_SIGMAS * sigmas)
-        if is_near and not is_far:
-            return x, solved.covariance[:3, :3], solved.size_mm
-        is_far = is_far and not is_near
-    raise ValueError(
-        "no film of the law is like these figures: they are of different films, or of a "
-        "wrong geometry"
-    )
+
+    # The misfit that grows fastest allows most: its solution is where those of the others begin.
+    # Each growth is judged at its own solution. A misfit that stays the same has to explain the
+    # sets' differences to the noise, and the law is not linear to the noise over many sigmas.
+    x, solved = converge(x, misfits[-1:])
+    found = [solved]
+    for misfit in misfits[-2::-1]:
+        try:
+            x, solved = converge(x, misfit[None])
+        except ValueError:  # no film of the law leaves such a misfit
+            continue
+        found.append(solved)
+    whole = average_models(found)
+    return whole.mean, whole.covariance[:3, :3], whole.size_mm
 
 
 def _limit_step(x: FloatArray, step: FloatArray) -> float:

@@ -5,7 +5,7 @@ with a power of the sag; both are estimated from the residuals.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,7 +63,8 @@ class Solved:
     covariance : (k, k) array
         Their covariance.
     log_evidence : float
-        Natural logarithm of the model's evidence, up to a constant.
+        Natural logarithm of the model's evidence, up to a constant; of several models that were
+        averaged, that of their sum.
     size_mm : float
         Size of the misfit, RMS over those that were averaged.
     """
@@ -137,18 +138,22 @@ def average_over_misfits(
         Size of the misfit in the terms that the law does not determine.
     """
     found = []
-    logs = []
-    sizes_mm = []
     for size_mm in seen_mm * _SIZES:
         log_prior = -float(np.log1p((np.log(size_mm / seen_mm) / _LOG_WIDTH) ** 2))
         for misfit in misfits:
             covariance = noise + size_mm**2 * misfit
             solved = solve_linear(design, residual, covariance, known, precision)
-            found.append(solved)
-            sizes_mm.append(size_mm)
-            logs.append(solved.log_evidence + log_prior)
-    weight = np.exp(np.array(logs) - np.max(logs))
-    weight /= weight.sum()
+            log_weight = solved.log_evidence + log_prior
+            found.append(replace(solved, log_evidence=log_weight, size_mm=float(size_mm)))
+    return average_models(found)
+
+
+def average_models(found: Sequence[Solved]) -> Solved:
+    """Average models, each with the weight of its evidence."""
+    logs = np.array([solved.log_evidence for solved in found])
+    weight = np.exp(logs - logs.max())
+    total = float(weight.sum())
+    weight /= total
 
     # Mean over the models, and its covariance: within the models, and between their means.
     means = np.array([solved.mean for solved in found])
@@ -156,5 +161,6 @@ def average_over_misfits(
     covariances = np.array([solved.covariance for solved in found])
     within = np.einsum("k,kij->ij", weight, covariances)
     between = np.einsum("k,ki,kj->ij", weight, means - mean, means - mean)
+    sizes_mm = np.array([solved.size_mm for solved in found])
     size_mm = float(np.sqrt(weight @ np.square(sizes_mm)))
-    return Solved(mean, within + between, float(np.max(logs)), size_mm)
+    return Solved(mean, within + between, float(logs.max() + np.log(total)), size_mm)
