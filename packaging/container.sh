@@ -17,6 +17,9 @@ make_wheel() {
     rm -rf "$out/wheel" && mkdir -p "$out/wheel"
     "$python" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$out/wheel" .
     cp requirements.lock packaging/install.sh "$out/wheel/"
+    # downloaded here, so that nothing in the image or folder needs a network
+    "$python" -m pip download --quiet --only-binary :all: --python-version 3.11 -c requirements.lock \
+        --dest "$out/wheel/wheels" "$(ls "$out"/wheel/membrane_ctrl-*.whl)[alarms,web,gpio]"
 }
 
 case ${1:-image} in
@@ -29,12 +32,16 @@ image)
     ;;
 chroot)
     make_wheel
-    rm -rf "$out/root"
+    rm -rf --one-file-system "$out/root"
     make_base "$out/root"
     mkdir -p "$out/root/opt/membrane-ctrl"
-    cp "$out"/wheel/* "$out/root/opt/membrane-ctrl/"
-    cp /etc/resolv.conf "$out/root/etc/resolv.conf"
+    cp -r "$out"/wheel/* "$out/root/opt/membrane-ctrl/"
     chroot "$out/root" sh /opt/membrane-ctrl/install.sh
+    # the mounts are in a namespace of their own: none is left when it ends
+    unshare --mount sh -eu -c '
+        mount --rbind /dev "$1/dev" && mount -t proc proc "$1/proc"
+        chroot "$1" su -s /bin/sh -c "$2" membrane
+    ' sh "$out/root" "cd && membrane-ctrl hold --twin --duration 20s --no-service"
     du -sm "$out/root" "$out/root/opt/membrane-ctrl/.venv"
     ;;
 *)
