@@ -48,7 +48,7 @@ def test_a_simulated_set_is_measured(tmp_path: Path) -> None:
 
 def test_reviewing_commands_start(tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()
-    for words in (("runs",), ("report", "last"), ("review", "last"), ("config", "explain", "loop")):
+    for words in (("runs",), ("report", "last"), ("config", "explain", "loop")):
         done = run_without_posix(tmp_path, *words)
         assert "Traceback" not in done.stderr
         assert "No module" not in done.stderr
