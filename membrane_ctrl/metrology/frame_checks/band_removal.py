@@ -74,8 +74,9 @@ class _Steps:
         self._first_squares = max(float(np.sum(self._rest**2)), 1e-30)
 
     def row_gain(self, place: FloatArray | IntArray) -> FloatArray:
-        """Of the light of rows (N, R)."""
-        return np.maximum(1 + self.amplitudes @ row_waves(self.rad_per_row, place), _DARKEST)
+        """Factor (N, R) of the light of rows at these places (R,), in each frame."""
+        bands = self.amplitudes @ row_waves(self.rad_per_row, place)
+        return np.maximum(1 + bands, _DARKEST)
 
     def _fit(self) -> None:
         """Fit level and phasor of each bin to the light without the present bands.
@@ -116,10 +117,20 @@ class _Steps:
         return float(of_rows / of_bins)
 
     def solve(self, rad_per_row: FloatArray) -> float:
-        """Fit the amplitudes of waves along the rows; returns `unexplained`.
+        """Fit the amplitudes of waves along the rows.
 
         The other unknowns, whose part of the rest is then known, are the flicker of each frame and
         the amplitudes of the fringes' harmonics.
+
+        Parameters
+        ----------
+        rad_per_row : (k,) array
+            Frequencies of the waves.
+
+        Returns
+        -------
+        float
+            `unexplained`.
         """
         count = len(self.frames)
         waves = row_waves(rad_per_row, self._rows)
@@ -150,9 +161,11 @@ class _Steps:
 
     def _free_harmonics(self, off: FloatArray) -> FloatArray:
         """What the model of level and phasor leaves of the fringes' harmonics (h, N, n)."""
-        swing = np.hypot(*self._parts[1:])
-        psi_rad = np.arctan2(self._parts[2], self._parts[1]) + self._shifts_rad[:, None]
-        return np.asarray(off @ np.stack([swing * np.cos(n * psi_rad) for n in _HARMONICS]))
+        _level, cosine, sine = self._parts
+        swing = np.hypot(cosine, sine)
+        psi_rad = np.arctan2(sine, cosine) + self._shifts_rad[:, None]
+        harmonics = np.stack([swing * np.cos(n * psi_rad) for n in _HARMONICS])
+        return np.asarray(off @ harmonics)
 
     def _solve_unknowns(
         self, off: FloatArray, waves: FloatArray, harmonics: FloatArray
@@ -179,9 +192,11 @@ class _Steps:
         unknowns_of_frames = count * len(waves)
 
         # Normal equations of waves with waves.
-        products = np.array(
-            [off[k][:, None] * self._sum_rows(self._lit[k] * self._lit) for k in range(count)]
-        )
+        row_products = []
+        for k in range(count):
+            row_sums = self._sum_rows(self._lit[k] * self._lit)
+            row_products.append(off[k][:, None] * row_sums)
+        products = np.array(row_products)
         wave_matrix = np.einsum("jkr,pr,qr->jpkq", products, waves, waves)
         wave_matrix = wave_matrix.reshape(unknowns_of_frames, unknowns_of_frames)
 
@@ -267,7 +282,7 @@ def remove_bands(
 
 
 def describe_bands(gain: FloatArray | None) -> str:
-    """Why a set with such gains (frames, rows) is degraded; empty if it is not."""
+    """Reason for which a set with such gains (frames, rows) is degraded; empty if it is not."""
     if gain is None:
         return ""
     most = float(np.abs(gain - 1).max())
@@ -293,8 +308,10 @@ def _add_frequency(rad_per_row: FloatArray, power: FloatArray, rows: IntArray) -
 
 def _with_fringes(binned: Binned, axes: list[list[int]]) -> IntArray:
     """Bins (n,), enough of those in which both axes swing and nothing is saturated."""
-    swing = np.minimum(*(np.ptp(binned.means[frames], axis=0) for frames in axes))
-    some = swing.ravel()[:: max(1, swing.size // _ENOUGH_BINS)]
+    of_axes = [np.ptp(binned.means[frames], axis=0) for frames in axes]
+    swing = np.minimum(*of_axes)
+    stride = max(1, swing.size // _ENOUGH_BINS)
+    some = swing.ravel()[::stride]
     least_swing = CONTRAST_SHARE * np.percentile(some, _LEAST_SWING_PERCENTILE)
     saturated = binned.saturated[[*axes[0], *axes[1]]].any(axis=0)
     usable = (swing > least_swing) & ~saturated

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.metrology.phase.phase_steps import step_residual, step_weights
+from membrane_ctrl.metrology.phase.phase_steps import step_design, step_residual, step_weights
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 # Instead of a division by zero; also the least share P_kk of a frame that the model does not
@@ -90,8 +90,10 @@ def compute_closure(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray)
     """
     stack, shifts = _check_frames(frames, shifts_rad)
     residual = step_residual(stack, shifts)
-    design = np.stack([np.ones_like(shifts), np.cos(shifts), -np.sin(shifts)], axis=1)
-    free = 1 - np.einsum("kp,pk->k", design, step_weights(shifts))  # diagonal of P
+
+    # Diagonal of the projector P = 1 - D D^+: the share of a frame's error that its residual shows.
+    explained = np.einsum("kp,pk->k", step_design(shifts), step_weights(shifts))
+    free = 1 - explained
     free_of_pixels = np.broadcast_to(free[:, None], residual.shape)
     return _summarise_residual(residual, free_of_pixels, len(shifts) - 3)
 
@@ -193,7 +195,8 @@ def _level_rss(centred: FloatArray, design: FloatArray, amplitude: FloatArray) -
     least_variance = np.linalg.eigvalsh(covariance)[0]  # a phasor of 0 has no direction
     variance = np.maximum(variance, least_variance)
     rss = np.sum((centred - design @ phasor) ** 2, axis=0)
-    return float(np.mean(rss + (length - amplitude) ** 2 / variance))
+    of_length = (length - amplitude) ** 2 / variance
+    return float(np.mean(rss + of_length))
 
 
 def _check_frames(

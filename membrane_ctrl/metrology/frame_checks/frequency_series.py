@@ -246,7 +246,10 @@ def _repair_series(
     # I0 = I1 + I3 - I2, and correspondingly for the others.
     steps = axis.frames[index].copy()
     count = len(steps)
-    steps[step] = steps[(step + 1) % count] + steps[(step - 1) % count] - steps[(step + 2) % count]
+    after = steps[(step + 1) % count]
+    before = steps[(step - 1) % count]
+    opposite = steps[(step + 2) % count]
+    steps[step] = after + before - opposite
     return flags, axis.with_frames(index, steps)
 
 

@@ -103,10 +103,15 @@ def describe_response(found: LightResponse) -> str:
 
 
 def _invert_share(share: float) -> float:
-    """Exponent of which a sinusoid's mean lies at this share between black and white."""
-    shares = [
-        math.exp(math.lgamma(g + 0.5) - math.lgamma(g + 1)) / math.sqrt(math.pi) for g in _EXPONENTS
-    ]
+    """Exponent of which a sinusoid's mean lies at this share between black and white.
+
+    The mean of ((1 + cos) / 2)^g is Gamma(g + 1/2) / (sqrt(pi) Gamma(g + 1)) (section 11 of
+    docs/explanation/metrology.md); it falls with g.
+    """
+    shares = []
+    for g in _EXPONENTS:
+        gamma_ratio = math.exp(math.lgamma(g + 0.5) - math.lgamma(g + 1))
+        shares.append(gamma_ratio / math.sqrt(math.pi))
     return float(np.interp(-share, -np.array(shares), _EXPONENTS))
 
 
@@ -116,4 +121,6 @@ def _find_losses(light: FloatArray, position: FloatArray) -> tuple[float, float]
     columns = np.stack([np.ones_like(x), x, y, x**2 + y**2])
     level, along_x, along_y, bowl = np.linalg.lstsq(columns.T, light, rcond=None)[0]
     level = max(float(level), 1e-9)
-    return float(-bowl / level), float(2 * math.hypot(along_x, along_y) / level)
+    edge_loss = -bowl / level
+    side_loss = 2 * math.hypot(along_x, along_y) / level
+    return float(edge_loss), float(side_loss)

@@ -276,7 +276,9 @@ def _compare_places(
 
     # Stray light around an edge has a mirror image of about the same share.
     mirrored = _score_places(images, [(2 - scale, np.array([-shift_rad]))], frames)
-    is_stray = bool(mirrored.share.size) and float(mirrored.share[0]) > _STRAY_SHARE * float(share)
+    is_stray = False
+    if mirrored.share.size:
+        is_stray = float(mirrored.share[0]) > _STRAY_SHARE * float(share)
 
     # Explained power over that of chance; 0 for stray light, and for a share that is no light.
     clear = 0.0
@@ -308,7 +310,8 @@ class _Images:
         """Light (frames, shifts, n) of images of the same brightness as the first."""
         place_rad = scale * self._phase_rad + shifts_rad[:, None] + self._reach_rad
         cell = np.rint(place_rad / _CELL_RAD).astype(np.int32)
-        shown = self._table[:, np.clip(cell, 0, self._table.shape[1] - 1)]
+        last = self._table.shape[1] - 1
+        shown = self._table[:, np.clip(cell, 0, last)]
         return np.asarray(shown * self._bright[:, None])
 
 
@@ -321,7 +324,8 @@ def _white_light(
         return 2 * scene.light  # of fringes with full contrast
     white, black = pair
     more = binned.means[white].astype(float) - binned.means[black]
-    return scene.light * float(np.median(more.reshape(-1)[scene.index] / scene.light))
+    ratio = more.reshape(-1)[scene.index] / scene.light
+    return scene.light * float(np.median(ratio))
 
 
 def _coarse_places(centre_rad: float, every: int = 1) -> list[tuple[float, FloatArray]]:
@@ -369,10 +373,14 @@ def _score_places(
     for scale, shifts_rad in places:
         image = images.light_at(scale, shifts_rad)
         whole_power = np.sum(image**2, axis=(0, 2))
+
+        # Power of the image outside the frames' own patterns, and its product with what is left.
         power = whole_power.copy()
-        product = np.zeros(shifts_rad.size)  # of the image with what is left
+        product = np.zeros(shifts_rad.size)
         for of_frame, frame in zip(image, frames, strict=True):
-            power -= np.sum((of_frame @ frame.solve.T) * (of_frame @ frame.columns.T), axis=1)
+            coefficients = of_frame @ frame.solve.T
+            products = of_frame @ frame.columns.T
+            power -= np.sum(coefficients * products, axis=1)
             product += of_frame @ frame.left
         determined = power > _LEAST_DETERMINED * whole_power + 1e-9
         power = power[determined]
