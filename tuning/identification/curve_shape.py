@@ -34,13 +34,15 @@ class Branch:
     flows: FloatArray
     sigmas: FloatArray
 
+    @classmethod
+    def empty(cls) -> "Branch":
+        """A branch without commands."""
+        return cls(np.empty(0), np.empty(0), np.empty(0))
+
     @property
     def columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """All three."""
         return self.fractions, self.flows, self.sigmas
-
-
-NO_BRANCH = Branch(np.empty(0), np.empty(0), np.empty(0))
 
 
 def find_first_jump(branch: Branch, full: float) -> tuple[float, float] | None:

@@ -25,6 +25,7 @@ _LEAK_S = 40.0  # between the nodes of the leak's course
 _LEAK_CHANGES_UM_PER_S = (0.02, 0.06, 0.2)
 _BEFORE_UM_PER_S = 0.5  # of the loop's flow from the leak, when a run begins
 _WHITES = (0.9, 0.97, 0.99, 0.997, 0.9995)
+_SHARE_BEFORE_RUNS = 0.8  # of white noise, before any run
 _DELAYS_S = (0.05, 0.2, 0.5, 1.0, 1.6, 2.2)
 _LAGS_S = (0.1, 0.4, 1.0, 2.0)
 _GRID = tuple(product(_DELAYS_S, _LAGS_S))  # actuators at which the search begins
@@ -78,6 +79,11 @@ class PumpFit:
     lag_s: float
     share_white: float
     leak_changes_um_per_s: float = _LEAK_CHANGES_UM_PER_S[-1]
+
+    @classmethod
+    def empty(cls) -> "PumpFit":
+        """The fit before any run: no level, no leak, no delay."""
+        return cls({}, np.empty((0, 0)), 0.0, 0.0, 0.0, _SHARE_BEFORE_RUNS)
 
     @property
     def likeliest(self) -> tuple[float, float, float, float]:
@@ -144,9 +150,6 @@ class _Flows:
     def differs_by_at_most_one(self, white: float, leak_changes_um_per_s: float) -> bool:
         """Whether at most one of the two differs."""
         return white == self.white or leak_changes_um_per_s == self.leak_changes_um_per_s
-
-
-NO_FIT = PumpFit({}, np.empty((0, 0)), 0.0, 0.0, 0.0, 0.8)
 
 
 def fit_pump(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:

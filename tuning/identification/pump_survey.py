@@ -16,13 +16,12 @@ from membrane_ctrl.control.pump_curve import STALL_MARGIN
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.curve_shape import (
     JUMP_SHARE,
-    NO_BRANCH,
     Branch,
     find_first_jump,
     limit_bend,
     smooth_flows,
 )
-from tuning.identification.pump_fit import NO_FIT, PumpFit, fit_pump
+from tuning.identification.pump_fit import PumpFit, fit_pump
 from tuning.identification.pump_map import PumpMap, Surveyed, is_stuck
 from tuning.identification.pump_run import Level, PumpRun
 
@@ -95,7 +94,7 @@ class PumpSurvey:
     limit_um: float = 10.0
     laser_um: float = 0.5
     runs: list[PumpRun] = field(default_factory=list)
-    fit: PumpFit = NO_FIT
+    fit: PumpFit = field(default_factory=PumpFit.empty)
     dark: int = 0  # the latest runs that were short and ended without a reading
     _share: float = 1.0  # of the travel, smaller after a run that was stopped
     _longer: float = 1.0  # the first pulses, while no flow is known
@@ -168,7 +167,7 @@ class PumpSurvey:
         rounds have shown no flow.
         """
         most_rounds = 3 * _FIRST_ROUNDS
-        if is_stuck(self.fit, self._branches.get(True, NO_BRANCH)):
+        if is_stuck(self.fit, self._branches.get(True, Branch.empty())):
             most_rounds = _FIRST_ROUNDS
         if self._rounds >= most_rounds:
             return ()
@@ -505,8 +504,8 @@ class PumpSurvey:
         """
         return Surveyed(
             self.fit,
-            self._branches.get(True, NO_BRANCH),
-            self._branches.get(False, NO_BRANCH),
+            self._branches.get(True, Branch.empty()),
+            self._branches.get(False, Branch.empty()),
             self.full_um_per_s,
             bool(self._branches) and self.hysteretic(),
             self.duration_s,
