@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.sessions.progress import Progress
 from tuning.commands import run
@@ -78,6 +78,17 @@ def test_a_pump_that_must_be_mapped_lengthens_the_announced_session(
     run.run_session(make_options(short))
     assert announced in capsys.readouterr().err
     assert after_s == [pytest.approx(rest_s, abs=15.0)]
+
+
+def test_a_verification_states_its_settling_and_that_it_may_be_prolonged(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """67 s for slow gains, and twice ten minutes if it is close."""
+    slow = LoopConfig(kp_per_s=0.492, ti_s=19.05)
+    monkeypatch.setattr(run.apply, "load_checked_gains", lambda folder: slow)
+    folder: Any = SimpleNamespace()
+    run._announce_step(Progress(), make_options(False), folder, "verify", [])
+    assert "verify: 11:06 to 21:06" in capsys.readouterr().err
 
 
 def test_a_step_that_takes_longer_than_planned_does_not_show_no_time_left(

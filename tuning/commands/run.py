@@ -13,7 +13,7 @@ from tuning.commands.map_pump import measure_pump
 from tuning.commands.open_page import find_page, link_to_tab
 from tuning.identification import pump_survey
 from tuning.options import TuneOptions
-from tuning.proposal.verification import SETTLE_LEAST_S, Stage
+from tuning.proposal.verification import SETTLE_LEAST_S, Stage, find_settling_time_s
 from tuning.report import page
 from tuning.rigs.hold_rig import HoldRig
 from tuning.steps import apply, characterise, design, identify, map_pump, observe, preview, verify
@@ -102,7 +102,7 @@ def _run_steps(
                 )
                 return
             candidate = chosen
-        _announce_step(progress, options, step, steps[number + 1 :])
+        _announce_step(progress, options, folder, step, steps[number + 1 :])
         _run_on_hold(step, folder, rig, options, progress, candidate)
         _report_step(step, folder, progress)
         if step == "identify":
@@ -178,11 +178,22 @@ def _note_verified(folder: SessionFolder, logs: Path, reason: str, again: bool =
     journal.append_entry(logs, entry)
 
 
-def _announce_step(progress: Progress, options: TuneOptions, step: str, after: list[str]) -> None:
+def _announce_step(
+    progress: Progress, options: TuneOptions, folder: SessionFolder, step: str, after: list[str]
+) -> None:
     """Show the step and the time that it and the later ones are expected to take."""
     planned_s = _plan_steps(options)
+    longest_s = 0.0
+    if step == "verify":
+        # slow gains settle for longer, and a close comparison continues for as long again
+        settling_s = find_settling_time_s(apply.load_checked_gains(folder))
+        planned_s["verify"] = settling_s + options.verify_s
+        longest_s = settling_s + 2.0 * options.verify_s
     progress.begin_step(
-        step, planned_s.get(step, 0.0), sum(planned_s.get(later, 0.0) for later in after)
+        step,
+        planned_s.get(step, 0.0),
+        sum(planned_s.get(later, 0.0) for later in after),
+        longest_s,
     )
 
 
