@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.tuning.laboratories import ended_well, format_page, is_held, list_misses
 from firmware_iface.emulators.pump_board import BoardSample
+from tests.studies.laboratory_sessions import ended_well, format_page, is_held, list_misses
 from tests.worlds.drawn_laboratories import (
     ACTUATORS,
     DrawnPlant,
