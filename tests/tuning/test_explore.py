@@ -130,11 +130,11 @@ def test_a_hold_lost_in_the_verification_is_reported(template: Path, tmp_path: P
     session_json.write_session_file(opened.file_path("applied.json"), {})
 
     class Lost:
-        dt_s, told, pump = 0.02, 0, PumpConfig()
+        dt_s, calls, pump = 0.02, 0, PumpConfig()
 
         def set_gains(self, *given: object) -> None:
-            self.told += 1
-            if self.told > 1:
+            self.calls += 1
+            if self.calls > 1:
                 raise HoldError("refused: gains is not allowed in state lower")
 
         def hold(self, duration_s: float) -> None:
@@ -171,13 +171,13 @@ def test_a_close_verification_continues_for_as_long_again(
     """
     opened = copy_of(template, tmp_path)
     session_json.write_session_file(opened.file_path("applied.json"), {})
-    left, told = list(growths), []
+    left, progress = list(growths), []
     held = SimpleNamespace(followed_by=lambda more: held)
     rig = SimpleNamespace(
         pump=PumpConfig(),
         dt_s=1.0,
         set_gains=lambda *given: None,
-        keep_gains=lambda: told.append("keep"),
+        keep_gains=lambda: progress.append("keep"),
         hold=lambda seconds: None,
         hold_about=lambda seconds: (held, np.zeros(round(seconds))),
     )
@@ -202,7 +202,7 @@ def test_a_close_verification_continues_for_as_long_again(
     monkeypatch.setattr(verification, "MS_PRESENT_MAX", 10.0)
     monkeypatch.setattr(record_file, "save_record", lambda path, record: None)
     done = verify.run_verify(opened, rig)  # type: ignore[arg-type]
-    assert (done.kept, done.stages[-1].time_s, told) == (kept, until_s, ["keep"] * kept)
+    assert (done.kept, done.stages[-1].time_s, progress) == (kept, until_s, ["keep"] * kept)
 
 
 def test_a_run_gives_its_weather_and_names_the_source_of_its_plant(

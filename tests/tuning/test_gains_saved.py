@@ -80,9 +80,9 @@ def test_the_next_hold_starts_with_the_kept_gains_and_comments_stay(
         "kp_per_s = 0.61   # 1/s",
         "ti_s     = 6.5",
     ]
-    said = capsys.readouterr().out.splitlines()
-    assert "-kp_per_s = 0.61   # 1/s" in said
-    assert "+kp_per_s = 0.448   # 1/s" in said
+    printed = capsys.readouterr().out.splitlines()
+    assert "-kp_per_s = 0.61   # 1/s" in printed
+    assert "+kp_per_s = 0.448   # 1/s" in printed
     assert path.stat().st_mode & 0o777 == 0o600
     last = read_entries(tmp_path / "logs")[-1]
     assert (last.what, last.session, last.reason) == ("saved", session.name, str(path))
@@ -176,10 +176,10 @@ def test_gains_for_another_bench_are_not_saved(
     path = tmp_path / "lab.toml"
     assert saved(path, "--yes", text=text) == Exit.BAD_INPUT
     assert path.read_text() == text
-    said = [
+    printed = [
         line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: ")
     ]
-    assert any("lab.toml" in line and reason in line for line in said), said
+    assert any("lab.toml" in line and reason in line for line in printed), printed
 
 
 def test_gains_that_were_not_kept_or_were_rolled_back_are_not_saved(

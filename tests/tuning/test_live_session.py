@@ -115,13 +115,13 @@ def test_a_foreign_log_does_no_harm(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_ends_the_log_and_is_reported_once(tmp_path: Path) -> None:
-    said: list[str] = []
+    message: list[str] = []
     (tmp_path / NAME).mkdir()
-    log = LiveLog(tmp_path, RATE_HZ, said.append)
+    log = LiveLog(tmp_path, RATE_HZ, message.append)
     log.log_entry("result", "one")
     log.log_entry("result", "two")
-    assert len(said) == 1
-    assert NAME in said[0]
+    assert len(message) == 1
+    assert NAME in message[0]
 
 
 @pytest.mark.parametrize(
@@ -279,20 +279,20 @@ def progress_of(log: LiveLog) -> Progress:
     return progress
 
 
-def answer(said: str, to: str = "which?", by: str = "anna") -> str:
-    return json.dumps({"to": to, "answer": said, "by": by})
+def answer(message: str, to: str = "which?", by: str = "anna") -> str:
+    return json.dumps({"to": to, "answer": message, "by": by})
 
 
-@pytest.mark.parametrize("said", ["calm", ""])
+@pytest.mark.parametrize("message", ["calm", ""])
 def test_a_question_is_answered_on_the_page(
-    tmp_path: Path, keyboard: int, capsys: pytest.CaptureFixture[str], said: str
+    tmp_path: Path, keyboard: int, capsys: pytest.CaptureFixture[str], message: str
 ) -> None:
     write_answer(
         tmp_path, "which?", PageAnswer("lively", "bob")
     )  # to an earlier question: too late
-    log = AskedPage(tmp_path, answer(said, by="anna\x1b[2J"))
-    assert progress_of(log).ask_question("which?", ("lively", "calm")) == said
-    assert f"answers on the page: {said or 'none'}" in capsys.readouterr().err
+    log = AskedPage(tmp_path, answer(message, by="anna\x1b[2J"))
+    assert progress_of(log).ask_question("which?", ("lively", "calm")) == message
+    assert f"answers on the page: {message or 'none'}" in capsys.readouterr().err
     reader = LiveReader(tmp_path)
     reader.read_new()
     (line,) = reader.progress.results

@@ -228,9 +228,9 @@ def test_a_stuck_pump_is_reported(
     ForeignHold.plant = ForeignPlant(ForeignPump("straight", 5.3), laser_um=0.5, weather=0.3)
     monkeypatch.setattr(ForeignHold, "stuck_fraction", 0.31)
     assert tuned(tmp_path, monkeypatch, "pump") == Exit.REJECTED
-    said = capsys.readouterr().err
-    assert "moves the same at every command" in said
-    assert "Traceback" not in said
+    message = capsys.readouterr().err
+    assert "moves the same at every command" in message
+    assert "Traceback" not in message
     link = ForeignHold.last
     assert link.rows[-1].state == State.HOLD
     link.bench.wrong.pump_stuck_fraction = math.nan
@@ -256,11 +256,11 @@ def survey_of(
 
 
 def test_a_pump_that_starts_with_several_leaks_is_distinguished_from_one_of_unknown_flow() -> None:
-    said = (
+    message = (
         "rises from 0.1 µm/s at a command of 0.25 to 17.0 µm/s at 0.35, and the mirror loses 1.8 "
         "µm/s: throttle"
     )
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         survey_of([0.25, 0.35], [0.1, 17.0], 1.8).make_map()
     with pytest.raises(
         ValueError, match=r"beyond a command of 0\.25 is not known"
@@ -575,7 +575,7 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
     monkeypatch.setattr(map_pump, "_wait_for_return", lambda rig: True)
     monkeypatch.setattr(operating_point, "require_room", lambda around: None)
     monkeypatch.setattr(experiments, "make_spec", lambda kind, around, seconds: seconds)
-    bent = {gain: told for gain, _, told in seen}
+    bent = {gain: expected for gain, _, expected in seen}
     monkeypatch.setattr(
         plant_fit,
         "identify_plant",
@@ -595,7 +595,7 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
 
 
 @pytest.mark.parametrize(
-    ("fractions", "flows", "said"),
+    ("fractions", "flows", "message"),
     [
         ([0.03, 0.22], [2.4, 4.8], r"to 2\.4 µm/s at 0\.03, .* larger by 0\.026"),
         ([0.23, 0.42], [12.6, 14.8], "did not come back"),
@@ -603,14 +603,14 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
     ],
 )
 def test_a_mirror_that_does_not_return_is_reported(
-    fractions: list[float], flows: list[float], said: str
+    fractions: list[float], flows: list[float], message: str
 ) -> None:
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         survey_of(fractions, flows, 1.0).make_map(held=False)
 
 
 @pytest.mark.parametrize(
-    ("white", "worse", "seconds", "said"),
+    ("white", "worse", "seconds", "message"),
     [
         (0.9995, 1.1, 1200.0, "--limit-um 20"),
         (0.9995, 1.5, 1200.0, "--limit-um 30"),
@@ -620,14 +620,14 @@ def test_a_mirror_that_does_not_return_is_reported(
     ],
 )
 def test_a_larger_limit_is_requested_only_where_it_helps(
-    white: float, worse: float, seconds: float, said: str
+    white: float, worse: float, seconds: float, message: str
 ) -> None:
     """In a random walk, or with errors far too large, it would be refused again."""
     survey = survey_of([0.25, 0.55], [0.1, 17.0], 1.8)
     survey.fit = replace(survey.fit, share_white=white)
     survey._branches[True].sigmas[1:] = [0.01, worse * 0.02 * survey.full_um_per_s]
     survey.runs = [PumpRun(DT_S, *np.zeros((3, round(seconds / DT_S))))]
-    with pytest.raises(ValueError, match=f"not known to 2% .*{said}"):
+    with pytest.raises(ValueError, match=f"not known to 2% .*{message}"):
         survey.make_map()
 
 
@@ -735,9 +735,9 @@ def test_a_whole_session_on_an_unknown_pump(
     pump = ForeignPump("quadratic", 6.0, 1.0, 0.2, start=0.22, stall=0.2)
     ForeignHold.plant = ForeignPlant(pump, seed=4, laser_um=0.5, weather=0.6)
     assert tuned(tmp_path, monkeypatch, "run", "--yes") == Exit.DONE
-    said = capsys.readouterr().err
-    assert "run `tune pump`" in said  # the relay saw the bend, and the session went on by itself
-    assert "verify: kept" in said
+    message = capsys.readouterr().err
+    assert "run `tune pump`" in message  # the relay saw the bend, and the session went on by itself
+    assert "verify: kept" in message
     assert all(abs(row.truth_displacement_um) < 3.0 for row in ForeignHold.last.rows[-6000:])
     config = tmp_path / "foreign.toml"
     assert (

@@ -27,7 +27,7 @@ class Refusal:
     """A bench, what is wrong with it, what is asked of it, what is said, and what is then done."""
 
     words: tuple[str, ...]  # of the command
-    said: str
+    refusal_text: str
     instead: tuple[str, ...] = ()  # the words that the refusal asks for; else the same
     plant: Callable[[], ForeignPlant] = lambda: ForeignPlant(
         ForeignPump(), weather=0.3, laser_um=0.5
@@ -126,15 +126,15 @@ def obeyed(
         code = run(["tune", *words, "--twin", "--config", str(config), "--logs", str(logs)])
         return code, capsys.readouterr().err
 
-    code, said = tuned(refusal.words)
-    assert code == refusal.code, said
-    assert refusal.said in said
-    assert "Traceback" not in said
+    code, refusal_text = tuned(refusal.words)
+    assert code == refusal.code, refusal_text
+    assert refusal.refusal_text in refusal_text
+    assert "Traceback" not in refusal_text
     monkeypatch.setattr(Hold, "obeyed", True)
-    asked = re.search(r"loop\.bleed_fraction larger by ([\d.]+)", said)
+    asked = re.search(r"loop\.bleed_fraction larger by ([\d.]+)", refusal_text)
     loop["bleed_fraction"] = float(asked[1]) if asked else 0.0
-    code, said = tuned(refusal.instead or refusal.words)
-    assert code == Exit.DONE, said
+    code, refusal_text = tuned(refusal.instead or refusal.words)
+    assert code == Exit.DONE, refusal_text
 
 
 @pytest.mark.campaign

@@ -212,9 +212,9 @@ def test_the_first_relay_that_shows_the_need_requests_the_map(
     )
     rig, before_s = HoldRig(link, "tester"), link.rows[-1].mono_s
     try:
-        said = "; ".join(fit_experiments(run_experiments(rig)).quality.reasons)
+        refusal_text = "; ".join(fit_experiments(run_experiments(rig)).quality.reasons)
     except ExperimentError as error:
-        said = str(error)
-    assert words in said
-    assert said.endswith("run `tune pump`")
+        refusal_text = str(error)
+    assert words in refusal_text
+    assert refusal_text.endswith("run `tune pump`")
     assert link.rows[-1].mono_s - before_s < at_most_s

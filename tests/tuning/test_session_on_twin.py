@@ -378,9 +378,9 @@ def test_a_gains_file_edited_to_something_bad_is_not_applied(
     done: SessionFolder, changed: dict[str, float], words: str
 ) -> None:
     edited(done, **changed)
-    with pytest.raises(InputError, match=words) as told:
+    with pytest.raises(InputError, match=words) as refused:
         apply.load_checked_gains(done)
-    assert "gains.toml" in str(told.value)
+    assert "gains.toml" in str(refused.value)
 
 
 def test_gains_that_are_worse_are_taken_back_by_themselves(
@@ -532,20 +532,20 @@ def test_the_candidate_that_a_person_chooses_is_the_one_that_is_applied(
     assert preview.load_preview(done).proposed[0].load_peak_um == pytest.approx(
         chosen.load_peak_um, rel=0.05
     )
-    said = capsys.readouterr().err
-    assert [name for name in ("fast", "present") if f"{name}: not a candidate of" in said] == [
+    printed = capsys.readouterr().err
+    assert [name for name in ("fast", "present") if f"{name}: not a candidate of" in printed] == [
         "fast",
         "present",
     ]
-    assert "ziegler-nichols: is not applied: Ms" in said
-    shown = [line.split()[0] for line in said.splitlines() if line.strip()]
+    assert "ziegler-nichols: is not applied: Ms" in printed
+    shown = [line.split()[0] for line in printed.splitlines() if line.strip()]
     ordered = ["present", *[name for name in NAMES if name in shown]]
     assert ordered[1] == "least-variance"  # it keeps the load peak, and is the proposal
     assert [
         name for name in shown if name in ordered
     ] == 2 * ordered  # the figures, and what gets better and worse
-    assert "in use" in said
-    assert "simc-slow is on trial" in said
+    assert "in use" in printed
+    assert "simc-slow is on trial" in printed
     assert "simc-slow is chosen" in done.file_path("report.html").read_text()
 
 
@@ -567,8 +567,8 @@ def test_no_answer_applies_nothing(
     )
     assert done.file_path("gains.toml").read_bytes() == before
     assert not done.is_done("apply")
-    said = capsys.readouterr().err
-    assert ("nothing is applied; `membrane-ctrl tune apply" in said) == (code == Exit.DONE)
+    printed = capsys.readouterr().err
+    assert ("nothing is applied; `membrane-ctrl tune apply" in printed) == (code == Exit.DONE)
 
 
 @pytest.mark.parametrize("name", ["balanced", "same-load"])
@@ -676,10 +676,10 @@ def test_what_cannot_be_written_ends_in_one_line(
     path.unlink()
     path.mkdir()
     assert command_line(["tune", "identify", "--session", str(done.path)]) == Exit.DEVICE_FAILED
-    (said,) = (
+    (printed,) = (
         line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: ")
     )
-    assert "cannot be written" in said
+    assert "cannot be written" in printed
 
 
 def test_a_picture_replaces_a_pipe_without_a_reader(done: SessionFolder) -> None:

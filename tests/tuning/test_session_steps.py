@@ -331,16 +331,16 @@ class OuterRig:
 
     def __init__(self, trial: list[ShapeEstimate], tracking: float = 1.0) -> None:
         self.shapes: list[ShapeEstimate] = []
-        self.told: list[tuple[float, float] | str] = []
+        self.messages: list[tuple[float, float] | str] = []
         self._trial, self._tracking = trial, tracking
 
     def set_gains(
         self, loop: LoopConfig, why: str, trial_s: float, shape_s: float = math.nan
     ) -> None:
-        self.told.append((trial_s, shape_s))
+        self.messages.append((trial_s, shape_s))
 
     def keep_gains(self) -> None:
-        self.told.append("keep")
+        self.messages.append("keep")
 
     def ticks(self, duration_s: float) -> list[SimpleNamespace]:
         self.shapes += self._trial
@@ -371,8 +371,8 @@ def test_a_time_constant_is_kept_if_it_predicts_the_shapes(
     done = try_time_constant(rig, (40.0, after_s), earlier, zernike_projection(), 600.0)  # type: ignore[arg-type]
     assert words in done.reason
     assert bool(words) == bool(done.reason)
-    assert rig.told[0] == (720.0, after_s)
-    assert rig.told[1:] == (
+    assert rig.messages[0] == (720.0, after_s)
+    assert rig.messages[1:] == (
         ["keep"] if not words else [(1.0, pytest.approx(math.nan, nan_ok=True))]
     )
 

@@ -222,9 +222,11 @@ def test_a_bench_of_which_nothing_is_known_is_held_better_by_what_was_identified
         delay_s + lag_s, abs=max(0.03, 3 * identified.sigma.delay_s)
     )
     assert max(abs(tick.truth_displacement_um) for tick in link.rows[2000:]) < 10.0
-    told = EstimatorConfig.model_validate(
+    configured = EstimatorConfig.model_validate(
         config.estimator.model_dump() | estimator_levels.derive_estimator_levels(folder)
     )
     before_um = held_std_um(config, plant(seed + 50), late_s)
-    after_um = held_std_um(config.model_copy(update={"estimator": told}), plant(seed + 50), late_s)
+    after_um = held_std_um(
+        config.model_copy(update={"estimator": configured}), plant(seed + 50), late_s
+    )
     assert after_um < 1.1 * before_um

@@ -82,10 +82,10 @@ def test_the_gain_in_accuracy_is_printed(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(words(bench, tmp_path / "camera.toml")) == 0
-    said = capsys.readouterr().out
-    assert "known before" in said
-    assert "omitted, without a board or with a bad fit: wall.png" in said
-    assert f"calibrate --prior {tmp_path / 'camera.toml'}" in said
+    output = capsys.readouterr().out
+    assert "known before" in output
+    assert "omitted, without a board or with a bad fit: wall.png" in output
+    assert f"calibrate --prior {tmp_path / 'camera.toml'}" in output
 
 
 def test_mirrored_photographs_are_reported(

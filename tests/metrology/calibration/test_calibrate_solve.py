@@ -157,11 +157,11 @@ def test_waves_that_all_sets_have_and_what_is_no_wave_stay() -> None:
     sigma_mm = float(truth.sets[3].sigma_mm.mean())
     sets = [replace(phases, period_mm=49.82) for phases in truth.sets]
     turns = [2 * np.pi * phases.screen_mm / 49.82 for phases in sets]
-    alike = [
+    moved_together = [
         replace(p, screen_mm=p.screen_mm + 3 * sigma_mm * np.cos(t))
         for p, t in zip(sets, turns, strict=True)
     ]
-    for some in (sets, alike):
+    for some in (sets, moved_together):
         kept = remove_fringe_waves(solution.bench, some, solution.states)
         assert all(a.screen_mm is b.screen_mm for a, b in zip(kept, some, strict=True))
     bowl_mm = (
@@ -207,11 +207,11 @@ def test_one_step_settles_from_the_solution() -> None:
 
 def test_progress_is_reported() -> None:
     truth, _ = solved(3)
-    told: list[tuple[int, float]] = []
+    reports: list[tuple[int, float]] = []
     solution = solve_calibration(
-        truth.problem(SIGMAS), lambda count, change: told.append((count, change))
+        truth.problem(SIGMAS), lambda count, change: reports.append((count, change))
     )
-    assert [count for count, _ in told] == list(range(1, len(solution.changes) + 1))
+    assert [count for count, _ in reports] == list(range(1, len(solution.changes) + 1))
 
 
 def test_no_sets_is_an_error() -> None:

@@ -236,9 +236,9 @@ def test_the_monitor_distinguishes_the_cameras_noise_from_the_film() -> None:
 
 def test_a_warning_ends_well_below_where_it_began() -> None:
     monitor = DriftMonitor(1.0, 0.0)
-    said = []
+    messages = []
     for residual_urad in (1.3, 1.2, 1.05):
         for _ in range(CYCLES):
             monitor.add(residual_urad, 0.0)
-        said.append(bool(monitor.description))
-    assert said == [True, True, False]
+        messages.append(bool(monitor.description))
+    assert messages == [True, True, False]

@@ -126,12 +126,12 @@ def test_motion_is_removed_from_the_phase() -> None:
     optics, rng = bench(), np.random.default_rng(2)
     stack = good_set(optics, motion_um=lambda t: 5 * math.sin(2 * math.pi * 0.3 * t))
     mean_um, noise_um = stack.mean_reading_um, rng.standard_normal(len(stack.patterns))
-    told = measured(replace(stack, displacement_um=stack.displacement_um + noise_um), optics)
+    with_noise = measured(replace(stack, displacement_um=stack.displacement_um + noise_um), optics)
     silent = FrameStack(stack.frames, stack.patterns, np.full(len(stack.patterns), np.nan), {})
     untold = measured(silent, optics)
-    assert told.moved
+    assert with_noise.moved
     assert untold.moved
-    with_laser = float(np.std(surface_error_um(told.surface, FILM, mean_um)))
+    with_laser = float(np.std(surface_error_um(with_noise.surface, FILM, mean_um)))
     without = float(np.std(surface_error_um(untold.surface, FILM, mean_um)))
     assert with_laser <= 0.15
     assert without > 4 * with_laser

@@ -234,14 +234,14 @@ def measured(world: CrossedWorld, folder: Path) -> tuple[Array, str]:
 
 
 @pytest.mark.parametrize(
-    ("pulses_hz", "rolling_s", "most_um", "said"),
+    ("pulses_hz", "rolling_s", "most_um", "message"),
     [
         (1923.0, 16 / 1923.0, 0.05, ""),
         (130.0, 0.13, 0.25, "% of the light along the rows: expose for whole backlight pulses"),
     ],
 )
 def test_bands_bend_no_figure_of_a_full_set(
-    tmp_path: Path, pulses_hz: float, rolling_s: float, most_um: float, said: str
+    tmp_path: Path, pulses_hz: float, rolling_s: float, most_um: float, message: str
 ) -> None:
     """Those of 1 % moved it by 0.1 µm, those of 16 % by micrometres or to a refusal."""
     steady = CrossedWorld(seed=1, **SIZE | CLEAN)  # type: ignore[arg-type]
@@ -251,6 +251,6 @@ def test_bands_bend_no_figure_of_a_full_set(
         measured(pulsed, tmp_path / "b"),
     )
     assert np.linalg.norm((after_um - before_um)[3:]) < most_um
-    assert ("bands" in after) == bool(said)
-    assert said in after
+    assert ("bands" in after) == bool(message)
+    assert message in after
     assert "bands" not in before

@@ -195,12 +195,12 @@ def test_no_alarm_for_any_depth_and_noise(bits: int, noise_adu: float) -> None:
     assert check_set(good_set(optics), optics).flags == ()
 
 
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("is_reported", [True, False])
 @pytest.mark.parametrize("steps", [3, 4, 8])
-def test_no_alarm_for_a_film_that_moves(steps: int, told: bool) -> None:
+def test_no_alarm_for_a_film_that_moves(steps: int, is_reported: bool) -> None:
     optics = bench(steps)
     stack = good_set(optics, motion_um=lambda t: 5 * math.sin(2 * math.pi * 0.3 * t))
-    if not told:
+    if not is_reported:
         stack = type(stack)(
             stack.frames, stack.patterns, np.full(len(stack.patterns), math.nan), {}
         )

@@ -45,12 +45,12 @@ def test_any_periods_give_the_place(periods: list[float]) -> None:
 def test_noise_gives_no_wrong_order_and_the_misfit_that_it_should() -> None:
     periods = [17.0, 19.0, 23.0]
     found = multi_period.places_mm(wrapped(periods, 0.03), periods, (-210, 190), sigma_rad=0.03)
-    sure = np.isfinite(found.place_mm)
-    assert sure.mean() > 0.9
-    assert np.abs(found.place_mm - PLACE)[sure].max() < 1.0
+    is_resolved = np.isfinite(found.place_mm)
+    assert is_resolved.mean() > 0.9
+    assert np.abs(found.place_mm - PLACE)[is_resolved].max() < 1.0
     assert found.misfit.mean() == pytest.approx(2, rel=0.1)
     expected = 0.03 / (2 * np.pi) / np.sqrt(np.sum(1 / np.square(periods)))
-    assert np.std((found.place_mm - PLACE)[sure]) == pytest.approx(expected, rel=0.1)
+    assert np.std((found.place_mm - PLACE)[is_resolved]) == pytest.approx(expected, rel=0.1)
 
 
 def test_places_that_two_orders_explain_are_not_given() -> None:

@@ -245,7 +245,7 @@ def test_a_hold_finds_the_films_vibrations_and_no_others() -> None:
     tracker = LiveTracker(optics, LiveReconstructor(optics, 1), 32, step_s=10.0)
     modes = drum_modes(20.0)
     renderer = OpticsRenderer(optics, FILM, seed=3, modes=modes)
-    film_um, listener, told = held_um(126.0), VibrationFollower(), []
+    film_um, listener, events = held_um(126.0), VibrationFollower(), []
     still = [
         renderer.render_picture(p, float(film_um[0]))
         for p in pattern_sequence.full_sequence(optics.pattern)
@@ -256,12 +256,12 @@ def test_a_hold_finds_the_films_vibrations_and_no_others() -> None:
         picture = renderer.render_picture(
             tracker.pattern, float(film_um[round(50 * time_s)]), time_s=time_s
         )
-        told += listener.add_estimate(
+        events += listener.add_estimate(
             tracker.measure_fringes([picture], np.array([time_s]), np.array([math.nan]))
         )
         time_s += tracker.interval_factor / 20
-    assert len(told) == 2
-    for heard in told:
+    assert len(events) == 2
+    for heard in events:
         assert isinstance(heard, Vibrations)
         assert sorted(filter(None, heard.frequency_hz)) == pytest.approx([27, 48, 57, 61], abs=0.02)
         assert [nm for nm in heard.amplitude_nm if nm] == pytest.approx([20.0] * 4, rel=0.15)

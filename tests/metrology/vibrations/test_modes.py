@@ -98,10 +98,12 @@ def test_the_slow_motion_of_a_held_film_gives_no_false_lines(seed: int) -> None:
     coeffs_um[:, [0, 3]] += 1e-3 * bowl_nm[:, None] * [math.sqrt(3), 1.0]  # the vertex stays at 0
     found = find_modes(time_s, np.round(coeffs_um, 3))
     assert found is not None
-    sure = [line for line in found if not line.aliases_hz]
-    assert sorted(line.frequency_hz for line in sure) == pytest.approx([27, 48, 57, 61], abs=0.02)
+    unaliased = [line for line in found if not line.aliases_hz]
+    assert sorted(line.frequency_hz for line in unaliased) == pytest.approx(
+        [27, 48, 57, 61], abs=0.02
+    )
     for mode in planted:
-        (seen,) = mode.seen_by(tuple(sure))
+        (seen,) = mode.seen_by(tuple(unaliased))
         assert seen.amplitude_nm == pytest.approx(20.0, rel=0.1)
 
 
@@ -122,10 +124,11 @@ def test_a_line_that_one_rate_alone_shows_may_be_any_of_its_aliases(seed: int) -
 def test_a_line_that_one_rate_cannot_see_makes_no_other(seed: int) -> None:
     """At one of the rates it may have the alias of drift; what it leaves there is not nothing."""
     time_s, coeffs_um, planted = watched(seed, rates_hz=(15, 15 / 1.09, 15 / 1.17), noise_nm=6.0)
-    sure = [line for line in find_modes(time_s, coeffs_um) if not line.aliases_hz]
-    assert len(sure) >= 3
+    unaliased = [line for line in find_modes(time_s, coeffs_um) if not line.aliases_hz]
+    assert len(unaliased) >= 3
     assert all(
-        any(abs(line.frequency_hz - mode.frequency_hz) < 0.1 for mode in planted) for line in sure
+        any(abs(line.frequency_hz - mode.frequency_hz) < 0.1 for mode in planted)
+        for line in unaliased
     )
 
 
@@ -227,26 +230,31 @@ def heard(
     """What a hold tells in minutes, from a day on, in which modes, by the number of their shape,
     have these lines.
     """
-    told: list[list[Event]] = []
+    event_lists: list[list[Event]] = []
     for minute, found in enumerate(lines):
         modes = tuple(VibrationMode(hz, 0.01, 5.0, SHAPES[k], 100.0) for k, hz in found.items())
         monkeypatch.setattr(mode_follower, "find_modes", lambda *_, modes=modes: modes)
-        told.append(
+        event_lists.append(
             listener.search_minute(
                 day * DAY_S + 60.0 * minute + np.arange(0.0, 60.0, 0.05),
                 np.zeros((1200, ZERNIKE_TERMS)),
             )
         )
-    return told
+    return event_lists
 
 
-def notices(told: list[list[Event]]) -> list[Event]:
-    return [event for minute in told for event in minute if not isinstance(event, Vibrations)]
-
-
-def places(told: list[list[Event]]) -> list[list[float | None]]:
+def notices(event_lists: list[list[Event]]) -> list[Event]:
     return [
-        event.frequency_hz for minute in told for event in minute if isinstance(event, Vibrations)
+        event for minute in event_lists for event in minute if not isinstance(event, Vibrations)
+    ]
+
+
+def places(event_lists: list[list[Event]]) -> list[list[float | None]]:
+    return [
+        event.frequency_hz
+        for minute in event_lists
+        for event in minute
+        if isinstance(event, Vibrations)
     ]
 
 
@@ -257,11 +265,11 @@ def scaled(by: float) -> dict[int, float]:
 def test_a_mode_keeps_its_place_and_a_minute_without_it_has_none_there(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    told = heard(
+    event_lists = heard(
         monkeypatch, VibrationFollower(), [{}, {3: 48.0}, {}, {7: 27.0, 3: 48.1}, {3: 47.0}]
     )
-    assert places(told) == [[48.0], [None], [48.1, 27.0], [47.0, None]]
-    assert told[2][0].to_dict()["message"] == "none"
+    assert places(event_lists) == [[48.0], [None], [48.1, 27.0], [47.0, None]]
+    assert event_lists[2][0].to_dict()["message"] == "none"
 
 
 def test_a_line_that_passes_by_leaves_its_place_and_a_mode_does_not(
@@ -269,8 +277,8 @@ def test_a_line_that_passes_by_leaves_its_place_and_a_mode_does_not(
 ) -> None:
     """A hold of a week would be full of them."""
     passing: Searches = [{3: 48.0, k: 30.0 + 5 * k} for k in range(8, 20)]
-    told = heard(monkeypatch, VibrationFollower(), [{3: 48.0}] * 5 + [{}] * 9 + passing)
-    lines = places(told)
+    event_lists = heard(monkeypatch, VibrationFollower(), [{3: 48.0}] * 5 + [{}] * 9 + passing)
+    lines = places(event_lists)
     assert max(len(each) for each in lines) == 6
     assert all(each[0] == 48.0 for each in lines[-12:])
     assert [sum(hz is not None for hz in each) for each in lines[-12:]] == [2] * 12
@@ -279,8 +287,10 @@ def test_a_line_that_passes_by_leaves_its_place_and_a_mode_does_not(
 def test_of_two_modes_of_nearly_one_frequency_each_keeps_its_place(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    told = heard(monkeypatch, VibrationFollower(), [{3: 48.0, 4: 48.15}, {4: 48.15, 3: 48.0}])
-    assert places(told) == [[48.0, 48.15], [48.0, 48.15]]
+    event_lists = heard(
+        monkeypatch, VibrationFollower(), [{3: 48.0, 4: 48.15}, {4: 48.15, 3: 48.0}]
+    )
+    assert places(event_lists) == [[48.0, 48.15], [48.0, 48.15]]
 
 
 def test_a_mode_that_moves_by_a_per_cent_gives_one_notice_and_its_return_ends_it(
@@ -300,19 +310,19 @@ def test_a_mode_that_moves_by_a_per_cent_gives_one_notice_and_its_return_ends_it
 
 
 @pytest.mark.parametrize(
-    ("change", "told"), [(0.01, 1), (-0.01, 1), (0.003, 0), (-0.003, 0), (0.0, 0)]
+    ("change", "event_lists"), [(0.01, 1), (-0.01, 1), (0.003, 0), (-0.003, 0), (0.0, 0)]
 )
 def test_a_slow_shift_within_a_week_gives_a_notice(
-    monkeypatch: pytest.MonkeyPatch, change: float, told: int
+    monkeypatch: pytest.MonkeyPatch, change: float, event_lists: int
 ) -> None:
     """Five minutes a day; the last on day 7."""
-    listener, said = VibrationFollower(), []
+    listener, kinds = VibrationFollower(), []
     for day in range(8):
-        said += notices(heard(monkeypatch, listener, 5 * [scaled(1 + change * day / 7)], day))
-    assert [type(event) for event in said] == [Maintenance] * told
+        kinds += notices(heard(monkeypatch, listener, 5 * [scaled(1 + change * day / 7)], day))
+    assert [type(event) for event in kinds] == [Maintenance] * event_lists
     assert all(
         f"moved by {change:+.1%} within 168 h: the film's tension by {2 * change:+.1%}" in str(e)
-        for e in said
+        for e in kinds
     )
 
 
@@ -320,7 +330,7 @@ def test_what_stays_where_it_moved_to_is_the_usual_after_a_week(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     listener = VibrationFollower()
-    said = [
+    kinds = [
         [
             event.kind
             for event in notices(
@@ -329,7 +339,7 @@ def test_what_stays_where_it_moved_to_is_the_usual_after_a_week(
         ]
         for day in range(12)
     ]
-    assert said == [[], [], ["maintenance"], *[[]] * 7, ["maintenance_over"], []]
+    assert kinds == [[], [], ["maintenance"], *[[]] * 7, ["maintenance_over"], []]
 
 
 def test_a_shift_slower_than_that_gives_no_notice(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -367,12 +377,12 @@ def test_pump_strokes_at_a_mode_give_one_notice_which_ends_with_them(
 ) -> None:
     away = {3: 48.0}
 
-    def told(stroke_hz: float) -> list[Event]:
+    def list_driven_notices(stroke_hz: float) -> list[Event]:
         minutes = [*5 * [USUAL], *4 * [away], USUAL, *6 * [away], *5 * [USUAL]]
         return notices(heard(monkeypatch, VibrationFollower(stroke_hz), minutes))
 
-    assert told(0.0) == told(59.9) == told(52.0) == []
-    driven, over, again = told(61.5)
+    assert list_driven_notices(0.0) == list_driven_notices(59.9) == list_driven_notices(52.0) == []
+    driven, over, again = list_driven_notices(61.5)
     assert isinstance(driven, Maintenance)
     assert driven.name == over.name == "pump_resonance"
     assert "strokes, 61.5 Hz, drive the mirror's vibration at 61.00 Hz, 5 nm" in driven.message
@@ -390,9 +400,9 @@ def test_a_line_found_once_at_the_strokes_gives_no_notice(monkeypatch: pytest.Mo
 @pytest.mark.campaign
 def test_a_follower_finds_planted_vibrations() -> None:
     time_s, coeffs_um, planted = watched(1, lines_hz=(48.0,))
-    (told,) = VibrationFollower().search_minute(time_s, coeffs_um)
-    assert isinstance(told, Vibrations)
-    assert told.frequency_hz == pytest.approx([planted[0].frequency_hz], abs=0.05)
+    (event_lists,) = VibrationFollower().search_minute(time_s, coeffs_um)
+    assert isinstance(event_lists, Vibrations)
+    assert event_lists.frequency_hz == pytest.approx([planted[0].frequency_hz], abs=0.05)
 
 
 def test_the_vibrations_event_survives_encoding_and_has_a_sentence() -> None:
