@@ -73,7 +73,24 @@ class Poses:
 
 
 def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
-    """The bench whose parameters, in the order of `NAMES`, are `values`."""
+    """The bench with other parameters.
+
+    Parameters
+    ----------
+    stated : Geometry
+        The stated bench.
+    values : (len(NAMES),) array
+        Parameters in the order of `bench_parameters.NAMES`, in their units; 0 for the stated bench.
+
+    Returns
+    -------
+    BenchGeometry
+
+    Raises
+    ------
+    ValueError
+        Camera and screen are in line with the vertex.
+    """
     poses = poses_at(stated, values)
     focal, column, row, k1, k2, p1, p2, bow_mm, pitch = values[len(POSE) : OPTICAL]
 

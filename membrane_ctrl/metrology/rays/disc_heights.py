@@ -9,8 +9,19 @@ _GRID = 41  # points along the diameter
 
 
 def heights_over_disc(radius: float) -> tuple[FloatArray, FloatArray]:
-    """Heights (n, parameters) of a surface over a disc of some radii, and the plane's columns (n,
-    3).
+    """Heights of the surface's parameters at points of a disc.
+
+    Parameters
+    ----------
+    radius : float
+        Radius of the disc, in radii of the terms.
+
+    Returns
+    -------
+    heights : (n, parameters) array
+        Height of each parameter at n points of a square grid inside the disc.
+    plane : (n, 3) array
+        1, x and y there.
     """
     axis = np.linspace(-radius, radius, _GRID)
     x, y = (a.ravel() for a in np.meshgrid(axis, axis))

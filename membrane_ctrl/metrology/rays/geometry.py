@@ -69,8 +69,17 @@ class Geometry:
         )
 
     def rays(self, columns_px: ArrayLike, rows_px: ArrayLike) -> FloatArray:
-        """Unit vectors in world, (3, ...), from the pinhole through image points (pixel centres are
-        integers).
+        """Rays from the pinhole through image points.
+
+        Parameters
+        ----------
+        columns_px, rows_px : (...) arrays
+            Image points; pixel centres are integers.
+
+        Returns
+        -------
+        (3, ...) array
+            Unit vectors in world; NaN where no ray belongs to a point of a distorted picture.
         """
         columns, rows = np.broadcast_arrays(
             np.asarray(columns_px, float), np.asarray(rows_px, float)
@@ -100,7 +109,19 @@ class Geometry:
 
 
 def project_points(geometry: Geometry, world_mm: FloatArray) -> FloatArray:
-    """Column and row (2, n) of world points (3, n), through the lens."""
+    """Project world points into the picture, through the lens.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    world_mm : (3, n) array
+        Points in front of the camera.
+
+    Returns
+    -------
+    (2, n) array
+        Column and row in pixels.
+    """
     camera = geometry.rotation @ (world_mm - geometry.pinhole_mm[:, None])
     through = camera[:2] / camera[2]
     if any(geometry.distortion):

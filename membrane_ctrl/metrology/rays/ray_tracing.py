@@ -99,7 +99,16 @@ class Tracer:
             points.t_mm[:] = (self.vertex_z_mm + h - f[2]) / d[2]
 
     def intersect(self, points: Points, surface: Surface, newton: int = 1) -> None:
-        """Put the points on a surface, from where they are, by Newton steps."""
+        """Put the points on a surface, from where they are, by Newton steps.
+
+        Parameters
+        ----------
+        points : Points
+            Their lengths `t_mm` are updated in place.
+        surface : Surface
+        newton : int
+            Number of steps; each squares the error, so that one from a micrometre off is enough.
+        """
         shape = surface.polynomial, surface.excess, 1.0, self.radius_mm
 
         def run(start: int, stop: int) -> None:
@@ -109,8 +118,21 @@ class Tracer:
         threads.split_over_threads(run, points.t_mm.size, threads.FEW)
 
     def residual_sums(self, points: Points, surface: Surface, newton: int = 0) -> FloatArray:
-        """Moments of the slope residual (see `kernels.residual_sums`), after Newton steps towards
-        the surface.
+        """Sum up the slope residual of the points.
+
+        Parameters
+        ----------
+        points : Points
+        surface : Surface
+            The fitted surface, from which the measured slopes are subtracted.
+        newton : int
+            Newton steps towards the surface before that.
+
+        Returns
+        -------
+        (SUMS,) array
+            Moments of `kernels.residual_sums`, from which the right-hand side of the least squares
+            is made.
         """
         shape = self._shape(surface)
 
@@ -170,8 +192,18 @@ class Tracer:
         return out
 
     def predict_screen(self, points: Points, surface: Surface) -> FloatArray:
-        """Screen points (2, n) in mm that the surface would send the rays to; the points must be on
-        it.
+        """Predict the screen points that a surface sends the rays to.
+
+        Parameters
+        ----------
+        points : Points
+            n points, which must be on the surface.
+        surface : Surface
+
+        Returns
+        -------
+        (2, n) array
+            s_x and s_y in mm.
         """
         shape = self._shape(surface)
         out = np.empty((2, points.t_mm.size))
@@ -210,5 +242,5 @@ class Tracer:
 
 
 def make_parabola(sag_mm: float, radius_mm: float) -> HeightFunction:
-    """The paper's starting shape."""
+    """The paper's starting shape, h = sag (x^2 + y^2) / R^2 (paper, eq. 20)."""
     return lambda x, y: sag_mm * (x * x + y * y) / radius_mm**2
