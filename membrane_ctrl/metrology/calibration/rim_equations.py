@@ -42,27 +42,43 @@ class Rim:
         return None
 
     def make_sums(self, stated: Geometry, common: FloatArray) -> FloatArray:
-        """Normal equations (COMMON + 1, squared) of the five
-        observations at the common unknowns.
+        """Make the normal equations of the five observations.
+
+        Parameters
+        ----------
+        stated : Geometry
+            The stated bench.
+        common : (COMMON,) array
+            The common unknowns, about which the observations are linearised.
+
+        Returns
+        -------
+        (COMMON + 1, COMMON + 1) array
+            Normal matrix, with the right-hand side as last column and row.
         """
         now = self._seen_mm(stated, common)
         columns = [np.zeros(now.size)] * common.size
-        optical = [
-            k
-            for k, name in enumerate(bench_parameters.NAMES[: bench_poses.OPTICAL])
-            if name not in _OF_SCREEN
-        ]
-        for k in (*optical, *range(RING_PLACE.start, RING_PLACE.stop)):
-            step = _STEP * (
-                bench_parameters.ALL[k].sigma if k < len(bench_parameters.NAMES) else 1.0
-            )
+
+        # Derivatives by the camera's pose and lens and by the ring, by differences; the screen does
+        # not matter to the rim.
+        names = bench_parameters.NAMES[: bench_poses.OPTICAL]
+        of_camera = [k for k, name in enumerate(names) if name not in _OF_SCREEN]
+        for k in (*of_camera, *range(RING_PLACE.start, RING_PLACE.stop)):
+            unit = 1.0
+            if k < len(bench_parameters.NAMES):
+                unit = bench_parameters.ALL[k].sigma
+            step = _STEP * unit
             there = common.copy()
             there[k] += step
             columns[k] = (self._seen_mm(stated, there) - now) / step
-        rows = np.column_stack([*columns, -now]) / self._sigmas_mm(stated)[:, None]
+
+        # The observations are 0 within their sigmas.
+        sigmas_mm = self._sigmas_mm(stated)
+        rows = np.column_stack([*columns, -now]) / sigmas_mm[:, None]
         return np.asarray(rows.T @ rows)
 
     def _sigmas_mm(self, stated: Geometry) -> FloatArray:
+        """Standard uncertainties (5,) of the observations: their own, and that of finding edges."""
         edge_mm = EDGE_SIGMA_PX * float(np.linalg.norm(stated.pinhole_mm)) / stated.focal_px
         own = np.array([self.radius_sigma_mm, _CENTRE_MM, _CENTRE_MM, _OVAL_MM, _OVAL_MM])
         return np.asarray(np.hypot(own, edge_mm))

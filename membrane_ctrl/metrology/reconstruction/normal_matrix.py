@@ -72,8 +72,23 @@ class NormalMatrix:
 
     @classmethod
     def from_products(cls, products: FloatArray, radius_mm: float) -> "NormalMatrix":
-        """From the moments of `kernels.product_sums`. Raises ValueError if the points do not
-        determine a surface.
+        """Assemble and invert the matrix.
+
+        Parameters
+        ----------
+        products : (PRODUCTS,) array
+            Moments of `kernels.product_sums`.
+        radius_mm : float
+            Radius of the terms' disc.
+
+        Returns
+        -------
+        NormalMatrix
+
+        Raises
+        ------
+        ValueError
+            The points do not determine a surface.
         """
         x, y = _assemble_matrix(products, radius_mm)
         inverse = x + y
@@ -84,7 +99,7 @@ class NormalMatrix:
         return cls(x, y, inverse)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """(D^T W D)^-1 times `right`."""
+        """(D^T W D)^-1 times `right` (parameters,): the least squares of the paper's eq. 19."""
         return np.asarray(self.inverse @ right)
 
 
@@ -115,12 +130,25 @@ def _assemble_matrix(products: FloatArray, radius_mm: float) -> tuple[FloatArray
 
 
 def right_side(sums: FloatArray, radius_mm: float) -> FloatArray:
-    """D^T W r of the x and of the y slopes, (2, parameters), from the moments of
-    `kernels.residual_sums`.
+    """Right-hand side of the least squares, without the matrix D of all points.
+
+    Parameters
+    ----------
+    sums : (SUMS,) array
+        Moments of `kernels.residual_sums`.
+    radius_mm : float
+        Radius of the terms' disc.
+
+    Returns
+    -------
+    (2, parameters) array
+        D^T W r of the x and of the y slopes.
     """
     out = np.empty((2, PARAMETERS))
     for axis, table in enumerate(slope_tables()):
-        out[axis, :-1] = table @ sums[axis * _M : (axis + 1) * _M]
+        # Terms: their slopes are sums of monomials. Excess: 2 e'(v) x / R, 2 e'(v) y / R.
+        moments = sums[axis * _M : (axis + 1) * _M]
+        out[axis, :-1] = table @ moments
         out[axis, -1] = 2 * sums[2 * _M + axis]
     return out / radius_mm
 
