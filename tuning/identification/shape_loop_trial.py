@@ -85,9 +85,10 @@ def _prediction_error(times_s: Series, gaps_um: Series, memory_s: float, last: i
     tracker = DriftTracker()
     tracker.begin(float(times_s[0]))
     errors_um: list[float] = []
-    for time_s, gap_um in zip(
-        times_s[1:].tolist(), (gaps_um[1:] - gaps_um[0]).tolist(), strict=True
-    ):
+    from_first_um = gaps_um[1:] - gaps_um[0]
+    for time_s, gap_um in zip(times_s[1:].tolist(), from_first_um.tolist(), strict=True):
         errors_um.append(gap_um - tracker.drift_at(time_s, memory_s))
         tracker.add_reading(gap_um, time_s, memory_s)
-    return float(np.sqrt(np.mean(np.square(errors_um[-last:])))) if last else math.nan
+    if not last:
+        return math.nan
+    return float(np.sqrt(np.mean(np.square(errors_um[-last:]))))

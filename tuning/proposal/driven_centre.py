@@ -11,8 +11,23 @@ _SUBSTEPS = 4  # per tick: resolves a dead time to 2.5 ms at 50 Hz
 
 
 class DrivenCentre:
-    """Way of the centre for the commands of a pump, through the identified delay and lag, with unit
-    leak left out.
+    """Way of the centre for the commands of a pump, without the leak.
+
+    Parameters
+    ----------
+    model : PlantModel
+        Gain, dead time and lag.
+    pump : PumpConfig
+        The pump's curve, and where it starts and stalls.
+    flow_um_per_s : float
+        Flow that is on its way at the start.
+    dt_s : float
+        A tick.
+
+    Attributes
+    ----------
+    way_um : float
+        The way since the start.
     """
 
     def __init__(
@@ -29,11 +44,16 @@ class DrivenCentre:
 
     def step(self, pump_fraction: float) -> float:
         """Run one tick; return the way since the start, without the leak's."""
-        pump = self._pump
-        self._running = pump_fraction >= (
-            pump.stall_fraction if self._running else pump.start_fraction
-        )
-        flow = self._curve.flow(pump_fraction) if self._running else 0.0
+        # A pump that runs does so down to its stall; one that stands needs more to start.
+        least_fraction = self._pump.start_fraction
+        if self._running:
+            least_fraction = self._pump.stall_fraction
+        self._running = pump_fraction >= least_fraction
+        flow = 0.0
+        if self._running:
+            flow = self._curve.flow(pump_fraction)
+
+        # Through the tube (dead time) and the film's lag, in parts of a tick.
         follow = -math.expm1(-self._step_s / self._model.lag_s)
         for _ in range(_SUBSTEPS):
             self._tube.append(flow)

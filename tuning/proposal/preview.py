@@ -11,16 +11,27 @@ from tuning.proposal.model_bench import ModelBench
 from tuning.rigs.bench_rig import Rig
 
 _SETTLE_S = 30.0
+_ANSWER_S = 120.0  # of the hold after a step of the leak
+_QUIET_SHARE = 1e-3  # of the laser's noise, without weather
 
 
 @dataclass(frozen=True, slots=True)
 class Preview:
-    """Result on the fitted twin."""
+    """Result on the fitted twin.
 
-    std_um: float  # of the true centre
-    bias_um: float  # target minus true centre
-    # After a step of the leak, weather off: furthest excursion, and time until the centre stays
-    # within `RECOVERED_UM`
+    Attributes
+    ----------
+    std_um : float
+        Standard deviation of the true centre.
+    bias_um : float
+        Target minus true centre.
+    load_peak_um, recovery_s : float
+        After a step of the leak, without weather: furthest excursion, and time until the centre
+        stays within `RECOVERED_UM`.
+    """
+
+    std_um: float
+    bias_um: float
     load_peak_um: float
     recovery_s: float
 
@@ -37,22 +48,26 @@ def preview_loop(
     """Hold on the fitted twin in its weather, and once more without
     weather for a step of the leak.
     """
-    loop = loop.model_copy(update={"rate_hz": 1.0 / disturbance.rest.dt_s})  # of fresh readings
-    true_um = _simulate_hold(
-        loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s
-    )
-    noise = replace(
-        disturbance.rest, white=disturbance.rest.white * 1e-3, fast=0.0, slow=0.0, coloured=()
-    )
+    # In its weather, at the rate of fresh readings.
+    loop = loop.model_copy(update={"rate_hz": 1.0 / disturbance.rest.dt_s})
+    windy = ModelBench(model, disturbance, pump, seed)
+    true_um = _simulate_hold(loop, pump, model, windy, duration_s)
+
+    # Without weather and with hardly any noise, for a step of the leak.
+    white = disturbance.rest.white * _QUIET_SHARE
+    noise = replace(disturbance.rest, white=white, fast=0.0, slow=0.0, coloured=())
     calm = DisturbanceModel(noise, None, None)
     stepped = ModelBench(model, calm, pump, seed, (_SETTLE_S, load_step_um_per_s))
-    answer_um = _simulate_hold(loop, pump, model, stepped, 120.0)
+    answer_um = _simulate_hold(loop, pump, model, stepped, _ANSWER_S)
     away = np.flatnonzero(np.abs(answer_um) > load_step.RECOVERED_UM)
+    recovery_s = 0.0
+    if away.size:
+        recovery_s = float((away[-1] + 1) / loop.rate_hz)
     return Preview(
         std_um=float(true_um.std()),
         bias_um=-float(true_um.mean()),
         load_peak_um=float(np.abs(answer_um).max()),
-        recovery_s=float((away[-1] + 1) / loop.rate_hz) if away.size else 0.0,
+        recovery_s=recovery_s,
     )
 
 

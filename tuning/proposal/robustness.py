@@ -9,6 +9,11 @@ from tuning.identification import closed_loop, margins, plant_fit, plant_model
 from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal import prediction
 
+_QUANTILE = 0.95
+# Least values of a drawn plant: share of the fitted gain, and lag.
+_LEAST_GAIN_SHARE = 0.05
+_LEAST_LAG_S = 1e-3
+
 
 @dataclass(frozen=True, slots=True)
 class Robustness:
@@ -24,11 +29,24 @@ class Robustness:
 def sample_plants(
     identified: plant_fit.Identified, count: int, seed: int = 1
 ) -> list[plant_model.PlantModel]:
-    """Plants drawn from the fit's covariance; times and gain stay positive."""
+    """Draw plants from the fit's covariance.
+
+    Parameters
+    ----------
+    identified : Identified
+        The fit.
+    count, seed : int
+        Number of plants, and seed of the draws.
+
+    Returns
+    -------
+    list of PlantModel
+        Times and gain stay positive.
+    """
     model = identified.model
     centre = np.array([model.gain, model.dead_time_s, model.lag_s, model.leak_um_per_s])
     draws = np.random.default_rng(seed).multivariate_normal(centre, identified.covariance, count)
-    floor = np.array([0.05 * model.gain, 0.0, 1e-3, 0.0])
+    floor = np.array([_LEAST_GAIN_SHARE * model.gain, 0.0, _LEAST_LAG_S, 0.0])
     return [plant_model.PlantModel(*row) for row in np.maximum(draws, floor).tolist()]
 
 
@@ -44,14 +62,14 @@ def evaluate_robustness(
     dt_s = disturbance.rest.dt_s
     peaks = np.array([margins.find_sensitivity_peak(gains, plant, dt_s) for plant in plants])
     stable = np.isfinite(peaks)
-    stds = np.array(
-        [
-            prediction.predict_loop(gains, p, disturbance, loop).std_um if ok else np.inf
-            for p, ok in zip(plants, stable, strict=True)
-        ]
-    )
-    # the next value above: interpolating between a number and infinity is impossible
-    peak_p95, std_p95 = (
-        float(np.quantile(values, 0.95, method="higher")) for values in (peaks, stds)
-    )
-    return Robustness(peak_p95, std_p95, float(stable.mean()))
+    stds_um = []
+    for plant, is_stable in zip(plants, stable, strict=True):
+        std_um = np.inf
+        if is_stable:
+            std_um = prediction.predict_loop(gains, plant, disturbance, loop).std_um
+        stds_um.append(std_um)
+
+    # The next value above: interpolating between a number and infinity is impossible.
+    peak_p95 = float(np.quantile(peaks, _QUANTILE, method="higher"))
+    std_p95_um = float(np.quantile(np.array(stds_um), _QUANTILE, method="higher"))
+    return Robustness(peak_p95, std_p95_um, float(stable.mean()))

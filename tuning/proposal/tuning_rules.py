@@ -16,9 +16,20 @@ def compute_effective_delay_s(model: plant_model.PlantModel, dt_s: float, filter
 def make_simc_gains(
     model: plant_model.PlantModel, dt_s: float, filter_s: float, closed_loop_s: float | None = None
 ) -> closed_loop.Gains:
-    """SIMC PI: K = 1 / (k (tc + d)), Ti = 4 (tc + d), tc = d unless given (Skogestad 2003)."""
+    """SIMC PI: K = 1 / (k (tc + d)), Ti = 4 (tc + d), tc = d unless given (Skogestad 2003).
+
+    Parameters
+    ----------
+    model : PlantModel
+    dt_s, filter_s : float
+        Sample time, and the filter of the reading.
+    closed_loop_s : float, optional
+        Time constant tc of the closed loop.
+    """
     delay_s = compute_effective_delay_s(model, dt_s, filter_s)
-    slowed_s = (delay_s if closed_loop_s is None else closed_loop_s) + delay_s
+    if closed_loop_s is None:
+        closed_loop_s = delay_s
+    slowed_s = closed_loop_s + delay_s
     return closed_loop.Gains(1 / (model.gain * slowed_s), 4 * slowed_s, 0.0, filter_s)
 
 
@@ -39,7 +50,8 @@ def make_lambda_gains(
     delay_s = compute_effective_delay_s(model, dt_s, filter_s)
     lambda_s = factor * delay_s
     ti_s = 2 * lambda_s + delay_s
-    return closed_loop.Gains(ti_s / (model.gain * (lambda_s + delay_s) ** 2), ti_s, 0.0, filter_s)
+    kp_per_s = ti_s / (model.gain * (lambda_s + delay_s) ** 2)
+    return closed_loop.Gains(kp_per_s, ti_s, 0.0, filter_s)
 
 
 def make_ziegler_nichols_gains(
