@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -228,6 +229,8 @@ async def test_every_button_needs_its_role(
         for button in shown:
             needed = BUTTONS[label_of(button)]
             assert role_includes(role, needed) or button.is_ignoring_events, label_of(button)
+        slider = next(each for each in viewer.find(ui.slider) if isinstance(each, ui.slider))
+        slider.set_value(slider.value + 0.1)
         for button in shown:
             await viewer.press(button)
         # what was sent before has arrived once this has
@@ -241,12 +244,15 @@ async def test_every_button_needs_its_role(
             await until(lambda: {each.kind for each in viewer.run.asked} >= OF_OPERATE)
             assert kept
             assert viewer.starter.started
+        find_chosen = partial(viewer.views.gains.find_chosen, "", f"tuning/{session.name}")
         file = tmp_path / "configurations" / "lab.toml"
         if role == "tune":
             await until(lambda: {"gains", "keep"} <= {each.kind for each in viewer.run.asked})
+            await until(find_chosen)
             await until(lambda: "# changed" in file.read_text())
             await until(lambda: (session / "gains.toml").read_text() != gains)
         else:
             assert {each.kind for each in viewer.run.asked} <= OF_OPERATE
+            assert find_chosen() is None, "others move the sliders for themselves alone"
             assert file.read_text() == CONFIGURATION
             assert (session / "gains.toml").read_text() == gains
