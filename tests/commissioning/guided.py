@@ -11,11 +11,12 @@ from membrane_ctrl.commissioning.guide.stage import SessionPlan
 from membrane_ctrl.hold.virtual_hold import VirtualHold
 from membrane_ctrl.model.errors import Exit
 
-# A pump of 100 mL/s fills the mirror in eight minutes
+# A flow controller of 100 mL/s fills the mirror in eight minutes
 PERSON = {
     "mirror.preset": "own",
     "mirror.relief_pa": "900",
     "mirror.pump_ml_per_s": "100",
+    "mirror.pump_kind": "proportional",
     "camera.driver": "none",
     "interlock1.driver": "board_input",
     "interlock1.name": "emergency_stop",

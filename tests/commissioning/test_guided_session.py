@@ -38,7 +38,7 @@ def test_a_whole_session_ends_accepted_with_configuration_and_report(
     config = load_toml(tmp_path / CONFIGURATION, Config)
     assert not [finding for finding in cross_check(config) if finding.severity == "error"]
     assert config.limits.displacement_min_um == -2000.0  # wider only while the mirror was filled
-    assert config.twin.leak_time_constant_s == pytest.approx(1e4, rel=0.1)  # measured
+    assert config.twin.leak_time_constant_s == pytest.approx(1e4, rel=0.25)  # measured, in weather
     html = (tmp_path / HTML).read_text(encoding="utf-8")
     assert "Accepted." in html
     assert "emulated bench" in html
@@ -80,6 +80,14 @@ def test_a_mirror_whose_film_would_yield_is_refused(tmp_path: Path, bench: Quick
     assert run_stages(tmp_path, bench, person, *DESK) == Exit.INTERRUPTED
     assert failed_in(tmp_path, person) == ["yield stress over the stress at the pressure limit"]
     assert "continue" not in person.text
+
+
+def test_a_pump_that_can_only_switch_is_refused(tmp_path: Path, bench: QuickBench) -> None:
+    person = Person(**{"mirror.pump_kind": "diaphragm"})
+    assert run_stages(tmp_path, bench, person, "mirror") == Exit.INTERRUPTED
+    assert failed_in(tmp_path, person) == [
+        "least flow of the running pump over the leak, as stated"
+    ]
 
 
 def test_a_typo_asks_again_and_keeps_the_other_answers(tmp_path: Path, bench: QuickBench) -> None:

@@ -140,7 +140,7 @@ ITEMS = (
 def find_dependencies() -> set[str]:
     """Names of all packages that the program and its extras need, as far as installed."""
     found: set[str] = set()
-    wanted = [("membrane-ctrl", ("", *_EXTRAS))]
+    wanted: list[tuple[str, tuple[str, ...]]] = [("membrane-ctrl", ("", *_EXTRAS))]
     while wanted:
         name, extras = wanted.pop()
         try:
@@ -167,7 +167,8 @@ def find_licence(name: str) -> str:
         for line in about.get_all("Classifier") or []
         if line.startswith("License ::")
     ]
-    stated = [about.get("License-Expression") or "", *classifiers, about.get("License") or ""]
+    expressions = about.get_all("License-Expression") or []
+    stated = [*expressions, *classifiers, *(about.get_all("License") or [])]
     return next((text.splitlines()[0] for text in stated if text.strip()), "")
 
 

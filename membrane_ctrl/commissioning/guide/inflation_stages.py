@@ -17,6 +17,7 @@ from membrane_ctrl.commissioning.guide.stage import (
     StageFailedError,
 )
 from membrane_ctrl.commissioning.guide.stage_words import format_duration
+from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model import events
 from membrane_ctrl.model.telemetry import State, TelemetryRow
@@ -197,6 +198,12 @@ def measure_leak(context: StageContext) -> None:
         leak_um_per_s / context.config.pump.flow_full_um_per_s,
         thresholds.LEAK_SHARE,
         "find the leak, or fit a larger pump",
+    )
+    context.judge(
+        "least flow of the running pump over the leak",
+        PumpCurve(context.config.pump).least_flow_um_per_s / max(leak_um_per_s, 1e-6),
+        thresholds.PUMP_LEAST,
+        "fit a smaller pump or a flow controller, or open a bleed (`loop.bleed_fraction`)",
     )
     estimated = float(np.mean([row.leak_um_per_s for row in held]))
     context.note("leak as the controller estimates it", f"{estimated:.2f} µm/s")

@@ -42,6 +42,9 @@ class MirrorFacts(BaseModel):
     yield_mpa: Annotated[float, Field(ge=0.1, le=5000)] = 100.0
     back_thickness_um: Annotated[float, Field(ge=1, le=1000)] = 10.0
     pump_ml_per_s: Annotated[float, Field(gt=0, le=1e5)] = 6.0
+    pump_proportional: bool = False
+    """Whether the flow follows the command from 0 on, as that of a flow controller; a diaphragm
+    pump starts at a fifth of its drive, and stalls below a seventh."""
     leak_time_constant_s: Annotated[float, Field(ge=10, le=1e8)] = 10_000.0
     relief_pa: Annotated[float, Field(ge=0, le=1e5)] = 0.0
     """0: no relief valve."""

@@ -14,6 +14,7 @@ from membrane_ctrl.commissioning.guide.stage import (
     StageFailedError,
 )
 from membrane_ctrl.commissioning.guide.stage_words import format_duration
+from membrane_ctrl.control.pump_curve import PumpCurve
 
 # key, question, unit, least, most
 _QUESTIONS = (
@@ -29,6 +30,7 @@ _QUESTIONS = (
     ("relief_pa", "opening pressure of the relief valve; 0: none is fitted", "Pa", 0.0, 1e5),
 )
 _OWN, _PAPER = "own", "paper"
+_DIAPHRAGM, _PROPORTIONAL = "diaphragm", "proportional"
 _RAMP_SHARE = 0.65  # of the full flow: the rest is for the leak
 
 
@@ -54,6 +56,16 @@ def ask_mirror(context: StageContext) -> None:
             key: dialogue.ask_number(f"mirror.{key}", question, start[key], low, high, unit)
             for key, question, unit, low, high in _QUESTIONS
         }
+        kind = dialogue.ask_choice(
+            "mirror.pump_kind",
+            "how does its flow follow the command?",
+            (
+                Choice(_DIAPHRAGM, "it starts at 22 % and stalls below 15 % of full drive"),
+                Choice(_PROPORTIONAL, "from 0 on, as a flow controller"),
+            ),
+            _DIAPHRAGM,
+        )
+        asked |= {"pump_proportional": kind == _PROPORTIONAL}
     facts = MirrorFacts.model_validate(asked)
     try:
         design = derive_design(facts)
@@ -61,8 +73,8 @@ def ask_mirror(context: StageContext) -> None:
         raise StageFailedError(f"no film has these data: {error}") from None
     context.state.facts = facts
     dialogue.show(*explain_design(facts, design))
-    _judge_design(context, facts, design)
     write_design(context, facts, design)
+    _judge_design(context, facts, design)
 
 
 def _ask_relief(context: StageContext) -> float:
@@ -109,6 +121,12 @@ def _judge_design(context: StageContext, facts: MirrorFacts, design: MirrorDesig
         thresholds.LEAK_SHARE,
         "fit a larger pump, or find the leak",
     )
+    context.judge(
+        "least flow of the running pump over the leak, as stated",
+        PumpCurve(context.config.pump).least_flow_um_per_s / design.leak_um_per_s,
+        thresholds.PUMP_LEAST,
+        "fit a smaller pump or a flow controller, or open a bleed (`loop.bleed_fraction`)",
+    )
 
 
 def write_design(context: StageContext, facts: MirrorFacts, design: MirrorDesign) -> None:
@@ -128,6 +146,8 @@ def write_design(context: StageContext, facts: MirrorFacts, design: MirrorDesign
         gauge_pressure_max_pa=design.gauge_max_pa,
     )
     context.set_keys("pump", flow_full_um_per_s=flow_um_per_s)
+    if facts.pump_proportional:
+        context.set_keys("pump", dead_fraction=0.0, start_fraction=0.0, stall_fraction=0.0)
     context.set_keys(
         "loop",
         flow_max_um_per_s=flow_um_per_s,

@@ -90,6 +90,12 @@ WATCHDOG_LATE = Threshold(
     "s beyond the period",
     "a watchdog's own loop and one reading; later the pump would run unguarded",
 )
+PUMP_LEAST = Threshold(
+    "least flow of the running pump over the leak",
+    1.0,
+    "",
+    "a pump that gives more than the leak whenever it runs can only switch on and off",
+)
 BENCH_PRESSURE_SHARE = Threshold(
     "pressure while pump and vent are tried",
     0.2,
