@@ -16,7 +16,7 @@ from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench,
 from tuning.identification.pump_run import PumpRun
 from tuning.identification.pump_survey import PumpSurvey
 from tuning.rigs.hold_rig import HoldRig
-from tuning.steps.identify import describe_losses
+from tuning.steps.identify import describe_gaps, describe_losses
 from tuning.twin_hold import TwinHold
 
 RATE_HZ = 50.0
@@ -179,6 +179,21 @@ def test_an_experiment_that_does_not_begin_is_reported() -> None:
 def test_a_record_without_a_gap_names_no_sensor() -> None:
     _, rig = settled([])
     assert describe_losses(rig.hold(1.0), by_optics=False) == ""
+
+
+def test_a_rig_counts_the_losses_of_all_that_it_has_seen() -> None:
+    """`tune pump` names a lossy sensor from them; its rounds are no record."""
+    _, rig = settled([(1.0, 1.08), (3.0, 3.2), (8.0, 8.08)])
+    assert rig.gaps_s == []
+    before_s = rig.held_s
+    rig.hold(2.0)
+    rig.perform_ticks(make_spec("steps", 5.0))
+    rig.hold(3.0)
+    assert rig.gaps_s == pytest.approx([0.08, 0.2, 0.08], abs=0.021)
+    assert rig.held_s - before_s == pytest.approx(10.0, abs=1.0)
+    lossy = describe_gaps(rig.gaps_s, rig.held_s - before_s, by_optics=False)
+    assert lossy.startswith("the laser had no reading 3 times in 1")
+    assert describe_gaps([], 10.0, by_optics=False) == ""
 
 
 def make_run(duration_s: float, ends_dark: bool) -> PumpRun:

@@ -10,6 +10,7 @@ from tuning.options import TuneOptions
 from tuning.rigs.hold_rig import HoldRig
 from tuning.sentences import TOO_TIGHT, describe_gains
 from tuning.steps import map_pump
+from tuning.steps.identify import describe_gaps
 
 
 def run_map_pump(options: TuneOptions) -> int:
@@ -24,6 +25,7 @@ def measure_pump(
 ) -> SessionFolder:
     """Measure the curve, apply it and print it; `after_s` is what the session takes after it."""
     progress.begin_step("pump", pump_survey.TYPICAL_S, after_s, pump_survey.LONGEST_S)
+    gaps, held_s = len(rig.gaps_s), rig.held_s
     mapped, folder = map_pump.map_pump(folder, rig, limit_um)
     found, pump = mapped.found, mapped.found.pump
     progress.print_line(
@@ -44,6 +46,9 @@ def measure_pump(
         f"{folder.path} --config FILE` "
         "saves them for the next one"
     )
+    lossy = describe_gaps(rig.gaps_s[gaps:], rig.held_s - held_s, folder.config.by_optics)
+    if lossy:
+        progress.print_line(f"pump: {lossy}")
     if found.leak_um_per_s < TOO_TIGHT_UM_PER_S:
         progress.print_line(TOO_TIGHT)
     return folder

@@ -54,6 +54,9 @@ class HoldRig:
         self._state = math.nan  # of the newest tick
         self._tick = math.nan  # its number
         self._reads = 0  # of news
+        self.held_s = 0.0  # of all ticks so far
+        self.gaps_s: list[float] = []  # times without a reading in them, the last one perhaps open
+        self._was_lost = False
         self.repeated = 0  # experiments that were repeated because the reading was lost
         self.loop, self.pump = link.config.loop, link.config.pump  # as last set
         self.good = self.loop, self.pump  # to go back to
@@ -270,7 +273,18 @@ class HoldRig:
             )
         self._progress(self.dt_s)
         self.seen(row)
+        self._count_losses(row)
         return self._rows.popleft()
+
+    def _count_losses(self, row: telemetry.TelemetryRow) -> None:
+        """Note whether this tick has a reading."""
+        self.held_s += self.dt_s
+        is_lost = math.isnan(row.displacement_um)
+        if is_lost and not self._was_lost:
+            self.gaps_s.append(0.0)
+        if is_lost:
+            self.gaps_s[-1] += self.dt_s
+        self._was_lost = is_lost
 
     def _read_news(self) -> None:
         news = self._link.read_news()

@@ -1,5 +1,6 @@
 """Second step of a session: fit the plant to the experiments and judge the fit."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,12 +87,16 @@ def describe_losses(record: Record, by_optics: bool) -> str:
     """How often and how long the sensor of the displacement had no reading; empty if it never
     had.
     """
-    gaps_s = record.gaps_s
+    return describe_gaps(record.gaps_s, record.duration_s, by_optics)
+
+
+def describe_gaps(gaps_s: Sequence[float], duration_s: float, by_optics: bool) -> str:
+    """As `describe_losses`, for times without a reading in a time of experiments."""
     if not gaps_s:
         return ""
     sensor = "camera" if by_optics else "laser"
     return (
-        f"the {sensor} had no reading {len(gaps_s)} times in {record.duration_s:.0f} s of "
+        f"the {sensor} had no reading {len(gaps_s)} times in {duration_s:.0f} s of "
         f"experiments, {max(gaps_s):.2f} s at the longest: look for something in its way and a "
         "loose cable"
     )
