@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from membrane_ctrl.commissioning.check import DeviceProbe
 from membrane_ctrl.commissioning.guide.dialogue import Dialogue
 from membrane_ctrl.commissioning.guide.inflation_stages import DepthPoint, judge_law
 from membrane_ctrl.commissioning.guide.mirror_design import PAPER_MIRROR
@@ -139,6 +140,17 @@ def test_wrong_wiring_is_found(
     failed = failed_in(tmp_path, person)
     assert any(found.startswith(check) for found in failed), person.text
     assert bench.bench.board.pump_fraction == 0.0
+
+
+def test_a_laser_that_does_not_see_the_flat_film_is_explained(
+    tmp_path: Path, bench: QuickBench
+) -> None:
+    run_stages(tmp_path, bench, Person(), *DESK)
+    blind = DeviceProbe("displacement", "/dev/ttyUSB0", problem="no reading")
+    bench.probe_devices = lambda config: [blind]  # type: ignore[method-assign]
+    person = Person()
+    assert run_stages(tmp_path, bench, person, "probe") == Exit.INTERRUPTED
+    assert "37.1 mm from displacement 0. Set `zero_mm`" in person.text
 
 
 def test_a_reversed_laser_is_found(tmp_path: Path, bench: QuickBench) -> None:

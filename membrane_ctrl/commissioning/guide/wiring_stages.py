@@ -74,7 +74,15 @@ def probe_devices(context: StageContext) -> None:
     """Probe each device as `check` does, without writing to it."""
     for probe in context.access.probe_devices(context.config):
         seen = probe.problem or f"{probe.identity}: {probe.reading}"
-        context.require(f"{probe.role} on {probe.device}", not probe.problem, seen, probe.notes)
+        remedy = probe.notes
+        if probe.role == "displacement":
+            remedy = (
+                f"if aim and cable are right: the flat film is {context.facts.sag_mm:g} mm from "
+                "displacement 0. Set `zero_mm` of its table so that its range covers the way"
+            )
+        context.require(f"{probe.role} on {probe.device}", not probe.problem, seen, remedy)
+    if context.access.simulated and context.devices.board is None:
+        context.note("the next stages", "they run on an emulated pump board, not on instruments")
 
 
 def test_gauge_zero(context: StageContext) -> None:
