@@ -193,6 +193,7 @@ def test_one_set_is_too_few() -> None:
 
 
 @pytest.mark.campaign
+@pytest.mark.timeout(1800)
 def test_bars_cover_the_truth_of_random_films() -> None:
     """120 films of all kinds: z near 1 and never far off."""
     rng = np.random.default_rng(11)
