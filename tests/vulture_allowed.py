@@ -164,3 +164,4 @@ _.beside_heading  # read by the template of a report page
     _.memory_locked,
     over_min,
 )  # of events, which are written as a whole
+_.ok  # of an answer of the control port, checked and passed on as a whole
