@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
@@ -138,13 +138,14 @@ def _ask_key(
     """Ask for a key of a driver's table; a port is chosen from those that are connected."""
     dialogue = context.dialogue
     meaning = find_key_meaning(f"{driver}.{field}").rstrip(".")
-    ports = [each.paste.partition('"')[2].rstrip('"') for each in found if each.kind == "port"]
+    ports = [tomllib.loads(each.paste)["port"] for each in found if each.kind == "port"]
     if field == "port" and ports:
         choices = [*(Choice(port) for port in ports), Choice(_OTHER, "type another one")]
         port = dialogue.ask_choice(f"{key}.port_of_list", f"  {meaning}", choices)
         if port != _OTHER:
             return port
-    if "tuple" in str(kind):
+    is_pair = any(get_origin(each) is tuple for each in (kind, *get_args(kind)))
+    if is_pair:
         text = dialogue.ask_text(f"{key}.{field}", f"  {field} ({meaning}): {_PAIR}")
         return _parse_toml(f"[{text.strip('[] ')}]")
     text = dialogue.ask_text(f"{key}.{field}", f"  {field} ({meaning})")
