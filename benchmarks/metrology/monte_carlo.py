@@ -41,10 +41,11 @@ def run() -> list[Figure]:
         figures = Figures()
         second = figures.measure_folder(Path(folder) / "0001")  # reads the reference as well
         swing_adu = second.figure.quality.modulation_share * (2**OPTICS.camera.bits - 1)
-        run_trials([second.bench()], PAPER_SPREAD, 1, range(2))  # compiles
+        run_trials([second.make_trial_bench()], PAPER_SPREAD, 1, range(2))  # compiles
         begin = time.perf_counter()
         benches = [
-            figures.measure_folder(Path(folder) / f"{k + 1:04d}").bench() for k in range(MEASURED)
+            figures.measure_folder(Path(folder) / f"{k + 1:04d}").make_trial_bench()
+            for k in range(MEASURED)
         ]
         set_s = (time.perf_counter() - begin) / MEASURED
     begin = time.perf_counter()
