@@ -12,6 +12,7 @@ import sys
 import numpy as np
 
 from membrane_ctrl.hold.virtual_run import VirtualTick
+from membrane_ctrl.model import telemetry
 from tests.studies.soak import (
     DAY_S,
     MINUTE_BAND_UM,
@@ -72,12 +73,13 @@ def run() -> list[Figure]:
     ]
 
 
-def _tell_days(tick: VirtualTick) -> None:
+def _print_days(tick: VirtualTick) -> None:
     """Print a line per simulated day."""
     day, second = divmod(tick.row.mono_s, DAY_S)
     if second < tick.row.dt_s / 2:
+        state = telemetry.State(int(tick.row.state)).name.lower()
         print(
-            f"day {day:.0f}: {tick.row.state.name.lower()}, {rss_mb():.1f} MB",
+            f"day {day:.0f}: {state}, {rss_mb():.1f} MB",
             file=sys.stderr,
             flush=True,
         )
@@ -91,7 +93,7 @@ def main() -> int:
     parser.add_argument("--days", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    found = figures(options.days, options.seed, _tell_days)
+    found = figures(options.days, options.seed, _print_days)
     show("soak", found)
     return int(any(figure.met is False for figure in found))
 
