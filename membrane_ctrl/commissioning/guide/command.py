@@ -7,7 +7,7 @@ from membrane_ctrl.commissioning.guide.bench_access import BenchAccess
 from membrane_ctrl.commissioning.guide.emulated_bench import EmulatedBench, MakeHold
 from membrane_ctrl.commissioning.guide.real_bench import RealBench
 from membrane_ctrl.commissioning.guide.session import CommissioningSession
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import errors, files
 
 
 def commission_bench(folder: Path, make_virtual_hold: MakeHold | None = None) -> int:
@@ -16,7 +16,7 @@ def commission_bench(folder: Path, make_virtual_hold: MakeHold | None = None) ->
     Raises InputError or DeviceError.
     """
     with errors.convert_write_errors(folder, errors.DeviceError):
-        folder.mkdir(parents=True, exist_ok=True)
+        files.make_folder(folder)
     access: BenchAccess = RealBench()
     if make_virtual_hold is not None:
         access = EmulatedBench(make_virtual_hold)

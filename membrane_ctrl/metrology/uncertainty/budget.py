@@ -72,6 +72,8 @@ class Source:
         """Effects on the change since an earlier set, arrays of (parameters, k) each.
 
         A paired input has the same error in both sets: only the difference of its effects counts.
+        Columns that only one of the sets has, as of frames that the other lacks, have no effect on
+        the other.
         """
         if earlier is None:
             return [self.known_mm]
@@ -83,12 +85,19 @@ class Source:
             lower = min(self.sigma, earlier.sigma)
             own_mm = own_mm * (lower / max(self.sigma, _TINY))
             earlier_mm = earlier_mm * (lower / max(earlier.sigma, _TINY))
+        columns = max(own_mm.shape[1], earlier_mm.shape[1])
         difference = replace(
             self,
-            effects_mm=own_mm - earlier_mm,
+            effects_mm=_fill_columns(own_mm, columns) - _fill_columns(earlier_mm, columns),
             noise_mm2=self.noise_mm2 + earlier.noise_mm2,
         )
         return [difference.known_mm]
+
+
+def _fill_columns(effects_mm: FloatArray, columns: int) -> FloatArray:
+    """Effects (parameters, k) with columns of zeros up to that number of columns."""
+    missing = columns - effects_mm.shape[1]
+    return np.pad(effects_mm, ((0, 0), (0, missing)))
 
 
 @dataclass(frozen=True)

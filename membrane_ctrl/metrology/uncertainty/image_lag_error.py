@@ -28,7 +28,7 @@ def image_lag_sources(
     """
     left = lag.remaining_sigma if math.isfinite(lag.remaining_sigma) else 0.0
     effect = image_lag_effect(bench, stack, used)
-    of_frames = lag.scatter
+    of_frames = _order_by_fringes(lag.scatter, stack)
     noise = lag.noise if left else 0.0
     rest = math.sqrt(max(left**2 - noise**2 - float(of_frames @ of_frames), 0.0))
     shared = np.outer(effect, [rest, *of_frames])
@@ -38,6 +38,18 @@ def image_lag_sources(
         Source("image_lag_share", _SAYS, left, shared, common=False),
         Source("image_lag_noise", description, noise, own, common=False, paired=False),
     ]
+
+
+def _order_by_fringes(of_frames: FloatArray, stack: FrameStack) -> FloatArray:
+    """Parts of single frames, (2 frames,), with the fringes first: a set of fringes alone has them
+    at the same place as a full one. None without an estimate.
+    """
+    if of_frames.size == 0:
+        return of_frames
+    fringes = [*stack.sinusoids(AXES[0]), *stack.sinusoids(AXES[1])]
+    others = [frame for frame in range(len(stack.patterns)) if frame not in fringes]
+    rise_and_fall = of_frames.reshape(2, len(stack.patterns)).T
+    return np.asarray(rise_and_fall[[*fringes, *others]].ravel())
 
 
 def image_lag_of_cycles(bench: TrialBench, shifts_rad: FloatArray, lag: ImageLag) -> FloatArray:

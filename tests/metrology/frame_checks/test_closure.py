@@ -42,7 +42,7 @@ def test_good_frames_leave_noise_and_no_frame_is_suspect(steps):
     for result in checks(*scene(steps)):
         assert result.rms_adu == pytest.approx(NOISE_ADU, rel=0.03)
         np.testing.assert_allclose(result.without_rms_adu, NOISE_ADU, rtol=0.05)
-        assert result.gain == pytest.approx(1, abs=0.05)
+        assert result.residual_ratio == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.parametrize("steps", [4, 5, 8])
@@ -51,8 +51,8 @@ def test_a_stale_frame_is_the_suspect(steps, bad):
     frames, *truth = scene(steps)
     frames[bad] = frames[bad - 1]
     for result in checks(frames, *truth):
-        assert result.suspect == bad
-        assert result.gain > 10
+        assert result.suspect_frame == bad
+        assert result.residual_ratio > 10
         assert result.without_rms_adu[bad] == pytest.approx(NOISE_ADU, rel=0.05)
 
 
@@ -61,8 +61,8 @@ def test_a_partly_stale_frame_is_the_suspect(share):
     frames, *truth = scene(4)
     frames[2] += share * (frames[1] - frames[2])
     for result in checks(frames, *truth):
-        assert result.suspect == 2
-        assert result.gain > 1.2
+        assert result.suspect_frame == 2
+        assert result.residual_ratio > 1.2
 
 
 def test_four_steps_alone_show_the_fault_but_no_suspect():
