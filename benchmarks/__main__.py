@@ -27,6 +27,7 @@ BENCHMARKS = {
     "snapshots": "benchmarks.control",
     "viewers": "benchmarks.interfaces",
     "strangers": "benchmarks.interfaces",
+    "alarm_delay": "benchmarks.interfaces",
     "live_cycle": "benchmarks.metrology",
     "tracking": "benchmarks.metrology",
     "measure_full": "benchmarks.metrology",

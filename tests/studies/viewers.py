@@ -159,11 +159,13 @@ def viewers(link: str, count: int) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextmanager
-def hold_with_page(folder: Path) -> Iterator[tuple[psutil.Process, psutil.Process, str, Path]]:
+def hold_with_page(
+    folder: Path, tables: str = ""
+) -> Iterator[tuple[psutil.Process, psutil.Process, str, Path]]:
     """A `hold --twin`, its page, the page's link and the folder of the run; the hold is stopped
-    afterwards.
+    afterwards. `tables` are more of its configuration.
     """
-    (folder / "lab.toml").write_text("[twin]\nport = 0\n")
+    (folder / "lab.toml").write_text(f"[twin]\nport = 0\n{tables}")
     command = [
         sys.executable,
         "-m",
