@@ -23,7 +23,7 @@ BLAMED: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("stale", r"stale|shows [xy]_|same picture", ("stale frame",)),
     (
         "orientation",
-        r"rotated|mirrored|upside|axes exchanged|exchanged axes",
+        r"rotated|mirrored|upside|(columns and rows|x and y) exchanged",
         ("frames rotated", "frames mirrored", "frames axes exchanged", "screen's axes exchanged"),
     ),
     ("byte order", r"byte order|bytes", ("bytes exchanged",)),
