@@ -98,6 +98,8 @@ def find_orientation(
         None if the stated one is not suspicious, or if no other is clearly better.
     """
     known = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
+    if known.size < _LEAST_BINS:
+        return None
     known = known[:: max(1, known.size // _BINS)]
     places_px = places_px[:, known]
     screen_mm = screen_scale.screen_mm(phase_rad[:, known], optics.pattern)

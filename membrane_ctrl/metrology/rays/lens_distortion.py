@@ -27,7 +27,9 @@ def undistort_points(
         one beyond a fold of the model, where the distance from the axis falls again: no ray, or
         another one, belongs to such a point.
     """
-    # OpenCV's iteration.
+    # OpenCV's iteration, which takes no empty array.
+    if x.size == 0:
+        return x.copy(), y.copy()
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     coefficients = np.array(distortion)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError
-from membrane_ctrl.metrology.frame_checks.picture_orientation import SUSPICIOUS_URAD
+from membrane_ctrl.metrology.frame_checks.picture_orientation import (
+    SUSPICIOUS_URAD,
+    find_orientation,
+)
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.film_shape import FilmShape, Wrinkle
@@ -105,3 +108,12 @@ def test_wrinkles_are_no_orientation() -> None:
     wrinkles = FilmShape(37.1, 500.0, wrinkles=(Wrinkle(60.0, lobes=12),))
     checked = check_set(good_set(bench(), film=wrinkles), bench())
     assert residual_urad(checked) > SUSPICIOUS_URAD
+
+
+@pytest.mark.parametrize("distortion", [(), (0.05, -0.02, 0.0, 0.0)])
+def test_pictures_without_a_phase_show_no_orientation(distortion: tuple[float, ...]) -> None:
+    optics = bench(4)
+    camera = optics.camera.model_copy(update={"distortion": distortion})
+    lens = optics.model_copy(update={"camera": camera})
+    unknown = np.full((2, 50), np.nan)
+    assert find_orientation(lens, 0.0, np.zeros((2, 50)), unknown) is None
