@@ -1,7 +1,7 @@
 #!/bin/sh
 # Builds the image of the Containerfile, or, where containers cannot be built, the same system in a folder.
 #   packaging/container.sh image     podman or docker; the image membrane-ctrl
-#   packaging/container.sh chroot    as root: the folder build/container/root, and a hold of the twin in it
+#   packaging/container.sh chroot    as root: the folder build/container/system, and a hold of the twin in it
 # The base is made of Debian's packages by mmdebstrap: no image is downloaded.
 set -eu
 cd "$(dirname "$0")/.."
@@ -32,17 +32,17 @@ image)
     ;;
 chroot)
     make_wheel
-    rm -rf --one-file-system "$out/root"
-    make_base "$out/root"
-    mkdir -p "$out/root/opt/membrane-ctrl"
-    cp -r "$out"/wheel/* "$out/root/opt/membrane-ctrl/"
-    chroot "$out/root" sh /opt/membrane-ctrl/install.sh
+    rm -rf --one-file-system "$out/system"
+    make_base "$out/system"
+    mkdir -p "$out/system/opt/membrane-ctrl"
+    cp -r "$out"/wheel/* "$out/system/opt/membrane-ctrl/"
+    chroot "$out/system" sh /opt/membrane-ctrl/install.sh
     # the mounts are in a namespace of their own: none is left when it ends
     unshare --mount sh -eu -c '
         mount --rbind /dev "$1/dev" && mount -t proc proc "$1/proc"
         chroot "$1" su -s /bin/sh -c "$2" membrane
-    ' sh "$out/root" "cd && membrane-ctrl hold --twin --duration 20s --no-service"
-    du -sm "$out/root" "$out/root/opt/membrane-ctrl/.venv"
+    ' sh "$out/system" "cd && membrane-ctrl hold --twin --duration 20s --no-service"
+    du -sm "$out/system" "$out/system/opt/membrane-ctrl/.venv"
     ;;
 *)
     echo "usage: packaging/container.sh image|chroot" >&2

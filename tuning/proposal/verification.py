@@ -252,8 +252,8 @@ def explain_no_benefit(stage: Stage, trial: VerificationTrial) -> str:
     """Why gains that passed the last stage are not worth keeping; empty if they are.
 
     Gains whose price a person accepted are, and so are those that replace gains without enough
-    margin. A record too short for a replay shows no benefit; whoever asks for so short a
-    verification gets gains that are no worse.
+    margin. A record too short for a replay shows no benefit: after such a short verification it is
+    enough that the gains are no worse.
     """
     if math.isinf(stage.growth_sigma):
         return ""

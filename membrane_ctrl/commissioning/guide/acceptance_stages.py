@@ -4,11 +4,10 @@ import math
 from dataclasses import dataclass, field
 
 from membrane_ctrl.commissioning.guide import thresholds
-from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth
+from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth, run_tuning_in_hold
 from membrane_ctrl.commissioning.guide.stage import (
     CommissioningStage,
     StageContext,
-    StageFailedError,
 )
 from membrane_ctrl.commissioning.guide.stage_words import format_duration
 from membrane_ctrl.model import events
@@ -79,13 +78,7 @@ class HoldFigures:
 def tune_loop(context: StageContext) -> None:
     """Tune the loop with `tune run`."""
     context.dialogue.show("  `membrane-ctrl tune run` does it; about half an hour at a real bench")
-    try:
-        with context.access.start_hold(context.folder, context.config, "tune") as link:
-            hold_depth(context, link, context.config.loop.setpoint_um)
-            link.close()
-            code = context.access.run_tuning(context.folder, context.config, "run")
-    except HoldError as error:
-        raise StageFailedError(f"the controller ended it: {error}") from None
+    code = run_tuning_in_hold(context, "tune", "run")
     if code == 0 and context.access.simulated:
         context.note("gains", "tuned on the twin; not saved into a configuration with devices")
     context.require(

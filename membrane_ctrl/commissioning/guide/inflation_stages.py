@@ -212,16 +212,24 @@ def measure_leak(context: StageContext) -> None:
     context.note("time constant of the leak", format_duration(time_constant_s))
 
 
+def run_tuning_in_hold(context: StageContext, run_name: str, command: str) -> int:
+    """Run a command of `tune` on a hold of the bench at its depth; its exit code.
+
+    Raises StageFailedError if the controller ends the hold.
+    """
+    try:
+        with context.access.start_hold(context.folder, context.config, run_name) as link:
+            hold_depth(context, link, context.config.loop.setpoint_um)
+            link.close()
+            return context.access.run_tuning(context.folder, context.config, command)
+    except HoldError as error:
+        raise StageFailedError(f"the controller ended it: {error}") from None
+
+
 def map_pump(context: StageContext) -> None:
     """Measure the pump's curve with `tune pump`."""
     context.dialogue.show("  `membrane-ctrl tune pump` measures it; 15 to 35 min at a real bench")
-    try:
-        with context.access.start_hold(context.folder, context.config, "pump") as link:
-            hold_depth(context, link, context.config.loop.setpoint_um)
-            link.close()
-            code = context.access.run_tuning(context.folder, context.config, "pump")
-    except HoldError as error:
-        raise StageFailedError(f"the controller ended it: {error}") from None
+    code = run_tuning_in_hold(context, "pump", "pump")
     context.require(
         "pump's curve", code == 0, f"exit code {code}", "read the messages above; then try again"
     )
