@@ -221,6 +221,7 @@ def commission(
     twin: Annotated[
         bool, typer.Option("--twin", help="Practise on the emulated bench, in virtual time.")
     ] = False,
+    messages: Annotated[bool, typer.Option("--messages", hidden=True)] = False,
 ) -> int:
     """Take a bench from a box of parts to an accepted hold, step by step; leave a configuration and
     a report.
@@ -228,10 +229,10 @@ def commission(
     from membrane_ctrl.commissioning.guide.command import commission_bench
 
     if not twin:
-        return commission_bench(folder)
+        return commission_bench(folder, as_messages=messages)
     from membrane_ctrl.hold.virtual_hold import VirtualHold
 
-    return commission_bench(folder, VirtualHold)
+    return commission_bench(folder, VirtualHold, messages)
 
 
 @devices_app.callback()

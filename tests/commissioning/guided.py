@@ -8,6 +8,7 @@ from membrane_ctrl.commissioning.guide.emulated_bench import EmulatedBench
 from membrane_ctrl.commissioning.guide.session import STAGES, CommissioningSession
 from membrane_ctrl.commissioning.guide.session_state import SessionState, read_state
 from membrane_ctrl.commissioning.guide.stage import SessionPlan
+from membrane_ctrl.commissioning.guide.text_display import TextDisplay
 from membrane_ctrl.hold.virtual_hold import VirtualHold
 from membrane_ctrl.model.errors import Exit
 
@@ -38,7 +39,7 @@ class QuickBench(EmulatedBench):
         super().__init__(VirtualHold)
         self.tuned = []
 
-    def run_tuning(self, folder: Path, config: object, command: str) -> int:
+    def run_tuning(self, folder: Path, config: object, command: str, show: object) -> int:
         self.tuned.append(command)
         return self.exit_code
 
@@ -68,6 +69,10 @@ class Person:
         return "y" if prompt.endswith("[y/n]") else ""
 
     @property
+    def display(self) -> TextDisplay:
+        return TextDisplay(self.read_line, self.shown.append)
+
+    @property
     def text(self) -> str:
         return "\n".join(self.shown)
 
@@ -77,9 +82,7 @@ def run_stages(
 ) -> Exit:
     """Run the named stages, or all, of a session in a folder."""
     stages = tuple(stage for stage in STAGES if not names or stage.name in names)
-    session = CommissioningSession(
-        folder, bench, person.read_line, person.shown.append, plan, stages
-    )
+    session = CommissioningSession(folder, bench, person.display, plan, stages)
     return session.run()
 
 

@@ -17,6 +17,7 @@ from membrane_ctrl.commissioning.guide.session_state import (
     read_state,
 )
 from membrane_ctrl.commissioning.guide.stage import StageContext
+from membrane_ctrl.commissioning.guide.text_display import TextDisplay
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import load_toml
 from membrane_ctrl.controller.cross_check import cross_check
@@ -217,7 +218,7 @@ def test_a_pump_without_gas_ends_the_inflation(tmp_path: Path, bench: QuickBench
 
 def context_of(folder: Path, bench: QuickBench, person: Person) -> StageContext:
     state = SessionState(created_utc="", author="", simulated=True, facts=PAPER_MIRROR)
-    dialogue = Dialogue(person.read_line, person.shown.append, {}, lambda: None)
+    dialogue = Dialogue(person.display, {}, lambda: None)
     return StageContext(folder, state, dialogue, bench)
 
 
@@ -258,6 +259,7 @@ def test_a_damaged_state_is_named(tmp_path: Path) -> None:
 def test_numbers_are_asked_until_they_are_within_limits() -> None:
     answers = ["x", "nan", "-1", "12,5"]
     shown: list[str] = []
-    dialogue = Dialogue(lambda key, prompt: answers.pop(0), shown.append, {}, lambda: None)
+    display = TextDisplay(lambda key, prompt: answers.pop(0), shown.append)
+    dialogue = Dialogue(display, {}, lambda: None)
     assert dialogue.ask_number("sag", "sag", 37.1, 0.1, 100.0, "mm") == 12.5
     assert len(shown) == 3

@@ -102,6 +102,10 @@ class BenchAccess(Protocol):
         """
         ...
 
-    def run_tuning(self, folder: Path, config: Config, command: str) -> int:
-        """Run `tune run` or `tune pump` on the hold that runs, or on the twin; the exit code."""
+    def run_tuning(
+        self, folder: Path, config: Config, command: str, show: Callable[[str], None]
+    ) -> int:
+        """Run `tune run` or `tune pump` on the hold that runs, or on the twin, and show what it
+        prints; returns its exit code.
+        """
         ...

@@ -42,8 +42,11 @@ def ask_devices(context: StageContext) -> None:
         "devices.kind",
         "what drives the pump?",
         (
-            Choice(_BOARD, "a pump board, with laser and sensors behind it: it has a watchdog"),
-            Choice(_SINGLE, "single instruments, one per role"),
+            Choice(
+                name=_BOARD,
+                meaning="a pump board, with laser and sensors behind it: it has a watchdog",
+            ),
+            Choice(name=_SINGLE, meaning="single instruments, one per role"),
         ),
         _BOARD,
     )
@@ -101,9 +104,11 @@ def _ask_table(
 ) -> TomlTable:
     """Ask for a driver and for its required keys, until its table is valid; empty without one."""
     dialogue = context.dialogue
-    choices = [Choice(driver, _first_line(section)) for driver, section in known.items()]
+    choices = [
+        Choice(name=driver, meaning=_first_line(section)) for driver, section in known.items()
+    ]
     if optional:
-        choices.insert(0, Choice(_NONE, "not on this bench"))
+        choices.insert(0, Choice(name=_NONE, meaning="not on this bench"))
     while True:
         driver = dialogue.ask_choice(f"{key}.driver", f"{name}: which driver?", choices)
         if driver == _NONE:
@@ -126,8 +131,8 @@ def _ask_table(
 def _ask_preset(context: StageContext, key: str) -> TomlTable:
     """Ask for the preset of a register map; empty without one."""
     presets = sorted(path.stem for path in PRESETS.glob("*.toml"))
-    choices = [Choice(_NONE, "I have the manual: ask for each key")]
-    choices += [Choice(name, "known device") for name in presets]
+    choices = [Choice(name=_NONE, meaning="I have the manual: ask for each key")]
+    choices += [Choice(name=name, meaning="known device") for name in presets]
     preset = context.dialogue.ask_choice(f"{key}.preset", "preset?", choices, _NONE)
     return {} if preset == _NONE else {"preset": preset}
 
@@ -140,7 +145,10 @@ def _ask_key(
     meaning = find_key_meaning(f"{driver}.{field}").rstrip(".")
     ports = [tomllib.loads(each.paste)["port"] for each in found if each.kind == "port"]
     if field == "port" and ports:
-        choices = [*(Choice(port) for port in ports), Choice(_OTHER, "type another one")]
+        choices = [
+            *(Choice(name=port) for port in ports),
+            Choice(name=_OTHER, meaning="type another one"),
+        ]
         port = dialogue.ask_choice(f"{key}.port_of_list", f"  {meaning}", choices)
         if port != _OTHER:
             return port

@@ -1,13 +1,17 @@
-"""Questions to the person at the bench. `back` and `stop` are accepted at every prompt."""
+"""Questions to the person at the bench. `back` and `stop` are accepted as every answer."""
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from enum import StrEnum
 from typing import TypeVar
 
+from pydantic import BaseModel, ConfigDict
+
+from membrane_ctrl.commissioning.guide.session_state import CheckRecord
+
 T = TypeVar("T")
-ReadLine = Callable[[str, str], str]  # key and prompt; raises EOFError at the end of input
-_BACK, _STOP = ("back", "b"), ("stop", "quit")
+BACK, STOP = "back", "stop"
+_BACK, _STOP = (BACK, "b"), (STOP, "quit")
 
 
 class GoBackError(Exception):
@@ -18,23 +22,94 @@ class StopSessionError(Exception):
     """The person wants to stop, and to resume later."""
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
+class Choice(BaseModel):
     """An entry of a numbered list."""
+
+    model_config = ConfigDict(frozen=True)
 
     name: str
     meaning: str = ""
 
 
+class QuestionKind(StrEnum):
+    """What answers a question."""
+
+    TEXT = "text"
+    NUMBER = "number"
+    CHOICE = "choice"
+    CONFIRMATION = "confirmation"  # `y` or `n`
+    READINESS = "readiness"  # anything, once the person has done what is asked
+
+
+class Question(BaseModel):
+    """A question as terminal and page show it.
+
+    Attributes
+    ----------
+    key : str
+        Of the answer in the session's state.
+    kind : QuestionKind
+    text : str
+        For people; of a readiness what they are to do.
+    default : str
+        The answer if none is typed; empty without one.
+    choices : tuple of Choice
+    unit : str
+        Of a number.
+    low, high : float
+        Limits of a number.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    key: str
+    kind: QuestionKind
+    text: str
+    default: str = ""
+    choices: tuple[Choice, ...] = ()
+    unit: str = ""
+    low: float = 0.0
+    high: float = 0.0
+
+
+class StageHead(BaseModel):
+    """A stage that begins."""
+
+    model_config = ConfigDict(frozen=True)
+
+    step: int
+    title: str
+    name: str
+    does: str
+    look_for: str
+
+
+class SessionDisplay:
+    """Where a session shows its progress, and from where it gets its answers."""
+
+    def show_line(self, line: str) -> None:
+        """Show a line."""
+        raise NotImplementedError
+
+    def show_stage(self, stage: StageHead) -> None:
+        """Show that a stage begins."""
+        raise NotImplementedError
+
+    def show_check(self, check: CheckRecord) -> None:
+        """Show a check."""
+        raise NotImplementedError
+
+    def ask_question(self, question: Question) -> str:
+        """Return what the person has typed. Raises EOFError at the end of the input."""
+        raise NotImplementedError
+
+
 class Dialogue:
-    """Asks and shows.
+    """Asks, and parses the answers.
 
     Parameters
     ----------
-    read_line : callable
-        Gets the key of a question and its prompt; returns the typed line.
-    show_line : callable
-        Shows a line.
+    display : SessionDisplay
     remembered : dict
         Typed answers by key: each becomes the default when its question is asked again.
     remember : callable
@@ -43,24 +118,23 @@ class Dialogue:
 
     def __init__(
         self,
-        read_line: ReadLine,
-        show_line: Callable[[str], None],
+        display: SessionDisplay,
         remembered: dict[str, str],
         remember: Callable[[], None],
     ) -> None:
-        self._read_line = read_line
-        self._show_line = show_line
+        self.display = display
         self._remembered = remembered
         self._remember = remember
 
     def show(self, *lines: str) -> None:
         """Show lines."""
         for line in lines:
-            self._show_line(line)
+            self.display.show_line(line)
 
     def ask_text(self, key: str, question: str, default: str = "") -> str:
         """Ask for a text; an empty answer is the default."""
-        return self._ask(key, question, default, lambda text: text)
+        asked = Question(key=key, kind=QuestionKind.TEXT, text=question, default=default)
+        return self._ask(asked, lambda text: text)
 
     def ask_number(
         self, key: str, question: str, default: float, low: float, high: float, unit: str = ""
@@ -76,17 +150,22 @@ class Dialogue:
                 raise ValueError(f"must be within {low:g} .. {high:g} {unit}".rstrip())
             return value
 
-        return self._ask(key, f"{question} [{unit}]" if unit else question, f"{default:g}", parse)
+        asked = Question(
+            key=key,
+            kind=QuestionKind.NUMBER,
+            text=question,
+            default=f"{default:g}",
+            unit=unit,
+            low=low,
+            high=high,
+        )
+        return self._ask(asked, parse)
 
     def ask_choice(
         self, key: str, question: str, choices: Sequence[Choice], default: str = ""
     ) -> str:
         """Ask for one of a numbered list; returns its name. A number or a name is accepted."""
         names = [choice.name for choice in choices]
-        self.show(question)
-        width = max(len(name) for name in names)
-        for number, choice in enumerate(choices, 1):
-            self.show(f"  {number}  {choice.name:{width}}  {choice.meaning}".rstrip())
 
         def parse(text: str) -> str:
             if text in names:
@@ -95,44 +174,46 @@ class Dialogue:
                 return names[int(text) - 1]
             raise ValueError(f"choose a number from 1 to {len(names)}, or a name")
 
-        return self._ask(key, "number or name", default, parse)
+        asked = Question(
+            key=key,
+            kind=QuestionKind.CHOICE,
+            text=question,
+            default=default,
+            choices=tuple(choices),
+        )
+        return self._ask(asked, parse)
 
     def confirm(self, key: str, question: str) -> bool:
         """Ask yes or no; there is no default, because it must be seen each time."""
-
-        def parse(text: str) -> bool:
-            if text.lower() in ("y", "yes"):
-                return True
-            if text.lower() in ("n", "no"):
-                return False
-            raise ValueError("answer y or n")
-
+        asked = Question(key=key, kind=QuestionKind.CONFIRMATION, text=question)
         while True:
-            typed = self._read(key, f"{question} [y/n]")
-            try:
-                return parse(typed)
-            except ValueError as error:
-                self.show(f"  {error}")
+            typed = self._read(asked).lower()
+            if typed in ("y", "yes"):
+                return True
+            if typed in ("n", "no"):
+                return False
+            self.show("  answer y or n")
 
     def wait(self, key: str, request: str) -> None:
-        """Ask the person to do something and to press Enter."""
-        self._read(key, f"{request}, then press Enter")
+        """Ask the person to do something and to state that it is done."""
+        self._read(Question(key=key, kind=QuestionKind.READINESS, text=request))
 
-    def _ask(self, key: str, question: str, default: str, parse: Callable[[str], T]) -> T:
-        default = self._remembered.get(key, default)
+    def _ask(self, asked: Question, parse: Callable[[str], T]) -> T:
+        default = self._remembered.get(asked.key, asked.default)
+        asked = asked.model_copy(update={"default": default})
         while True:
-            typed = self._read(key, f"{question} ({default})" if default else question)
+            typed = self._read(asked)
             try:
                 value = parse(typed or default)
             except ValueError as error:
                 self.show(f"  {error}")
                 continue
-            self._remembered[key] = typed or default
+            self._remembered[asked.key] = typed or default
             self._remember()
             return value
 
-    def _read(self, key: str, prompt: str) -> str:
-        typed = self._read_line(key, prompt).strip()
+    def _read(self, asked: Question) -> str:
+        typed = self.display.ask_question(asked).strip()
         if typed.lower() in _BACK:
             raise GoBackError
         if typed.lower() in _STOP:

@@ -7,7 +7,6 @@ by `instrument_lab` where they are probed.
 
 import asyncio
 import contextlib
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,6 +25,7 @@ from membrane_ctrl.commissioning.guide.bench_access import (
 )
 from membrane_ctrl.commissioning.guide.real_bench import stop_outputs
 from membrane_ctrl.commissioning.guide.session_state import CONFIGURATION
+from membrane_ctrl.commissioning.guide.shown_program import run_shown
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.sessions.live_hold import HoldLink
@@ -161,13 +161,15 @@ class EmulatedBench:
         finally:
             link.close()
 
-    def run_tuning(self, folder: Path, config: Config, command: str) -> int:
+    def run_tuning(
+        self, folder: Path, config: Config, command: str, show: Callable[[str], None]
+    ) -> int:
         """Run `tune` on a twin of its own; its gains are not saved."""
         configuration = str(folder / CONFIGURATION)
         logs = str(folder / "logs")
         arguments = [sys.executable, "-m", "membrane_ctrl", "tune", command, "--twin"]
         arguments += ["--config", configuration, "--logs", logs, "--yes"]
-        return subprocess.run(arguments, check=False).returncode
+        return run_shown(arguments, show)
 
 
 class _BoardInMemory:

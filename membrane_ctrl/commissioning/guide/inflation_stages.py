@@ -221,7 +221,8 @@ def run_tuning_in_hold(context: StageContext, run_name: str, command: str) -> in
         with context.access.start_hold(context.folder, context.config, run_name) as link:
             hold_depth(context, link, context.config.loop.setpoint_um)
             link.close()
-            return context.access.run_tuning(context.folder, context.config, command)
+            show = context.dialogue.show
+            return context.access.run_tuning(context.folder, context.config, command, show)
     except HoldError as error:
         raise StageFailedError(f"the controller ended it: {error}") from None
 

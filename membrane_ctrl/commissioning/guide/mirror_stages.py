@@ -42,9 +42,10 @@ def ask_mirror(context: StageContext) -> None:
         "which mirror?",
         (
             Choice(
-                _PAPER, "1 m, 37.1 mm deep, PET 50 µm and 10 µm: the paper's; you may change it"
+                name=_PAPER,
+                meaning="1 m, 37.1 mm deep, PET 50 µm and 10 µm: the paper's; you may change it",
             ),
-            Choice(_OWN, "another one"),
+            Choice(name=_OWN, meaning="another one"),
         ),
         _PAPER,
     )
@@ -60,8 +61,10 @@ def ask_mirror(context: StageContext) -> None:
             "mirror.pump_kind",
             "how does its flow follow the command?",
             (
-                Choice(_DIAPHRAGM, "it starts at 22 % and stalls below 15 % of full drive"),
-                Choice(_PROPORTIONAL, "from 0 on, as a flow controller"),
+                Choice(
+                    name=_DIAPHRAGM, meaning="it starts at 22 % and stalls below 15 % of full drive"
+                ),
+                Choice(name=_PROPORTIONAL, meaning="from 0 on, as a flow controller"),
             ),
             _DIAPHRAGM,
         )

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,6 +21,7 @@ from membrane_ctrl.commissioning.devices import (
 )
 from membrane_ctrl.commissioning.guide.bench_access import Action, HandMotion, OpenBench
 from membrane_ctrl.commissioning.guide.session_state import CONFIGURATION
+from membrane_ctrl.commissioning.guide.shown_program import run_shown
 from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port.ctl import Where
@@ -115,16 +116,18 @@ class RealBench:
         finally:
             _end_process(process)
 
-    def run_tuning(self, folder: Path, config: Config, command: str) -> int:
+    def run_tuning(
+        self, folder: Path, config: Config, command: str, show: Callable[[str], None]
+    ) -> int:
         """Run `tune` on the hold that runs."""
         logs = str(folder / "logs")
         arguments = [*_own_command(), "tune", command, "--logs", logs, "--yes", "--take-over"]
-        found = subprocess.run(arguments, check=False)
-        if found.returncode == 0:
+        code = run_shown(arguments, show)
+        if code == 0:
             configuration = str(folder / CONFIGURATION)
             saved = [*_own_command(), "tune", "save", "--logs", logs, "--config", configuration]
-            found = subprocess.run([*saved, "--yes"], check=False)
-        return found.returncode
+            code = run_shown([*saved, "--yes"], show)
+        return code
 
 
 async def stop_outputs(open_bench: roles.Bench) -> None:

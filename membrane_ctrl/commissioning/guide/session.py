@@ -1,6 +1,6 @@
 """The command `commission`: runs the stages in order, and resumes where it stopped."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,7 +19,8 @@ from membrane_ctrl.commissioning.guide.dialogue import (
     Choice,
     Dialogue,
     GoBackError,
-    ReadLine,
+    SessionDisplay,
+    StageHead,
     StopSessionError,
 )
 from membrane_ctrl.commissioning.guide.session_state import (
@@ -62,8 +63,7 @@ class CommissioningSession:
     folder : path
         Of the session: `session.json`, `lab.toml`, runs, report.
     access : BenchAccess
-    read_line, show_line : callable
-        See `Dialogue`.
+    display : SessionDisplay
     plan : SessionPlan, optional
     stages : sequence of CommissioningStage, optional
     """
@@ -72,8 +72,7 @@ class CommissioningSession:
         self,
         folder: Path,
         access: BenchAccess,
-        read_line: ReadLine,
-        show_line: Callable[[str], None],
+        display: SessionDisplay,
         plan: SessionPlan = FULL_PLAN,
         stages: Sequence[CommissioningStage] = STAGES,
     ) -> None:
@@ -83,7 +82,7 @@ class CommissioningSession:
         self._stages = stages
         self._state = self._open_state()
         self._dialogue = Dialogue(
-            read_line, show_line, self._state.answers, lambda: write_state(folder, self._state)
+            display, self._state.answers, lambda: write_state(folder, self._state)
         )
 
     def _open_state(self) -> SessionState:
@@ -130,13 +129,7 @@ class CommissioningSession:
         stage = self._stages[index]
         if not self._is_needed(stage):
             return index + 1
-        title = report.STEP_TITLES[stage.step]
-        self._dialogue.show(
-            "",
-            f"{stage.step}. {title}: {stage.name}",
-            f"  It {stage.does}.",
-            f"  To be seen: {stage.look_for}.",
-        )
+        self._dialogue.display.show_stage(make_stage_head(stage))
         context = StageContext(self._folder, self._state, self._dialogue, self._access, self._plan)
         problem = ""
         try:
@@ -158,9 +151,14 @@ class CommissioningSession:
     def _ask_after_failure(self, index: int, record: StageRecord, problem: str) -> int:
         """What to do after a stage that failed: again, back, or on where gas may move anyway."""
         stage = self._stages[index]
-        choices = [Choice(_AGAIN, "run this stage again"), Choice(_BACK, "the stage before")]
+        choices = [
+            Choice(name=_AGAIN, meaning="run this stage again"),
+            Choice(name=_BACK, meaning="the stage before"),
+        ]
         if not problem and not stage.must_pass:
-            choices.append(Choice(_ON, "go on; the report names it as a reason not to accept"))
+            choices.append(
+                Choice(name=_ON, meaning="go on; the report names it as a reason not to accept")
+            )
         self._state.answers.pop(f"{stage.name}.after", None)
         try:
             answer = self._dialogue.ask_choice(f"{stage.name}.after", "what now?", choices)
@@ -201,6 +199,17 @@ class CommissioningSession:
             f"configuration: {self._folder / CONFIGURATION}",
         )
         return errors.Exit.DONE if accepted else errors.Exit.REJECTED
+
+
+def make_stage_head(stage: CommissioningStage) -> StageHead:
+    """What is shown when a stage begins."""
+    return StageHead(
+        step=stage.step,
+        title=report.STEP_TITLES[stage.step],
+        name=stage.name,
+        does=stage.does,
+        look_for=stage.look_for,
+    )
 
 
 def _now_utc() -> str:

@@ -133,10 +133,7 @@ class StageContext:
 
     def _add(self, check: CheckRecord) -> None:
         self.checks.append(check)
-        limit = f" ({check.limit})" if check.limit else ""
-        self.dialogue.show(f"  {check.verdict}: {check.name}: {check.measured}{limit}")
-        if check.remedy:
-            self.dialogue.show(f"    {check.remedy}")
+        self.dialogue.display.show_check(check)
 
     def _write(self, tables: TomlTable) -> None:
         try:

@@ -1,0 +1,116 @@
+"""A session as messages: what the page's service gets from it, and sends back.
+
+The session runs in a program of its own (`commission FOLDER --messages`). It writes one JSON object
+a line; each question has a number. It reads one JSON object a line, an answer with the number of
+its question. An answer to any other question is dropped: a confirmation acts once, however often a
+browser sends it.
+"""
+
+import queue
+import threading
+from collections.abc import Callable
+from typing import Annotated, Literal, TextIO
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from membrane_ctrl.commissioning.guide.dialogue import Question, SessionDisplay, StageHead
+from membrane_ctrl.commissioning.guide.session_state import CheckRecord
+
+
+class LineMessage(BaseModel):
+    """A line for people."""
+
+    kind: Literal["line"] = "line"
+    text: str
+
+
+class StageMessage(BaseModel):
+    """A stage begins."""
+
+    kind: Literal["stage"] = "stage"
+    stage: StageHead
+
+
+class CheckMessage(BaseModel):
+    """A check was made."""
+
+    kind: Literal["check"] = "check"
+    check: CheckRecord
+
+
+class QuestionMessage(BaseModel):
+    """A question waits for its answer."""
+
+    kind: Literal["question"] = "question"
+    number: int
+    question: Question
+
+
+SessionMessage = Annotated[
+    LineMessage | StageMessage | CheckMessage | QuestionMessage, Field(discriminator="kind")
+]
+MESSAGES: TypeAdapter[SessionMessage] = TypeAdapter(SessionMessage)
+
+
+class AnswerMessage(BaseModel):
+    """An answer to the question of a number."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    number: int
+    answer: str
+
+
+class MessageDisplay(SessionDisplay):
+    """Writes messages, and waits for answers.
+
+    Parameters
+    ----------
+    source, target : file
+        Where answers are read from, and messages are written to.
+    interrupt : callable
+        Called once the source has ended: the service is gone, and the session stops at once.
+    """
+
+    def __init__(self, source: TextIO, target: TextIO, interrupt: Callable[[], None]) -> None:
+        self._source = source
+        self._target = target
+        self._interrupt = interrupt
+        self._number = 0
+        self._answers: queue.SimpleQueue[AnswerMessage | None] = queue.SimpleQueue()
+        threading.Thread(target=self._read_answers, daemon=True).start()
+
+    def show_line(self, line: str) -> None:
+        """Send a line."""
+        self._send(LineMessage(text=line))
+
+    def show_stage(self, stage: StageHead) -> None:
+        """Send that a stage begins."""
+        self._send(StageMessage(stage=stage))
+
+    def show_check(self, check: CheckRecord) -> None:
+        """Send a check."""
+        self._send(CheckMessage(check=check))
+
+    def ask_question(self, question: Question) -> str:
+        """Send a question and wait for its answer. Raises EOFError if none can come."""
+        self._number += 1
+        self._send(QuestionMessage(number=self._number, question=question))
+        while True:
+            given = self._answers.get()
+            if given is None:
+                raise EOFError
+            if given.number == self._number:
+                return given.answer
+
+    def _send(self, message: BaseModel) -> None:
+        print(message.model_dump_json(), file=self._target, flush=True)
+
+    def _read_answers(self) -> None:
+        for line in self._source:
+            try:
+                self._answers.put(AnswerMessage.model_validate_json(line))
+            except ValidationError:
+                continue
+        self._answers.put(None)
+        self._interrupt()
