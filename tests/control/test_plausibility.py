@@ -217,3 +217,24 @@ def test_a_laser_after_a_gap_is_compared_by_its_new_readings(moved_um: float) ->
         figure = estimate(time_s, SAG_UM + film_um) if tick % 20 == 0 else None
         verdicts.add(check.step(1 / RATE_HZ, laser_um, gauge_pa, figure))
     assert verdicts == {FaultySensor.NONE}
+
+
+@pytest.mark.parametrize("size_um", [-345.0, 25.0, 330.0])
+def test_a_displaced_laser_is_not_blamed_again_in_its_new_place(size_um: float) -> None:
+    """Its mean was 16 µm behind when the comparison began again."""
+    check, now_s = settled(0.0, 0.0, 0.0)
+    rng = np.random.default_rng(3)
+
+    def judge(duration_s: float) -> list[FaultySensor]:
+        nonlocal now_s
+        verdicts: list[FaultySensor] = []
+        for _ in range(round(duration_s * RATE_HZ)):
+            now_s += 1.0 / RATE_HZ
+            laser_um = size_um + rng.standard_normal()
+            figure = estimate(now_s, SAG_UM)
+            verdicts.append(check.step(1.0 / RATE_HZ, laser_um, PRESSURE_PA, figure))
+        return verdicts
+
+    assert judge(31.0)[-1] == FaultySensor.LASER
+    check.rebase()
+    assert set(judge(120.0)) == {FaultySensor.NONE}
