@@ -22,7 +22,6 @@ from pydantic import Field
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
 from membrane_ctrl.control import gas_transit
 from membrane_ctrl.control.centre_estimate import (
-    FRESH_S,
     CentreEstimate,
     CentreReadings,
     Sensor,
@@ -50,6 +49,8 @@ LOCK_FRAMES = 5  # from then on the optics alone could hold the mirror
 # long after the first frame
 _LOCK_SIGMA_UM = 0.03
 _LOCK_MOST_S = 60.0
+# How long after its last accepted reading a sensor still counts as seeing the mirror, at most.
+FRESH_S = {Sensor.LASER: 0.5, Sensor.OPTICS: 5.0, Sensor.BAROMETER: 5.0, Sensor.THERMOMETER: 5.0}
 _FRAMES_LOST = 3  # after this many missing frames the optics are gone
 _INTERVAL_SHARE = 0.2  # of a new interval in their mean
 _IMPOSSIBLE = 1e4  # µm, Pa or K: no film, weather or mount moves that far in a hold

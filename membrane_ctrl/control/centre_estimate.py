@@ -16,10 +16,6 @@ class Sensor(IntEnum):
     THERMOMETER = 3
 
 
-# How long after its last accepted reading a sensor still counts as seeing the mirror, at most.
-FRESH_S = {Sensor.LASER: 0.5, Sensor.OPTICS: 5.0, Sensor.BAROMETER: 5.0, Sensor.THERMOMETER: 5.0}
-
-
 @dataclass(frozen=True, slots=True)
 class CentreReadings:
     """Readings of one tick; NaN for missing ones."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from membrane_ctrl.commissioning.guide.emulated_bench import EmulatedBench
-from membrane_ctrl.commissioning.guide.session import STAGES, CommissioningSession
+from membrane_ctrl.commissioning.guide.session import CommissioningSession
 from membrane_ctrl.commissioning.guide.session_state import SessionState, read_state
 from membrane_ctrl.commissioning.guide.stage import SessionPlan
+from membrane_ctrl.commissioning.guide.stage_list import STAGES
 from membrane_ctrl.commissioning.guide.text_display import TextDisplay
 from membrane_ctrl.hold.virtual_hold import VirtualHold
 from membrane_ctrl.model.errors import Exit

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from membrane_ctrl.commissioning.guide import thresholds
 from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth, run_tuning_in_hold
 from membrane_ctrl.commissioning.guide.stage import (
-    CommissioningStage,
     StageContext,
 )
 from membrane_ctrl.commissioning.guide.stage_words import format_duration
@@ -153,21 +152,3 @@ def _judge_hold(context: StageContext, figures: HoldFigures, faults: list[str]) 
         thresholds.HOLD_MISSED,
         "move other work off this machine (docs/how-to/operations.md, Deadlines)",
     )
-
-
-STAGES = (
-    CommissioningStage(
-        step=6,
-        name="tune",
-        does="identifies the plant, designs gains, tries them, and keeps them if they are better",
-        look_for="a verification that keeps the gains",
-        run=tune_loop,
-    ),
-    CommissioningStage(
-        step=6,
-        name="hold",
-        does="holds the mirror for an hour",
-        look_for="no fault, and an error well below the band",
-        run=hold_hour,
-    ),
-)

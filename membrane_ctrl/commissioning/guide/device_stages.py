@@ -17,7 +17,6 @@ from membrane_ctrl.commissioning.first_config import (
 from membrane_ctrl.commissioning.guide.dialogue import Choice
 from membrane_ctrl.commissioning.guide.session_state import TomlTable
 from membrane_ctrl.commissioning.guide.stage import (
-    CommissioningStage,
     StageContext,
     StageFailedError,
 )
@@ -209,15 +208,3 @@ def _judge_configuration(context: StageContext) -> None:
         )
     if not findings:
         context.require("configuration", True, "no finding")
-
-
-STAGES = (
-    CommissioningStage(
-        step=2,
-        name="devices",
-        does="asks which device fills which role, and writes the configuration",
-        look_for="no contradiction between devices, mirror and limits",
-        run=ask_devices,
-        must_pass=True,
-    ),
-)

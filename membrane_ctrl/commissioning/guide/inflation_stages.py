@@ -12,7 +12,6 @@ import numpy as np
 from membrane_ctrl.commissioning.guide import thresholds
 from membrane_ctrl.commissioning.guide.mirror_design import derive_design
 from membrane_ctrl.commissioning.guide.stage import (
-    CommissioningStage,
     StageContext,
     StageFailedError,
 )
@@ -234,29 +233,3 @@ def map_pump(context: StageContext) -> None:
     context.require(
         "pump's curve", code == 0, f"exit code {code}", "read the messages above; then try again"
     )
-
-
-STAGES = (
-    CommissioningStage(
-        step=4,
-        name="inflation",
-        does="fills the mirror with the controller, depth by depth, each after your confirmation",
-        look_for="a round film without folds, gauge and laser that agree with the film's law",
-        run=inflate_in_steps,
-        must_pass=True,
-    ),
-    CommissioningStage(
-        step=4,
-        name="leak",
-        does="holds the mirror, switches the pump off for a minute, and measures how it sinks",
-        look_for="a leak between 0.4 µm/s and 60 % of the pump's flow",
-        run=measure_leak,
-    ),
-    CommissioningStage(
-        step=4,
-        name="pump",
-        does="measures the pump's flow against its command, by the mirror",
-        look_for="a curve that passes its trial",
-        run=map_pump,
-    ),
-)

@@ -9,7 +9,6 @@ from membrane_ctrl.commissioning.guide.mirror_design import (
     derive_design,
 )
 from membrane_ctrl.commissioning.guide.stage import (
-    CommissioningStage,
     StageContext,
     StageFailedError,
 )
@@ -166,15 +165,3 @@ def write_design(context: StageContext, facts: MirrorFacts, design: MirrorDesign
 def _round(value: float) -> float:
     """Four digits, for a file that people read."""
     return float(f"{value:.4g}")
-
-
-STAGES = (
-    CommissioningStage(
-        step=1,
-        name="mirror",
-        does="asks for films, ring, pump and relief valve, and derives pressure, stress and limits",
-        look_for="a stress well below the film's yield stress, and a pump that exceeds the leak",
-        run=ask_mirror,
-        must_pass=True,
-    ),
-)

@@ -6,10 +6,10 @@ from membrane_ctrl.commissioning.guide import thresholds
 from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth
 from membrane_ctrl.commissioning.guide.session_state import SessionState, TomlTable
 from membrane_ctrl.commissioning.guide.stage import (
-    CommissioningStage,
     StageContext,
     StageFailedError,
 )
+from membrane_ctrl.commissioning.guide.threshold import Threshold
 from membrane_ctrl.config import sight
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sessions.live_hold import HoldError
@@ -17,7 +17,7 @@ from membrane_ctrl.sessions.live_hold import HoldError
 _FIGURES = 5
 _FIGURES_WITHIN_S = 300.0
 _FULL_8_BITS = 255.0
-_GOOD_SHARE = thresholds.Threshold(
+_GOOD_SHARE = Threshold(
     "figures with the verdict ok", 0.8, "of all", "one of five may be disturbed", is_least=True
 )
 
@@ -121,31 +121,3 @@ def measure_figure(context: StageContext) -> None:
 def has_camera(state: SessionState, tables: TomlTable) -> bool:
     """Whether a camera is configured."""
     return "camera" in tables.get("devices", {})
-
-
-STAGES = (
-    CommissioningStage(
-        step=5,
-        name="screen",
-        does="takes pictures of a checkerboard, of steps and of a ramp of grey",
-        look_for="a good exposure, single pixels, a settling time, a gamma",
-        run=test_screen,
-        is_needed=has_camera,
-    ),
-    CommissioningStage(
-        step=5,
-        name="geometry",
-        does="asks for the distances measured by hand, and follows the camera's rays",
-        look_for="the whole mirror reflects the pattern",
-        run=ask_geometry,
-        is_needed=has_camera,
-    ),
-    CommissioningStage(
-        step=5,
-        name="figure",
-        does="holds the mirror and measures five figures",
-        look_for="verdict ok, most of the mirror measured, bright fringes",
-        run=measure_figure,
-        is_needed=has_camera,
-    ),
-)

@@ -5,15 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from firmware_iface import roles
-from membrane_ctrl.commissioning.guide import (
-    acceptance_stages,
-    device_stages,
-    inflation_stages,
-    mirror_stages,
-    optics_stages,
-    report,
-    wiring_stages,
-)
+from membrane_ctrl.commissioning.guide import report
 from membrane_ctrl.commissioning.guide.bench_access import BenchAccess
 from membrane_ctrl.commissioning.guide.dialogue import (
     Choice,
@@ -32,23 +24,15 @@ from membrane_ctrl.commissioning.guide.session_state import (
     write_state,
 )
 from membrane_ctrl.commissioning.guide.stage import (
-    FULL_PLAN,
     CommissioningStage,
     SessionPlan,
     StageContext,
     StageFailedError,
 )
+from membrane_ctrl.commissioning.guide.stage_list import STAGES
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.account import account_name
 
-STAGES: tuple[CommissioningStage, ...] = (
-    *mirror_stages.STAGES,
-    *device_stages.STAGES,
-    *wiring_stages.STAGES,
-    *inflation_stages.STAGES,
-    *optics_stages.STAGES,
-    *acceptance_stages.STAGES,
-)
 _AGAIN, _ON, _BACK = "again", "continue", "back"
 _HELP = (
     "At every prompt: `back` returns to the stage before, `stop` or Ctrl-C ends; nothing is lost."
@@ -65,6 +49,7 @@ class CommissioningSession:
     access : BenchAccess
     display : SessionDisplay
     plan : SessionPlan, optional
+        The durations of a full session by default.
     stages : sequence of CommissioningStage, optional
     """
 
@@ -73,7 +58,7 @@ class CommissioningSession:
         folder: Path,
         access: BenchAccess,
         display: SessionDisplay,
-        plan: SessionPlan = FULL_PLAN,
+        plan: SessionPlan = SessionPlan(),  # noqa: B008
         stages: Sequence[CommissioningStage] = STAGES,
     ) -> None:
         self._folder = folder

@@ -16,7 +16,7 @@ from membrane_ctrl.commissioning.guide.session_state import (
     read_tables,
     write_tables,
 )
-from membrane_ctrl.commissioning.guide.thresholds import Threshold
+from membrane_ctrl.commissioning.guide.threshold import Threshold
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.model import errors
@@ -48,9 +48,6 @@ class SessionPlan:
     hold_s: float = 3600.0
 
 
-FULL_PLAN = SessionPlan()
-
-
 @dataclass(slots=True)
 class StageContext:
     """What a stage works with; it collects the stage's checks."""
@@ -59,7 +56,7 @@ class StageContext:
     state: SessionState
     dialogue: Dialogue
     access: BenchAccess
-    plan: SessionPlan = FULL_PLAN
+    plan: SessionPlan = SessionPlan()
     checks: list[CheckRecord] = field(default_factory=list)
 
     @property

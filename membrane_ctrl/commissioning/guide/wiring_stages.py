@@ -19,7 +19,6 @@ from membrane_ctrl.commissioning.guide.bench_access import (
 from membrane_ctrl.commissioning.guide.mirror_design import derive_design
 from membrane_ctrl.commissioning.guide.session_state import SessionState, TomlTable
 from membrane_ctrl.commissioning.guide.stage import (
-    CommissioningStage,
     StageContext,
     StageFailedError,
 )
@@ -407,87 +406,6 @@ def _bench_pressure_pa(context: StageContext) -> float:
     return share * context.config.limits.gauge_pressure_max_pa
 
 
-def _has_laser(state: SessionState, tables: TomlTable) -> bool:
+def has_laser(state: SessionState, tables: TomlTable) -> bool:
     devices = tables.get("devices", {})
     return "board" in devices or "displacement" in devices
-
-
-STAGES = (
-    CommissioningStage(
-        step=3,
-        name="probe",
-        does="opens each device, reads it, and closes it; nothing is written",
-        look_for="every device answers with a plausible reading",
-        run=probe_devices,
-        must_pass=True,
-    ),
-    CommissioningStage(
-        step=3,
-        name="gauge_zero",
-        does="reads the gauge of the vented mirror for 3 s",
-        look_for="a reading near 0 Pa whose last digit moves",
-        run=test_gauge_zero,
-        must_pass=True,
-    ),
-    CommissioningStage(
-        step=3,
-        name="gauge_sign",
-        does="reads the gauge before and while a hand presses the film",
-        look_for="a reading that rises",
-        run=test_gauge_sign,
-        must_pass=True,
-    ),
-    CommissioningStage(
-        step=3,
-        name="laser",
-        does="reads the laser before and after a card is moved",
-        look_for="a reading that rises by as much as the card was moved",
-        run=test_laser,
-        must_pass=True,
-        is_needed=_has_laser,
-    ),
-    CommissioningStage(
-        step=3,
-        name="outputs",
-        does="opens the vent, then runs the pump with the vent open, 3 s each",
-        look_for="read-backs that follow, and the sound of vent and pump",
-        run=test_outputs,
-        must_pass=True,
-    ),
-    CommissioningStage(
-        step=3,
-        name="watchdog",
-        does="runs the pump with the vent open, and stops commanding it",
-        look_for="the pump stops by itself",
-        run=test_watchdog,
-        must_pass=True,
-    ),
-    CommissioningStage(
-        step=3,
-        name="cable",
-        does="runs the pump with the vent open, until its data cable is pulled",
-        look_for="the pump stops without the program",
-        run=test_cable,
-    ),
-    CommissioningStage(
-        step=3,
-        name="interlocks",
-        does="reads every circuit while you open it, and while its signal is unplugged",
-        look_for="the opened circuit, and no other, is seen open",
-        run=test_interlocks,
-    ),
-    CommissioningStage(
-        step=3,
-        name="emergency_stop",
-        does="runs the pump with the vent open while you push the emergency stop",
-        look_for="the pump stops at once",
-        run=test_emergency_stop,
-    ),
-    CommissioningStage(
-        step=3,
-        name="relief",
-        does="compares the relief valve's pressure with the limit and with the film's strength",
-        look_for="a valve between the two that was seen to open",
-        run=test_relief,
-    ),
-)
