@@ -17,6 +17,7 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from firmware_iface import driver_kind, drivers
 from firmware_iface.roles import ROLES
+from membrane_ctrl.config.attribute_texts import list_attribute_texts
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import suggest_word
 from membrane_ctrl.model.errors import InputError
@@ -106,7 +107,20 @@ class TableHelp:
 
 
 class _TomlSchema(GenerateJsonSchema):
-    """TOML has no null: an optional key is one that may be absent."""
+    """The schema of TOML tables, each key with the text below its attribute.
+
+    TOML has no null: an optional key is one that may be absent.
+    """
+
+    def model_schema(self, schema: Any) -> dict[str, Any]:
+        table = super().model_schema(schema)
+        section = schema["cls"]
+        texts = list_attribute_texts(section)
+        for name, field in section.model_fields.items():
+            key = table.get("properties", {}).get(field.alias or name)
+            if key is not None and field.description is None and name in texts:
+                key["description"] = texts[name]
+        return table
 
     def nullable_schema(self, schema: Any) -> dict[str, Any]:
         return self.generate_inner(schema["schema"])
