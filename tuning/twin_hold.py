@@ -73,6 +73,9 @@ class TwinHold:
                     "loop.kp_per_s and double "
                     "loop.ti_s; else see `membrane-ctrl check`"
                 )
+        # The start may have limited the gains, and replaced an assumed curve of the pump
+        in_use = {"loop": self._run.loop_config, "pump": self._run.pump_config}
+        self.config = config.model_copy(update=in_use)
 
     def send_command(self, command: Command) -> None:
         """Run the tick that executes the command. Raises HoldError if it is refused."""

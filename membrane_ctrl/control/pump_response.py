@@ -168,6 +168,25 @@ def identify_pump_response(
     return replace(response, sum_sigma_s=max(response.sum_sigma_s, shift_sigma_s))
 
 
+def estimate_flow(
+    readings: FloatArray,
+    switches: Sequence[Switch],
+    response: PumpResponse,
+    still_um_per_s: float,
+) -> float:
+    """Flow of the pump when it is on, in µm/s: k of (1) by least squares, for a known response.
+
+    Parameters are those of `identify_pump_response`.
+    """
+    time_s = readings[:, 0]
+    path = _simulate_paths(
+        time_s, switches, np.array([response.delay_s]), np.array([response.lag_s])
+    )[:, 0]
+    height_um = readings[:, 1] - still_um_per_s * time_s
+    path = path - path.mean()
+    return float(path @ height_um / (path @ path))
+
+
 def apply_response(estimator: EstimatorConfig, response: PumpResponse | None) -> EstimatorConfig:
     """The settings with an identified response, if they do not state one."""
     if response is None or estimator.pump_response == "stated":

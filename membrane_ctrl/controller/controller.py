@@ -57,6 +57,7 @@ from membrane_ctrl.model.events import (
     LockRemoved,
     LockSet,
     PumpResponseFound,
+    PumpStronger,
     Resumed,
     ShapeLoopState,
     StateEntered,
@@ -233,6 +234,7 @@ class Controller:
             self.memory.state_since_s = inputs.now_s
             context.state_age_s = 0.0
         self._run_state(events)
+        self._use_pump(events)
         self._use_response(events)
         if context.loop.learned and self.state == State.HOLD:
             events += self._consistency.report_pump_curve(context.loop)
@@ -345,6 +347,7 @@ class Controller:
             self.memory.state_since_s = inputs.now_s
         context.state_age_s = inputs.now_s - self.memory.state_since_s
         context.found_response = None
+        context.found_pump = None
         events += context.interlocks.observe_reading(inputs.reading, self.state)
         self._answers = []
         self._clear_mask = 0
@@ -590,6 +593,19 @@ class Controller:
                 context.vent_fraction = 0.0
         if wanted != self.state:
             self._enter_state(wanted, context.why.text, events)
+
+    def _use_pump(self, events: list[Event]) -> None:
+        """Let the loop use the size of a pump that was found much stronger than assumed."""
+        context = self._context
+        pump = context.found_pump
+        if pump is None or self._gains.on_trial:
+            return
+        self._gains.replace_pump(pump)
+        self._set_gains(context.loop_config)
+        # The loop began in this tick at the flow of the leak, by the assumed curve
+        context.loop.start(context.observer.displacement_um, context.found_leak_um_per_s)
+        assumed_um_per_s = self._config.pump.flow_full_um_per_s
+        events.append(PumpStronger(pump.flow_full_um_per_s, assumed_um_per_s))
 
     def _use_response(self, events: list[Event]) -> None:
         """Let loop and estimate use a response that was identified in this tick."""

@@ -76,6 +76,11 @@ class GainsTrial:
         self.memory.good = self.memory.tried
         self._end_trial()
 
+    def replace_pump(self, pump: PumpConfig) -> None:
+        """Replace the pump's curve, which is not on trial, by another one that stays."""
+        self.memory.tried = replace(self.memory.tried, pump=pump)
+        self.keep()
+
     def limit(self, loop: LoopConfig) -> None:
         """Replace the loop's settings, which are not on trial, by others that stay."""
         self.memory.tried = replace(self.memory.tried, loop=loop)

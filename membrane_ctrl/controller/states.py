@@ -365,21 +365,31 @@ def _test_actuators(context: TickContext) -> State:
         context.explain(WhyCode.FILM_NOT_RESPONDING, responds)
         return State.CHECK
     context.found_response = test.response
+    context.found_pump = test.stronger_pump
+    context.found_leak_um_per_s = test.leak_um_per_s
     return _begin_loop(context, test.leak_um_per_s)
 
 
 def _get_actuator_test(context: TickContext) -> actuator_test.ActuatorTest:
     """The actuator test, which begins with this tick if there is none."""
     memory, rate_hz = context.test_memory, context.config.loop.rate_hz
+    # A curve that was measured since the start is no assumption
+    assumed = (
+        context.config.states.actuator_size == "any" and context.pump_config == context.config.pump
+    )
     if memory is not None:
-        return actuator_test.ActuatorTest(memory.pump, memory.test_vent, rate_hz, memory=memory)
+        return actuator_test.ActuatorTest(
+            memory.pump, memory.test_vent, rate_hz, memory=memory, assumed=assumed
+        )
     reading = context.observer.reading
     vents = reading is not None and math.isfinite(reading.vent_fraction)
     tense = (
         reading is not None and reading.gauge_pressure_pa > context.config.states.vented_pressure_pa
     )
     identify = context.config.estimator.pump_response == "identified"
-    test = actuator_test.ActuatorTest(context.pump_config, vents and tense, rate_hz, identify)
+    test = actuator_test.ActuatorTest(
+        context.pump_config, vents and tense, rate_hz, identify, assumed=assumed
+    )
     context.test_memory = test.memory
     return test
 

@@ -95,6 +95,8 @@ class TickContext(TickContextState):
     state_age_s: float = 0.0  # 0 exactly in the first tick of a state
     estimate: CentreEstimate | None = None  # held instead of the laser's reading, if there is one
     found_response: PumpResponse | None = None  # identified in this tick
+    found_pump: PumpConfig | None = None  # in this tick: it is stronger than assumed
+    found_leak_um_per_s: float = 0.0  # in that tick
     pump_fraction: float = 0.0
     vent_fraction: float = 0.0
 

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from firmware_iface import roles
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.controller import controller, tick
 from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
@@ -113,9 +113,8 @@ class VirtualRun:
             shapes=self._newest_shape if shape else None,
             truth=self._record_truth,
         )
-        self._supervisor = Supervisor(
-            controller.Controller(config, sag_sensitivity), wiring, self.clock, config.loop.rate_hz
-        )
+        self._controller = controller.Controller(config, sag_sensitivity)
+        self._supervisor = Supervisor(self._controller, wiring, self.clock, config.loop.rate_hz)
         bench.open()
 
     def run_tick(self, commands: tuple[Command, ...] = ()) -> VirtualTick | None:
@@ -150,6 +149,16 @@ class VirtualRun:
         if self.finished is None:
             return errors.Exit.INTERRUPTED
         return self.finished
+
+    @property
+    def loop_config(self) -> LoopConfig:
+        """The loop's present settings."""
+        return self._controller.loop_config
+
+    @property
+    def pump_config(self) -> PumpConfig:
+        """The pump's curve, as the loop uses it now."""
+        return self._controller.pump_config
 
     def end_run(self) -> None:
         """Record the end of the run."""

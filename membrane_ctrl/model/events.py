@@ -365,6 +365,19 @@ class GainsLimited(
     stated_ti_s: float
 
 
+class PumpStronger(
+    Event,
+    kind="pump_stronger",
+    sentence="The pump gives about {flow_full_um_per_s:.3g} µm/s, not {assumed_um_per_s:.3g}: the "
+    "loop takes it as a straight line until `tune pump` measures it",
+    notable=True,
+):
+    """A pump whose curve nobody has stated is much stronger than the default one."""
+
+    flow_full_um_per_s: float
+    assumed_um_per_s: float
+
+
 class ProcessValueChosen(
     Event, kind="process_value", sentence="The loop follows the {value}: {reason}"
 ):

@@ -27,7 +27,7 @@ from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
-from membrane_ctrl.model.events import Event, GainsLimited, PumpResponseFound
+from membrane_ctrl.model.events import Event, GainsLimited, PumpResponseFound, PumpStronger
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.state_tree import decode_state, encode_state
 from membrane_ctrl.model.telemetry import State
@@ -61,6 +61,8 @@ class Bench:
     identify: bool = False
     error_um: Error = no_error  # of the laser, by the time of the test
     before_um_per_s: float = 0.0  # the pump's flow until the test begins
+    leak_um_per_s: float = 1.2
+    assumed: bool = False
 
     def run(self, seed: int) -> tuple[str, float]:
         """The test's failure, and how long it took."""
@@ -71,7 +73,7 @@ class Bench:
         """The test at its end, and how long it took."""
         rng = np.random.default_rng(seed)
         pump = PumpConfig()
-        test = ActuatorTest(pump, True, self.rate_hz, self.identify)
+        test = ActuatorTest(pump, True, self.rate_hz, self.identify, assumed=self.assumed)
         dt_s = 1.0 / self.rate_hz / _SUBSTEPS
         pumped, vented = (
             deque([flow_um_per_s] * max(1, round(delay_s / dt_s)))
@@ -89,7 +91,7 @@ class Bench:
                 vented.append(self.vent_um_per_s * part.vent_fraction)
                 inflow -= (pumped.popleft() - inflow) * math.expm1(-dt_s / self.pump_lag_s)
                 outflow -= (vented.popleft() - outflow) * math.expm1(-dt_s / self.vent_lag_s)
-                height_um += dt_s * (inflow - outflow - 1.2)
+                height_um += dt_s * (inflow - outflow - self.leak_um_per_s)
             seen_um = height_um + self.error_um(time_s) + self.noise_um * rng.standard_normal()
             test.step(seen_um, 1.0 / self.rate_hz)
             time_s += 1.0 / self.rate_hz
@@ -181,6 +183,82 @@ def test_a_pump_of_another_size_than_its_curve_fails(share: float) -> None:
     failures = Bench(pump_share=share).failures(40)
     assert len(failures) >= 39
     assert all("not by about 4.1 µm/s" in failure for failure in failures)
+
+
+@pytest.mark.parametrize(
+    ("share", "leak_um_per_s", "rate_hz"),
+    [(0.4, 1.2, 50.0), (0.27, 0.2, 20.0), (0.27, 0.8, 20.0), (4.0, 1.2, 10.0), (4.0, 1.2, 50.0)],
+)
+def test_a_pump_of_an_assumed_curve_passes_if_it_lifts_the_mirror(
+    share: float, leak_um_per_s: float, rate_hz: float
+) -> None:
+    bench = Bench(
+        rate_hz, share, leak_um_per_s=leak_um_per_s, before_um_per_s=leak_um_per_s, assumed=True
+    )
+    assert len(bench.failures(30)) <= 1
+    late = replace(bench, pump_delay_s=0.3, pump_lag_s=0.5)
+    assert len(late.failures(30)) <= 1
+
+
+@pytest.mark.parametrize("dead", [{"pump_share": 0.0}, {"pump_share": -1.0}, {"pump_share": 10.0}])
+@pytest.mark.parametrize("rate_hz", [10.0, 50.0])
+def test_an_assumed_curve_delays_no_failure_and_hides_none(
+    rate_hz: float, dead: dict[str, float]
+) -> None:
+    bench = replace(Bench(rate_hz, assumed=True), **dead)
+    stated = replace(bench, assumed=False)
+    count = 30
+    assert len(bench.failures(count)) >= count - 1
+    later_s = np.subtract(bench.durations_s(count), stated.durations_s(count))
+    if dead["pump_share"] <= 0.0:
+        assert np.quantile(later_s, 0.97) <= 0.0
+
+
+def test_a_dead_pump_of_a_tight_mirror_is_found_whatever_the_curve() -> None:
+    bench = Bench(pump_share=0.0, leak_um_per_s=0.1, assumed=True)
+    assert len(bench.failures(100)) >= 98
+
+
+@pytest.mark.parametrize("delay_s", [0.05, 0.3])
+def test_a_pump_much_stronger_than_assumed_is_a_line_of_its_size(delay_s: float) -> None:
+    bench = Bench(pump_share=3.5, pump_delay_s=delay_s, identify=True, assumed=True)
+    for seed in range(5):
+        pump = bench.run_test(seed)[0].stronger_pump
+        assert pump is not None
+        # at the test's command it gives what the stronger pump does
+        assert 0.8 * pump.flow_full_um_per_s == pytest.approx(3.5 * 5.3 * 0.7 / 0.9, rel=0.15)
+        assert pump.dead_fraction == pump.start_fraction == pump.stall_fraction == 0.0
+        assert replace(bench, assumed=False).run_test(seed)[0].stronger_pump is None
+        assert replace(bench, pump_share=1.1).run_test(seed)[0].stronger_pump is None
+
+
+@pytest.mark.parametrize(
+    "pump",
+    [
+        pytest.param(ForeignPump("root", 16.0, 0.05, 0.1), id="first percent gives more than leak"),
+        pytest.param(ForeignPump("quadratic", 2.3, 0.1, 0.2), id="weak"),
+    ],
+)
+def test_a_hold_of_an_unknown_pump_begins_with_the_defaults(pump: ForeignPump) -> None:
+    config = leave_to_start(foreign_config(rate_hz=10.0))
+    assert config.states.actuator_size == "any"
+    run = VirtualRun(config, foreign_bench(ForeignPlant(pump, 5)), zernike_projection())
+    ticks = [run.run_tick((Command("hold", "test"),))]
+    while run.now_s < 100.0 and run.finished is None:
+        ticks.append(run.run_tick())
+    assert ticks[-1] is not None
+    assert ticks[-1].row.state == State.HOLD
+    events = [event for tick in ticks if tick is not None for event in tick.events]
+    found = [event for event in events if isinstance(event, PumpStronger)]
+    assert len(found) == (pump.shape == "root")
+    assert run.pump_config.flow_full_um_per_s == (
+        found[0].flow_full_um_per_s if found else config.pump.flow_full_um_per_s
+    )
+
+
+def test_a_stated_curve_keeps_its_limits() -> None:
+    config = leave_to_start(Config(pump=PumpConfig(flow_full_um_per_s=5.3)))
+    assert config.states.actuator_size == "stated"
 
 
 @pytest.mark.parametrize(
