@@ -62,7 +62,29 @@ class CycleMotion:
         covariance_mm2: FloatArray,
         changed_mm: FloatArray,
     ) -> "CycleMotion":
-        """At points that stand on the reference's surface; `index` (n,) are their bins."""
+        """Compute the signatures of all motions at some points of the reference cycle.
+
+        Section 7 of docs/explanation/tracking.md.
+
+        Parameters
+        ----------
+        tracer : Tracer
+            The bench of the reference.
+        points : Points
+            They stand on the reference's surface.
+        index : (n,) array
+            Their bins, in any order.
+        surface : Surface
+            Of the reference.
+        covariance_mm2 : (parameters, parameters) array
+            Of its parameters.
+        changed_mm : (2, n) array
+            As in `find`, of the reference.
+
+        Returns
+        -------
+        CycleMotion
+        """
         order = np.argsort(index)
         points, index = points.subset(order), index[order]
 
@@ -134,5 +156,5 @@ class CycleMotion:
         return test.find_motions(ring @ moved_mm, np.zeros(2), parts.sum(axis=1))
 
     def tilt_urad(self, surface: Surface) -> float:
-        """Tilt of the ring since the reference."""
+        """Tilt of the ring since the reference, in µrad."""
         return ring_tilt_urad(self.surface, surface)

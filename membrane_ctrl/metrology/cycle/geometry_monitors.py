@@ -29,7 +29,22 @@ RING_BACK_UM = 3.0
 
 
 def noise_urad(geometry: Geometry, surface: Surface, screen_sigma_mm: float) -> float:
-    """RMS of the slopes of points whose screen coordinates have this noise."""
+    """RMS of the slopes that noise of the screen coordinates makes.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        The bench.
+    surface : Surface
+        Its depth sets how a screen point turns into a slope.
+    screen_sigma_mm : float
+        Standard deviation of each screen coordinate.
+
+    Returns
+    -------
+    float
+        RMS over both slopes, µrad.
+    """
     gain = slope_per_screen(geometry, surface.radius_mm, surface.sag_mm)
     return 1e6 * screen_sigma_mm * float(np.sqrt(gain.sum() / 2))
 
@@ -46,13 +61,21 @@ class DriftMonitor:
     _seen: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=CYCLES))
 
     def add(self, residual_urad: float, live_noise_urad: float) -> None:
-        """Take one cycle's residual and the camera's share of it; cycles without a figure (NaN) do
-        not count.
+        """Add one cycle, and renew `description` once there are `CYCLES`.
+
+        Parameters
+        ----------
+        residual_urad : float
+            Slopes that the cycle's fit leaves, RMS; a cycle without a figure (NaN) does not count.
+        live_noise_urad : float
+            The part of it that is noise of the camera.
         """
         if np.isfinite(residual_urad) and np.isfinite(live_noise_urad):
             self._seen.append((residual_urad, live_noise_urad))
         if len(self._seen) < CYCLES:
             return
+        # The residual that the calibration predicts here: what its model left, and this camera's
+        # noise.
         now_urad, live_urad = (float(v) for v in np.median(np.array(self._seen), axis=0))
         model_urad = np.sqrt(max(0.0, self.calibrated_urad**2 - self.calibrated_noise_urad**2))
         ratio = now_urad / float(np.hypot(model_urad, live_urad))

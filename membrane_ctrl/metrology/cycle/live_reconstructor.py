@@ -267,8 +267,23 @@ class LiveReconstructor:
     def height_map(
         self, coeffs_um: FloatArray, hencky_um: float, n: int = 256
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A figure as a picture: x_mm (n,), y_mm (n,), h_mm (n, n) with rows along y; NaN outside
-        the analysis.
+        """Return a figure as a picture.
+
+        Parameters
+        ----------
+        coeffs_um : (terms,) array
+            Zernike terms in Noll's order.
+        hencky_um : float
+            Amplitude of the excess of Hencky's bowl, as its sag.
+        n : int
+            Pixels along a side.
+
+        Returns
+        -------
+        x_mm, y_mm : (n,) array
+            Places of columns and rows.
+        h_mm : (n, n) array
+            Heights, rows along y; NaN outside the analysed radius.
         """
         mirror = self._optics.mirror
         axis = np.linspace(-mirror.radius_mm, mirror.radius_mm, n)
@@ -382,6 +397,7 @@ class LiveReconstructor:
 
         `known` are the frequencies that the last full cycle found; empty in a full cycle.
         """
+        # The sinusoids as means over bins, and the bands that they share.
         slots = np.r_[self._slots.sinusoids]
         binned = self._mean_of_bins(self._binner.sums[slots])
         stack = self._stack_without_frames(self._patterns)
@@ -393,6 +409,7 @@ class LiveReconstructor:
                 "bands of the backlight could not be separated from other changes in this cycle"
             )
         elif found.size:
+            # Sums are integers: the corrected ones are rounded.
             self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
 
     def _remove_lag_of_full(self, state: tracked_points.TrackedPoints) -> None:
@@ -401,10 +418,12 @@ class LiveReconstructor:
         The first frame has no previous picture: its pattern is on the screen while the former cycle
         is computed.
         """
+        # The patterns of the cycle with the phase steps that were taken.
         patterns = list(pattern_sequence.full_sequence(self._optics.pattern))
         for slots, shifts in zip(self._slots.sinusoids, self._shifts_rad, strict=True):
             for slot, shift in zip(range(slots.start, slots.stop), shifts, strict=True):
                 patterns[slot] = replace(patterns[slot], shift_rad=float(shift))
+        # A sample of the bins shows the shares.
         stack = self._stack_without_frames(tuple(patterns))
         some = image_lag.choose_lag_bins(state.index)
         bins = state.index[some]
@@ -416,6 +435,7 @@ class LiveReconstructor:
         places_px = np.stack([self._grid.column_px[bins], self._grid.row_px[bins]])
         phase_rad = state.accepted[:, 0, some]
         self._lag = image_lag.find_image_lag(stack, sample, phase_rad, places_px)
+        # All bins are corrected.
         if self._lag.corrected:
             binned = self._mean_of_bins(self._binner.sums[: self._slots.count])
             corrected = image_lag.remove_image_lag(stack, binned, self._lag)
@@ -462,8 +482,11 @@ class LiveReconstructor:
 
     def _track_phases(self, state: tracked_points.TrackedPoints, readings: FloatArray) -> None:
         """Fresh phases from the bin sums, corrected for the film's motion between the frames."""
+        # Motion between the frames, about its mean over both axes, where it exceeds the laser's
+        # noise (section 7 of docs/explanation/metrology.md).
         moved = film_motion.is_worth_correcting(readings, self._laser_noise_um)
         motion_um = np.reshape(readings - np.mean(readings), (2, -1)) if moved else None
+        # One row of weights per frame turns sums of bins into phasors, corrected for that motion.
         combined = []
         for axis in range(2):
             part = None if motion_um is None else motion_um[axis]
@@ -487,9 +510,12 @@ class LiveReconstructor:
         """One or two steps from the last surface; the full cycle's normal matrix while its points
         are there.
         """
+        # Screen points s = T phi / 2 pi less the averaging over a bin (sections 1 and 2 of
+        # docs/explanation/metrology.md).
         state.points.weights[:] = usable
         np.multiply(state.fresh[:, 0], self._mm_per_rad, out=state.points.screen_mm)
         state.points.screen_mm -= state.offset_mm
+        # Any matrix leads to the same solution (section 5); the kept one saves its computation.
         complete = np.count_nonzero(usable) > MATRIX_KEPT_SHARE * usable.size
         normal = state.normal if complete else None
         return surface_fit.fit_surface(
@@ -634,7 +660,24 @@ def _finite_mean(values: FloatArray) -> float:
 def make_rejected_cycle(
     kind: Kind, times: FloatArray, readings: FloatArray, reason: str, tracking_lost: bool = False
 ) -> ShapeEstimate:
-    """A cycle without a figure."""
+    """Return the estimate of a cycle without a figure.
+
+    Parameters
+    ----------
+    kind : Kind
+        "full" or "fringes".
+    times, readings : (frames,) arrays
+        Time in s and laser reading in µm of each exposure; NaN where there is none.
+    reason : str
+        Why, for people.
+    tracking_lost : bool
+        Whether a full cycle is needed.
+
+    Returns
+    -------
+    ShapeEstimate
+        Verdict "rejected"; NaN for all that follows from a figure.
+    """
     nan = float("nan")
     return ShapeEstimate(
         time_s=_finite_mean(times),

@@ -161,7 +161,23 @@ def fitted_waves(waves: FloatArray | Singles, rows: FloatArray) -> FloatArray:
 
 
 def clear_power(power: FloatArray, least_bands: int) -> FloatArray:
-    """Power over the median around it and of all; 0 for waves wider than 1 / `least_bands`."""
+    """Power of waves of the backlight over that of chance.
+
+    A band is narrow in frequency, all else is broad. Section 9 of docs/explanation/metrology.md.
+
+    Parameters
+    ----------
+    power : (m,) array
+        Power by frequency, rising, `FREQUENCIES_PER_BIN` values for each wave over the picture.
+    least_bands : int
+        Least number of waves over the picture; wider ones are taken for shape or for a lamp.
+
+    Returns
+    -------
+    (m,) array
+        Power over the larger of two medians, that around the frequency and that of all; 0 for waves
+        wider than 1 / `least_bands` of the picture.
+    """
     means = power.reshape(-1, FREQUENCIES_PER_BIN).mean(axis=1)
     of_neighbours = ndimage.median_filter(means, 2 * _AROUND + 1)
     around = np.maximum(of_neighbours, np.median(means) + 1e-30)
@@ -171,6 +187,19 @@ def clear_power(power: FloatArray, least_bands: int) -> FloatArray:
 
 
 def row_waves(rad_per_row: FloatArray, place: FloatArray | IntArray) -> FloatArray:
-    """Cosines, then sines (2 k, rows), of k frequencies at these rows."""
+    """Waves along the rows of a picture, as columns of a fit.
+
+    Parameters
+    ----------
+    rad_per_row : (k,) array
+        Frequencies.
+    place : (rows,) array
+        Number of each row.
+
+    Returns
+    -------
+    (2 k, rows) array
+        Cosines, then sines.
+    """
     phase_rad = rad_per_row[:, None] * place
     return np.concatenate([np.cos(phase_rad), np.sin(phase_rad)])

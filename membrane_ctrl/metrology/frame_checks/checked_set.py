@@ -139,7 +139,23 @@ class RejectedSetError(bin_view.NoFigureError):
 
 
 def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:
-    """Position of the vertex at a displacement: z = -(d - reference); 0 if one is not known."""
+    """Position of the vertex at a displacement, with the ring at z = 0.
+
+    A deeper bowl has a lower vertex: z = -(displacement - reference). Section 3 of
+    docs/explanation/metrology.md.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        Its geometry states the reference displacement.
+    displacement_um : float
+        Reading of the laser; NaN without one.
+
+    Returns
+    -------
+    float
+        In mm in world; 0 if the reference or the reading is unknown.
+    """
     reference_um = optics.geometry.reference_displacement_um
     if reference_um is None or not math.isfinite(displacement_um):
         return 0.0

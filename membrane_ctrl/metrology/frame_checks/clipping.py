@@ -37,7 +37,22 @@ class ClippedShares:
 
 
 def clipped_shares(binned: Binned, frames: list[int], seen: BoolArray) -> ClippedShares:
-    """Return the shares among the bins `seen` (rows, columns), over these frames."""
+    """Return the shares of bins that are clipped in at least one of some frames.
+
+    Parameters
+    ----------
+    binned : Binned
+        The set's frames as bins.
+    frames : list of int
+        The frames that count.
+    seen : (rows, columns) bool array
+        The bins that count.
+
+    Returns
+    -------
+    ClippedShares
+        At white and at black; 0 without frames or bins.
+    """
     if not frames or not seen.any():
         return ClippedShares(0.0, 0.0)
     clipped = binned.saturated[frames]
@@ -54,7 +69,22 @@ def _share_of(clipped: BoolArray, seen: BoolArray) -> float:
 
 
 def clipped_shares_of_lit(binned: Binned, frames: list[int], near: BoolArray) -> ClippedShares:
-    """Return the shares among the bins near the mirror that are bright in one of these frames."""
+    """Return the clipped shares of the bins that see the panel.
+
+    Parameters
+    ----------
+    binned : Binned
+        The set's frames as bins.
+    frames : list of int
+        The frames that count.
+    near : (rows, columns) bool array
+        Bins whose rays may meet the mirror; of these, the bins count that are bright in one of the
+        frames.
+
+    Returns
+    -------
+    ClippedShares
+    """
     if not frames or not near.any():
         return ClippedShares(0.0, 0.0)
     brightest = binned.means[frames].max(axis=0)

@@ -58,5 +58,18 @@ class Flag:
 
 
 def flag_unreadable(frame: int, reason: str) -> Flag:
-    """Return the flag of a frame that could not be read."""
+    """Return the flag of a frame that could not be read.
+
+    Parameters
+    ----------
+    frame : int
+        Its place in the set.
+    reason : str
+        Why, for people.
+
+    Returns
+    -------
+    Flag
+        Of infinite severity.
+    """
     return Flag(frame, FrameDefect.UNREADABLE, reason, np.inf)

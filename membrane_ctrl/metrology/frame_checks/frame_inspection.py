@@ -71,6 +71,18 @@ def find_obvious_faults(stack: FrameStack, binned: Binned) -> list[Flag]:
     """Find sinusoids that are bad without a prediction: far darker than the others, or saturated.
 
     They are compared on the brighter half of the bins.
+
+    Parameters
+    ----------
+    stack : FrameStack
+        The set.
+    binned : Binned
+        Its frames as means over bins.
+
+    Returns
+    -------
+    list of Flag
+        In the order of the frames.
     """
     frames = [k for axis in AXES for k in stack.sinusoids(axis) if k not in stack.unusable]
     if not frames:
@@ -118,8 +130,10 @@ def inspect_frames(
     list of Flag
         The frames that do not belong to the set, the worst first.
     """
+    # Frames that are left out already may not widen the limits of the others.
     trusted = {k: e for k, e in evidence.items() if k not in excluded}
     flags = [*_judge_sinusoids(stack, evidence, trusted), *_judge_gray(stack, evidence, trusted)]
+    # A frame that repeats another one is stale, whatever else is wrong with it.
     earlier = find_identical_frames(stack)
     flags = [_name_pattern(stack, flag, evidence, earlier) for flag in flags]
     return sorted(flags, key=lambda flag: -flag.severity)
@@ -218,6 +232,7 @@ def _judge_gray(
     stack: FrameStack, evidence: dict[int, FrameEvidence], trusted: dict[int, FrameEvidence]
 ) -> list[Flag]:
     """Gray frames against each other, white against them, black against white."""
+    # The light of bright bits, usual among the Gray frames that show an edge of their bit.
     gray = [k for axis in AXES for k in stack.gray(axis) if k in evidence]
     good = [evidence[k] for k in gray if k in trusted and evidence[k].lit > _NO_EDGE]
     if not good:

@@ -82,7 +82,15 @@ class AxisSeries:
         return float(np.mean(~unwrap_in_time(self.phases_rad(), self.periods).consistent))
 
     def with_frames(self, index: int, steps: FloatArray) -> "AxisSeries":
-        """The same with other frames of one frequency."""
+        """Return the series with other frames of one frequency.
+
+        Parameters
+        ----------
+        index : int
+            Number of the frequency.
+        steps : (4, n) array
+            Its frames.
+        """
         frames = self.frames.copy()
         frames[index] = steps
         return replace(self, frames=frames)

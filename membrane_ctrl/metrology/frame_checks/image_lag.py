@@ -203,7 +203,24 @@ def add_image_lag(removed: ImageLag, found: ImageLag) -> ImageLag:
 
 
 def remove_image_lag(stack: FrameStack, binned: Binned, lag: ImageLag) -> Binned:
-    """Return the bins with the previous pictures taken out."""
+    """Return the bins with the previous pictures taken out: P = I + f / (1 - f) (I - I_before).
+
+    Section 10 of docs/explanation/metrology.md.
+
+    Parameters
+    ----------
+    stack : FrameStack
+        Its `frame_before` states which picture was shown before each frame.
+    binned : Binned
+        The frames as the camera took them.
+    lag : ImageLag
+        The shares f to remove.
+
+    Returns
+    -------
+    Binned
+        The means of frames with a known predecessor are corrected, others as they were.
+    """
     means = binned.means.copy()
     for frame in range(len(stack.patterns)):
         previous = stack.frame_before(frame)
@@ -255,6 +272,7 @@ def find_image_lag(
     x_frames = stack.sinusoids(AXES[0])
     mean_of_steps = stack.weights(x_frames)[0]
     index = np.arange(phase_rad.shape[1])
+    # Each round finds what the frames as corrected so far still contain.
     lag = ImageLag.unknown()
     corrected = binned
     for _ in range(ROUNDS):
@@ -349,6 +367,7 @@ def _own_columns(
     if pattern.role in ("white", "black"):
         return smooth, every_bin
     phase_rad = scene.phase_rad[AXES.index(pattern.axis)]
+    # A Gray frame: two levels, each with slow changes over the mirror.
     if pattern.role == "gray":
         shown, from_edge_rad = gray_bit(phase_rad, pattern.index)
         return np.concatenate([smooth, smooth * shown]), from_edge_rad > _EDGE_RAD

@@ -97,6 +97,7 @@ def find_orientation(
     Orientation or None
         None if the stated one is not suspicious, or if no other is clearly better.
     """
+    # Bins with a phase, about as many as change the answer.
     known = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
     if known.size < _LEAST_BINS:
         return None
@@ -149,6 +150,7 @@ def _residual_urad(
     count = int(np.count_nonzero(inside))
     if count < _LEAST_BINS:
         return math.inf, count
+    # A fit from the paper's parabola, with the tolerance that the comparison needs.
     points = Points.from_rays(rays[:, inside], screen_mm[:, inside])
     start = make_parabola(optics.mirror.sag_mm, tracer.radius_mm)
     try:

@@ -307,7 +307,20 @@ class _Images:
         self._bright = bright * np.stack([frame.sure for frame in frames])
 
     def light_at(self, scale: float, shifts_rad: FloatArray) -> FloatArray:
-        """Light (frames, shifts, n) of images of the same brightness as the first."""
+        """Light of images of the same brightness as the first.
+
+        Parameters
+        ----------
+        scale : float
+            Phase of the second image over that of the first, about the pattern's middle.
+        shifts_rad : (s,) array
+            Phase added to it.
+
+        Returns
+        -------
+        (frames, s, n) array
+            Light of each bin in each Gray frame.
+        """
         place_rad = scale * self._phase_rad + shifts_rad[:, None] + self._reach_rad
         cell = np.rint(place_rad / _CELL_RAD).astype(np.int32)
         last = self._table.shape[1] - 1

@@ -209,6 +209,7 @@ def _put_back(
         except RejectedSetError:
             continue
         if not checked.flags and _is_one_surface(checked):
+            # The two frames are named; the set itself is sound.
             flags = (
                 _flag_swapped(a, stack.patterns[b].name, b),
                 _flag_swapped(b, stack.patterns[a].name, a),
@@ -302,6 +303,7 @@ def _check_rounds(
             )
             return _measure_light_path(checked, attempt.scene, excluded, optics)
 
+        # Two frames that show each other's pictures are exchanged, and both stay in use.
         pair = _find_swapped_pair(fresh, known)
         if pair is not None:
             order = _exchange(len(stack.patterns), *pair)
@@ -429,7 +431,17 @@ class _Bench:
 
     @classmethod
     def from_optics(cls, optics: OpticsConfig, bin_px: int, anchor: Anchor | None) -> "_Bench":
-        """The bench of sets with bins of this side."""
+        """Return the bench of sets with bins of this side.
+
+        Parameters
+        ----------
+        optics : OpticsConfig
+            The stated bench.
+        bin_px : int
+            Side of the bins.
+        anchor : Anchor or None
+            Fringe orders of another set.
+        """
         geometry = Geometry.from_config(optics)
         grid = bin_grid.BinGrid(geometry, optics.camera, bin_px)
         near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
@@ -452,6 +464,8 @@ def _attempt_without_lag(
     lag = image_lag.ImageLag.unknown()
     attempt = _attempt_fit(stack, binned, bench, excluded)
     for _ in range(image_lag.ROUNDS):
+        # The light and the phases to compare with contain the lag, too: each fit finds a part of
+        # it.
         found = image_lag.estimate_image_lag(stack, binned, attempt.scene, excluded)
         lag = image_lag.add_image_lag(lag, found)
         if not lag.corrected or not image_lag.is_worth_another_round(found):
