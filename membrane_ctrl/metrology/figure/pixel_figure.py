@@ -85,9 +85,17 @@ class FullResult:
     def slope_variance(
         self, optics: OpticsConfig, shifts_rad: list[FloatArray], noise_adu: float
     ) -> FloatArray:
-        """Variance (2,) of an x and of a y slope of one pixel.
+        """Variance of an x and of a y slope of one pixel.
 
-        The parameters are those of `screen_variance_mm2`.
+        Parameters
+        ----------
+        optics, shifts_rad, noise_adu
+            As of `screen_variance_mm2`.
+
+        Returns
+        -------
+        (2,) array
+            In squared slopes.
         """
         gain = slope_noise.slope_per_screen(
             Geometry.from_config(optics), self.surface.radius_mm, self.surface.sag_mm

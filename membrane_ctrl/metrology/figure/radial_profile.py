@@ -100,7 +100,13 @@ def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) ->
 
 
 def pressure_pa(sag_mm: float, rim_mm: float) -> float:
-    """Gauge pressure under a film of the paper's kind with that sag:
-    (w0 / (0.65344 a))^3 E t / a.
+    """Gauge pressure under a film of the paper's kind, by Hencky: (w0 / (0.65344 a))^3 E t / a.
+
+    Parameters
+    ----------
+    sag_mm : float
+        w0, above the rim.
+    rim_mm : float
+        a, radius of the rim.
     """
     return (sag_mm / (_CENTRE * rim_mm)) ** 3 * _YOUNG_PA * _THICKNESS_MM / rim_mm

@@ -58,6 +58,19 @@ def geometry_sources(
 def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
     """Rows of the budget for what bends the rays, or moves the bench beyond its poses: glass, air
     and temperature.
+
+    Section 4 of docs/explanation/uncertainty.md.
+
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the set.
+    sigmas : SigmasConfig
+        Standard uncertainties of glass, air gradient and temperature.
+
+    Yields
+    ------
+    Source
     """
     geometry = bench.geometry().geometry
 
@@ -69,6 +82,7 @@ def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
     leaving /= path_mm
 
     # Glass: the tangents of the ray in it, with sines of 1 / n.
+    # Snell's law: the components of the direction along the screen shrink by 1 / n.
     sines = (geometry.screen_axes @ leaving)[:2]
     tangents = sines / np.sqrt(_GLASS_INDEX**2 - np.sum(sines**2, axis=0))
     description = "glass in front of the screen's pixels"
@@ -120,7 +134,23 @@ def _shift_on_screen(geometry: Geometry, leaving: FloatArray, shift_mm: FloatArr
 def disturbed_source(
     bench: TrialBench, name: str, description: str, sigma: float, per_unit_mm: FloatArray
 ) -> Source:
-    """A row for an input that moves the screen points by `per_unit_mm` (2, n), mm per its unit."""
+    """Return the row for an input that moves the screen points.
+
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the set.
+    name, description : str
+        Of the row.
+    sigma : float
+        Standard uncertainty of the input, in its unit.
+    per_unit_mm : (2, n) array
+        Motion of the screen points per unit of the input.
+
+    Returns
+    -------
+    Source
+    """
     solved = bench.solve(bench.geometry(), sigma * per_unit_mm, linear=True)
     effect = solved - bench.surface.parameters
     return Source(name, description, sigma, effect[:, None])
@@ -156,11 +186,25 @@ def film_source(
 
 
 def vertex_source(bench: TrialBench, sigma_um: float, description: str) -> Source:
-    """The row for a vertex that is nearer to camera and screen, or further from them, than the
-    laser measures.
+    """Return the row for a vertex that is nearer to camera and screen, or further from them, than
+    the laser measures.
+
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the set.
+    sigma_um : float
+        Standard uncertainty of the vertex' place.
+    description : str
+        Of the row.
+
+    Returns
+    -------
+    Source
     """
     nominal = bench.geometry()
     geometry = nominal.geometry
+    # A vertex that is lower by sigma is a camera and a screen that are higher by it.
     away_mm = np.array([0.0, 0.0, 1e-3 * sigma_um])
     farther = replace(
         geometry,

@@ -34,7 +34,17 @@ class SensitivityError:
     def from_spread(
         cls, bench: TrialBench, spread: GeometrySpread, laser_relative: float
     ) -> "SensitivityError":
-        """Errors by the geometry's spread and by the laser's scale."""
+        """Return the errors that the geometry's spread and the laser's scale cause.
+
+        Parameters
+        ----------
+        bench : TrialBench
+            n points of the set.
+        spread : GeometrySpread
+            Covariance of the geometry; one error for each column of its root.
+        laser_relative : float
+            Standard uncertainty of the laser's scale.
+        """
         moved_mm = moves_mm(bench)
         errors_mm = [laser_relative * moved_mm]
         for change in spread.covariance_root().T:

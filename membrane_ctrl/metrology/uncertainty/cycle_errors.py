@@ -348,7 +348,12 @@ class ErrorWatch:
     def begin(self, state: tracked_points.TrackedPoints, lag: ImageLag | None = None) -> None:
         """Choose the points that are examined from those of a full cycle.
 
-        `lag` is the share of the previous frames that its frames show; None: unknown.
+        Parameters
+        ----------
+        state : TrackedPoints
+            The points of the full cycle.
+        lag : ImageLag, optional
+            Share of the previous picture that its frames show; unknown by default.
         """
         if lag is None:
             lag = ImageLag.unknown()

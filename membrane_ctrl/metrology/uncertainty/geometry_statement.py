@@ -62,7 +62,24 @@ class GeometryStatement:
     def from_evidence(
         cls, known_by: KnownBy, source: str, rim: RimMisfit | None, slopes: SlopeMisfit
     ) -> "GeometryStatement":
-        """Judge by what the uncertainty rests on, by the rim and by the slopes."""
+        """Judge how well the geometry is known.
+
+        Parameters
+        ----------
+        known_by : KnownBy
+            What the stated uncertainty rests on.
+        source : str
+            The same for people, with the file.
+        rim : RimMisfit or None
+            The rim in the picture against its prediction.
+        slopes : SlopeMisfit
+            Slopes that belong to no surface.
+
+        Returns
+        -------
+        GeometryStatement
+            Contradicted by either, else calibrated or uncalibrated.
+        """
         state = GeometryState.UNCALIBRATED
         if slopes.contradicts_bench or (rim is not None and rim.contradicts):
             state = GeometryState.CONTRADICTED

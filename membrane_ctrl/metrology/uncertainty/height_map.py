@@ -40,7 +40,17 @@ class HeightMap:
     def over_disc(
         cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE
     ) -> "HeightMap":
-        """A grid over the analysis radius; `radius_mm` is that of the Zernike disc."""
+        """Return a grid over the analysis radius.
+
+        Parameters
+        ----------
+        analysis_radius_mm : float
+            Radius of the disc that the grid covers.
+        radius_mm : float
+            Radius of the Zernike disc.
+        side : int
+            Points along a side.
+        """
         axis = np.linspace(-analysis_radius_mm, analysis_radius_mm, side)
         x, y = np.meshgrid(axis, axis)
         inside = np.hypot(x, y) <= analysis_radius_mm
@@ -61,7 +71,20 @@ class HeightMap:
 
 
 def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
-    """Matrix (points, parameters) from parameters to heights, 0 at the vertex."""
+    """Matrix from parameters to heights: h = P a.
+
+    Parameters
+    ----------
+    x_mm, y_mm : (points,) arrays
+        Places on the mirror.
+    radius_mm : float
+        Radius of the Zernike disc.
+
+    Returns
+    -------
+    (points, parameters) array
+        Heights, 0 at the vertex, in mm per mm.
+    """
     x = np.asarray(x_mm) / radius_mm
     y = np.asarray(y_mm) / radius_mm
     out = np.asarray(zernike.evaluate_terms(x, y).T @ parameter_to_coeffs())

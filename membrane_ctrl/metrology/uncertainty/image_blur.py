@@ -13,11 +13,23 @@ _TINY = 1e-300  # instead of a division by zero
 
 
 def blur_source(bench: TrialBench, sigma_px: float) -> Source:
-    """The row for a picture that is blurred by a Gaussian of this width: a phase is its mean over
-    the blur.
+    """Return the row for a picture that is blurred by a Gaussian.
+
+    A phase is its mean over the blur.
 
     The mean over the Gaussian is that of the four values at a distance of sqrt(2) sigma (as in
     `bin_grid.BinGrid.averaging_bias_mm`).
+
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the set.
+    sigma_px : float
+        Standard deviation of the Gaussian.
+
+    Returns
+    -------
+    Source
     """
     nominal = bench.geometry()
     distance_px = math.sqrt(2) * sigma_px

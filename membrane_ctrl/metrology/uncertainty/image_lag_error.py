@@ -20,16 +20,33 @@ _SAYS = "what each frame still shows of the previous picture"
 def image_lag_sources(
     bench: TrialBench, stack: FrameStack, used: tuple[list[int], list[int]], lag: ImageLag
 ) -> list[Source]:
-    """Return the rows of the budget; without an estimate their uncertainty is 0, and so stated.
+    """Return the rows of the budget for the share of the previous picture left in the frames.
 
     The panel has the same share in all sets of a bench, and what the model of the share or the
     light over the mirror adds to single frames is also the same: two sets share it frame by frame.
     They do not share the noise.
+
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the set.
+    stack : FrameStack
+        The set's patterns and their order.
+    used : two lists of int
+        The used sinusoids of x and of y.
+    lag : ImageLag
+        The share; without an estimate the rows' uncertainty is 0, and so stated.
+
+    Returns
+    -------
+    list of Source
+        The shared part, and the noise.
     """
     left = lag.remaining_sigma if math.isfinite(lag.remaining_sigma) else 0.0
     effect = image_lag_effect(bench, stack, used)
     of_frames = _order_by_fringes(lag.scatter, stack)
     noise = lag.noise if left else 0.0
+    # sigma^2 = rest^2 + noise^2 + the frames' own parts.
     rest = math.sqrt(max(left**2 - noise**2 - float(of_frames @ of_frames), 0.0))
     shared = np.outer(effect, [rest, *of_frames])
     own = (noise * effect)[:, None]
@@ -53,9 +70,21 @@ def _order_by_fringes(of_frames: FloatArray, stack: FrameStack) -> FloatArray:
 
 
 def image_lag_of_cycles(bench: TrialBench, shifts_rad: FloatArray, lag: ImageLag) -> FloatArray:
-    """Return the error (parameters,), mm, that live cycles share: that of their fringes.
+    """Return the error that live cycles share: that of their fringes.
 
-    `shifts_rad` (2, N) are the steps of x and y.
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the cycle.
+    shifts_rad : (2, N) array
+        Phase steps of x and y.
+    lag : ImageLag
+        The share; unknown counts as 0.
+
+    Returns
+    -------
+    (parameters,) array
+        Change of the surface's parameters by 1 sigma, mm.
     """
     patterns = fringe_sequence(bench.optics.pattern)
     shifted = tuple(
@@ -72,7 +101,25 @@ def image_lag_of_cycles(bench: TrialBench, shifts_rad: FloatArray, lag: ImageLag
 def image_lag_effect(
     bench: TrialBench, stack: FrameStack, used: tuple[list[int], list[int]]
 ) -> FloatArray:
-    """Return the change of the parameters (parameters,), mm, per unit of the share."""
+    """Return the change of the surface's parameters per unit of the share.
+
+    The previous frame's light adds to each step, which turns the phase by the part of that light
+    that the weights of the steps take for sine and cosine: d phi = -(C sin phi - S cos phi).
+
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the set.
+    stack : FrameStack
+        The set's patterns and their order.
+    used : two lists of int
+        The used sinusoids of x and of y.
+
+    Returns
+    -------
+    (parameters,) array
+        In mm.
+    """
     scale = screen_scale.mm_per_rad(bench.optics.pattern)
     centre_rad = screen_scale.centre_phase_rad(bench.optics.pattern)
     angle = bench.screen_mm / scale + centre_rad

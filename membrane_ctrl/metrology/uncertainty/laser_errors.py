@@ -13,8 +13,14 @@ _UNKNOWN_UM = 20.0
 
 
 def vertex_um(readings_um: FloatArray, laser_noise_um: float) -> float:
-    """1 sigma of the vertex' place, from the noise of the laser's readings (n,), NaN without a
-    laser.
+    """Return 1 sigma of the vertex' place.
+
+    Parameters
+    ----------
+    readings_um : (n,) array
+        The laser's readings at the frames; NaN without a laser.
+    laser_noise_um : float
+        Noise of a reading.
     """
     if not np.isfinite(readings_um).all():
         return _UNKNOWN_UM

@@ -55,17 +55,37 @@ def noise_covariance(bench: TrialBench) -> FloatArray:
 
 
 def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:
-    """Covariance (parameters, parameters), mm^2, from the geometry.
+    """Covariance of the surface's parameters from the geometry, J S J^T.
 
-    `jacobian` (parameters, k) is that of `geometry_jacobian`.
+    Parameters
+    ----------
+    jacobian : (parameters, k) array
+        Of `geometry_jacobian`.
+    spread : GeometrySpread
+        S, of the same k numbers.
+
+    Returns
+    -------
+    (parameters, parameters) array
+        In mm^2.
     """
     return np.asarray(jacobian @ spread.covariance @ jacobian.T)
 
 
 def linear_covariance(benches: Sequence[TrialBench], spread: GeometrySpread) -> FloatArray:
-    """Covariance (parameters, parameters), mm^2, that the Monte Carlo approximates.
+    """Covariance that the Monte Carlo approximates (eq. 2 of docs/explanation/uncertainty.md).
 
-    With two benches it is that of the change between them: they share the geometry, not the noise.
+    Parameters
+    ----------
+    benches : sequence of one or two TrialBench
+        A set, or two sets whose change is asked for: they share the geometry, not the noise.
+    spread : GeometrySpread
+        Covariance of the geometry.
+
+    Returns
+    -------
+    (parameters, parameters) array
+        In mm^2.
     """
     jacobian = geometry_jacobian(benches[0], spread)
     if len(benches) > 1:

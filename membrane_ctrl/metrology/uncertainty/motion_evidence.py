@@ -87,7 +87,7 @@ def ring_saddle() -> FloatArray:
 
 
 def ring_tilt_urad(earlier: Surface, later: Surface) -> float:
-    """Angle by which the ring has tilted from one surface to another."""
+    """Angle by which the ring has tilted from one surface to another, in µrad."""
     tilt_mm = ring_tilt() @ (later.parameters - earlier.parameters)
     return 1e6 * math.hypot(*tilt_mm) / later.radius_mm
 
@@ -299,7 +299,15 @@ class _GroupTest:
     spread: FloatArray
 
     def make_right_side(self, ring_mm: FloatArray, left: FloatArray) -> FloatArray:
-        """b (k,) of the ring's tilt or saddle (2,) and of the products q (components,)."""
+        """Return b (k,) of the module's equation.
+
+        Parameters
+        ----------
+        ring_mm : (2,) array
+            c: the ring's tilt or saddle.
+        left : (components,) array
+            q: products with the slopes that no surface has.
+        """
         return np.asarray(self.by_ring @ ring_mm + self.by_left @ left[self.columns])
 
 
@@ -388,8 +396,10 @@ class MotionTest:
         covariance.
         """
         change = harmonic @ self._effects.figure_mm
+        # h^T C_c^-1 and its product with h, for all components at once.
         by_ring = change.T @ np.linalg.inv(ring_mm2)
         information = _blocks_of_groups(by_ring @ change)
+        # G C_q^-1 and G C_q^-1 G. Scatter of a component that no square shows is singular.
         by_left = np.zeros_like(information)
         if self._slopes is not None:
             own = _blocks_of_groups(self._slopes.gram)
@@ -442,6 +452,7 @@ class MotionTest:
         test = self._by_tilt[mirror]
         tilt = np.linalg.solve(test.information, test.make_right_side(tilt_mm, left))
         tilt_knock = _KNOCK_PER_TILT * float(np.linalg.norm(tilt))
+        # A larger knock is a wider prior: (A + 1 / K^2)^-1.
         tests = dict(self._by_tilt)
         for number, test in self._by_tilt.items():
             if tilt_knock > GROUPS[number].knock:
@@ -491,6 +502,7 @@ def _worst_effect(
         if fit.gain < fits[0].gain - _PLAUSIBLE_GAIN:
             continue
         columns = group_columns()[fit.group]
+        # Amounts shrink by the part of the gain that chance gives.
         chance = _CHANCE_GAIN * group.components
         share = math.sqrt(max(0.0, 1 - chance / max(fit.gain, _TINY)))
         effect_mm = share * (effects.figure_mm[:, columns] @ fit.amount)

@@ -53,9 +53,14 @@ class PairMotion:
         return cls(MotionEffects(figure_mm, none), bench.surface.parameters)
 
     def find(self, earlier: "PairMotion", covariance_mm2: FloatArray) -> MotionFinding:
-        """The motions since an earlier set.
+        """Return the motions of the bench since an earlier set, by the ring's tilt.
 
-        `covariance_mm2` (parameters, parameters) is that of the change on a bench at rest.
+        Parameters
+        ----------
+        earlier : PairMotion
+            Of the earlier set.
+        covariance_mm2 : (parameters, parameters) array
+            Of the change of the surface's parameters on a bench at rest.
         """
         ring = ring_tilt()
         test = MotionTest(self.effects, ring @ covariance_mm2 @ ring.T, None, None)

@@ -19,9 +19,19 @@ _RMS_SINE = 0.7  # of an unknown place
 
 
 def second_reflection_source(bench: TrialBench, seen: SecondReflection) -> Source:
-    """Return the row of the budget: what was found, or what may hide in the noise.
+    """Return the row of the budget for a second image, found or too weak to be found.
 
-    A set that cannot show a second image has a row of 0.
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the set.
+    seen : SecondReflection
+        What the Gray frames show; a set that cannot show a second image has a row of 0.
+
+    Returns
+    -------
+    Source
+        A limit if nothing was found.
     """
     sigma = seen.sigma if math.isfinite(seen.sigma) else 0.0
     share = seen.share if seen.is_found else _UNIFORM * _HIDDEN_SIGMAS * sigma

@@ -65,6 +65,18 @@ def drift_um(frames: tuple[FloatArray, FloatArray], film_um: FloatArray) -> floa
     """Drift of the film from one frame to the next, as the fringes show it.
 
     A drift is the same in both axes. A step within one of them is none.
+
+    Parameters
+    ----------
+    frames : two arrays
+        Numbers of the used sinusoids of x and of y in the set.
+    film_um : (used,) array
+        Displacement of the film during them, first x.
+
+    Returns
+    -------
+    float
+        µm a frame; the smaller of both axes, 0 if their signs differ.
     """
     rates_um = []
     for numbers, places_um in zip(frames, np.split(film_um, [len(frames[0])]), strict=True):
@@ -106,16 +118,40 @@ def step_sigma_um(
 
 
 def left_out_sigma_um(used: int, shown: int, laser_noise_um: float) -> float:
-    """1 sigma of the mean reading of the used sinusoids about that of all that were shown."""
+    """Return 1 sigma of the mean reading of the used sinusoids about that of all that were shown.
+
+    Parameters
+    ----------
+    used, shown : int
+        Number of sinusoids.
+    laser_noise_um : float
+        Noise of a reading.
+    """
     return laser_noise_um * math.sqrt(1 / used - 1 / shown)
 
 
 def moment_source(
     checked: Checked, film: FilmMotion, seen: UnseenMotion | None, radius_mm: float
 ) -> Source | None:
-    """The row of the budget; None with a laser, unless the film moved and a frame is left out.
+    """Return the row for a figure whose moment is not the mean moment of the set.
 
-    `seen` is the motion from x to y as the fringes show it, without a laser.
+    Section 3 of docs/explanation/uncertainty.md.
+
+    Parameters
+    ----------
+    checked : Checked
+        The set.
+    film : FilmMotion
+        Motion of the film by laser and fringes.
+    seen : UnseenMotion or None
+        Motion from x to y as the fringes show it, of a set without a laser.
+    radius_mm : float
+        Radius of the mirror.
+
+    Returns
+    -------
+    Source or None
+        None with a laser, unless the film moved and a frame is left out.
     """
     used = [np.array(frames, float) for frames in checked.view.used]
     stack = checked.stack

@@ -97,7 +97,17 @@ def measure_slope_misfit(
 def estimate_explained_urad(bench: TrialBench, spread: GeometrySpread) -> float:
     """Slopes without a surface, 1 sigma, that the geometry's spread and the light explain.
 
-    Raises ArithmeticError if the spread is so wide that a fit does not converge.
+    Parameters
+    ----------
+    bench : TrialBench
+        Some points of the set.
+    spread : GeometrySpread
+        Its numbers count as independent: each is moved by its sigma.
+
+    Raises
+    ------
+    ArithmeticError
+        If the spread is so wide that a fit does not converge.
     """
     squares_urad2 = [_LIGHT_URAD**2]
     for k, sigma in enumerate(spread.sigmas):
@@ -110,7 +120,15 @@ def estimate_explained_urad(bench: TrialBench, spread: GeometrySpread) -> float:
 
 
 def measure_curl_urad(grid: ResidualGrid, height_mm: FloatArray) -> float:
-    """RMS, µrad, of the slopes less the gradient of the height, averaged over patches."""
+    """RMS, µrad, of the slopes less the gradient of the height, averaged over patches.
+
+    Parameters
+    ----------
+    grid : ResidualGrid
+        Measured slopes of cells, less those of the fit.
+    height_mm : (n, n) array
+        Height over the fit that explains them best.
+    """
     seen = grid.count > 0
     # The slope between two neighbouring cells: measured as the mean of theirs, and by the height.
     measured_x = (grid.slope_x[:, :-1] + grid.slope_x[:, 1:]) / 2

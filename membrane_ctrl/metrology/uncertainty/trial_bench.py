@@ -78,7 +78,19 @@ class TrialBench:
         figure: bin_figure.BinFigure,
         count: int = TRIAL_POINTS,
     ) -> "TrialBench":
-        """The trial bench of a set and its figure, with about `count` of the bins."""
+        """Return the trial bench of a set.
+
+        Parameters
+        ----------
+        optics : OpticsConfig
+            The bench.
+        checked : Checked
+            The set.
+        figure : BinFigure
+            Its figure by bins.
+        count : int
+            About how many of the bins to use.
+        """
         places_px = checked.places_px(figure.index)
         return cls.from_points(
             optics,
@@ -194,7 +206,15 @@ class TrialBench:
         raise ArithmeticError("a trial did not converge: the geometry's spread is too wide")
 
     def geometry(self, names: tuple[str, ...] = (), change: ArrayLike = ()) -> BenchGeometry:
-        """The nominal bench, with its named numbers changed by (k,) amounts."""
+        """Return the bench with some of its numbers changed.
+
+        Parameters
+        ----------
+        names : tuple of str
+            k parameters; none for the nominal bench.
+        change : (k,) array
+            By how much, in the unit of each.
+        """
         return moved_bench(self.optics, names, change)
 
     def slope_variance(self) -> FloatArray:
@@ -242,9 +262,19 @@ def moved_film(bench: TrialBench, displacement_um: float) -> TrialBench:
 
 
 def moves_mm(bench: TrialBench, there: bench_poses.BenchGeometry | None = None) -> FloatArray:
-    """Change (2, n) of the screen points per µm of the film's displacement.
+    """Return the change of the screen points per µm of the film's displacement.
 
-    `there` is another bench than the nominal one.
+    Parameters
+    ----------
+    bench : TrialBench
+        n points.
+    there : BenchGeometry, optional
+        Another bench than the nominal one.
+
+    Returns
+    -------
+    (2, n) array
+        In mm.
     """
     if there is None:
         there = bench.geometry()
@@ -255,7 +285,22 @@ def moves_mm(bench: TrialBench, there: bench_poses.BenchGeometry | None = None) 
 def predicted_mm(
     bench: TrialBench, there: bench_poses.BenchGeometry, surface: Surface
 ) -> FloatArray:
-    """Where (2, n) a surface on another bench sends the rays of the points."""
+    """Return where a surface on another bench sends the rays of the points.
+
+    Parameters
+    ----------
+    bench : TrialBench
+        n points.
+    there : BenchGeometry
+        The other bench.
+    surface : Surface
+        The surface.
+
+    Returns
+    -------
+    (2, n) array
+        Screen points in mm, in the scale of the stated screen.
+    """
     tracer, points = traced_points(bench, there.geometry)
     tracer.intersect(points, surface, newton=3)
     return tracer.predict_screen(points, surface) / there.pitch
@@ -264,9 +309,20 @@ def predicted_mm(
 def traced_points(
     bench: TrialBench, geometry: Geometry, bent: FloatArray | float = 0.0
 ) -> tuple[Tracer, Points]:
-    """The points of a bench with another geometry, near the surface.
+    """Return the points of a bench with another geometry, near the surface.
 
-    `bent` (3, n) is added to the directions of their rays.
+    Parameters
+    ----------
+    bench : TrialBench
+        n points.
+    geometry : Geometry
+        The other geometry.
+    bent : (3, n) array, optional
+        Added to the directions of their rays.
+
+    Returns
+    -------
+    Tracer, Points
     """
     points = Points.from_rays(geometry.rays(bench.column_px, bench.row_px) + bent, bench.screen_mm)
     points.t_mm[:] = bench.t_mm
