@@ -13,7 +13,7 @@ from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.result_files import number_or_null, write_arrays
 from membrane_ctrl.measure.results import ErrorBars
 from membrane_ctrl.metrology.figure import best_sphere
-from membrane_ctrl.metrology.figure.error_bars import LEAST_CELLS, FigureBars, figure_bars
+from membrane_ctrl.metrology.figure.error_bars import LEAST_CELLS, FigureBars, FigureTrials
 from membrane_ctrl.metrology.figure.power_spectrum import PowerSpectrum, power_spectrum
 from membrane_ctrl.metrology.figure.quantities import Figure, FigureOf
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
@@ -73,8 +73,9 @@ def measured_figure(
         return None
     evaluate = FigureOf(seen, aperture)
     found = evaluate(seen)
-    of_noise = figure_bars(evaluate, seen, found, mirror.radius_mm, bars.noise, bars.cell_slope)
-    of_geometry = figure_bars(evaluate, seen, found, mirror.radius_mm, bars.geometry)
+    trials = FigureTrials(evaluate, seen, found, mirror.radius_mm)
+    of_noise = trials.figure_bars(bars.noise, bars.cell_slope)
+    of_geometry = trials.figure_bars(bars.geometry)
     spectrum = power_spectrum(found, seen.axis_mm, aperture)
     return MeasuredFigure(found, of_noise, of_geometry, spectrum, seen, aperture, nominal_radius_mm)
 

@@ -6,7 +6,7 @@ q^2, which also holds for a flat.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -65,24 +65,46 @@ class Sphere:
         return c * radius_mm**2 / (1 + math.sqrt(cosine_square))
 
 
-def best_sphere(points_mm: FloatArray) -> Sphere:
-    """Sphere with the least squares of the deviations along its normal, for points (3, n)."""
-    # The start: a paraboloid z = z0 + t_x x + t_y y + c (x^2 + y^2) / 2 through some of the points.
-    # Its four columns are scaled to one size.
+def best_sphere(points_mm: FloatArray, near: Sphere | None = None) -> Sphere:
+    """Sphere with the least squares of the deviations along its normal.
+
+    Parameters
+    ----------
+    points_mm : (3, n) array
+    near : Sphere, optional
+        The best sphere of nearly the same points, from which two steps are enough.
+
+    Returns
+    -------
+    Sphere
+    """
     stride = max(1, points_mm.shape[1] // _SPHERE_POINTS)
     some = points_mm[:, ::stride]
-    x, y, z = some
-    scale = float(np.sqrt(np.mean(x**2 + y**2)))
+    scale = float(np.sqrt(np.mean(some[0] ** 2 + some[1] ** 2)))
+    # Vertex, tilts and curvature are scaled to one size.
     columns = np.array([1.0, 1 / scale, 1 / scale, 2 / scale**2])
+
+    # Gauss-Newton steps, the last one with all points.
+    if near is None:
+        sphere = _fit_paraboloid(some, columns)
+        clouds = [some, some, points_mm]
+    else:
+        sphere = near
+        clouds = [some, points_mm]
+    for cloud in clouds:
+        sphere = Sphere(
+            *(np.array(astuple(sphere)) + _sphere_step(sphere, cloud, columns)).tolist()
+        )
+    return sphere
+
+
+def _fit_paraboloid(points_mm: FloatArray, columns: FloatArray) -> Sphere:
+    """Sphere of the paraboloid z = z0 + t_x x + t_y y + c (x^2 + y^2) / 2 through the points."""
+    x, y, z = points_mm
     bent = (x * x + y * y) / 2
     paraboloid = np.stack([np.ones_like(x), x, y, bent], axis=1)
     found = columns * np.linalg.lstsq(paraboloid * columns, z, rcond=None)[0]
-
-    # Gauss-Newton steps, the last one with all points.
-    for cloud in (some, some, points_mm):
-        found = found + _sphere_step(Sphere(*found), cloud, columns)
-    vertex_mm, tilt_x, tilt_y, curvature_per_mm = (float(value) for value in found)
-    return Sphere(vertex_mm, tilt_x, tilt_y, curvature_per_mm)
+    return Sphere(*found.tolist())
 
 
 def _sphere_step(sphere: Sphere, points_mm: FloatArray, columns: FloatArray) -> FloatArray:
@@ -90,22 +112,27 @@ def _sphere_step(sphere: Sphere, points_mm: FloatArray, columns: FloatArray) -> 
 
     From (1 - c d)^2 = s^2, the derivatives of d need no division by c.
     """
-    deviation, normals = sphere.deviation(points_mm)
-    q = points_mm - np.array([[0.0], [0.0], [sphere.vertex_mm]])
-    square = np.einsum("in,in->n", q, q)
-    s = 1 - sphere.curvature_per_mm * deviation
+    # q, q n, q^2, s and d of each point.
+    x, y, z = points_mm
+    z = z - sphere.vertex_mm
     n = sphere.normal
+    c = sphere.curvature_per_mm
+    along = n[0] * x + n[1] * y + n[2] * z
+    square = x * x + y * y + z * z
+    s = np.sqrt(1 - 2 * c * along + c * c * square)
+    deviation = (2 * along - c * square) / (1 + s)
 
     # Derivatives of the unit normal by the tilts.
     length = 1 / n[2]
     normal_by_x = (np.array([-1.0, 0, 0]) + n * n[0]) / length
     normal_by_y = (np.array([0.0, -1, 0]) + n * n[1]) / length
 
-    # Derivatives of the deviation by vertex, tilts and curvature.
-    by_curvature = (deviation**2 - square) / (2 * s)
-    by_tilt_x = normal_by_x @ q / s
-    by_tilt_y = normal_by_y @ q / s
-    rows = np.stack([-normals[2], by_tilt_x, by_tilt_y, by_curvature])
-    rows *= columns[:, None]
+    # Derivatives of the deviation by vertex, tilts and curvature, all times s.
+    by_vertex = c * z - n[2]
+    by_tilt_x = normal_by_x[0] * x + normal_by_x[1] * y + normal_by_x[2] * z
+    by_tilt_y = normal_by_y[0] * x + normal_by_y[1] * y + normal_by_y[2] * z
+    by_curvature = (deviation * deviation - square) / 2
+    rows = np.stack([by_vertex, by_tilt_x, by_tilt_y, by_curvature])
+    rows *= columns[:, None] / s
     step = np.linalg.lstsq(rows @ rows.T, -rows @ deviation, rcond=1e-13)[0]
     return np.asarray(columns * step)

@@ -44,15 +44,8 @@ class FigureBars:
     fringe_um: FloatArray
 
 
-def figure_bars(
-    evaluate: FigureOf,
-    seen: SurfaceMap,
-    found: Figure,
-    disc_mm: float,
-    covariance_mm2: FloatArray,
-    cell_slope: float = 0.0,
-) -> FigureBars:
-    """Error bars of a figure.
+class FigureTrials:
+    """Error bars of one figure by trials; what they have in common is prepared once.
 
     Parameters
     ----------
@@ -64,65 +57,88 @@ def figure_bars(
         Its figure, `evaluate(seen)`.
     disc_mm : float
         Radius of the fit's Zernike disc.
-    covariance_mm2 : (parameters, parameters) array
-        Covariance of the fit's parameters, in mm^2. Not finite: no error bar, all NaN.
-    cell_slope : float
-        1 sigma of the mean slope of a cell by white noise.
-
-    Returns
-    -------
-    FigureBars
-        1 sigma of each number.
     """
-    if not np.isfinite(covariance_mm2).all():
-        nothing = Quantities(*[np.nan] * len(fields(Quantities)))
-        return FigureBars(nothing, np.full(zernike.FRINGE_TERMS, np.nan))
 
-    # Trials on a thinned grid, unless few cells of a sparse map would be left.
-    thin = seen.take_every(max(1, seen.axis_mm.size // _TRIAL_CELLS))
-    if np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS:
-        thin = seen
-    rough = FigureOf(thin, evaluate.aperture_mm)
-    nominal = rough(thin)
+    def __init__(self, evaluate: FigureOf, seen: SurfaceMap, found: Figure, disc_mm: float) -> None:
+        self._evaluate = evaluate
+        self._seen = seen
+        self._found = found
 
-    # Independent modes of the parameters' errors, each of 1 sigma, as surfaces on that grid: the
-    # eigenvectors of the covariance, scaled by the roots of its eigenvalues.
-    values, vectors = np.linalg.eigh(covariance_mm2)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    surfaces = [surface.Surface.from_parameters(parameters, disc_mm) for parameters in root.T]
-    modes = np.stack([mode.on_grid(thin.axis_mm) for mode in surfaces])
+        # Trials on a thinned grid, unless few cells of a sparse map would be left.
+        thin = seen.take_every(max(1, seen.axis_mm.size // _TRIAL_CELLS))
+        if np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS:
+            thin = seen
+        self._thin = thin
+        self._rough = FigureOf(thin, evaluate.aperture_mm)
+        self._nominal = self._rough(thin)
+        self._nominal_spot_mm = np.sort(self._nominal.spot_mm)
 
-    # Mean squares of the changes by random sums of these modes. The seed is fixed: the same set has
-    # the same error bars.
-    random = np.random.default_rng(1)
-    squares = np.zeros(len(fields(Quantities)))
-    for _ in range(_TRIALS):
-        change = np.tensordot(random.normal(size=len(root)), modes, axes=1)
-        disturbed = rough(thin.add_change(change))
-        squares += _compute_change(nominal, disturbed) ** 2 / _TRIALS
+        # Heights and slopes (parameters, 3, n, n) by 1 mm of each parameter, and the Fringe terms
+        # (parameters, 37), which are linear in the parameters.
+        units = np.eye(surface.PARAMETERS)
+        surfaces = [surface.Surface.from_parameters(unit, disc_mm) for unit in units]
+        self._by_parameter = np.stack([unit.on_grid(thin.axis_mm) for unit in surfaces])
+        terms = [self._rough.fringe.coefficients(unit[0]) for unit in self._by_parameter]
+        self._terms_um = 1e3 * np.stack(terms)
 
-    # And by the cells' own noise, which is independent of them.
-    if cell_slope > 0:
-        for change in _propagate_white_noise(seen, evaluate.aperture_mm, cell_slope, random):
-            moved = np.array(astuple(evaluate(seen.add_change(change)).numbers))
-            squares += (moved - astuple(found.numbers)) ** 2 / _WHITE_TRIALS
+    def figure_bars(self, covariance_mm2: FloatArray, cell_slope: float = 0.0) -> FigureBars:
+        """Error bars of the figure.
 
-    # The Fringe terms are linear in the parameters.
-    terms = np.stack([1e3 * rough.fringe.coefficients(mode[0]) for mode in modes])
-    return FigureBars(Quantities(*np.sqrt(squares)), np.sqrt(np.sum(terms**2, axis=0)))
+        Parameters
+        ----------
+        covariance_mm2 : (parameters, parameters) array
+            Covariance of the fit's parameters, in mm^2. Not finite: no error bar, all NaN.
+        cell_slope : float
+            1 sigma of the mean slope of a cell by white noise.
 
+        Returns
+        -------
+        FigureBars
+            1 sigma of each number.
+        """
+        if not np.isfinite(covariance_mm2).all():
+            nothing = Quantities(*[np.nan] * len(fields(Quantities)))
+            return FigureBars(nothing, np.full(zernike.FRINGE_TERMS, np.nan))
 
-def _compute_change(nominal: Figure, moved: Figure) -> FloatArray:
-    """Change of all numbers; of an encircled share, the mean over its neighbours, since few rays
-    make it jump.
-    """
-    change = np.subtract(astuple(moved.numbers), astuple(nominal.numbers))
-    farther_mm = np.sort(moved.spot_mm) - np.sort(nominal.spot_mm)
-    for place, share in zip(range(-len(ENERGY_SHARES), 0), ENERGY_SHARES, strict=True):
-        first = int((share - _NEIGHBOURS) * farther_mm.size)
-        last = int((share + _NEIGHBOURS) * farther_mm.size)
-        change[place] = farther_mm[first : last + 1].mean()
-    return np.asarray(change)
+        # Independent modes of the parameters' errors, each of 1 sigma: the eigenvectors of the
+        # covariance, scaled by the roots of its eigenvalues.
+        values, vectors = np.linalg.eigh(covariance_mm2)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+
+        # Mean squares of the changes by random sums of these modes. The seed is fixed: the same set
+        # has the same error bars.
+        random = np.random.default_rng(1)
+        drawn_mm = random.normal(size=(_TRIALS, len(root))) @ root.T
+        changes = drawn_mm @ self._by_parameter.reshape(len(root), -1)
+        squares = np.zeros(len(fields(Quantities)))
+        for change in changes.reshape(_TRIALS, *self._by_parameter.shape[1:]):
+            disturbed = self._rough(self._thin.add_change(change), self._nominal.sphere)
+            squares += self._compute_change(disturbed) ** 2 / _TRIALS
+
+        # And by the cells' own noise, which is independent of them.
+        if cell_slope > 0:
+            aperture_mm = self._evaluate.aperture_mm
+            found = self._found
+            for change in _propagate_white_noise(self._seen, aperture_mm, cell_slope, random):
+                disturbed = self._evaluate(self._seen.add_change(change), found.sphere)
+                moved = np.subtract(astuple(disturbed.numbers), astuple(found.numbers))
+                squares += moved**2 / _WHITE_TRIALS
+
+        # The sums of squares of the Fringe terms over the modes.
+        terms_um = root.T @ self._terms_um
+        return FigureBars(Quantities(*np.sqrt(squares)), np.sqrt(np.sum(terms_um**2, axis=0)))
+
+    def _compute_change(self, moved: Figure) -> FloatArray:
+        """Change of all numbers on the thinned grid; of an encircled share, the mean over its
+        neighbours, since few rays make it jump.
+        """
+        change = np.subtract(astuple(moved.numbers), astuple(self._nominal.numbers))
+        farther_mm = np.sort(moved.spot_mm) - self._nominal_spot_mm
+        for place, share in zip(range(-len(ENERGY_SHARES), 0), ENERGY_SHARES, strict=True):
+            first = int((share - _NEIGHBOURS) * farther_mm.size)
+            last = int((share + _NEIGHBOURS) * farther_mm.size)
+            change[place] = farther_mm[first : last + 1].mean()
+        return np.asarray(change)
 
 
 def _propagate_white_noise(

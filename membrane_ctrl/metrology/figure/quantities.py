@@ -21,6 +21,7 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray
 _FRINGE = [zernike.fringe_set_orders(j) for j in range(1, zernike.FRINGE_TERMS + 1)]
 _PVR_TERMS = 36  # by definition, whatever the fit's own number
 _RINGS = 96  # knots of the rotationally invariant part: 5 mm on a 1 m mirror
+_SEPARABLE = 1e-10  # eigenvalue over the largest, below which knots are without cells
 ENERGY_SHARES = (0.5, 0.8, 0.95)  # of the encircled energy
 
 
@@ -98,13 +99,15 @@ class FigureOf:
         r = np.hypot(seen.axis_mm[rows], seen.axis_mm[columns])
         self._rings = _Rings(r, max(2, min(_RINGS, len(axis) // 4)))
 
-    def __call__(self, seen: SurfaceMap) -> Figure:
+    def __call__(self, seen: SurfaceMap, near: best_sphere.Sphere | None = None) -> Figure:
         """Evaluate the figure of a surface.
 
         Parameters
         ----------
         seen : SurfaceMap
             On the grid, and with the measured cells, of the first one.
+        near : Sphere, optional
+            The best sphere of a surface that is nearly the same: saves half of the time.
 
         Returns
         -------
@@ -114,7 +117,7 @@ class FigureOf:
         points = seen.points()
 
         # Deviation from the best sphere, its rotationally invariant part, and its smooth part.
-        sphere = best_sphere.best_sphere(points)
+        sphere = best_sphere.best_sphere(points, near)
         deviation_mm, sphere_normals = sphere.deviation(points)
         deviation_um = 1e3 * (deviation_mm - deviation_mm.mean())
         rotational_um = self._rings.round_part(deviation_um)
@@ -191,7 +194,8 @@ class _Rings:
         beside = self._sum_by_knot(self._share * (1 - self._share))[:-1]
         above_diagonal = np.diag(beside, 1)
         below_diagonal = np.diag(beside, -1)
-        self._normal = np.diag(diagonal) + above_diagonal + below_diagonal
+        normal = np.diag(diagonal) + above_diagonal + below_diagonal
+        self._solver = np.linalg.pinv(normal, rcond=_SEPARABLE, hermitian=True)
 
     def _sum_by_knot(self, values: FloatArray) -> FloatArray:
         """Sum of values by their lower knot, (knots,)."""
@@ -201,7 +205,7 @@ class _Rings:
         """That part at the same cells."""
         right = self._sum_by_knot((1 - self._share) * values)
         right[1:] += self._sum_by_knot(self._share * values)[:-1]
-        knots = np.linalg.lstsq(self._normal, right, rcond=1e-10)[0]
+        knots = self._solver @ right
         from_lower = (1 - self._share) * knots[self._low]
         from_upper = self._share * knots[self._low + 1]
         return np.asarray(from_lower + from_upper)

@@ -8,6 +8,8 @@ from numpy.polynomial.legendre import legvander, poly2leg
 from membrane_ctrl.metrology.numerics.zernike import radial_polynomial
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
+_SEPARABLE = 1e-12  # eigenvalue over the largest, below which the mask does not separate terms
+
 
 class GridFit:
     """Least squares of terms over the cells of a grid that a mask selects.
@@ -54,7 +56,9 @@ class GridFit:
         pairs_x = np.einsum("ia,ib->iab", self._x, self._x)
         pairs_y = np.einsum("ia,ib->iab", self._y, self._y)
         moments = np.einsum("iac,ij,jbd->acbd", pairs_y, mask.astype(float), pairs_x, optimize=True)
-        self._gram = np.einsum("kba,acbd,ldc->kl", self._terms, moments, self._terms, optimize=True)
+        gram = np.einsum("kba,acbd,ldc->kl", self._terms, moments, self._terms, optimize=True)
+        # Its pseudo-inverse: terms that the mask does not separate share their value.
+        self._solver = np.linalg.pinv(gram, rcond=_SEPARABLE, hermitian=True)
 
     def coefficients(self, values: FloatArray) -> FloatArray:
         """Fit a map.
@@ -72,7 +76,7 @@ class GridFit:
         inside = np.where(self._mask, values, 0.0)
         moments = self._y.T @ inside @ self._x
         right = np.einsum("kba,ab->k", self._terms, moments)
-        return np.asarray(np.linalg.lstsq(self._gram, right, rcond=1e-12)[0])
+        return np.asarray(self._solver @ right)
 
     def values(self, coefficients: FloatArray) -> FloatArray:
         """Map (H, W) of the terms, also outside the mask."""

@@ -152,10 +152,11 @@ class Surface:
         out = np.stack([series.polygrid2d(axis, axis, polynomial) for polynomial in polynomials])
 
         # The excess e(v), with the slopes 2 e'(v) x and 2 e'(v) y.
-        v = axis**2 + axis[:, None] ** 2
-        excess = series.polyval(v, self.excess)
-        excess_slope = 2 * series.polyval(v, series.polyder(self.excess))
-        out += np.stack([excess, excess_slope * axis, excess_slope * axis[:, None]])
+        if self.excess.any():
+            v = axis**2 + axis[:, None] ** 2
+            excess = series.polyval(v, self.excess)
+            excess_slope = 2 * series.polyval(v, series.polyder(self.excess))
+            out += np.stack([excess, excess_slope * axis, excess_slope * axis[:, None]])
         out[1:] /= self.radius_mm
         return np.asarray(out)
 

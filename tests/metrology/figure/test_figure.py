@@ -54,7 +54,8 @@ def bars_of(
 ) -> error_bars.FigureBars:
     """Its error bars."""
     evaluate = quantities.FigureOf(some, APERTURE)
-    return error_bars.figure_bars(evaluate, some, evaluate(some), 500.0, covariance, cell_slope)
+    trials = error_bars.FigureTrials(evaluate, some, evaluate(some), 500.0)
+    return trials.figure_bars(covariance, cell_slope)
 
 
 def ball(radius_mm: float, tilt_x: float = 0.0, tilt_y: float = 0.0) -> np.ndarray:
@@ -82,6 +83,22 @@ def test_a_flat_with_a_bump_is_no_exception() -> None:
     found = of(seen(bump + 1e-5 * X))
     assert abs(found.sphere.curvature_per_mm) < 1e-8
     assert found.numbers.irregularity_pv_um == pytest.approx(1.0, rel=0.03)
+
+
+def test_from_a_sphere_nearby_the_same_sphere_is_found() -> None:
+    cloud = seen(height_of(TrueFilm(37.0, ABERRATED)), hole=True).points()
+    found = best_sphere.best_sphere(cloud)
+    for near in (
+        best_sphere.Sphere(
+            found.vertex_mm + 0.3, found.tilt_x - 1e-3, found.tilt_y + 5e-4, 1 / 3300.0
+        ),
+        best_sphere.Sphere(found.vertex_mm, found.tilt_x, found.tilt_y, found.curvature_per_mm),
+    ):
+        again = best_sphere.best_sphere(cloud, near)
+        assert again.vertex_mm == pytest.approx(found.vertex_mm, abs=1e-6)
+        assert again.tilt_x == pytest.approx(found.tilt_x, abs=1e-8)
+        assert again.tilt_y == pytest.approx(found.tilt_y, abs=1e-8)
+        assert again.curvature_per_mm == pytest.approx(found.curvature_per_mm, rel=1e-7)
 
 
 def test_the_sphere_has_the_least_squares_of_the_distances() -> None:
