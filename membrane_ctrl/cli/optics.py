@@ -366,6 +366,13 @@ def simulate(
     artefact: ArtefactOption = "",
     screen_moved_mm: ScreenMovedOption = 0.0,
     turned_deg: TurnedOption = None,
+    front_film: Annotated[
+        bool, typer.Option("--front-film", help="Add the paper's clear film in front.")
+    ] = False,
+    unstated_front_film: Annotated[
+        bool,
+        typer.Option("--unstated-front-film", help="The same, but the set does not mention it."),
+    ] = False,
     track: Annotated[
         int,
         typer.Option(
@@ -402,6 +409,8 @@ def simulate(
         artefact=artefact,
         screen_moved_mm=screen_moved_mm,
         turned_deg=turned_deg,
+        front_film=front_film,
+        unstated_front_film=unstated_front_film,
         track=track,
         rate_hz=rate_hz,
     )

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from firmware_iface.settings import Micrometres, Section
+from membrane_ctrl.config.front_film import FrontFilmConfig
 
 Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # of whatever unit: a kilometre of mm
 Vector3 = tuple[Length, Length, Length]
@@ -294,6 +295,7 @@ class MirrorConfig(Section):
     """
     pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 600.0
     """Gauge reading at displacement 0; 0: unknown. Set it for another film."""
+    front_film: FrontFilmConfig | None = None
 
     @model_validator(mode="after")
     def _check_radius(self) -> "MirrorConfig":

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from membrane_ctrl.config import sight
+from membrane_ctrl.config.front_film import FrontFilmConfig
 from membrane_ctrl.config.optics import ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig
 from membrane_ctrl.geometry.file import read_geometry
@@ -17,6 +18,7 @@ from membrane_ctrl.geometry.set_tables import move_screen
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics import film_shape, pattern_levels, simulate, simulation_spec
+from membrane_ctrl.sim.optics.front_film import make_front_film
 from membrane_ctrl.sim.optics.turned_film import MirrorSeat, turn_film
 
 _USED = 0.95  # of the artefact's radius, as of the mirror's
@@ -51,6 +53,8 @@ class SimulateOptions:
     artefact: str = ""  # "flat:RADIUS", "sphere:CURVATURE:RADIUS" or "screen:DISTANCE", mm
     screen_moved_mm: float = 0.0  # towards the mirror
     turned_deg: float | None = None  # angle of a mirror that was turned about its axis
+    front_film: bool = False  # the paper's clear film, if the configuration has none
+    unstated_front_film: bool = False  # a front film that the set does not mention
     track: int = 0  # frames of a tracking set
     rate_hz: float = 20.0
 
@@ -125,8 +129,16 @@ def _of_film(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.
         seat = MirrorSeat.drawn(options.turned_deg, options.seed + round(1e3 * options.turned_deg))
         shape = turn_film(shape, seat, options.motion.start_um)
         stated_turn = {"angle_deg": options.turned_deg}
+    seed = None
+    if options.figure:
+        seed = options.seed
+    stated_mirror = None
+    if options.unstated_front_film:
+        stated_mirror = optics.mirror.model_copy(update={"front_film": None})
     return replace(
         _make_rest_specification(options, optics, shape),
+        front=make_front_film(optics.mirror, options.sag_mm, seed),
+        stated_mirror=stated_mirror,
         mirror_turned=stated_turn,
         seat=seat,
         stiffness_n_per_m=twin.film_stiffness_n_per_m,
@@ -262,11 +274,15 @@ def _adjust_optics(options: SimulateOptions) -> OpticsConfig:
     steps = {}
     if options.steps is not None:
         steps = {"steps": options.steps}
+    mirror = optics.mirror
+    asked = options.front_film or options.unstated_front_film
+    if asked and mirror.front_film is None:
+        mirror = mirror.model_copy(update={"front_film": FrontFilmConfig()})
     return OpticsConfig(
         geometry=optics.geometry,
         camera=type(camera)(**{**camera.model_dump(exclude_none=True), **changes}),
         pattern=type(pattern)(**{**pattern.model_dump(), **steps}),
-        mirror=optics.mirror,
+        mirror=mirror,
     )
 
 

@@ -22,8 +22,16 @@ from membrane_ctrl.sim.optics.bench_poses import (
 )
 from membrane_ctrl.sim.optics.disturbances import Disturber, Nodes
 from membrane_ctrl.sim.optics.drum_modes import DrumMode, drum_modes
+from membrane_ctrl.sim.optics.film_images import (
+    NO_ADDED_LIGHT,
+    AddedLight,
+    light_of_panel,
+    light_of_pattern,
+    shade_images,
+)
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.film_terms import FilmTerms
+from membrane_ctrl.sim.optics.front_film import FrontFilm, make_front_film
 from membrane_ctrl.sim.optics.node_interpolation import cubic_weights, node_positions
 from membrane_ctrl.sim.optics.pattern_levels import Light, level_table
 from membrane_ctrl.sim.optics.pixel_noise import noise_bank, normal_quantiles
@@ -31,6 +39,7 @@ from membrane_ctrl.sim.optics.shade import shade_rows, vignetting_loss
 from membrane_ctrl.sim.optics.shade_crossed import shade_crossed_rows
 from membrane_ctrl.sim.optics.shade_panel import PanelPicture, shade_panel_rows
 from membrane_ctrl.sim.optics.trace import Trace, trace_rays
+from membrane_ctrl.sim.optics.trace_cushion import trace_cushion
 
 # Distance of the nodes on the mirror: a typical film's phase is then less than 1e-4 rad off the
 # exact trace (asserted in the tests).
@@ -39,6 +48,7 @@ _NODE_MM = 4.6
 # rad, a straight line only to 2e-5 rad.
 _CELL_UM = 100.0
 _KEPT_TRACES = 8
+_MAPS = 3  # at the nodes: screen point, squared distance from the vertex
 _DARK = Pattern("black")
 _NO_PATTERN = Pattern("picture")  # of a panel whose pixels are given
 
@@ -50,9 +60,9 @@ class OpticsRenderer:
     The film is traced at nodes (see module `shade`) and, unless `exact`, at displacements _CELL_UM
     apart: a parabola through the three nearest gives the maps at any other, so that a moving film
     costs nothing until it leaves its cell. `exact` traces every pixel at every displacement: slow,
-    for sets that must be exact. At `reference_um` the vertex is at the origin of the geometry. Each
-    picture has its own pixel noise (`camera.noise_adu`). Raises ValueError if the film's rim is not
-    the configured one.
+    for sets that must be exact. A `front` film adds further images of the screen. At `reference_um`
+    the vertex is at the origin of the geometry. Each picture has its own pixel noise
+    (`camera.noise_adu`). Raises ValueError if the film's rim is not the configured one.
     """
 
     optics: OpticsConfig
@@ -63,6 +73,7 @@ class OpticsRenderer:
     exact: bool = False
     seed: int = 0
     modes: tuple[DrumMode, ...] = ()
+    front: FrontFilm | None = None
     disturbances: DisturbancesConfig = field(default_factory=DisturbancesConfig)
     _disturber: Disturber | None = field(default=None, init=False, repr=False)
     _traces: OrderedDict[float, FloatArray] = field(
@@ -143,14 +154,20 @@ class OpticsRenderer:
             )
         self._pictures += 1
         paint = self._make_painter(shown, gain)
-        # Maps at the nodes, moved by the bench's disturbances and by vibrations.
-        nodes = self._interpolate_nodes(displacement_um)
+        # Maps at the nodes, and light of the front film's images of the screen.
+        maps = self._interpolate_nodes(displacement_um)
+        nodes = maps[:_MAPS]
+        added = NO_ADDED_LIGHT
+        if self.front is not None:
+            added = self._shade_images(maps[_MAPS:], self.front, shown, gain)
+
+        # The maps moved by the bench's disturbances and by vibrations.
         times_s = np.array([[time_s]])
         if self._disturber is not None:
             nodes = nodes + self._disturber.ray_disturbance(time_s)
             times_s = self._disturber.row_times_s(time_s)
         for mode in self.modes:
-            nodes = nodes + mode.swing_um(times_s) * self._swing_maps(mode)
+            nodes = nodes + mode.swing_um(times_s) * self._swing_maps(mode)[:_MAPS]
         if self._disturber is not None:
             pattern = _NO_PATTERN
             if isinstance(shown, Pattern):
@@ -160,8 +177,10 @@ class OpticsRenderer:
         # Half of the rows on each of two threads.
         seed = (self.seed << 32) + self._pictures
         middle = camera.height_px // 2
-        other = _second_thread().submit(paint, nodes, seed, picture, middle, camera.height_px)
-        paint(nodes, seed, picture, 0, middle)
+        other = _second_thread().submit(
+            paint, nodes, seed, added, picture, middle, camera.height_px
+        )
+        paint(nodes, seed, added, picture, 0, middle)
         other.result()
         return picture
 
@@ -182,7 +201,9 @@ class OpticsRenderer:
         light = panel.light_of_pixels(self.light)
         places = panel.places
 
-        def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
+        def paint(
+            nodes: FloatArray, seed: int, added: AddedLight, picture: Pixels, start: int, stop: int
+        ) -> None:
             noise = normal_quantiles(), noise_adu, seed
             shade_panel_rows(
                 nodes,
@@ -193,6 +214,7 @@ class OpticsRenderer:
                 scale,
                 self._loss,
                 noise,
+                tuple(added),
                 picture,
                 start,
                 stop,
@@ -206,7 +228,9 @@ class OpticsRenderer:
         table = level_table(pattern, self.optics.pattern, self.light)
         dark, white, full = self._compute_levels(gain)
 
-        def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
+        def paint(
+            nodes: FloatArray, seed: int, added: AddedLight, picture: Pixels, start: int, stop: int
+        ) -> None:
             shade_rows(
                 nodes,
                 self._weights,
@@ -217,6 +241,7 @@ class OpticsRenderer:
                 np.array([dark, white, self.light.leak, full]),
                 self._loss,
                 (normal_quantiles(), noise_adu, seed),
+                tuple(added),
                 picture,
                 start,
                 stop,
@@ -245,22 +270,58 @@ class OpticsRenderer:
         padded = np.pad(column_loss, (0, -column_loss.size % self._step))
         loss = (padded.reshape(-1, self._step).T.copy(), row_loss)
 
-        def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
+        def paint(
+            nodes: FloatArray, seed: int, added: AddedLight, picture: Pixels, start: int, stop: int
+        ) -> None:
             shade_crossed_rows(
-                nodes, weights, shape, scale, loss, (noise_bank(), seed), picture, start, stop
+                nodes,
+                weights,
+                shape,
+                scale,
+                loss,
+                (noise_bank(), seed),
+                tuple(added),
+                picture,
+                start,
+                stop,
             )
 
         return paint
 
     def _compute_levels(self, gain: float) -> tuple[float, float, float]:
-        """Counts without light, of a white screen above that, and full scale."""
+        """Counts without light, of a white screen in the mirror above that, and full scale.
+
+        A front film takes its share of the light twice.
+        """
         full = float(2**self.optics.camera.bits - 1)
         dark = self.light.dark_fraction * full
-        return dark, gain * (self.light.white_fraction * full - dark), full
+        white = gain * (self.light.white_fraction * full - dark)
+        if self.front is not None:
+            white *= self.front.transmittance**2
+        return dark, white, full
+
+    def _shade_images(
+        self, maps: FloatArray, front: FrontFilm, shown: Pattern | PanelPicture, gain: float
+    ) -> AddedLight:
+        """Light of the images of the screen that a front film makes."""
+        if isinstance(shown, PanelPicture):
+            light_at = light_of_panel(shown, self.light)
+        else:
+            light_at = light_of_pattern(shown, self.optics.pattern, self.light)
+        dark, _, full = self._compute_levels(gain)
+        return shade_images(
+            maps.reshape(2, 2, *maps.shape[1:]),
+            front.image_shares,
+            self._side_mm,
+            light_at,
+            self._weights,
+            gain * (self.light.white_fraction * full - dark),
+            self._loss,
+        )
 
     def trace_pixels(self, displacement_um: float) -> Trace:
         """Exact s_x, s_y and place on the film of every pixel, each (H * W,), row by row; nothing
-        interpolated.
+        interpolated. A front film is not in it.
         """
         camera = self.optics.camera
         columns, rows = np.meshgrid(
@@ -299,11 +360,30 @@ class OpticsRenderer:
         if displacement_um in self._traces:
             self._traces.move_to_end(displacement_um)
             return self._traces[displacement_um]
-        maps = self._make_maps(self._trace_film(self._directions, displacement_um))
+        maps = self._trace_maps(displacement_um)
         self._traces[displacement_um] = maps
         while len(self._traces) > (1 if self.exact else _KEPT_TRACES):
             self._traces.popitem(last=False)
         return maps
+
+    def _trace_maps(self, displacement_um: float) -> FloatArray:
+        """Maps at the nodes; with a front film also s_x and s_y of its images, (7, rows,
+        columns).
+        """
+        if self.front is None:
+            return self._make_maps(self._trace_film(self._directions, displacement_um))
+        found = trace_cushion(
+            self._camera_pose,
+            self._directions,
+            self.film.terms_at(displacement_um),
+            self.film.sag_at_mm(displacement_um),
+            -(displacement_um - self.reference_um) / 1000.0,
+            self.front,
+            self._screen_pose,
+        )
+        maps = self._make_maps(found.main)
+        images_mm = found.images_mm.reshape(4, *maps.shape[1:]) + self._side_mm / 2.0
+        return np.concatenate([maps, images_mm])
 
     def _swing_maps(self, mode: DrumMode) -> FloatArray:
         """Change of the maps at the nodes by 1 µm of a mode: linear to 1e-4 of it, at any
@@ -468,6 +548,7 @@ class TwinOptics:
                 film,
                 reference_um=reference_um,
                 seed=self._twin.seed,
+                front=make_front_film(self._optics.mirror, film.sag_mm, self._twin.seed),
                 modes=drum_modes(self._twin.drum_nm),
                 disturbances=self._twin.disturbances,
             )

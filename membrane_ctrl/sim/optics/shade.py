@@ -44,6 +44,7 @@ def shade_rows(
     scale: FloatArray,
     loss: tuple[FloatArray, FloatArray],
     noise: tuple[Singles, float, int],
+    added: tuple[Singles, int, int],
     out: Pixels,
     start: int,
     stop: int,
@@ -72,6 +73,8 @@ def shade_rows(
         Vignetting: a column's part and a row's.
     noise : array, float, int
         `pixel_noise.normal_quantiles()`, standard deviation in counts, seed of this picture.
+    added : array, int, int
+        The fields of a `film_images.AddedLight`.
     out : (H, W) array
         The picture.
     start, stop : int
@@ -83,6 +86,7 @@ def shade_rows(
     dark, white, leak, full = scale
     column_loss, row_loss = loss
     quantiles, sigma, seed = noise
+    more, first_row, first_column = added
     radius2_mm2 = radius_mm * radius_mm
     # An array for each quantity, not rows of one: a view taken per pixel costs more than the pixel.
     line_x = np.empty(nodes.shape[2])
@@ -124,6 +128,12 @@ def shade_rows(
                         light *= interpolate_cubic(line_factor, cell, weights, k)
                         counts += interpolate_cubic(line_room, cell, weights, k)
                     counts += white * light * (1.0 - column_loss[column] - row_loss[row])
+
+                # Light of further images of the screen.
+                i = row - first_row
+                j = column - first_column
+                if 0 <= i < more.shape[0] and 0 <= j < more.shape[1]:
+                    counts += more[i, j]
 
                 # Noise: four 16-bit numbers from each 64-bit one.
                 if sigma > 0.0:

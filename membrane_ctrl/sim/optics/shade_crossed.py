@@ -88,6 +88,7 @@ def shade_crossed_rows(
     scale: tuple[float, ...],
     loss: tuple[Singles, Singles],
     noise: tuple[Singles, int],
+    added: tuple[Singles, int, int],
     out: Pixels,
     start: int,
     stop: int,
@@ -110,6 +111,8 @@ def shade_crossed_rows(
         Vignetting of the columns k + step * cell, and of the rows.
     noise : array, int
         `pixel_noise.noise_bank()`, and the seed of this picture.
+    added : array, int, int
+        The fields of a `film_images.AddedLight`.
     out : (H, W) array
         The picture.
     start, stop : int
@@ -120,6 +123,8 @@ def shade_crossed_rows(
     column_loss, row_loss = loss
     cells = column_loss.shape[1]
     bank, seed = noise
+    more, first_row, first_column = added
+    full = scale[-1]
     lines = np.empty((nodes.shape[0], nodes.shape[2]), np.float32)
     levels = np.empty(cells, np.float32)
     rooms = np.zeros(cells, np.float32)
@@ -148,3 +153,10 @@ def shade_crossed_rows(
             )
             for cell in range((width - k + step - 1) // step):
                 out[row, cell * step + k] = np.int32(counts[cell])
+
+        # Light of further images of the screen.
+        i = row - first_row
+        if 0 <= i < more.shape[0]:
+            for j in range(more.shape[1]):
+                seen = out[row, first_column + j] + more[i, j] + _FLOAT(0.5)
+                out[row, first_column + j] = np.int32(min(seen, full))

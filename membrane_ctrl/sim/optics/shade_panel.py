@@ -58,6 +58,7 @@ def shade_panel_rows(
     scale: FloatArray,
     loss: tuple[FloatArray, FloatArray],
     noise: tuple[Singles, float, int],
+    added: tuple[Singles, int, int],
     out: Pixels,
     start: int,
     stop: int,
@@ -70,7 +71,7 @@ def shade_panel_rows(
         `PanelPicture.places`.
     picture : (rows, columns) array
         `PanelPicture.light_of_pixels`.
-    nodes, weights, radius_mm, scale, loss, noise, out, start, stop
+    nodes, weights, radius_mm, scale, loss, noise, added, out, start, stop
         As in `shade.shade_rows`.
     """
     step = weights.shape[0]
@@ -78,6 +79,7 @@ def shade_panel_rows(
     column_loss, row_loss = loss
     quantiles, sigma, seed = noise
     low_column, low_row, pitch_mm = places
+    more, first_row, first_column = added
     lines = np.empty((nodes.shape[0], nodes.shape[2]))
     for row in range(start, stop):
         # The random numbers do not depend on how rows are shared between threads.
@@ -105,6 +107,12 @@ def shade_panel_rows(
                     light *= interpolate_cubic(lines[3], cell, weights, k)
                     counts += interpolate_cubic(lines[4], cell, weights, k)
                 counts += white * light * (1.0 - column_loss[column] - row_loss[row])
+
+            # Light of further images of the screen.
+            i = row - first_row
+            j = column - first_column
+            if 0 <= i < more.shape[0] and 0 <= j < more.shape[1]:
+                counts += more[i, j]
 
             # Noise; then the converter rounds, and clips at both ends.
             if sigma > 0.0:

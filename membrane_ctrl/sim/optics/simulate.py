@@ -15,6 +15,7 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.program import describe_origin, file_origin
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.drum_modes import drum_modes
+from membrane_ctrl.sim.optics.film_shape import FilmShape
 from membrane_ctrl.sim.optics.screen_face import project_onto_face
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
 from membrane_ctrl.sim.optics.trace import Trace
@@ -52,7 +53,7 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
         "pattern": _make_config_table(spec.optics.pattern),
         "geometry": geometry,
         "camera": camera,
-        "mirror": _make_config_table(spec.optics.mirror),
+        "mirror": _make_config_table(spec.stated_mirror or spec.optics.mirror),
     }
     if spec.artefact:
         table["artefact"] = dict(spec.artefact)
@@ -105,7 +106,10 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     )
 
     # The numbers, and what was requested.
-    film = {name: value for name, value in asdict(spec.film).items() if name != "terms"}
+    film = _film_table(spec.film)
+    front = None
+    if spec.front is not None:
+        front = asdict(spec.front) | {"shape": _film_table(spec.front.shape)}
     truth = {
         **file_origin("membrane-simulation/1"),
         "displacement_um": mean_um,
@@ -113,6 +117,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
         "coeffs_um": None if coeffs_um is None else coeffs_um.tolist(),
         "frame_displacement_um": displacement_um.tolist(),
         "film": film,
+        "front_film": front,
         "geometry": _make_config_table(spec.optics.geometry)
         | {"reference_displacement_um": spec.reference_um},
         "light": asdict(spec.light),
@@ -122,6 +127,11 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
         "seed": spec.seed,
     }
     (folder / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+
+
+def _film_table(film: FilmShape) -> dict[str, Any]:
+    """A film as it was asked for, without the numbers made of that."""
+    return {name: value for name, value in asdict(film).items() if name != "terms"}
 
 
 def _mean_um(spec: SimulationSpec) -> float:
@@ -380,6 +390,7 @@ def _make_renderer(spec: SimulationSpec) -> OpticsRenderer:
         exact=spec.exact,
         seed=spec.seed,
         modes=drum_modes(spec.drum_nm),
+        front=spec.front,
         disturbances=spec.disturbances,
     )
 

@@ -8,10 +8,16 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from firmware_iface.optical_roles import Pattern
-from membrane_ctrl.config.schema import DisturbancesConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.config.schema import (
+    DisturbancesConfig,
+    GeometryConfig,
+    MirrorConfig,
+    OpticsConfig,
+)
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film as gas_film
 from membrane_ctrl.sim.optics import bench_poses, film_shape, pattern_levels, zernike_polynomials
+from membrane_ctrl.sim.optics.front_film import FrontFilm
 from membrane_ctrl.sim.optics.turned_film import MirrorSeat
 
 # Faults of single frames on a real bench, for simulated sets.
@@ -202,6 +208,10 @@ class SimulationSpec:
         Standard deviation of that reading.
     stated_geometry : GeometryConfig, optional
         Geometry in `capture.toml` if not the true one.
+    stated_mirror : MirrorConfig, optional
+        Mirror in `capture.toml` if not that of `optics`.
+    front : FrontFilm, optional
+        The clear film in front of the mirror, as it truly is.
     light : pattern_levels.Light
     screen_error : bench_poses.ScreenError, optional
     disturbances : DisturbancesConfig
@@ -236,6 +246,8 @@ class SimulationSpec:
     laser: bool = True
     laser_noise_um: float = 0.0
     stated_geometry: GeometryConfig | None = None
+    stated_mirror: MirrorConfig | None = None
+    front: FrontFilm | None = None
     light: pattern_levels.Light = field(default_factory=pattern_levels.Light)
     screen_error: bench_poses.ScreenError | None = None
     disturbances: DisturbancesConfig = field(default_factory=DisturbancesConfig)

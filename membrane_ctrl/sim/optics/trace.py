@@ -82,7 +82,7 @@ def trace_rays(
 
 
 @compile_loop()
-def _film_distance(
+def find_film_distance(
     start: FloatArray,
     direction: FloatArray,
     film: FilmTerms,
@@ -108,7 +108,7 @@ def _film_distance(
 
 
 @compile_loop()
-def _plane_point(
+def find_plane_point(
     p: FloatArray, direction: FloatArray, origin: FloatArray, axes: FloatArray
 ) -> tuple[float, float, float, float]:
     """s_x and s_y where a ray from `p` crosses the screen's plane, and its tangents; NaN if it runs
@@ -157,7 +157,7 @@ def _trace_kernel(
             continue
 
         # Where it meets the film.
-        t = _film_distance(start, d, film, sag_mm, vertex_z_mm, to_rim_mm)
+        t = find_film_distance(start, d, film, sag_mm, vertex_z_mm, to_rim_mm)
         if np.isnan(t):
             hits[2:, n] = np.nan
             continue
@@ -172,5 +172,7 @@ def _trace_kernel(
         normal[1] = -hy
         normal[2] = 1.0
         reflected = d - (2.0 * np.dot(d, normal) / np.dot(normal, normal)) * normal
-        hits[2, n], hits[3, n], hits[4, n], hits[5, n] = _plane_point(p, reflected, origin, axes)
+        hits[2, n], hits[3, n], hits[4, n], hits[5, n] = find_plane_point(
+            p, reflected, origin, axes
+        )
     return hits
