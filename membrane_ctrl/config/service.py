@@ -59,6 +59,8 @@ class ServiceConfig(Section):
     """
     configurations: str = "."
     """Folder of the configurations with which a hold can be started. Set it to where they are."""
+    commissioning: str = "commissioning"
+    """Folder of the guided sessions. Set it to where `membrane-ctrl commission` has them."""
     units: bool = False
     """Start holds as units of systemd (`membrane-ctrl service install` sets it); else as programs
     in a session of their own.

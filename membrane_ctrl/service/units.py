@@ -38,6 +38,7 @@ _SETTINGS = "service.toml"
 _SETTINGS_TEXT = f"""# Settings of the service (docs/how-to/service.md).
 logs = "{_STATE}/logs"
 configurations = "{_CONFIGURATIONS}"
+commissioning = "{_STATE}/commissioning"
 units = true
 """
 _UNIT_SYNTAX = frozenset(" \t\"'\\%$")  # characters with a meaning in a line of a unit

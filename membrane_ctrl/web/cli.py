@@ -21,6 +21,7 @@ _FILES = frozenset(
     {
         "logs",
         "configurations",
+        "commissioning",
         "users_file",
         "certificate_file",
         "key_file",
@@ -49,6 +50,9 @@ def serve(
         typer.Option(
             help="Folder of the configurations to start holds with; by default, this one."
         ),
+    ] = None,
+    commissioning: Annotated[
+        Path | None, typer.Option(help="Folder of the guided sessions; commissioning by default.")
     ] = None,
     fleet: Annotated[
         Path | None, typer.Option("--fleet", help="File with several holds; see `ctl fleet`.")
@@ -98,6 +102,7 @@ def serve(
     given: dict[str, Any] = {
         "logs": logs,
         "configurations": configurations,
+        "commissioning": commissioning,
         "host": host,
         "port": port,
         "names": name,

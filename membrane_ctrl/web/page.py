@@ -28,15 +28,18 @@ from membrane_ctrl.service.action_button import ActionButton
 from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.event_lines import find_new_lines
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed
+from membrane_ctrl.service.guided_session import GuidedSession
 from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.service.work_pool import PoolFullError
-from membrane_ctrl.service.work_pools import COMMANDS
+from membrane_ctrl.service.work_pools import COMMANDS, SAFETY_COMMANDS
 from membrane_ctrl.web import figure_map, history_chart
 from membrane_ctrl.web.action_dialog import ask_for_confirmation
 from membrane_ctrl.web.alarms_panel import alarms_panel
 from membrane_ctrl.web.chart_marks import is_now, mark_past
+from membrane_ctrl.web.commissioning_panel import COMMISSIONS, CommissioningPanel
 from membrane_ctrl.web.configuration_panel import EDITS, ConfigurationPanel
+from membrane_ctrl.web.confirmation import confirm
 from membrane_ctrl.web.consequences import Consequence, find_consequence
 from membrane_ctrl.web.fetched_charts import SCRIPT as FETCHED_CHARTS
 from membrane_ctrl.web.fleet_panel import fleet_panel
@@ -108,8 +111,10 @@ class WebPage:
         views: SharedViews,
         starter: HoldStarter | None = None,
         editor: ConfigurationEditor | None = None,
+        guided: GuidedSession | None = None,
     ) -> None:
         self._editor = editor
+        self._guided = guided
         self._feeds = feeds
         self._hold = hold
         self._user = user
@@ -190,6 +195,8 @@ class WebPage:
             alarms, tune = ui.tab("Alarms"), ui.tab("Tune")
             configuration = ui.tab("Configuration")
             configuration.set_visibility(self._may_edit)
+            commission = ui.tab("Commission")
+            commission.set_visibility(self._may_commission)
             for tab in (look_back, alarms, tune):
                 tab.set_visibility(self._logs is not None)  # the runs of a hold elsewhere are there
         with ui.tab_panels(tabs, value=now).classes("w-full"):
@@ -227,6 +234,10 @@ class WebPage:
             if self._may_edit:
                 with ui.tab_panel(configuration):
                     loads[configuration.props["name"]] = self._build_editor().load_list
+            if self._guided is not None and self._may_commission:
+                with ui.tab_panel(commission):
+                    panel = CommissioningPanel(self._guided, self._user)
+                    loads[commission.props["name"]] = panel.load_list
 
         async def load(event: Any) -> None:
             if event.value in loads:
@@ -242,6 +253,11 @@ class WebPage:
         """Whether this viewer may see and edit the configurations of this folder."""
         is_ours = self._editor is not None and self._starter is not None
         return is_ours and role_includes(self._user.role, EDITS)
+
+    @property
+    def _may_commission(self) -> bool:
+        """Whether this viewer may see and answer the guided session of this folder."""
+        return self._guided is not None and role_includes(self._user.role, COMMISSIONS)
 
     def _build_editor(self) -> ConfigurationPanel:
         assert self._editor is not None
@@ -507,6 +523,7 @@ class WebPage:
                 and state in action.states
             )
             allowed = allowed and changes_something(action, status)
+            allowed = allowed or (action is STOP and self._can_stop_guided)
             if button.enabled != allowed:
                 button.set_enabled(allowed)
 
@@ -566,6 +583,9 @@ class WebPage:
         """Ask for the input and for a confirmation, send, and show what became of it."""
         if self._stopping or (self._asking and action is not STOP):
             return
+        if action is STOP and self._can_stop_guided:
+            await self._stop_guided()
+            return
         given = await self._ask(action)
         if given is None:
             return
@@ -581,6 +601,23 @@ class WebPage:
             return
         asked["on_behalf"] = on_behalf(self._user, self._session)
         await send_and_show(self._feed, asked)
+
+    @property
+    def _can_stop_guided(self) -> bool:
+        """Whether a guided session runs that this viewer may stop: the feed has not its holds."""
+        is_running = self._guided is not None and self._guided.seen.is_running
+        return is_running and role_includes(self._user.role, STOP.role)
+
+    async def _stop_guided(self) -> None:
+        """Ask, and stop the guided session: it switches its pump off."""
+        does = "The pump of the guided session is switched off; it can be resumed."
+        self._stopping = True
+        try:
+            is_sure = await confirm("STOP the guided session?", (does,), "Stop", "negative", True)
+        finally:
+            self._stopping = False
+        if is_sure and self._guided is not None and self._can_stop_guided:
+            await SAFETY_COMMANDS.run(self._guided.stop, self._user.name)
 
 
 def format_number(column: TelemetryColumn, value: float | None) -> str:

@@ -16,9 +16,11 @@ from fastapi.responses import HTMLResponse, PlainTextResponse, Response
 from nicegui import Client, app, ui
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from membrane_ctrl.commissioning.guide import session_state
 from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.link_code import draw_link_code
+from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.control_port.service_link import link_key, publish_address, read_or_make_secret
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.service.accounts import Accounts
@@ -28,6 +30,7 @@ from membrane_ctrl.service.configuration_editor import ConfigurationEditor
 from membrane_ctrl.service.connections import ConnectionGuard, GuardedHttp, raise_file_limit
 from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed
+from membrane_ctrl.service.guided_session import GuidedSession
 from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.idle_end import IdleEnd
 from membrane_ctrl.service.listening import require_free_address
@@ -40,6 +43,7 @@ from membrane_ctrl.service.tokens import TokenBook, tokens_file
 from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.service.work_pool import PoolFullError
 from membrane_ctrl.service.work_pools import REPORT_FILES, SESSIONS
+from membrane_ctrl.web.commissioning_panel import COMMISSIONS
 from membrane_ctrl.web.gains_views import parse_setting
 from membrane_ctrl.web.page import WebPage
 from membrane_ctrl.web.runs_panel import run_folder
@@ -92,13 +96,16 @@ def serve(holds: dict[str, Where], page: ServiceConfig, idle_s: float = math.inf
     logs = Path(page.logs)
     # before the priority is lowered, which holds must not inherit
     starter = HoldStarter(logs, Path(page.configurations), page.units)
+    guided = GuidedSession(Path(page.commissioning), page.units)
     os.nice(max(0, _NICE - os.nice(0)))
-    with contextlib.closing(starter), publish_address(logs, address.base_url, not accounts.users):
+    published = publish_address(logs, address.base_url, not accounts.users)
+    with contextlib.closing(starter), contextlib.closing(guided), published:
         _run_server(
             {name: make_feed(where) for name, where in holds.items()},
             page,
             accounts,
             starter,
+            guided,
             idle_s,
         )
 
@@ -108,6 +115,7 @@ def _run_server(
     page: ServiceConfig,
     accounts: Accounts,
     starter: HoldStarter,
+    guided: GuidedSession,
     idle_s: float,
 ) -> None:
     address = public_address(page)
@@ -132,7 +140,7 @@ def _run_server(
     def look_after() -> None:
         """End a service that nobody uses; keep the log of a hold short."""
         viewers = sum(client.has_socket_connection for client in Client.instances.values())
-        holding = any(not feed.seen.problem for feed in feeds.values())
+        holding = any(not feed.seen.problem for feed in feeds.values()) or guided.seen.is_running
         idle_end.note_use(time.monotonic(), viewers, holding)
         starter.is_running()  # takes the exit code of a hold that has ended
         starter.limit_log()
@@ -154,7 +162,7 @@ def _run_server(
         user: WebUser = request.scope["membrane_user"]
         shown = hold if hold in feeds else next(iter(feeds))
         is_ours = feeds[shown].logs == Path(page.logs)
-        ours = (starter, editor) if is_ours else (None, None)
+        ours = (starter, editor, guided) if is_ours else (None, None, None)
         WebPage(feeds, shown, user, views, *ours).build(tab, gains)
 
     @app.get("/chart")
@@ -210,6 +218,16 @@ def _run_server(
         logs = feeds[hold].logs if hold in feeds else None
         try:
             return await REPORT_FILES.run(report_page, logs, name)
+        except PoolFullError as error:
+            return PlainTextResponse(str(error), 503)
+
+    @app.get("/commissioning/{name}/{file}")
+    async def commissioning_report(request: Request, name: str, file: str) -> Response:
+        user: WebUser = request.scope["membrane_user"]
+        if not role_includes(user.role, COMMISSIONS):
+            return PlainTextResponse(f"needs the role {COMMISSIONS}", 403)
+        try:
+            return await REPORT_FILES.run(session_report, guided, name, file)
         except PoolFullError as error:
             return PlainTextResponse(str(error), 503)
 
@@ -281,6 +299,27 @@ class HangUp:
             )
 
 
+def session_report(guided: GuidedSession, name: str, file: str) -> Response:
+    """The report of a commissioning session, HTML or PDF."""
+    try:
+        folder = guided.find_folder(name)
+        if file == session_state.PDF:
+            pdf = files.read_bytes(folder / file, _REPORT_BYTES_MAX)
+            return Response(pdf, media_type="application/pdf")
+        if file == session_state.HTML:
+            text = files.read_bytes(folder / file, _REPORT_BYTES_MAX).decode("utf-8", "replace")
+            return _sandboxed_page(text)
+    except (errors.InputError, OSError, ValueError):
+        return HTMLResponse("no report yet", 404)
+    return HTMLResponse("no such file", 404)
+
+
+def _sandboxed_page(text: str) -> HTMLResponse:
+    """A page of a folder that may come from anywhere."""
+    sandbox = "sandbox allow-scripts; default-src 'unsafe-inline' data:"
+    return HTMLResponse(text, headers={"content-security-policy": sandbox})
+
+
 def report_page(logs: Path | None, name: str) -> HTMLResponse:
     """A run's report, in a sandbox: a run folder may come from anywhere."""
     folder = None if logs is None else run_folder(logs, name)
@@ -290,5 +329,4 @@ def report_page(logs: Path | None, name: str) -> HTMLResponse:
         text = files.read_bytes(folder / REPORT_NAME, _REPORT_BYTES_MAX).decode("utf-8", "replace")
     except (OSError, ValueError):  # ValueError: a name that no file can have
         return HTMLResponse("no report yet", 404)
-    sandbox = "sandbox allow-scripts; default-src 'unsafe-inline' data:"
-    return HTMLResponse(text, headers={"content-security-policy": sandbox})
+    return _sandboxed_page(text)

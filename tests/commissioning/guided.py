@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from membrane_ctrl.commissioning.guide.dialogue import SessionDisplay
 from membrane_ctrl.commissioning.guide.emulated_bench import EmulatedBench
 from membrane_ctrl.commissioning.guide.session import CommissioningSession
 from membrane_ctrl.commissioning.guide.session_state import SessionState, read_state
@@ -76,6 +77,13 @@ class Person:
     @property
     def text(self) -> str:
         return "\n".join(self.shown)
+
+
+def make_session(
+    folder: Path, bench: EmulatedBench, display: SessionDisplay, plan: SessionPlan = SHORT
+) -> CommissioningSession:
+    """A session of all stages."""
+    return CommissioningSession(folder, bench, display, plan)
 
 
 def run_stages(

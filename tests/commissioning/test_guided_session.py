@@ -10,9 +10,10 @@ from membrane_ctrl.commissioning.check import DeviceProbe
 from membrane_ctrl.commissioning.guide.dialogue import Dialogue
 from membrane_ctrl.commissioning.guide.inflation_stages import DepthPoint, judge_law
 from membrane_ctrl.commissioning.guide.mirror_design import PAPER_MIRROR
-from membrane_ctrl.commissioning.guide.report import HTML, PDF
 from membrane_ctrl.commissioning.guide.session_state import (
     CONFIGURATION,
+    HTML,
+    PDF,
     SessionState,
     read_state,
 )

@@ -84,12 +84,35 @@ class StageHead(BaseModel):
     look_for: str
 
 
+class StageResult(StrEnum):
+    """How far a stage is."""
+
+    OPEN = "open"
+    PASSED = "passed"
+    FAILED = "failed"  # passed by, with a failed check
+    NOT_NEEDED = "not needed"  # the bench has not what it tests
+
+
+class StageProgress(BaseModel):
+    """A stage in the list of all."""
+
+    model_config = ConfigDict(frozen=True)
+
+    step: int
+    title: str
+    name: str
+    result: StageResult
+
+
 class SessionDisplay:
     """Where a session shows its progress, and from where it gets its answers."""
 
     def show_line(self, line: str) -> None:
         """Show a line."""
         raise NotImplementedError
+
+    def show_plan(self, plan: tuple[StageProgress, ...]) -> None:
+        """Show all stages and how far each is; not shown by default."""
 
     def show_stage(self, stage: StageHead) -> None:
         """Show that a stage begins."""

@@ -8,6 +8,8 @@ from membrane_ctrl.commissioning.guide.mirror_design import derive_design
 from membrane_ctrl.commissioning.guide.mirror_stages import explain_design
 from membrane_ctrl.commissioning.guide.session_state import (
     CONFIGURATION,
+    HTML,
+    PDF,
     CheckVerdict,
     SessionState,
     TomlTable,
@@ -27,7 +29,6 @@ from membrane_ctrl.report_pages.blocks import (
 )
 from membrane_ctrl.report_pages.render import render_page
 
-HTML, PDF = "report.html", "report.pdf"
 STEP_TITLES = {
     1: "Mirror",
     2: "Devices",

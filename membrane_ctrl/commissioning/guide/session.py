@@ -13,12 +13,17 @@ from membrane_ctrl.commissioning.guide.dialogue import (
     GoBackError,
     SessionDisplay,
     StageHead,
+    StageProgress,
+    StageResult,
     StopSessionError,
 )
 from membrane_ctrl.commissioning.guide.session_state import (
     CONFIGURATION,
+    HTML,
+    PDF,
     SessionState,
     StageRecord,
+    TomlTable,
     read_state,
     read_tables,
     write_state,
@@ -88,6 +93,7 @@ class CommissioningSession:
         Raises DeviceError or InputError for files that cannot be written or read.
         """
         self._dialogue.show(_HELP)
+        self._show_plan()
         index = self._find_first_open()
         try:
             while index < len(self._stages):
@@ -108,6 +114,31 @@ class CommissioningSession:
 
     def _is_needed(self, stage: CommissioningStage) -> bool:
         return stage.is_needed(self._state, read_tables(self._folder))
+
+    def _show_plan(self) -> None:
+        """Show all stages and how far each is."""
+        tables = read_tables(self._folder)
+        plan = [
+            StageProgress(
+                step=stage.step,
+                title=report.STEP_TITLES[stage.step],
+                name=stage.name,
+                result=self._find_result(stage, tables),
+            )
+            for stage in self._stages
+        ]
+        self._dialogue.display.show_plan(tuple(plan))
+
+    def _find_result(self, stage: CommissioningStage, tables: TomlTable) -> StageResult:
+        """How far a stage is."""
+        record = self._state.find_record(stage.name)
+        if record is None and "devices" not in tables:
+            return StageResult.OPEN
+        if not stage.is_needed(self._state, tables):
+            return StageResult.NOT_NEEDED
+        if record is None:
+            return StageResult.OPEN
+        return StageResult.FAILED if record.failed else StageResult.PASSED
 
     def _run_stage(self, index: int) -> int:
         """Run a stage; returns the index of the next one."""
@@ -160,6 +191,7 @@ class CommissioningSession:
             if self._is_needed(self._stages[before]):
                 self._state.remove_record(self._stages[before].name)
                 write_state(self._folder, self._state)
+                self._show_plan()
                 return before
         self._dialogue.show("  this is the first stage")
         return index
@@ -167,6 +199,7 @@ class CommissioningSession:
     def _store(self, record: StageRecord) -> None:
         self._state.add_record(record)
         write_state(self._folder, self._state)
+        self._show_plan()
 
     def _finish(self) -> errors.Exit:
         """Ask for the signature, write the report, and show the verdict."""
@@ -180,7 +213,7 @@ class CommissioningSession:
         self._dialogue.show("", "accepted" if accepted else "not accepted:")
         self._dialogue.show(*(f"  {reason}" for reason in reasons))
         self._dialogue.show(
-            f"report: {self._folder / report.HTML}, {self._folder / report.PDF}",
+            f"report: {self._folder / HTML}, {self._folder / PDF}",
             f"configuration: {self._folder / CONFIGURATION}",
         )
         return errors.Exit.DONE if accepted else errors.Exit.REJECTED

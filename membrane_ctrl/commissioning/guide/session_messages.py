@@ -13,7 +13,12 @@ from typing import Annotated, Literal, TextIO
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from membrane_ctrl.commissioning.guide.dialogue import Question, SessionDisplay, StageHead
+from membrane_ctrl.commissioning.guide.dialogue import (
+    Question,
+    SessionDisplay,
+    StageHead,
+    StageProgress,
+)
 from membrane_ctrl.commissioning.guide.session_state import CheckRecord
 
 
@@ -29,6 +34,13 @@ class StageMessage(BaseModel):
 
     kind: Literal["stage"] = "stage"
     stage: StageHead
+
+
+class PlanMessage(BaseModel):
+    """All stages, whenever one has changed."""
+
+    kind: Literal["plan"] = "plan"
+    plan: tuple[StageProgress, ...]
 
 
 class CheckMessage(BaseModel):
@@ -47,7 +59,8 @@ class QuestionMessage(BaseModel):
 
 
 SessionMessage = Annotated[
-    LineMessage | StageMessage | CheckMessage | QuestionMessage, Field(discriminator="kind")
+    LineMessage | PlanMessage | StageMessage | CheckMessage | QuestionMessage,
+    Field(discriminator="kind"),
 ]
 MESSAGES: TypeAdapter[SessionMessage] = TypeAdapter(SessionMessage)
 
@@ -83,6 +96,10 @@ class MessageDisplay(SessionDisplay):
     def show_line(self, line: str) -> None:
         """Send a line."""
         self._send(LineMessage(text=line))
+
+    def show_plan(self, plan: tuple[StageProgress, ...]) -> None:
+        """Send the list of stages."""
+        self._send(PlanMessage(plan=plan))
 
     def show_stage(self, stage: StageHead) -> None:
         """Send that a stage begins."""

@@ -18,6 +18,7 @@ from membrane_ctrl.model import errors, files
 
 _SCHEMA = "membrane-commissioning/1"
 _NAME, CONFIGURATION = "session.json", "lab.toml"
+HTML, PDF = "report.html", "report.pdf"
 _HEAD = (
     "# Written by `membrane-ctrl commission`; `membrane-ctrl config explain KEY` explains a key.\n"
 )
