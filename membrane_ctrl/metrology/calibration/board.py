@@ -98,8 +98,24 @@ class Board:
 
 
 def on_screen(board: Board, square_px: int, width_px: int, height_px: int) -> Levels:
-    """The board in the middle of a white screen. Raises ValueError if it does not fit, or
-    `Board.draw` does.
+    """Return the board in the middle of a white screen.
+
+    Parameters
+    ----------
+    board : Board
+    square_px : int
+        Side of a square in pixels of the screen.
+    width_px, height_px : int
+        Size of the screen.
+
+    Returns
+    -------
+    (height_px, width_px) uint8 array
+
+    Raises
+    ------
+    ValueError
+        If it does not fit, or if `Board.draw` does.
     """
     drawn = board.draw(square_px)
     height, width = drawn.shape

@@ -16,10 +16,21 @@ _CONFIRMED = 2  # photographs, or the only one
 
 
 def find_other_board(stated: Board, photographs: Sequence[Levels]) -> Board | None:
-    """Return the board of another size that is found in the photographs; None without one.
+    """Return the board of another size that is found in the photographs.
 
     A size is named only if the detector finds it in two photographs, if there are as many. Of
     several, the one with the most corners is named, and the smallest of those.
+
+    Parameters
+    ----------
+    stated : Board
+        The board that was not found.
+    photographs : sequence of (height, width) arrays
+
+    Returns
+    -------
+    Board or None
+        None without one.
     """
     small = [_shrink(photograph) for photograph in photographs[:_TRIED]]
     needed = min(_CONFIRMED, len(small))

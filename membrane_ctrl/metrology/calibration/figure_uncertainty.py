@@ -115,7 +115,19 @@ def propagate_to_figure(solution: Solution, index: int, analysis_radius_mm: floa
 
 
 def seat_sigmas(solution: Solution, index: int) -> FloatArray:
-    """Standard deviations (3,) of a turned mirror's seat: place of its axis, mm, and turn, rad."""
+    """Standard deviations of a turned mirror's seat.
+
+    Parameters
+    ----------
+    solution : Solution
+    index : int
+        Number of the set.
+
+    Returns
+    -------
+    (3,) array
+        Place of the mirror's axis along x and y, mm, and turn about it, rad.
+    """
     # The set's own share of the error, and that of the common unknowns.
     local = forward_model.LOCAL
     sums = solution.equations[index].sums

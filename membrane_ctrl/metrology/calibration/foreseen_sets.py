@@ -20,7 +20,24 @@ def foreseen_set(
     state: set_state.SetState,
     half_mm: FloatArray,
 ) -> set_phases.SetPhases:
-    """A set whose rays end where the bench found sends them; those that end on the fringes."""
+    """Return a set whose rays end where the bench found sends them.
+
+    Parameters
+    ----------
+    solution : Solution
+        Its bench.
+    phases : SetPhases
+        Bins of the set; their screen points are replaced.
+    state : SetState
+        Surface, vertex and screens of the set.
+    half_mm : (2,) array
+        Half of the pattern's width and height.
+
+    Returns
+    -------
+    SetPhases
+        The bins whose rays end on the pattern.
+    """
     dark = replace(phases, screen_mm=np.zeros_like(phases.screen_mm))
     at_mm = -forward_model.residual_mm(
         solution.bench, dark, state.surface, state.vertex_z_mm, state.moved_screens
@@ -36,6 +53,23 @@ def foreseen_equations(
     state: set_state.SetState,
     robust: robust_weights.RobustWeights,
 ) -> normal_equations.Equations:
+    """Return the equations of a foreseen set about the solution.
+
+    Parameters
+    ----------
+    solution : Solution
+        The unknowns about which is linearised.
+    phases : SetPhases
+        The set.
+    state : SetState
+        Its own unknowns.
+    robust : RobustWeights
+        Weights of its points.
+
+    Returns
+    -------
+    Equations
+    """
     turns = bench_poses.pose_derivatives(solution.problem.stated, solution.values)
     references = solution.problem.references
     return normal_equations.linearise_set(
@@ -44,12 +78,16 @@ def foreseen_equations(
 
 
 def with_equations(solution: Solution, linear: tuple[normal_equations.Equations, ...]) -> Solution:
-    sums, sigmas = (
-        np.sum([each.eliminate_surface() for each in linear], axis=0),
-        solution.problem.sigmas,
-    )
-    return replace(
-        solution,
-        equations=linear,
-        covariance=solve_step(sums + solution.prior_sums(sigmas), sigmas).covariance,
-    )
+    """Return the solution with the covariance that other sets would give it.
+
+    Parameters
+    ----------
+    solution : Solution
+        Its unknowns stay.
+    linear : tuple of Equations
+        Equations of all sets, foreseen ones among them.
+    """
+    sigmas = solution.problem.sigmas
+    of_sets = np.sum([each.eliminate_surface() for each in linear], axis=0)
+    step = solve_step(of_sets + solution.prior_sums(sigmas), sigmas)
+    return replace(solution, equations=linear, covariance=step.covariance)

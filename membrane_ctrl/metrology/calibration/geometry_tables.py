@@ -132,14 +132,35 @@ def make_geometry_tables(
 
 
 def calibrated_geometry(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
-    """The calibrated geometry in the general form, with the height map of the stated screen."""
+    """Return the calibrated geometry in the general form.
+
+    Parameters
+    ----------
+    solution : Solution
+    optics : OpticsConfig
+        The stated bench, whose height map of the screen stays.
+
+    Returns
+    -------
+    GeometryConfig
+        With the reference displacement of the calibration.
+    """
     reference = {"reference_displacement_um": solution.problem.references.reference_um}
     return general_form(solution.bench.geometry, optics).model_copy(update=reference)
 
 
 def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
-    """A geometry as two poses; the height map and the reference displacement are the stated
-    bench's.
+    """Return a geometry as the poses of camera and screen.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    optics : OpticsConfig
+        The stated bench, whose height map and reference displacement stay.
+
+    Returns
+    -------
+    GeometryConfig
     """
     height_map = None
     if optics.geometry.screen is not None:

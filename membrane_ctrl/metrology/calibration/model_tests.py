@@ -368,8 +368,15 @@ def _free_motion(
 
 
 def leave_set_out(solution: solver.Solution, index: int) -> solver.Solution:
-    """The solution without one set, to first order: its equations and state are left out, the
-    unknowns moved.
+    """Return the solution without one set, to first order.
+
+    Its equations and state are left out, and the unknowns are moved by one step.
+
+    Parameters
+    ----------
+    solution : Solution
+    index : int
+        Number of the set.
     """
     keep = [k for k in range(len(solution.states)) if k != index]
     problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))

@@ -73,7 +73,20 @@ class Equations:
         return np.asarray(np.linalg.solve(own, right - mixed @ common_step))
 
     def screen_steps(self, local_step: FloatArray, common_step: FloatArray) -> list[FloatArray]:
-        """Steps (MOVED,) of the screens elsewhere that go with those."""
+        """Steps of the screens elsewhere that go with those of the other unknowns.
+
+        Parameters
+        ----------
+        local_step : (LOCAL,) array
+            Step of the set's own unknowns.
+        common_step : (COMMON,) array
+            Step of the common ones.
+
+        Returns
+        -------
+        list of (MOVED,) arrays
+            One for each place of the screen.
+        """
         moved = moved_screen.MOVED
         step = np.append(local_step, common_step)
         steps = []

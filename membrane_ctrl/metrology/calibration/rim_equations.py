@@ -36,7 +36,20 @@ class Rim:
     def from_edges(
         cls, edges_px: Sequence[FloatArray], radius_mm: float, radius_sigma_mm: float
     ) -> "Rim | None":
-        """The edges of several sets together; None without any."""
+        """Return the edges of several sets together.
+
+        Parameters
+        ----------
+        edges_px : sequence of (2, n) arrays
+            Columns and rows of the edge in each set.
+        radius_mm, radius_sigma_mm : float
+            Radius of the ring, with its standard uncertainty.
+
+        Returns
+        -------
+        Rim or None
+            None without any edges.
+        """
         if edges_px:
             return cls(np.concatenate(edges_px, axis=1), radius_mm, radius_sigma_mm)
         return None

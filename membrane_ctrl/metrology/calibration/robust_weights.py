@@ -47,10 +47,22 @@ class RobustWeights:
     def from_residual(
         cls, phases: set_phases.SetPhases, residual_mm: FloatArray
     ) -> "RobustWeights":
-        """Huber's weights of residuals (2, n), against their own scatter.
+        """Return Huber's weights of residuals, against their own scatter.
 
-        The scatter is not less than the camera's noise.
+        Parameters
+        ----------
+        phases : SetPhases
+            The set; the scatter is not less than the noise of its points.
+        residual_mm : (2, n) array
+            What the solution leaves of the screen points.
+
+        Returns
+        -------
+        RobustWeights
+            1 up to `_HUBER` standard deviations, falling with the inverse of the residual beyond.
         """
+        # Lengths of two normal components are distributed as Rayleigh's; their median gives the
+        # scatter.
         length = np.hypot(*residual_mm) / phases.sigma_mm
         variance = max(float(np.median(length) / _RAYLEIGH_MEDIAN) ** 2, 1.0)
         return cls(_HUBER / np.maximum(length / np.sqrt(variance), _HUBER), variance)

@@ -227,6 +227,7 @@ def solve_step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
     delta[free] = inverse @ right
     covariance = np.zeros((set_state.COMMON, set_state.COMMON))
     covariance[np.ix_(free, free)] = inverse
+    # The sum of squares at the solution of normal equations: (b, b) - (right, step).
     squares = sums[-1, -1] - right @ delta[free]
     return SolverStep(delta, covariance, float(squares))
 
@@ -405,7 +406,17 @@ def _linearise_sets(
 def move_state(
     state: set_state.SetState, linear: normal_equations.Equations, common_step: FloatArray
 ) -> set_state.SetState:
-    """The unknowns of a set after a step (COMMON,) of the common ones."""
+    """Return the unknowns of a set after a step.
+
+    Parameters
+    ----------
+    state : SetState
+        The present ones.
+    linear : Equations
+        The set's equations about them.
+    common_step : (COMMON,) array
+        Step of the common unknowns, which the set's own follow.
+    """
     own = linear.local_step(common_step)
 
     # Its surface, with the terms beyond the fit's.

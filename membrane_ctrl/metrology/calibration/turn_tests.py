@@ -69,7 +69,14 @@ def find_unturned_figures(solution: Solution) -> tuple[UnturnedFigure, ...]:
 
 
 def free_figures(problem: Problem, indices: Sequence[int]) -> Problem:
-    """The problem without the assumption that the film's figure turns in these sets."""
+    """Return the problem without the assumption that the film's figure turns in some sets.
+
+    Parameters
+    ----------
+    problem : Problem
+    indices : sequence of int
+        Numbers of these sets.
+    """
     sets = list(problem.sets)
     for k in indices:
         turned = sets[k].turned
@@ -79,8 +86,16 @@ def free_figures(problem: Problem, indices: Sequence[int]) -> Problem:
 
 
 def bind_figures(solution: Solution, stated: Problem) -> Solution:
-    """The equations of a solution with free figures, for figures that turn as stated; its unknowns
-    stay.
+    """Return the equations of a solution with free figures, for figures that turn as stated.
+
+    Its unknowns stay.
+
+    Parameters
+    ----------
+    solution : Solution
+        Of the problem with free figures.
+    stated : Problem
+        The problem as stated.
     """
     equations = list(solution.equations)
     sets = list(solution.problem.sets)
@@ -125,6 +140,12 @@ def find_wrong_angles(
     angle far from the stated one is found here. Smaller errors are left to
     `find_unturned_figures`: a solution is near them.
 
+    Parameters
+    ----------
+    problem : Problem
+    states : sequence of SetState
+        Surfaces of the sets on the stated bench.
+
     Returns
     -------
     list of (int, float)
@@ -150,7 +171,20 @@ def find_wrong_angles(
 
 
 def find_angle_of_set(freed: Solution, index: int) -> float | None:
-    """The angle by which the others' figure fits the set's, if it fits far better than stated."""
+    """Return the angle by which the others' figure fits that of a set.
+
+    Parameters
+    ----------
+    freed : Solution
+        Without the assumption that the set's figure turns as stated.
+    index : int
+        Number of the set.
+
+    Returns
+    -------
+    float or None
+        In degrees; None if the stated angle fits about as well.
+    """
     references = freed.problem.references
     state = freed.states[index]
     turned = freed.problem.sets[index].turned
@@ -183,6 +217,7 @@ def _find_angle(
         left = left - shifts @ best_shift
         return float(left @ left)
 
+    # Every half degree is tried: the misfit has several minima.
     misfits = np.array([compute_misfit(angle_deg) for angle_deg in _ANGLES_DEG])
     best_deg = float(_ANGLES_DEG[np.argmin(misfits)])
     better = float(misfits.min()) < _FITS_BETTER * compute_misfit(stated_deg)

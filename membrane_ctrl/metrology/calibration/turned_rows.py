@@ -27,7 +27,20 @@ _SEATED = 1e-6  # mm and rad, of a mirror that was not turned
 
 
 def seat_rows(turned: TurnedMirror | None, state: SetState) -> FloatArray:
-    """What is known of the seat, as weighted rows [derivatives, miss]."""
+    """Rows of what is known of the seat.
+
+    Parameters
+    ----------
+    turned : TurnedMirror or None
+        How the set's mirror was turned; None: it was not, and its seat is exact.
+    state : SetState
+        The set's own unknowns.
+
+    Returns
+    -------
+    (3, LOCAL + COMMON + 1) array
+        Weighted rows [derivatives, miss] of x, y and angle.
+    """
     rows = np.zeros((3, LOCAL + COMMON + 1))
     rows[:, SEAT] = np.eye(3)
     rows[:, -1] = -np.array(state.seat)
@@ -95,8 +108,18 @@ def form_sigmas_mm(references: References) -> FloatArray:
 
 
 def shift_derivatives(surface: Surface, places: IntArray) -> FloatArray:
-    """Slopes of a surface along x and y, (n, 2), as terms at these places among the parameters and
-    the terms beyond the fit's, mm per mm.
+    """Change of a surface's terms when it is shifted: its slopes, as terms.
+
+    Parameters
+    ----------
+    surface : Surface
+    places : (n,) int array
+        Numbers of the terms among the parameters and the terms beyond the fit's.
+
+    Returns
+    -------
+    (n, 2) array
+        For a shift along x and along y, mm per mm.
     """
     x, y, project = height_projection()
     slopes = surface.slopes(x * surface.radius_mm, y * surface.radius_mm)

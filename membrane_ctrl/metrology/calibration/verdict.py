@@ -133,6 +133,7 @@ def check_solution(solution: Solution) -> tuple[CalibrationFinding, ...]:
     sum of squares, less two for each number it frees (Akaike's rule), is the cause; the others wait
     until it is gone.
     """
+    # A film of another kind may keep the steps from converging: it is judged first.
     of_film = _judge_film(solution)
     if not solution.converged:
         if of_film:
@@ -190,7 +191,16 @@ def _judge_turns(solution: Solution) -> list[Cause]:
 
 
 def describe_unturned(problem: Problem, index: int, found_deg: float | None) -> CalibrationFinding:
-    """Finding on a figure that did not turn as stated; None: no other angle fits better."""
+    """Return the finding on a figure that did not turn as stated.
+
+    Parameters
+    ----------
+    problem : Problem
+    index : int
+        Number of the set.
+    found_deg : float or None
+        The angle that fits; None: no other angle fits better.
+    """
     if found_deg is not None:
         return CalibrationFinding(True, _describe_angle(problem, index, found_deg), (index,))
     description = (

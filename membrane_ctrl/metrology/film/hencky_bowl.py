@@ -35,7 +35,19 @@ def profile_legendre() -> Legendre:
 
 
 def legendre_series(bowl: Bowl, degree: int) -> Legendre:
-    """A bowl's depth in mm as a series on v in [0, 1]."""
+    """Return a bowl's depth as a series on v = (r / R)^2.
+
+    Parameters
+    ----------
+    bowl : Bowl
+    degree : int
+        Degree of the Chebyshev interpolation from which it is converted.
+
+    Returns
+    -------
+    Legendre
+        In mm, on v in [0, 1].
+    """
     depth = Chebyshev.interpolate(lambda v: bowl.height_mm(np.sqrt(v)), degree, domain=[0, 1])
     return depth.convert(domain=[0, 1], kind=Legendre)
 

@@ -177,8 +177,19 @@ def fit_film(
 
 
 def round_terms_mm(bowls: Bowl, reach: float) -> FloatArray:
-    """The round terms and the excess (n, k), mm, that a fit of slopes inside `reach` radii finds in
-    bowls (n, 1).
+    """The round terms and the excess that a fit of slopes finds in bowls.
+
+    Parameters
+    ----------
+    bowls : Bowl
+        (n, 1) of them.
+    reach : float
+        Radius of the analysis over that of the mirror.
+
+    Returns
+    -------
+    (n, k) array
+        In mm.
     """
     rho, weight, onto = _round_projection(reach)
     return np.asarray(bowls.rise_mm(rho) * weight @ onto.T)

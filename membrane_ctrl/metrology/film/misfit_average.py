@@ -27,8 +27,21 @@ _LOG_WIDTH = 1.0
 
 
 def shared_covariance(figures: Sequence[FilmFigure], terms: IntArray) -> FloatArray:
-    """Covariance (n k, n k), mm^2, of k terms of n sets: each has its noise, and all share the
-    geometry's error.
+    """Covariance of k terms of n sets.
+
+    Each set has its own noise, and all share the geometry's error.
+
+    Parameters
+    ----------
+    figures : sequence of FilmFigure
+        The n sets.
+    terms : (k,) int array
+        Numbers of the terms.
+
+    Returns
+    -------
+    (n k, n k) array
+        In mm^2, set by set.
     """
     errors = np.vstack([each.geometry_mm[terms] for each in figures])
     out = errors @ errors.T

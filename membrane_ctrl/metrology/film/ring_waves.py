@@ -233,8 +233,15 @@ def _rank_causes(
 def unexplained_term_mm(figures: Sequence[FilmFigure], bowls: Bowl, reach: float) -> float:
     """RMS of a term that no cause explains, from the azimuthal orders of 4 and more, without noise.
 
-    Arguments as in `fit_waves`. 0 if these orders have no term beyond the causes, as with 21
-    Zernike terms.
+    Parameters
+    ----------
+    figures, bowls, reach
+        As in `fit_waves`.
+
+    Returns
+    -------
+    float
+        0 if these orders have no term beyond the causes, as with 21 Zernike terms.
     """
     squares = 0.0
     freedom = 0
@@ -258,7 +265,22 @@ def unexplained_term_mm(figures: Sequence[FilmFigure], bowls: Bowl, reach: float
 
 
 def wave_responses_mm(bowls: Bowl, order: int, reach: float) -> FloatArray:
-    """Zernike terms (n, k, causes) of one unit of each cause of an order."""
+    """Zernike terms of one unit of each cause of an azimuthal order.
+
+    Parameters
+    ----------
+    bowls : Bowl
+        (n, 1) of them.
+    order : int
+        Waves around the ring.
+    reach : float
+        Radius of the analysis over that of the mirror.
+
+    Returns
+    -------
+    (n, k, causes) array
+        In mm.
+    """
     columns = [_wave_terms_mm(bowls, order, cause, reach) for cause in CAUSES[order]]
     return np.stack(columns, axis=-1)
 

@@ -7,8 +7,19 @@ from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 
 @compile_kernel
 def sum_by_group(number, values, count):  # type: ignore[no-untyped-def]
-    """Sums (k, count) of values (k, n) over the columns of each `number` (n,), which is below
-    `count`.
+    """Sums over groups of columns.
+
+    Parameters
+    ----------
+    number : (n,) int array
+        Group of each column, from 0.
+    values : (k, n) array
+    count : int
+        Number of groups.
+
+    Returns
+    -------
+    (k, count) array
     """
     out = np.zeros((values.shape[0], count))
     for k in range(values.shape[0]):

@@ -86,12 +86,23 @@ def _term_polynomial(j: int) -> FloatArray:
 
 
 def radial_polynomial(n: int, m: int, degree: int) -> FloatArray:
-    """Polynomial (degree + 1, degree + 1) in x and y of a term without normalisation, R(1) = 1;
-    sine for m < 0.
+    """Polynomial in x and y of a term without normalisation, with R(1) = 1.
 
     R_n^m(r) is a sum over k of radial coefficients times r^(n - 2k) = r^|m| u^p, with u = x^2 +
     y^2 and p = (n - |m|) / 2 - k. Both factors are expanded by the binomial theorem: u^p, and
     (x + iy)^|m| = r^|m| (cos + i sin)(|m| theta).
+
+    Parameters
+    ----------
+    n, m : int
+        Radial and azimuthal order; sine for m < 0.
+    degree : int
+        Of the polynomial, at least n.
+
+    Returns
+    -------
+    (degree + 1, degree + 1) array
+        Coefficient of x^p y^q at [p, q].
     """
     order = abs(m)
     half = (n - order) // 2
@@ -118,8 +129,18 @@ def sum_polynomial(coeffs: FloatArray) -> FloatArray:
 
 
 def evaluate_terms(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> FloatArray:
-    """All terms, (terms, ...), at points of the unit disc; or the polynomials of a table like
-    theirs.
+    """Values of all terms at points of the unit disc.
+
+    Parameters
+    ----------
+    x, y : (...) arrays
+        Places, over the radius.
+    table : (k, degree + 1, degree + 1) array, optional
+        Other polynomials than the terms, as `monomial_table`.
+
+    Returns
+    -------
+    (k, ...) array
     """
     if table is None:
         table = monomial_table()
@@ -135,14 +156,38 @@ def evaluate_terms(x: FloatArray, y: FloatArray, table: FloatArray | None = None
 
 
 def evaluate_gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """d/dx and d/dy of all terms, each (terms, ...), at points of the unit disc."""
+    """Slopes of all terms at points of the unit disc.
+
+    Parameters
+    ----------
+    x, y : (...) arrays
+        Places, over the radius.
+
+    Returns
+    -------
+    by_x, by_y : (terms, ...) arrays
+        d/dx and d/dy, per radius.
+    """
     by_x = evaluate_terms(x, y, differentiate_table(monomial_table(), 1))
     by_y = evaluate_terms(x, y, differentiate_table(monomial_table(), 2))
     return by_x, by_y
 
 
 def differentiate_table(table: FloatArray, axis: int) -> FloatArray:
-    """Derivative of polynomials whose powers run along `axis` (1: x, 2: y), in the same shape."""
+    """Derivatives of polynomials.
+
+    Parameters
+    ----------
+    table : (k, degree + 1, degree + 1) array
+        As `monomial_table`.
+    axis : int
+        1: by x, 2: by y.
+
+    Returns
+    -------
+    array
+        In the same shape.
+    """
     # Each coefficient times its power, one place lower; the constant, times 0, comes last.
     along_axis = [1, 1, 1]
     along_axis[axis] = -1

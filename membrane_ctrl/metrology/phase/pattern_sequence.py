@@ -14,8 +14,16 @@ AXES = ("x", "y")
 
 
 def sinusoid_patterns(axis: str, steps: int) -> tuple[Pattern, ...]:
-    """The N phase steps of one axis: I = A + B cos(phi + 2 pi k / N), k = 0..N-1 (N = 4: the
-    paper's eq. 1).
+    """Return the phase steps of one axis: I = A + B cos(phi + 2 pi k / N), k = 0..N-1.
+
+    For N = 4 they are the paper's (eq. 1).
+
+    Parameters
+    ----------
+    axis : str
+        "x" or "y".
+    steps : int
+        N.
     """
     return tuple(Pattern("sin", axis, k, 2 * math.pi * k / steps) for k in range(steps))
 

@@ -113,9 +113,18 @@ def compute_phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray)
 
 
 def step_residual(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
-    """What the model A + B cos(phi + d_k) leaves of each frame (N, ...): noise, if all is well.
+    """What the model A + B cos(phi + d_k) leaves of each frame: noise, if all is well.
 
-    Arguments and errors as in `compute_phasors`.
+    The projector 1 - D W removes all that the three columns of the design D explain.
+
+    Parameters
+    ----------
+    frames, shifts_rad
+        As in `compute_phasors`, whose errors are also raised.
+
+    Returns
+    -------
+    (N, ...) array
     """
     stack = np.asarray(frames, float)
     fitted = step_design(shifts_rad) @ step_weights(shifts_rad)

@@ -11,6 +11,11 @@ def branchless_arctan2(y, x):  # type: ignore[no-untyped-def]
 
     The angle of the smaller over the larger coordinate is halved, which leaves t <= tan(pi/8),
     where 16 terms of the series of arctan leave less than 1e-13.
+
+    Parameters
+    ----------
+    y, x : float
+        Coordinates, as of `math.atan2`.
     """
     # The first octant, with 0 <= ratio <= 1; the smallest number keeps (0, 0) from 0 / 0.
     ax = abs(x)
@@ -37,8 +42,22 @@ def branchless_arctan2(y, x):  # type: ignore[no-untyped-def]
 def remove_phasor_motion(c, s, q, turn, mirror):  # type: ignore[no-untyped-def]
     """The phasor c + i s without the film's motion, to second order.
 
-    Solves z' = T z + M conj z for z (`reconstruction.film_motion`), with the point's change of
-    phase per µm, `q`, and the moments `turn` and `mirror` (2,) of the motion.
+    Solves z' = T z + M conj z for z (`reconstruction.film_motion`, section 7 of
+    docs/explanation/metrology.md).
+
+    Parameters
+    ----------
+    c, s : float
+        The phasor z' that was seen.
+    q : float
+        The point's change of phase per µm.
+    turn, mirror : (2,) complex arrays
+        First and second moment of the motion, of T and of M.
+
+    Returns
+    -------
+    real, imaginary : float
+        Of z.
     """
     # T = 1 + i q turn_1 - q^2 turn_2 / 2, M = -i q mirror_1 - q^2 mirror_2 / 2
     half = q * q / 2

@@ -118,8 +118,14 @@ def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
 
 
 def poses_at(stated: Geometry, values: AnyArray) -> Poses:
-    """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven
-    count.
+    """Return the poses of a parameter vector.
+
+    Parameters
+    ----------
+    stated : Geometry
+        The bench at which all parameters are 0.
+    values : (n,) array
+        Real, or complex for `pose_derivatives`; only the first eleven count.
     """
     rad_per_unit = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
     in_radians = values[: len(POSE)] * rad_per_unit
@@ -127,9 +133,11 @@ def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     f0 = stated.pinhole_mm
     o0 = stated.screen_origin_mm
     rows = stated.screen_axes
+    # alpha turns camera and screen about the hinge, in opposite senses.
     hinge = _hinge_axis(f0, o0)
     up = _turn_matrix(hinge, alpha)
     back = _turn_matrix(hinge, -alpha)
+    # a and b lengthen the distances; x and y shift the screen in its plane.
     farther_origin = (1 + b / np.linalg.norm(o0)) * o0
     shifted_origin = farther_origin + x * rows[0] + y * rows[1]
     return Poses(
@@ -141,10 +149,17 @@ def poses_at(stated: Geometry, values: AnyArray) -> Poses:
 
 
 def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
-    """d poses / d parameter, one for each of the eleven, exact to rounding.
+    """Return the derivatives of the poses by each of the eleven parameters, exact to rounding.
 
     All of `poses_at` is analytic, so Im f(p + i h) / h is its derivative, without the loss of a
     difference.
+
+    Parameters
+    ----------
+    stated : Geometry
+        The bench at which all parameters are 0.
+    values : (n,) array
+        Where the derivatives are taken.
     """
     out = []
     for k in range(len(POSE)):

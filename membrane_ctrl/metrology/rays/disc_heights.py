@@ -33,5 +33,13 @@ def heights_over_disc(radius: float) -> tuple[FloatArray, FloatArray]:
 
 
 def remove_plane(heights: FloatArray, plane: FloatArray) -> FloatArray:
-    """Heights (n, ...) less their best plane."""
+    """Return heights less their best plane.
+
+    Parameters
+    ----------
+    heights : (n, ...) array
+        At n points.
+    plane : (n, 3) array
+        1, x and y there.
+    """
     return np.asarray(heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0])

@@ -83,7 +83,18 @@ class Chunk:
 
 
 def camera_rays(geometry: Geometry, phases: SetPhases) -> FloatArray:
-    """Unit vectors (3, n) in world of a set's bins."""
+    """Return the directions in which the camera sees a set's bins.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    phases : SetPhases
+
+    Returns
+    -------
+    (3, n) array
+        Unit vectors in world.
+    """
     return geometry.rays(phases.column_px, phases.row_px)
 
 

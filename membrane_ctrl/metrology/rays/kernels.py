@@ -51,9 +51,21 @@ PRODUCTS = PRODUCT_MONOMIALS + 2 * SLOPE_MONOMIALS + 2
 
 @compile_step
 def evaluate_surface(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
-    """Height, dh/dx, dh/dy and the excess' own de/dv, v = x^2 + y^2, at a point in radii.
+    """Height and slopes of the surface at a point.
 
-    Slopes are per radius. Horner's rule gives value and derivative in one pass.
+    Horner's rule gives value and derivative in one pass.
+
+    Parameters
+    ----------
+    poly, excess, amplitude
+        See the module.
+    x, y : float
+        In radii.
+
+    Returns
+    -------
+    h, hx, hy, ev : float
+        Height, dh/dx and dh/dy per radius, and the excess' own de/dv, v = x^2 + y^2.
     """
     # The Zernike part: each row is a polynomial in y, and their sum one in x.
     h = 0.0
@@ -122,7 +134,15 @@ def _newton_step(block, count, pinhole, poly, excess, amplitude, radius, vertex_
 def intersect_surface(  # type: ignore[no-untyped-def]
     rays, t, pinhole, poly, excess, amplitude, radius, vertex_z, newton, start, stop
 ):
-    """Newton steps towards the surface, in place in `t`."""
+    """Newton steps towards the surface, in place in `t`.
+
+    Parameters
+    ----------
+    rays, t, pinhole, poly, excess, amplitude, radius, vertex_z, start, stop
+        See the module.
+    newton : int
+        Number of steps.
+    """
     block = np.empty((4, _BLOCK))
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
@@ -136,7 +156,19 @@ def intersect_surface(  # type: ignore[no-untyped-def]
 def bisector_slopes(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
     """Slopes of the mirror that turns the ray d towards q.
 
-    Its normal n ~ q / |q| - d halves the angle between -d and q; dh/dx = -n_x / n_z.
+    Its normal n ~ q / |q| - d halves the angle between -d and q; dh/dx = -n_x / n_z (section 3
+    of docs/explanation/metrology.md).
+
+    Parameters
+    ----------
+    dx, dy, dz : float
+        Unit vector d of the ray.
+    qx, qy, qz : float
+        From the point to the screen, of any length.
+
+    Returns
+    -------
+    gx, gy : float
     """
     scale = 1 / math.sqrt(qx * qx + qy * qy + qz * qz)
     nx = qx * scale - dx
@@ -147,7 +179,14 @@ def bisector_slopes(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
 
 @compile_step
 def component_along(vx, vy, vz, axes, row):  # type: ignore[no-untyped-def]
-    """Scalar product of a vector with a row of `axes`."""
+    """Scalar product of a vector with a row of `axes`.
+
+    Parameters
+    ----------
+    vx, vy, vz : float
+    axes : (k, 3) array
+    row : int
+    """
     return vx * axes[row, 0] + vy * axes[row, 1] + vz * axes[row, 2]
 
 
@@ -169,7 +208,22 @@ def _screen_coordinate(plane, axis, a, b, w):  # type: ignore[no-untyped-def]
 
 @compile_step
 def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-untyped-def]
-    """x, y and both measured slopes at point p; the screen point is w off the plane."""
+    """Slopes that the mirror must have at point p, so that the camera sees there what it saw.
+
+    Parameters
+    ----------
+    rays, t, screen, pinhole, plane
+        See the module.
+    w : float
+        Deviation of the screen's face from its plane at that screen point.
+    p : int
+        Number of the point.
+
+    Returns
+    -------
+    x, y, gx, gy : float
+        Place on the mirror, and both slopes.
+    """
     # From P on the film to S on the screen.
     x, y, z = _film_point(rays, t, pinhole, p)
     a = screen[0, p]
@@ -231,8 +285,20 @@ def residual_sums(  # type: ignore[no-untyped-def]
     """Moments of the weighted slope residual r = g - D a: all that the right-hand side of the least
     squares needs.
 
-    Returns (SUMS,): sum w r_x x^p y^q (SLOPE_MONOMIALS), as many of r_y, sum w r_x x e'(v) and sum
-    w r_y y e'(v) for the excess, sum w r_x^2, sum w r_y^2, sum w.
+    Section 4 of docs/explanation/metrology.md.
+
+    Parameters
+    ----------
+    rays, t, screen, pinhole, plane, face, poly, excess, amplitude, radius, start, stop
+        See the module.
+    weights : (n,) array
+        w.
+
+    Returns
+    -------
+    (SUMS,) array
+        sum w r_x x^p y^q (SLOPE_MONOMIALS), as many of r_y, sum w r_x x e'(v) and sum w r_y y
+        e'(v) for the excess, sum w r_x^2, sum w r_y^2, sum w.
     """
     sums = np.zeros(SUMS)
     # Memory of a block: x, y, weighted residuals of both slopes, deviation of the face.
@@ -283,10 +349,20 @@ def residual_sums(  # type: ignore[no-untyped-def]
 
 @compile_kernel
 def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # type: ignore[no-untyped-def]
-    """Moments from which the normal matrix is made.
+    """Moments from which the normal matrix D^T W D is made.
 
-    Returns (PRODUCTS,): sum w x^p y^q of PRODUCT_MONOMIALS, sum w e' x x^p y^q and sum w e' y x^p
-    y^q with SLOPE_MONOMIALS each, sum w (e' x)^2, sum w (e' y)^2.
+    Parameters
+    ----------
+    rays, t, pinhole, excess, radius, start, stop
+        See the module.
+    weights : (n,) array
+        w.
+
+    Returns
+    -------
+    (PRODUCTS,) array
+        sum w x^p y^q of PRODUCT_MONOMIALS, sum w e' x x^p y^q and sum w e' y x^p y^q with
+        SLOPE_MONOMIALS each, sum w (e' x)^2, sum w (e' y)^2.
     """
     sums = np.zeros(PRODUCTS)
     first_of_x = PRODUCT_MONOMIALS
@@ -329,7 +405,15 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
 def slope_field(  # type: ignore[no-untyped-def]
     rays, t, screen, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop
 ):
-    """x, y, measured g_x, g_y and fitted h_x, h_y of each point into `out` (6, n)."""
+    """Measured and fitted slopes of each point.
+
+    Parameters
+    ----------
+    rays, t, screen, pinhole, plane, face, poly, excess, amplitude, radius, start, stop
+        See the module.
+    out : (6, n) array
+        Gets x, y, measured g_x, g_y and fitted h_x, h_y.
+    """
     off = np.empty(_BLOCK)
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
@@ -350,9 +434,14 @@ def slope_field(  # type: ignore[no-untyped-def]
 def predict_screen(  # type: ignore[no-untyped-def]
     rays, t, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop
 ):
-    """Where the surface sends each ray on the screen: s_x and s_y into `out` (2, n).
+    """Where the surface sends each ray on the screen.
 
-    The points must be on the surface.
+    Parameters
+    ----------
+    rays, t, pinhole, plane, face, poly, excess, amplitude, radius, start, stop
+        See the module; the points must be on the surface.
+    out : (2, n) array
+        Gets s_x and s_y.
     """
     tangents = np.empty((2, _BLOCK))
     for first in range(start, stop, _BLOCK):

@@ -61,7 +61,20 @@ def _find_fold(distortion: tuple[float, ...]) -> float:
 
 
 def distort_points(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> FloatArray:
-    """Distorted coordinates (2, n) of normalised pinhole ones, by OpenCV's model."""
+    """Return where a lens images points, by OpenCV's model.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays
+        Normalised coordinates of a pinhole camera: tangents of the angles to the axis.
+    distortion : tuple of float
+        k1, k2, p1, p2[, k3[, k4, k5, k6]].
+
+    Returns
+    -------
+    (2, n) array
+        Normalised coordinates in the picture.
+    """
     points = np.stack([x, y, np.ones_like(x)], axis=1)
     no_turn = np.zeros(3)
     no_shift = np.zeros(3)

@@ -40,5 +40,15 @@ class MotionGroup:
 
     @classmethod
     def hidden(cls, name: str, unit: str, allowance: float = 10.0) -> "MotionGroup":
-        """A hidden motion of one component."""
+        """Return a hidden motion of one component.
+
+        Parameters
+        ----------
+        name : str
+            For people.
+        unit : str
+            Of the motion.
+        allowance : float
+            See the attribute.
+        """
         return cls(name, 1, unit, allowance, knock=LARGEST, is_hidden=True)

@@ -44,7 +44,17 @@ class Points:
     def from_rays(
         cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None
     ) -> "Points":
-        """Points at the pinhole, with unit weights unless given; shapes as the attributes'."""
+        """Return points at the pinhole; their shapes are those of the attributes.
+
+        Parameters
+        ----------
+        rays : (3, n) array
+            Unit vectors.
+        screen_mm : (2, n) array
+            Screen points.
+        weights : (n,) array, optional
+            1 if not given.
+        """
         count = rays.shape[1]
         if weights is None:
             weights = np.ones(count)
@@ -90,6 +100,15 @@ class Tracer:
 
         Each step contracts by slope times inclination of the ray (below 0.1), also at the kink of a
         cone.
+
+        Parameters
+        ----------
+        points : Points
+            Their lengths `t_mm` are replaced.
+        height : callable
+            h(x, y) in mm, at places in mm.
+        steps : int
+            Number of steps.
         """
         f = self._pinhole
         d = points.rays
@@ -172,7 +191,19 @@ class Tracer:
         return np.asarray(np.sum(parts, axis=0))
 
     def slope_field(self, points: Points, surface: Surface) -> FloatArray:
-        """x and y in mm, measured dh/dx and dh/dy, fitted dh/dx and dh/dy at the points, (6, n)."""
+        """Return measured and fitted slopes at points of the surface.
+
+        Parameters
+        ----------
+        points : Points
+            n points on the surface.
+        surface : Surface
+
+        Returns
+        -------
+        (6, n) array
+            x and y in mm, measured dh/dx and dh/dy, fitted dh/dx and dh/dy.
+        """
         shape = self._shape(surface)
         out = np.empty((6, points.t_mm.size))
 
@@ -242,5 +273,15 @@ class Tracer:
 
 
 def make_parabola(sag_mm: float, radius_mm: float) -> HeightFunction:
-    """The paper's starting shape, h = sag (x^2 + y^2) / R^2 (paper, eq. 20)."""
+    """Return the paper's starting shape, h = sag (x^2 + y^2) / R^2 (paper, eq. 20).
+
+    Parameters
+    ----------
+    sag_mm, radius_mm : float
+
+    Returns
+    -------
+    callable
+        h(x, y) in mm.
+    """
     return lambda x, y: sag_mm * (x * x + y * y) / radius_mm**2

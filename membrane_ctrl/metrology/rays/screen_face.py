@@ -103,7 +103,19 @@ def is_plane(face):  # type: ignore[no-untyped-def]
 
 @compile_step
 def face_height(face, a, b):  # type: ignore[no-untyped-def]
-    """w, dw/ds_x and dw/ds_y at a point."""
+    """Deviation of the face from its plane at a point.
+
+    Parameters
+    ----------
+    face : Face
+    a, b : float
+        s_x and s_y in mm.
+
+    Returns
+    -------
+    w, wa, wb : float
+        Height in mm, and its derivatives by s_x and s_y.
+    """
     w = face.bow_per_mm * (a * a + b * b)
     wa = 2 * face.bow_per_mm * a
     wb = 2 * face.bow_per_mm * b

@@ -42,15 +42,26 @@ class Surface:
 
     @classmethod
     def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> "Surface":
-        """The surface of parameters [a_2, a_3, ..., excess with unit RMS] in mm; piston makes h(0,
-        0) = 0.
+        """Return the surface of the fit's parameters; piston makes h(0, 0) = 0.
+
+        Parameters
+        ----------
+        parameters : (parameters,) array
+            [a_2, a_3, ..., excess with unit RMS] in mm.
+        radius_mm : float
+            Radius of the Zernike disc.
         """
         hencky_mm = float(parameters[-1]) / hencky_bowl.excess_rms()
         return cls(parameter_to_coeffs() @ parameters, hencky_mm, radius_mm)
 
     @classmethod
     def hencky_bowl(cls, sag_mm: float, radius_mm: float) -> "Surface":
-        """A Hencky bowl of the given sag."""
+        """Return a Hencky bowl.
+
+        Parameters
+        ----------
+        sag_mm, radius_mm : float
+        """
         return cls(sag_mm * hencky_bowl.zernike_projection(), sag_mm, radius_mm)
 
     @property
@@ -96,7 +107,17 @@ class Surface:
         return float(sag_gradient() @ self.parameters)
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Height in mm at points (...) in mm (paper, eq. 15, with the excess)."""
+        """Height at points (paper, eq. 15, with the excess).
+
+        Parameters
+        ----------
+        x_mm, y_mm : (...) arrays
+
+        Returns
+        -------
+        (...) array
+            In mm.
+        """
         x = np.asarray(x_mm) / self.radius_mm
         y = np.asarray(y_mm) / self.radius_mm
         terms = series.polyval2d(x, y, self._whole)
@@ -104,7 +125,17 @@ class Surface:
         return np.asarray(terms + excess)
 
     def slopes(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """dh/dx and dh/dy at points (...) in mm (paper, eqs. 16 and 17, with the excess)."""
+        """Slopes at points (paper, eqs. 16 and 17, with the excess).
+
+        Parameters
+        ----------
+        x_mm, y_mm : (...) arrays
+
+        Returns
+        -------
+        slope_x, slope_y : (...) arrays
+            dh/dx and dh/dy.
+        """
         x = x_mm / self.radius_mm
         y = y_mm / self.radius_mm
         # The excess e(v), v = x^2 + y^2, has the slopes 2 e'(v) x and 2 e'(v) y.
@@ -119,7 +150,17 @@ class Surface:
     def curvatures(
         self, x_mm: FloatArray, y_mm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """h_xx, h_xy and h_yy in 1/mm."""
+        """Second derivatives at points.
+
+        Parameters
+        ----------
+        x_mm, y_mm : (...) arrays
+
+        Returns
+        -------
+        h_xx, h_xy, h_yy : (...) arrays
+            In 1/mm.
+        """
         # Of the terms.
         x = x_mm / self.radius_mm
         y = y_mm / self.radius_mm

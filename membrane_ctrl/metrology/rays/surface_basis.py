@@ -12,8 +12,17 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 
 def evaluate_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights of the surface's parameters and their slopes along x and y, each (parameters, n), at
-    points of the unit disc; slopes per radius, heights 0 at the vertex.
+    """Heights and slopes of the surface's parameters.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays
+        Points of the unit disc.
+
+    Returns
+    -------
+    heights, slopes_x, slopes_y : (parameters, n) arrays
+        Heights are 0 at the vertex, slopes per radius.
     """
     # The Zernike terms, as sums of monomials.
     powers = _evaluate_monomials(x, y, ZERNIKE_DEGREE)
@@ -33,8 +42,17 @@ def evaluate_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def evaluate_round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights of the round terms beyond the fit's and their slopes along x and y, each (k, n), at
-    points of the unit disc; slopes per radius, heights 0 at the vertex.
+    """Heights and slopes of the round terms beyond the fit's.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays
+        Points of the unit disc.
+
+    Returns
+    -------
+    heights, slopes_x, slopes_y : (k, n) arrays
+        Heights are 0 at the vertex, slopes per radius.
     """
     v = x * x + y * y
     heights = []
@@ -49,8 +67,17 @@ def evaluate_round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, Floa
 def evaluate_beyond_basis(
     x: FloatArray, y: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights of all terms beyond the fit's and their slopes along x and y, each (k, n), at points
-    of the unit disc: the round ones, then the waves.
+    """Heights and slopes of all terms beyond the fit's: the round ones, then the waves.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays
+        Points of the unit disc.
+
+    Returns
+    -------
+    heights, slopes_x, slopes_y : (k, n) arrays
+        Slopes per radius.
     """
     round_height, round_x, round_y = evaluate_round_basis(x, y)
     powers = _evaluate_monomials(x, y, terms_beyond_fit.WAVE_DEGREE)

@@ -60,11 +60,25 @@ class BinGrid:
     def averaging_bias_mm(
         self, tracer: Tracer, points: Points, surface: Surface, index: IntArray
     ) -> FloatArray:
-        """Mean of s over a bin's pixels minus s at its centre, (2, n).
+        """Mean of s over a bin's pixels minus s at its centre.
 
         A bin's phase is the mean over its pixels: s + sigma^2 / 2 (s_uu + s_vv), sigma^2 = (m^2 -
         1) / 12. That is the mean of the four values at a distance h with h^2 = 2 sigma^2, so four
-        traces of the model give it.
+        traces of the model give it (section 1 of docs/explanation/metrology.md).
+
+        Parameters
+        ----------
+        tracer : Tracer
+            The bench.
+        points : Points
+            n bins, on the surface.
+        surface : Surface
+        index : (n,) int array
+            Numbers of the bins.
+
+        Returns
+        -------
+        (2, n) array
         """
         centre = tracer.predict_screen(points, surface)
         if not self._around:  # a bin is a pixel

@@ -67,7 +67,19 @@ class NormalMatrix:
 
     @classmethod
     def from_points(cls, tracer: Tracer, points: Points) -> "NormalMatrix":
-        """D^T W D at the present places of the points. Raises ValueError as `from_products`."""
+        """Return D^T W D at the present places of points.
+
+        Parameters
+        ----------
+        tracer : Tracer
+        points : Points
+            With their weights W.
+
+        Raises
+        ------
+        ValueError
+            As `from_products`.
+        """
         return cls.from_products(tracer.product_sums(points), tracer.radius_mm)
 
     @classmethod

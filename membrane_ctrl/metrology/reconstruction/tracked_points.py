@@ -64,7 +64,15 @@ class TrackedPoints:
     fresh: FloatArray
 
     def accept(self, surface: Surface, usable: BoolArray) -> None:
-        """Make the fresh phases the reference; points that gave none keep theirs."""
+        """Make the fresh phases the reference for the next cycle.
+
+        Parameters
+        ----------
+        surface : Surface
+            The surface of the cycle.
+        usable : (n,) bool array
+            Points that gave a phase; the others keep theirs.
+        """
         not_usable = np.flatnonzero(~usable)
         self.fresh[:, :, not_usable] = self.accepted[:, :, not_usable]
         before = self.accepted

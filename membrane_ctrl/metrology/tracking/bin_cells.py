@@ -150,8 +150,18 @@ class Cells:
 
 @compile_kernel
 def combine_planes(slow, factors, start, planes):  # type: ignore[no-untyped-def]
-    """Planes (3 x 64) of a block's cells: of level `start`, plus (k, 3 x 64) times their factors
-    (k,).
+    """Sum of planes of a block's cells, for its surface or its light.
+
+    Parameters
+    ----------
+    slow : (k, 3 x 64) array
+        A plane over each cell for each of k parameters: level, slope along x, slope along y.
+    factors : (k,) array
+        The parameters.
+    start : float
+        Level without them.
+    planes : (3 x 64,) array
+        Gets the sum.
     """
     planes[:BLOCK_CELLS] = start
     planes[BLOCK_CELLS:] = 0
@@ -162,7 +172,17 @@ def combine_planes(slow, factors, start, planes):  # type: ignore[no-untyped-def
 
 @compile_kernel
 def project_planes(slow, planes, out):  # type: ignore[no-untyped-def]
-    """Add the products (k,) of planes (3 x 64) with others (k, 3 x 64)."""
+    """Add the products of planes with those of parameters: the transpose of `combine_planes`.
+
+    Parameters
+    ----------
+    slow : (k, 3 x 64) array
+        As in `combine_planes`.
+    planes : (3 x 64,) array
+        Moments over the cells.
+    out : (k,) array
+        Gets the products in addition.
+    """
     for k in range(out.size):
         total = np.float32(0)
         for q in range(planes.size):
@@ -172,7 +192,17 @@ def project_planes(slow, planes, out):  # type: ignore[no-untyped-def]
 
 @compile_kernel
 def spread_planes(planes, offset, out):  # type: ignore[no-untyped-def]
-    """Values (16, 64) of a block's bins on the planes of its cells."""
+    """Values of a block's bins on the planes of its cells.
+
+    Parameters
+    ----------
+    planes : (3 x 64,) array
+        Level and slopes of each cell.
+    offset : (2, 16, 64) array
+        Place of each bin in its cell.
+    out : (16, 64) array
+        Gets the values.
+    """
     for j in range(CELL_BINS):
         for q in range(BLOCK_CELLS):
             out[j, q] = (
@@ -184,7 +214,17 @@ def spread_planes(planes, offset, out):  # type: ignore[no-untyped-def]
 
 @compile_kernel
 def compute_moments(values, offset, planes):  # type: ignore[no-untyped-def]
-    """Moments of values (16, 64) over a block's cells."""
+    """Moments of values over a block's cells: the transpose of `spread_planes`.
+
+    Parameters
+    ----------
+    values : (16, 64) array
+        Of the bins.
+    offset : (2, 16, 64) array
+        Place of each bin in its cell.
+    planes : (3 x 64,) array
+        Gets the sums, and those weighted with either offset.
+    """
     planes[:] = 0
     for j in range(CELL_BINS):
         for q in range(BLOCK_CELLS):

@@ -147,7 +147,15 @@ class FrameFitter:
         return found
 
     def prepare(self, shifts_rad: Shifts, start: FrameFit) -> None:
-        """Make the matrix for frames with these phase steps that will be fitted from `start`."""
+        """Make the matrix of the least squares before a frame needs it.
+
+        Parameters
+        ----------
+        shifts_rad : (float, float)
+            Phase steps of x and y of the frames to come.
+        start : FrameFit
+            Where their fits will begin.
+        """
         self._inverse = self._invert_matrix(shifts_rad, start.surface, start.light, start.weights)
 
     def _descend(

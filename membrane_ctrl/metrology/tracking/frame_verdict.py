@@ -69,8 +69,17 @@ def light_faults(saturated: float, light: float, covered: BoolArray) -> list[Fin
 
 
 def light_changes(light: float, last: float, anchor: float) -> list[Finding]:
-    """Faults of exposure and panel, from the light of a frame, of the last one and at the anchor,
-    each over the reference's.
+    """Faults of exposure and panel.
+
+    Parameters
+    ----------
+    light, last, anchor : float
+        Light of this frame, of the last one and at the anchor, each over the reference's.
+
+    Returns
+    -------
+    list of Finding
+        At most one.
     """
     if abs(light / last - 1) > _EXPOSURE:
         reason = f"exposure changed: {light / last:.2f} of the light of the last frame"

@@ -119,10 +119,15 @@ def _compute_block(b, base, light, slow, offset, response, changes, shifts, plan
 
 @compile_kernel
 def light_waves(base, light, slow, offset, response, changes, shifts, out):  # type: ignore[no-untyped-def]
-    """Derivatives (6, n) of the light of n bins by phi_x, phi_y and relative changes of A, B_x, B_y
-    and of all.
+    """Derivatives of the light of n bins.
 
-    Arguments as in `light_left`.
+    Parameters
+    ----------
+    base, light, slow, offset, response, changes, shifts
+        As in `light_left`.
+    out : (6, n) array
+        Gets the derivatives by phi_x and phi_y, by relative changes of A, B_x and B_y, and by one
+        of all light.
     """
     rows = np.empty(6 * BLOCK_BINS, np.float32)
     planes = np.empty(3 * BLOCK_CELLS, np.float32)

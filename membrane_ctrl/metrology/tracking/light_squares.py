@@ -80,10 +80,19 @@ class LightSquares:
         return light, self._whole & (is_wrong | is_grey)
 
     def explain_failed_fit(self, seen_adu: Singles, covered: float) -> Finding | None:
-        """Why a frame has no fit, other than by a motion of the mirror; None if nothing is wrong.
+        """Why a frame has no fit, other than by a motion of the mirror.
 
-        `seen_adu` (n,) is the light of the bins, `covered` the share of the squares that are
-        covered.
+        Parameters
+        ----------
+        seen_adu : (n,) array
+            Light of the bins.
+        covered : float
+            Share of the squares that are covered.
+
+        Returns
+        -------
+        Finding or None
+            None if nothing is wrong.
         """
         _, contrasts = self._compare_squares(seen_adu)
         contrast = float(np.median(contrasts[self._even]))

@@ -126,7 +126,16 @@ class LiveTracker:
     ) -> ShapeEstimate:
         """Measure the figure of one frame of `pattern`.
 
-        An estimate with `tracking_lost` requests a full cycle.
+        Parameters
+        ----------
+        frames : sequence of one (height, width) array
+        time_s, displacement_um : (1,) arrays
+            Start of the exposure, and laser reading during it; NaN without one.
+
+        Returns
+        -------
+        ShapeEstimate
+            With `tracking_lost` if a full cycle must follow.
         """
         at_s = round(float(np.asarray(time_s)[0]) + self._exposure_s / 2, _TIME_DECIMALS)
         reading_um = round(float(np.asarray(displacement_um)[0]), _UM_DECIMALS)

@@ -98,8 +98,17 @@ class LostOrders:
         return None
 
     def is_certain(self, change_um: FloatArray, passed_s: float) -> bool:
-        """Whether a change (parameters,) is that of a film, and would not be with other orders."""
+        """Whether a change is that of a film, and would not be with other orders.
+
+        Parameters
+        ----------
+        change_um : (parameters,) array
+            Change of the surface since the last frame.
+        passed_s : float
+            Time since then.
+        """
         usual_um = min(_USUAL_UM + _USUAL_UM_PER_S * passed_s, _USUAL_MOST_UM)
+        # The score s of the change as it is, and of the same change with whole periods added.
         own = float(self._score(change_um, usual_um))
         others = self._score(change_um + self._lost_um, usual_um)
         return own < _MOST_SCORE and bool(np.all(others > own + _LEAST_DIFFERENCE))

@@ -35,7 +35,17 @@ class StepMeans:
         self._times_s: list[float] = []
 
     def add_frame(self, seen_adu: Singles, fit: FrameFit, time_s: float) -> None:
-        """Add a frame; the means begin again if the mirror has moved since the first one."""
+        """Add a frame; the means begin again if the mirror has moved since the first one.
+
+        Parameters
+        ----------
+        seen_adu : (n,) array
+            Light of the bins.
+        fit : FrameFit
+            The frame's solution.
+        time_s : float
+            Middle of the exposure.
+        """
         parameters_mm = fit.surface.parameters
         if self.count:
             moved_mm = surface.height_probe() @ (parameters_mm - self._first_mm)

@@ -74,7 +74,16 @@ class TrackedFrame:
 
 
 def moved_frame(frame: TrackedFrame, by_mm: FloatArray, radius_mm: float) -> TrackedFrame:
-    """Return the frame with the surface's parameters changed by `by_mm` (parameters,)."""
+    """Return the frame with another surface; its error bars stay.
+
+    Parameters
+    ----------
+    frame : TrackedFrame
+    by_mm : (parameters,) array
+        Change of the surface's parameters.
+    radius_mm : float
+        Radius of the Zernike disc.
+    """
     change = surface.Surface.from_parameters(by_mm, radius_mm)
     return replace(
         frame,
@@ -87,7 +96,19 @@ def moved_frame(frame: TrackedFrame, by_mm: FloatArray, radius_mm: float) -> Tra
 def rejected_frame(
     time_s: float, reason: str, rest: float = math.nan, lost: bool = False
 ) -> TrackedFrame:
-    """Return a frame without a figure."""
+    """Return a frame without a figure.
+
+    Parameters
+    ----------
+    time_s : float
+        Middle of the exposure.
+    reason : str
+        Why, for people.
+    rest : float
+        What the fit left, over the swing of the fringes; NaN without a fit.
+    lost : bool
+        Whether a new reference is needed.
+    """
     nan = math.nan
     return TrackedFrame(
         time_s, _NONE, _NO_COVARIANCE, nan, nan, nan, "rejected", reason, rest, lost=lost

@@ -245,7 +245,14 @@ class FollowedMode(StateNode):
         self.past = [(at_s, then_hz) for at_s, then_hz in self.past if utc_s - at_s < _WEEK_S]
 
     def add(self, line: VibrationMode, utc_s: float) -> None:
-        """Add its line of a search."""
+        """Add its line of a search.
+
+        Parameters
+        ----------
+        line : VibrationMode
+        utc_s : float
+            Time of the search.
+        """
         self.line = line
         self.last = line
         self.missed = 0

@@ -148,13 +148,24 @@ class _Piece:
         return np.asarray(np.abs(self.alias_hz - alias_hz) < reach_hz)
 
     def estimate_noise(self, power: FloatArray, gone: BoolArray) -> FloatArray:
-        """Noise (frequencies, terms - 1) under the lines: a function of the alias that falls
-        with it, from drift to white noise.
+        """Noise under the lines: a function of the alias that falls with it, from drift to
+        white noise.
 
-        It is the median of `power` (frequencies, terms - 1) over bands of half an octave, never
-        larger than in a slower band, where a line has less influence. The frequencies `gone` with a
-        line are left out while most of the band remains: an emptied slow band would leave no noise
-        for itself and all faster ones.
+        It is the median of the power over bands of half an octave, never larger than in a slower
+        band, where a line has less influence. The frequencies with a line are left out while most
+        of the band remains: an emptied slow band would leave no noise for itself and all faster
+        ones.
+
+        Parameters
+        ----------
+        power : (frequencies, terms - 1) array
+            |X|^2 of the terms.
+        gone : (frequencies,) bool array
+            Frequencies near a line that was found.
+
+        Returns
+        -------
+        (frequencies, terms - 1) array
         """
         # Bands of half an octave, from below the slowest line to the fastest alias.
         slowest_hz = _LEAST_HZ / 2
@@ -189,8 +200,14 @@ class _Piece:
     def remove_oscillations(
         self, terms_um: FloatArray, frequency_hz: float, shapes: FloatArray
     ) -> FloatArray:
-        """The terms (n, terms - 1) without the oscillations about a frequency that the projection
-        `shapes` (terms - 1, terms - 1) selects.
+        """Return the terms without the oscillations about a frequency.
+
+        Parameters
+        ----------
+        terms_um : (n, terms - 1) array
+        frequency_hz : float
+        shapes : (terms - 1, terms - 1) array
+            Projection that selects which of them.
         """
         # Cosines and sines at the frequency and beside it, fitted to the selected terms.
         rad_per_hz = 2 * np.pi * (self.time_s - self.time_s[0])
