@@ -14,7 +14,7 @@ EXTRAS = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(
     "optional-dependencies"
 ]
 # Without them their tests use a stand-in, or are skipped
-NOT_INSTALLED_FOR_TESTS = {"alarms", "gpio", "notebooks"}
+NOT_INSTALLED_FOR_TESTS = {"alarms", "gpio", "notebooks", "render"}
 
 
 def names_of(extra: str) -> set[str]:

@@ -176,7 +176,7 @@ class World:
             table["mirror_turned"] = {"angle_deg": self.stated.turned_deg}
         if pressure_pa is not None:
             table["pressure_pa"] = pressure_pa
-        _write(folder, table, [row["file"] for row in rows], frames)
+        write_files(folder, table, [row["file"] for row in rows], frames)
         return self.truth([k for k, p in enumerate(pictures) if p.role == "sin"], displacements_um)
 
     def write_track(
@@ -215,7 +215,7 @@ class World:
             "pattern": _pattern_table() | {"crossed": crossed},
             "frames": rows,
         }
-        _write(folder, table, [row["file"] for row in rows], frames)
+        write_files(folder, table, [row["file"] for row in rows], frames)
         return displacements_um
 
     def truth(self, sinusoids: Sequence[int], displacements_um: FloatArray) -> Truth:
@@ -410,7 +410,7 @@ def _pattern_table() -> dict[str, Any]:
     }
 
 
-def _write(
+def write_files(
     folder: Path, table: Mapping[str, Any], names: Sequence[str], frames: Sequence[Counts]
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
