@@ -34,7 +34,15 @@ class CameraMountGrowth:
         self.memory.locked_c = self.memory.mount_c.value
 
     def step(self, air_c: float, dt_s: float) -> None:
-        """Follow the air's temperature; NaN without a good reading."""
+        """Follow the air's temperature by one tick.
+
+        Parameters
+        ----------
+        air_c : float
+            NaN without a good reading: the growth stays.
+        dt_s : float
+            Time since the last tick.
+        """
         if math.isfinite(air_c):
             self.memory.mount_c.update(air_c, dt_s, self._follows_air_s)
             if math.isnan(self.memory.locked_c):

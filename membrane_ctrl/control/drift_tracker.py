@@ -36,13 +36,33 @@ class DriftTracker(StateNode):
         self.rate_um_per_s = 0.0
 
     def drift_at(self, time_s: float, memory_s: float) -> float:
-        """Value in µm expected at a time (not before the last reading's); a rate is used for
-        one memory.
+        """Return the value expected at a time.
+
+        Parameters
+        ----------
+        time_s : float
+            Not before the last reading's.
+        memory_s : float
+            Memory of value and rate; a rate is used for so long and no longer.
+
+        Returns
+        -------
+        float
+            In µm.
         """
         return self.value_um + self.rate_um_per_s * min(time_s - self.time_s, memory_s)
 
     def add_reading(self, reading_um: float, time_s: float, memory_s: float) -> None:
-        """Take a reading, later than the last one, into the memory."""
+        """Take a reading into the memory.
+
+        Parameters
+        ----------
+        reading_um : float
+        time_s : float
+            Later than that of the last reading.
+        memory_s : float
+            Memory of value and rate.
+        """
         dt_s = time_s - self.time_s
         beta = math.exp(-dt_s / memory_s)
         expected_um = self.drift_at(time_s, memory_s)

@@ -64,7 +64,15 @@ class ErrorCorrelation:
         self.memory.start_afresh()
 
     def step(self, error_um: float, dt_s: float) -> None:
-        """Add a tick's error of the estimate; NaN for a tick without one."""
+        """Add a tick.
+
+        Parameters
+        ----------
+        error_um : float
+            Error of the estimate; NaN for a tick without one.
+        dt_s : float
+            Time since the last tick.
+        """
         memory = self.memory
         memory.time_s += dt_s
         if math.isfinite(error_um):

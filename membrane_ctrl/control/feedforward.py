@@ -49,7 +49,20 @@ class FeedForward:
         self._loop = loop
 
     def update(self, ambient_pressure_pa: float, air_temperature_c: float, dt_s: float) -> float:
-        """Flow in µm/s; NaN for a missing quantity."""
+        """Return the flow that cancels the weather.
+
+        Parameters
+        ----------
+        ambient_pressure_pa, air_temperature_c : float
+            NaN for a missing quantity, whose rate decays.
+        dt_s : float
+            Time since the last tick.
+
+        Returns
+        -------
+        float
+            In µm/s.
+        """
         loop = self._loop
         pressure_pa, temperature_c = discard_impossible_weather(
             ambient_pressure_pa, air_temperature_c

@@ -17,8 +17,19 @@ _STEPS = 1000  # of the integral: exact to 1e-6 of it
 
 
 def find_leak_speed(sag_mm: float, time_constant_s: float) -> float:
-    """Speed in µm/s at which a leak lowers the centre, from the time constant T of the pressure:
-    w0 / (3 T).
+    """Speed at which a leak lowers the centre: w0 / (3 T).
+
+    Parameters
+    ----------
+    sag_mm : float
+        w0.
+    time_constant_s : float
+        T of the pressure.
+
+    Returns
+    -------
+    float
+        In µm/s.
     """
     return 1e3 * sag_mm / (3.0 * time_constant_s)
 

@@ -62,8 +62,21 @@ class FilmHealth:
     def step(
         self, dt_s: float, leak_um_per_s: float, gauge_pressure_pa: float
     ) -> tuple[MaintenanceNotice, ...]:
-        """Process one tick of a held mirror; at the end of an hour, return new and withdrawn
-        warnings.
+        """Process one tick of a held mirror.
+
+        Parameters
+        ----------
+        dt_s : float
+            Time since the last tick.
+        leak_um_per_s : float
+            Estimate of the leak.
+        gauge_pressure_pa : float
+            NaN without a reading.
+
+        Returns
+        -------
+        tuple of MaintenanceNotice
+            At the end of an hour: new and withdrawn warnings.
         """
         if not (math.isfinite(leak_um_per_s) and math.isfinite(gauge_pressure_pa)):
             return ()

@@ -55,8 +55,16 @@ TAUT_PA = 100.0
 
 
 def are_means_known(seen_s: float, readings: int) -> bool:
-    """Whether the means are good enough for a reference: until there is one, nothing shows what a
-    jump was.
+    """Whether the means are good enough for a reference: until there is one, nothing shows
+    what a jump
+    was.
+
+    Parameters
+    ----------
+    seen_s : float
+        Time over which both sensors were there.
+    readings : int
+        Number of figures in it.
     """
     return seen_s >= WARM_S or (seen_s >= _KNOWN_S and readings >= _KNOWN_READINGS)
 

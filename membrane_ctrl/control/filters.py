@@ -42,7 +42,17 @@ class LowPass(StateNode):
         self.value = value
 
     def update(self, given: float, dt_s: float, time_constant_s: float) -> float:
-        """Output after `given` was applied for `dt_s`."""
+        """Return the output after one step.
+
+        Parameters
+        ----------
+        given : float
+            Input that was applied since the last step.
+        dt_s : float
+            For how long.
+        time_constant_s : float
+            0: the output is the input.
+        """
         self.age_s += dt_s
         if math.isnan(self.value):
             self.value = given
@@ -71,7 +81,24 @@ class LagRate(StateNode):
     def update(
         self, given: float, dt_s: float, time_constant_s: float, step_max: float = math.inf
     ) -> float:
-        """Mean rate per second over the step; `given` may be NaN."""
+        """Return the mean rate of the filtered input over the step.
+
+        Parameters
+        ----------
+        given : float
+            The input; NaN while it is absent.
+        dt_s : float
+            For how long.
+        time_constant_s : float
+            Of the lag.
+        step_max : float
+            A larger change counts as an absence: the rate continues.
+
+        Returns
+        -------
+        float
+            In units of the input per second.
+        """
         share = lag_step_fraction(dt_s, time_constant_s)
         if math.isfinite(given):
             if self.absent or abs(given - self.input) > step_max:

@@ -33,7 +33,14 @@ class FlowLimiter:
         return self.memory.flow_um_per_s
 
     def limit(self, wanted_um_per_s: float, dt_s: float) -> float:
-        """The flow nearest to the wanted one that range and rate allow."""
+        """Return the flow nearest to the wanted one that range and rate allow.
+
+        Parameters
+        ----------
+        wanted_um_per_s : float
+        dt_s : float
+            Time since the last flow, which bounds the change.
+        """
         step_um_per_s = self.rate_um_per_s2 * dt_s
         flow_um_per_s = self.memory.flow_um_per_s
         low, high = flow_um_per_s - step_um_per_s, flow_um_per_s + step_um_per_s

@@ -18,6 +18,13 @@ def find_dead_time_s(loop: LoopConfig, response: PumpResponse) -> float:
 
     The standard deviation of dead time and lag together is added: a response that is hardly known
     is taken as a slower one.
+
+    Parameters
+    ----------
+    loop : LoopConfig
+        Filter and rate of the ticks.
+    response : PumpResponse
+        Dead time and lag of the pump, with their errors.
     """
     pump_s = response.delay_s + response.lag_s / 2.0 + response.sum_sigma_s
     return pump_s + loop.measurement_filter_s + _TICKS / loop.rate_hz

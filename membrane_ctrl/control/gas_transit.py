@@ -38,7 +38,20 @@ class Transit:
         self.memory.arriving = flow_um_per_s
 
     def advance(self, flow_um_per_s: float, dt_s: float) -> float:
-        """Pump at a rate for a step; returns the rise of the centre in it, µm."""
+        """Pump at a rate for a step.
+
+        Parameters
+        ----------
+        flow_um_per_s : float
+            Commanded since the last step.
+        dt_s : float
+            For how long.
+
+        Returns
+        -------
+        float
+            Rise of the centre in it, µm, by the gas that has arrived.
+        """
         memory = self.memory
         for _ in range(max(1, round(dt_s / self._period_s))):
             memory.flows.appendleft(flow_um_per_s)

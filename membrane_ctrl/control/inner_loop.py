@@ -162,7 +162,11 @@ class InnerLoop:
     def start(self, displacement_um: float, flow_um_per_s: float) -> None:
         """Start at a reading: the setpoint ramps from there, the integrator stands at the flow.
 
-        The flow is the pump's present flow, or the mean it is known to need.
+        Parameters
+        ----------
+        displacement_um : float
+        flow_um_per_s : float
+            The pump's present flow, or the mean it is known to need.
         """
         self._forget_output()
         self.memory.measured.reset(displacement_um)
@@ -173,10 +177,18 @@ class InnerLoop:
         self.memory.leak.skip_step()
 
     def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
-        """Run one automatic tick, on the estimate if there is one; `dt_s` must exceed 0.
+        """Run one automatic tick, on the estimate if there is one.
 
-        Without either, the reading counts as missing (`step_without_reading`). Source:
-        docs/explanation/control.md, eq. 2; with an estimate docs/explanation/estimator.md, eq. 2.
+        Without estimate and reading, the reading counts as missing (`step_without_reading`).
+        Source: docs/explanation/control.md, eq. 2; with an estimate docs/explanation/estimator.md,
+        eq. 2.
+
+        Parameters
+        ----------
+        given : LoopInput
+            Target, trim and readings of the tick.
+        dt_s : float
+            Time since the last tick, above 0.
         """
         self.memory.learned = False
         if given.estimate is None and not math.isfinite(given.displacement_um):
@@ -237,6 +249,11 @@ class InnerLoop:
 
         A sensor slower than the loop gives such readings. The next `step` covers the time since the
         last one, so the loop runs at the sensor's rate.
+
+        Parameters
+        ----------
+        given, dt_s
+            As of `step`.
         """
         memory = self.memory
         if memory.kept_output is None:
@@ -301,11 +318,17 @@ class InnerLoop:
         return self._error_gain_per_s * memory.aim_offset_um
 
     def step_without_reading(self, given: LoopInput, dt_s: float) -> LoopOutput:
-        """One tick without control: the integrator is frozen and put out, for it is the mean flow.
+        """Run one tick without control: the integrator is frozen and put out, for it is the
+        mean flow.
 
         Repeating the last reading instead would integrate its error: 5 times the excursion
         (docs/explanation/physics.md). A reading that is there (a pause) is filtered nevertheless,
         so that the error is the present one.
+
+        Parameters
+        ----------
+        given, dt_s
+            As of `step`.
         """
         self._forget_output()
         seen = math.isfinite(given.displacement_um)
@@ -328,7 +351,14 @@ class InnerLoop:
         """Run one tick with an external flow (manual, tuning, ramp-down), within the pump's range.
 
         The setpoint stands at the last finite reading and the integrator at the flow, so that
-        `step` continues from there; the target is not used.
+        `step` continues from there.
+
+        Parameters
+        ----------
+        given, dt_s
+            As of `step`; the target is not used.
+        flow_um_per_s : float
+            The external flow.
         """
         self._forget_output()
         # 1. The filter runs on, and the setpoint stands at its output: a later `step` has no jump
@@ -362,19 +392,34 @@ class InnerLoop:
         )
 
     def resume_at_mean(self, given: LoopInput, mean_um_per_s: float, dt_s: float) -> LoopOutput:
-        """`follow_flow` with the flow that holds the mirror on average: the feed-forward of the
-        weather is added to it.
+        """Run `follow_flow` with the flow that holds the mirror on average.
 
-        If the weather's present share were taken out of the mean, as `follow_flow` does for a flow
-        that a person has set, the integrator would be wrong by the present gust.
+        The feed-forward of the weather is added to it. If the weather's present share were taken
+        out of the mean, as `follow_flow` does for a flow that a person has set, the integrator
+        would be wrong by the present gust.
+
+        Parameters
+        ----------
+        given, dt_s
+            As of `step`.
+        mean_um_per_s : float
+            The mean flow.
         """
         output = self.follow_flow(given, mean_um_per_s, dt_s)
         self._pid.place(self._limiter.flow_um_per_s)
         return output
 
     def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
-        """`follow_flow` with a raw pump command, which is output unchanged; whether the pump runs
-        is unknown.
+        """Run `follow_flow` with a raw pump command, which is output unchanged.
+
+        Whether the pump runs is unknown.
+
+        Parameters
+        ----------
+        given, dt_s
+            As of `step`.
+        fraction : float
+            Command of the pump, 0..1.
         """
         flow_um_per_s = self._pump_flow(fraction)
         output = self.follow_flow(given, flow_um_per_s, dt_s)
@@ -384,7 +429,15 @@ class InnerLoop:
         return replace(output, flow_um_per_s=self._pump_flow(fraction), pump_fraction=fraction)
 
     def follow_pump(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
-        """`follow_flow` behind a pump that another controller drives, by its read-back."""
+        """Run `follow_flow` behind a pump that another controller drives.
+
+        Parameters
+        ----------
+        given, dt_s
+            As of `step`.
+        fraction : float
+            The pump's read-back, 0..1.
+        """
         return self.follow_flow(given, self._pump_flow(fraction), dt_s)
 
     def set_gains(self, loop: LoopConfig) -> None:

@@ -32,7 +32,22 @@ class InnovationRamp(StateNode):
     slope: float = math.nan  # of the last ramp: its rise per second
 
     def update(self, innovation: float, taken_s: float, limit: float) -> bool:
-        """Take an innovation in standard deviations; returns whether a ramp is found."""
+        """Take an innovation into both cumulative sums.
+
+        Parameters
+        ----------
+        innovation : float
+            In standard deviations.
+        taken_s : float
+            Time of the reading.
+        limit : float
+            Of a sum, in standard deviations, beyond which it is a ramp.
+
+        Returns
+        -------
+        bool
+            Whether a ramp is found.
+        """
         found = False
         innovation = min(max(innovation, -_STEEPEST), _STEEPEST)
         for side, sign in ((self.up, 1.0), (self.down, -1.0)):

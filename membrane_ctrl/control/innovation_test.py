@@ -48,7 +48,15 @@ class InnovationTest:
         self.memory = memory or InnovationTestState()
 
     def step(self, innovation: float, dt_s: float) -> None:
-        """Add an innovation in standard deviations; NaN for a tick without one."""
+        """Add a tick.
+
+        Parameters
+        ----------
+        innovation : float
+            In standard deviations; NaN for a tick without one.
+        dt_s : float
+            Time since the last tick.
+        """
         memory = self.memory
         memory.block_s += dt_s
         if math.isfinite(innovation):

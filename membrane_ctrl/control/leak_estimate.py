@@ -59,8 +59,16 @@ class LeakEstimate(StateNode):
     def update(
         self, pumped_um_per_s: float, displacement_um: float, filtered_um: float, dt_s: float
     ) -> None:
-        """Take a step: the flow without the feed-forward's share, and the reading, as read and
-        filtered.
+        """Take a step: what the pump added, and what arrived.
+
+        Parameters
+        ----------
+        pumped_um_per_s : float
+            Flow without the feed-forward's share.
+        displacement_um, filtered_um : float
+            The reading, as read and behind the loop's filter.
+        dt_s : float
+            Time since the last step.
         """
         jumps = abs(displacement_um - filtered_um) > JUMP_UM
         if math.isfinite(self.last_um) and not jumps:
@@ -68,7 +76,16 @@ class LeakEstimate(StateNode):
         self.last_um = displacement_um if jumps else filtered_um  # where the filter will be
 
     def add_loss(self, loss_um_per_s: float, centre_um: float, dt_s: float) -> None:
-        """Take a step's loss that is known, and where it ends."""
+        """Take a step whose loss is known.
+
+        Parameters
+        ----------
+        loss_um_per_s : float
+        centre_um : float
+            Displacement at its end.
+        dt_s : float
+            Time since the last step.
+        """
         self.elapsed_s = min(self.elapsed_s + dt_s, WINDOW_S)
         self.mean_um_per_s += dt_s / self.elapsed_s * (loss_um_per_s - self.mean_um_per_s)
         self.last_um = centre_um

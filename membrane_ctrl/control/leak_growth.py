@@ -45,11 +45,24 @@ class LeakGrowth(StateNode):
         self.stands_s = 0.0
 
     def step(self, leak_um_per_s: float, flow_um_per_s: float, most: float, dt_s: float) -> str:
-        """Process one tick of a held mirror and return any problem. NaN for unknown values.
+        """Process one tick of a held mirror.
 
         The leak is the inner loop's estimate, without the feed-forward's share, and a faulty
-        thermometer shifts it; a film that really takes more gas gets more. `most`: times the usual
-        consumption; infinite if a camera sees the film stand still.
+        thermometer shifts it; a film that really takes more gas gets more.
+
+        Parameters
+        ----------
+        leak_um_per_s, flow_um_per_s : float
+            The estimate, and the flow of the pump; NaN if unknown.
+        most : float
+            Times the usual consumption; infinite if a camera sees the film stand still.
+        dt_s : float
+            Time since the last tick.
+
+        Returns
+        -------
+        str
+            The problem, for people; empty without one.
         """
         if not (math.isfinite(leak_um_per_s) and math.isfinite(flow_um_per_s)):
             return ""

@@ -74,7 +74,16 @@ class LoopComparison:
         self.memory.start_afresh()
 
     def step(self, own_um: float, other_um: float, dt_s: float) -> None:
-        """Add a reading's distance from the setpoint in either loop, µm; NaN without a reading."""
+        """Add a reading.
+
+        Parameters
+        ----------
+        own_um, other_um : float
+            Distance from the setpoint under the present and under the other loop; NaN without a
+            reading.
+        dt_s : float
+            Time since the last one.
+        """
         memory = self.memory
         memory.block_s += dt_s
         if math.isfinite(own_um) and math.isfinite(other_um):

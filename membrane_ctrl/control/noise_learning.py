@@ -35,9 +35,18 @@ class LearnedFactor(StateNode):
         return math.exp(self.log)
 
     def learn(self, slope: float, information: float, forget: float, bound: float) -> None:
-        """Take the slope of the log-likelihood from one reading, and the information that it bears.
+        """Take what one reading shows: a step of Fisher's scoring in the logarithm of the factor.
 
-        The logarithm stays within +- `bound`.
+        Parameters
+        ----------
+        slope : float
+            Derivative of the log-likelihood by the logarithm.
+        information : float
+            Fisher information of the reading.
+        forget : float
+            Share of the information so far that is forgotten.
+        bound : float
+            The logarithm stays within +- this.
         """
         # at least that: a few readings must not overturn a level that has hardly shown for long
         self.information = max(

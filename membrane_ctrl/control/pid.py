@@ -74,7 +74,15 @@ class Pid:
         self.memory.rate_um_per_s = 0.0
 
     def terms(self, error_um: float, measured_rate_um_per_s: float) -> PidTerms:
-        """P, I and D for the (filtered) error and the rate of the filtered measurement."""
+        """Return P, I and D.
+
+        Parameters
+        ----------
+        error_um : float
+            Setpoint less (filtered) measurement.
+        measured_rate_um_per_s : float
+            Rate of the filtered measurement, for D.
+        """
         self.memory.error_um = error_um
         self.memory.rate_um_per_s = measured_rate_um_per_s
         return self._compute_terms()

@@ -88,17 +88,33 @@ class ReferenceMeans(StateNode):
     def follow(
         self, means: tuple[float, float, float], dt_s: float, time_constant_s: float
     ) -> None:
-        """Move it towards the present means."""
+        """Move the reference towards the present means.
+
+        Parameters
+        ----------
+        means : (float, float, float)
+            Of laser in µm, optics in µm and gauge in Pa.
+        dt_s : float
+            Time since the last tick.
+        time_constant_s : float
+            In which it follows.
+        """
         share = lag_step_fraction(dt_s, time_constant_s)
         self.laser_um += share * (means[0] - self.laser_um)
         self.optics_um += share * (means[1] - self.optics_um)
         self.gauge_pa += share * (means[2] - self.gauge_pa)
 
     def changes(self, means: tuple[float, float, float], sag_um: float) -> SagChanges:
-        """Changes of sag since the reference; the gauge's by Hencky's law: the sag goes with the
-        cube root.
+        """Return the changes of sag since the reference.
 
-        `sag_um` is that of the mirror at displacement 0.
+        The gauge's follows by Hencky's law: the sag goes with the cube root of the pressure.
+
+        Parameters
+        ----------
+        means : (float, float, float)
+            The present ones of laser in µm, optics in µm and gauge in Pa.
+        sag_um : float
+            Sag of the mirror at displacement 0.
         """
         gauge_um = (sag_um + self.laser_um) * (math.cbrt(means[2] / self.gauge_pa) - 1)
         return SagChanges(means[0] - self.laser_um, means[1] - self.optics_um, gauge_um)

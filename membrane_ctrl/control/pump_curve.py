@@ -66,7 +66,15 @@ class _Measured:
 
 
 def make_branch(pump: PumpConfig, flows_um_per_s: Sequence[float]) -> _StraightLine | _Measured:
-    """One branch of the pump's curve."""
+    """Return one branch of the pump's curve.
+
+    Parameters
+    ----------
+    pump : PumpConfig
+        Its fractions are those of the curve's points.
+    flows_um_per_s : sequence of float
+        Flow at each; empty for a straight line.
+    """
     if flows_um_per_s:
         return _Measured(pump.curve_fraction, flows_um_per_s)
     return _StraightLine(pump)
@@ -179,7 +187,19 @@ class PumpCurve:
         return self._rising.fraction(flow_um_per_s)
 
     def command(self, flow_um_per_s: float, dt_s: float) -> float:
-        """Command for a flow; a stopped pump gets a start pulse."""
+        """Return the command for a flow; a stopped pump gets a start pulse.
+
+        Parameters
+        ----------
+        flow_um_per_s : float
+        dt_s : float
+            Time until the next command, for the duration of the pulse.
+
+        Returns
+        -------
+        float
+            Fraction of full scale.
+        """
         if flow_um_per_s <= 0.5 * self.least_flow_um_per_s:
             self.note_stop()
             return 0.0

@@ -119,8 +119,21 @@ class PumpDrift:
         self.memory.whole = False
 
     def step(self, displacement_um: float, flow_um_per_s: float, dt_s: float) -> bool:
-        """Take a tick: the reading, and the flow by the configured curve from then on. True if it
-        ends a segment.
+        """Take a tick.
+
+        Parameters
+        ----------
+        displacement_um : float
+            The reading.
+        flow_um_per_s : float
+            By the configured curve, from now on.
+        dt_s : float
+            Time since the last tick.
+
+        Returns
+        -------
+        bool
+            Whether it ends a segment.
         """
         memory = self.memory
         if memory.time_s >= _SETTLE_S:

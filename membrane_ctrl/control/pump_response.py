@@ -188,7 +188,14 @@ def estimate_flow(
 
 
 def apply_response(estimator: EstimatorConfig, response: PumpResponse | None) -> EstimatorConfig:
-    """The settings with an identified response, if they do not state one."""
+    """Return the settings with an identified response, if they do not state one.
+
+    Parameters
+    ----------
+    estimator : EstimatorConfig
+    response : PumpResponse or None
+        Found by the test of the actuators; None without one.
+    """
     if response is None or estimator.pump_response == "stated":
         return estimator
     return estimator.model_copy(

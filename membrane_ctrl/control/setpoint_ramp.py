@@ -44,11 +44,19 @@ class SetpointRamp:
         self.memory.value_um = value_um
 
     def advance(self, target_um: float, mean_flow_um_per_s: float, dt_s: float) -> float:
-        """Setpoint after one step towards `target_um`.
+        """Return the setpoint after one step towards the target.
 
         The pump only adds gas: the mirror falls no faster than it leaks, and the mean flow balances
         the leak. So a fall is limited to a share of the mean flow, a rise to a share of the flow
         above it.
+
+        Parameters
+        ----------
+        target_um : float
+        mean_flow_um_per_s : float
+            The flow that balances the leak.
+        dt_s : float
+            Time since the last step.
         """
         down = min(self.rate_um_per_s, RAMP_SHARE * mean_flow_um_per_s)
         up = min(self.rate_um_per_s, RAMP_SHARE * (self.flow_max_um_per_s - mean_flow_um_per_s))

@@ -25,7 +25,13 @@ def explain_weather_fault(ambient_pressure_pa: float, air_temperature_c: float) 
 def discard_impossible_weather(
     ambient_pressure_pa: float, air_temperature_c: float
 ) -> tuple[float, float]:
-    """The readings, an impossible one as NaN."""
+    """Return the readings, an impossible one as NaN.
+
+    Parameters
+    ----------
+    ambient_pressure_pa, air_temperature_c : float
+        NaN if absent.
+    """
     if not _is_possible(ambient_pressure_pa, _PRESSURE_PA):
         ambient_pressure_pa = math.nan
     if not _is_possible(air_temperature_c, _TEMPERATURE_C):

@@ -270,7 +270,15 @@ class ActuatorTest:
         return max(0.0, -self.memory.off_um_per_s)
 
     def step(self, displacement_um: float, dt_s: float) -> None:
-        """Take one reading (NaN: none) and advance the time."""
+        """Take one reading and advance the time.
+
+        Parameters
+        ----------
+        displacement_um : float
+            NaN: none.
+        dt_s : float
+            Time since the last tick.
+        """
         part = self.part
         if part is None:
             return

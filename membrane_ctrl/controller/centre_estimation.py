@@ -126,7 +126,28 @@ class CentreEstimation:
         shape: ShapeState,
         consistency: SensorConsistency,
     ) -> list[Event]:
-        """One tick, after the sensors were judged; returns what is news."""
+        """Run one tick, after the sensors were judged.
+
+        Parameters
+        ----------
+        inputs : TickInputs
+            Readings of the tick.
+        state : State
+            Of the controller.
+        context : TickContext
+            Observer, figure and command of the tick.
+        last : LoopOutput
+            What the loop put out in the tick before: the flow since then.
+        shape : ShapeState
+            Of the shape loop.
+        consistency : SensorConsistency
+            Which sensors are to be left out.
+
+        Returns
+        -------
+        list of Event
+            What has changed: sensors in use, jumps, a choice of the process value.
+        """
         flow_um_per_s, seen_um = last.flow_um_per_s, context.observer.displacement_um
         figures = context.observer.figures
         is_moved = state in state_sets.ESTIMATED or context.config.states.observe

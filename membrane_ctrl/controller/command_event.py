@@ -7,8 +7,13 @@ from membrane_ctrl.model.events import CommandTaken
 
 
 def make_command_event(command: Command, refused: str) -> CommandTaken:
-    """The event of a command: its sender, reason and settings, and why it was refused (empty: it
-    was not).
+    """Return the event of a command: its sender, reason and settings.
+
+    Parameters
+    ----------
+    command : Command
+    refused : str
+        Why it was refused; empty: it was not.
     """
     spec, experiment = command.experiment, None
     if spec is not None:

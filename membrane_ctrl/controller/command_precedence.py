@@ -19,7 +19,19 @@ def sort_commands(commands: Iterable[Command]) -> list[Command]:
 
 
 def explain_overruled(command: Command, obeyed: Collection[str]) -> str:
-    """Refusal naming the command of the same tick that overrules this one; empty if none does."""
+    """Say which command of the same tick overrules this one.
+
+    Parameters
+    ----------
+    command : Command
+    obeyed : collection of str
+        Names of the commands that the tick has accepted before.
+
+    Returns
+    -------
+    str
+        The refusal; empty if none does.
+    """
     winner = next((kind for kind in DOWN if kind in obeyed), "")
     if command.kind not in _OVERRULED or not winner:
         return ""

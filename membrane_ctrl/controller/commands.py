@@ -75,7 +75,21 @@ TABLE: dict[Kind, CommandRule] = {
 
 
 def explain_refusal(command: Command, state: State, config: Config) -> str:
-    """Why a command cannot be executed now; empty if it can."""
+    """Say why a command cannot be executed now.
+
+    Parameters
+    ----------
+    command : Command
+    state : State
+        Of the controller.
+    config : Config
+        Limits of its values.
+
+    Returns
+    -------
+    str
+        Empty if it can.
+    """
     if command.kind == "resumed" or command.kind == "latched":
         return (
             ""

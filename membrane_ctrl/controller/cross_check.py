@@ -44,7 +44,14 @@ _TWIN_BOARD = DevicesConfig(board="tcp://twin")  # the device of `--twin` if non
 def cross_check(
     config: Config, board: BenchIdentity | None = None
 ) -> tuple[cross_check_plant.ConfigFinding, ...]:
-    """Findings on a configuration and, if given, on its board's limits; errors first."""
+    """Return the findings on a configuration, errors first.
+
+    Parameters
+    ----------
+    config : Config
+    board : BenchIdentity, optional
+        The devices' limits and ranges, if they are known.
+    """
     findings = cross_check_plant.ConfigFindings(config)
     _check_finite(config, findings)
     if not findings.found:  # the others compute with the values
@@ -79,7 +86,26 @@ def cross_check(
 def require_sound(
     config: Config, source: str, board: BenchIdentity | None = None
 ) -> tuple[cross_check_plant.ConfigFinding, ...]:
-    """Return the warnings; raise FindingsError for a configuration with errors, one line each."""
+    """Refuse a configuration with errors.
+
+    Parameters
+    ----------
+    config : Config
+    source : str
+        Name of the file, for the messages.
+    board : BenchIdentity, optional
+        As of `cross_check`.
+
+    Returns
+    -------
+    tuple of ConfigFinding
+        The warnings.
+
+    Raises
+    ------
+    FindingsError
+        One line for each error.
+    """
     findings = cross_check(config, board)
     if any(finding.severity == "error" for finding in findings):
         raise FindingsError([finding.line(source) for finding in findings])

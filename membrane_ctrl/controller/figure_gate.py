@@ -103,7 +103,16 @@ class FigureGate:
         self.accepted: ShapeEstimate | None = None
 
     def judge_figure(self, now_s: float, figure: ShapeEstimate | None, laser_um: float) -> None:
-        """Judge this tick's figure, if there is one; `laser_um` is NaN without a good reading."""
+        """Judge this tick's figure.
+
+        Parameters
+        ----------
+        now_s : float
+        figure : ShapeEstimate or None
+            None without a new one.
+        laser_um : float
+            NaN without a good reading.
+        """
         self.memory.now_s = now_s
         self.accepted = None
         if math.isnan(self.memory.first_tick_s):

@@ -46,7 +46,16 @@ class GainsTrial:
         return math.isfinite(self.memory.until_s)
 
     def begin(self, loop: LoopConfig, command: Command, now_s: float) -> None:
-        """Set a command's gains for as many seconds as its value, or permanently if that is NaN."""
+        """Set a command's gains.
+
+        Parameters
+        ----------
+        loop : LoopConfig
+            The settings with the new gains.
+        command : Command
+            Its value is the duration of the trial in s; NaN: permanently.
+        now_s : float
+        """
         memory = self.memory
         tried = replace(memory.tried, loop=loop)
         if command.pump is not None:

@@ -57,8 +57,19 @@ class Interlocks:
         return self.memory.last_mask
 
     def observe_reading(self, reading: BenchReading | None, state: State) -> list[Event]:
-        """Take the reading of a tick in a state; returns the events of circuits that have opened or
-        closed.
+        """Take the reading of a tick.
+
+        Parameters
+        ----------
+        reading : BenchReading or None
+            None without one: the circuits stay as they were.
+        state : State
+            Of the controller.
+
+        Returns
+        -------
+        list of Event
+            Of circuits that have opened or closed.
         """
         self.seen = reading is not None
         if reading is None:

@@ -26,7 +26,14 @@ class Repeats(StateNode):
     since_s: float = math.nan
 
     def same_s(self, value: float, now_s: float) -> float:
-        """Add a value and return the time in seconds; NaN changes nothing."""
+        """Add a value, and return for how long it has been the same.
+
+        Parameters
+        ----------
+        value : float
+            NaN changes nothing.
+        now_s : float
+        """
         if math.isfinite(value) and value != self.value:
             self.value = value
             self.since_s = now_s
@@ -109,7 +116,11 @@ class Observer:
     def observe_inputs(self, inputs: tick.TickInputs, may_follow_optics: bool = True) -> None:
         """Take the tick's reading and find what is new or a jump.
 
-        `may_follow_optics`: the estimate uses the figures; otherwise they replace no laser.
+        Parameters
+        ----------
+        inputs : TickInputs
+        may_follow_optics : bool
+            Whether the estimate uses the figures; otherwise they replace no laser.
         """
         reading = self.reading = inputs.reading
         self.link = inputs.link
@@ -189,8 +200,15 @@ class Observer:
         return self.figures.waited_s if self._by_optics else 0.0
 
     def make_observation(self, inputs: tick.TickInputs, error_um: float) -> Observation:
-        """Return what the inputs show, after `observe_inputs`; the control code fills in what it
-        knows itself.
+        """Return what the inputs show, after `observe_inputs`; the control code fills in what
+        it knows
+        itself.
+
+        Parameters
+        ----------
+        inputs : TickInputs
+        error_um : float
+            Setpoint less process value; NaN without one.
         """
         reading, now_s = self.reading, inputs.now_s
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan

@@ -197,7 +197,13 @@ class ProcessValueChoice:
         self._correlation = ErrorCorrelation(loop, estimator, self.memory.correlation)
 
     def set_loop(self, loop: LoopConfig, pump: PumpConfig, estimator: EstimatorConfig) -> None:
-        """Predict and compare with other settings, from the beginning."""
+        """Predict and compare with other settings, from the beginning.
+
+        Parameters
+        ----------
+        loop, pump, estimator
+            The settings of the two loops that are compared.
+        """
         self._loop = loop
         self._pump = pump
         self._estimator = estimator

@@ -53,11 +53,25 @@ class ResumeRule:
     def is_due(
         self, fault: Rule, levels: SafeLevels, observation: Observation, now_s: float
     ) -> bool:
-        """Observe a tick of a fault; True once its cause has been absent for long enough.
+        """Observe a tick of a fault.
 
         Sets `possible` (the fault may still clear automatically) and `clear_mask` (the board's
-        latches to clear for
-        that: the watchdog's, or none).
+        latches to clear for that: the watchdog's, or none).
+
+        Parameters
+        ----------
+        fault : Rule
+            The rule that tripped.
+        levels : SafeLevels
+            How deep the fault has gone.
+        observation : Observation
+            Of this tick.
+        now_s : float
+
+        Returns
+        -------
+        bool
+            True once its cause has been absent for long enough.
         """
         self.memory.never |= _needs_a_person(levels, observation)
         listed = fault.may_resume and fault.name in self._config.faults

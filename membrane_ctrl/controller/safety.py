@@ -468,11 +468,21 @@ class SafetyTable:
         self.memory = memory or SafetyState()
 
     def judge(self, state: State, observation: Observation) -> Verdict:
-        """Return the tripped rule with the deepest level, the first of equals. Judges all: every
-        history is complete.
+        """Judge an observation by all rules: every history is complete.
 
         Returning simply the first would let a lost laser, which only holds the flow, hide a lost
         pressure sensor.
+
+        Parameters
+        ----------
+        state : State
+            Of the controller: each rule states in which ones it applies.
+        observation : Observation
+
+        Returns
+        -------
+        Verdict
+            The tripped rule with the deepest level, the first of equals.
         """
         tripped: Rule | None = None
         deepest = SafeLevel.NONE

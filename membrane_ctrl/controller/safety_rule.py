@@ -57,8 +57,14 @@ class Rule:
         return self.safe_level > SafeLevel.HOLD_FLOW
 
     def fault(self, seen: str, safe_level: SafeLevel) -> Fault:
-        """The event of a tripped rule, with the observed value in words and the level that it
-        enters.
+        """Return the event of the tripped rule.
+
+        Parameters
+        ----------
+        seen : str
+            The observed value in words.
+        safe_level : SafeLevel
+            The level that it enters.
         """
         return Fault(
             code=self.code,

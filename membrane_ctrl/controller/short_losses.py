@@ -63,15 +63,31 @@ class ShortLossCounter:
         self.memory = memory or ShortLossesState()
 
     def begin_fault(self, fault: Fault, now_s: float) -> list[Event]:
-        """A fault that holds the flow begins: list it, unless such faults are counted."""
+        """Note that a fault that holds the flow begins.
+
+        Parameters
+        ----------
+        fault : Fault
+        now_s : float
+
+        Returns
+        -------
+        list of Event
+            The fault; empty while such faults are counted.
+        """
         memory = self.memory
         memory.began_s = now_s
         memory.withheld = memory.counts and fault.code == memory.code
         return [] if memory.withheld else [fault]
 
     def must_list(self, now_s: float, is_deeper: bool) -> bool:
-        """Whether a withheld fault is to be listed in this tick: it lasts, or the safe level is
-        deeper than that which holds the flow.
+        """Whether a withheld fault is to be listed in this tick.
+
+        Parameters
+        ----------
+        now_s : float
+        is_deeper : bool
+            Whether the safe level is deeper than that which holds the flow.
         """
         memory = self.memory
         if not memory.withheld or not (is_deeper or now_s - memory.began_s > _SHORT_S):
@@ -80,7 +96,21 @@ class ShortLossCounter:
         return True
 
     def end_fault(self, code: int, ended: Event, now_s: float) -> list[Event]:
-        """The cause of a fault that held the flow has gone: list that, or count the fault."""
+        """Note that the cause of a fault that held the flow has gone.
+
+        Parameters
+        ----------
+        code : int
+            Of the fault.
+        ended : Event
+            What to list.
+        now_s : float
+
+        Returns
+        -------
+        list of Event
+            `ended`, or none if the fault is counted.
+        """
         memory = self.memory
         events = [] if memory.withheld else [ended]
         if now_s - memory.began_s <= _SHORT_S:

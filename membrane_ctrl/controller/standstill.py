@@ -137,7 +137,17 @@ class Standstill:
         commanded: tuple[float, float],
         link_up: bool,
     ) -> None:
-        """Note a tick's reading, and the last two pump commands before it."""
+        """Note a tick's reading.
+
+        Parameters
+        ----------
+        now_s : float
+        reading : BenchReading or None
+        commanded : (float, float)
+            The last two pump commands before it.
+        link_up : bool
+            Whether the link is up; otherwise commands have not arrived.
+        """
         memory = self.memory
         if reading is not None or math.isnan(memory.read_s):
             memory.read_s = now_s

@@ -21,8 +21,17 @@ HANDLERS: dict[State, Callable[[TickContext], State]] = {
 
 
 def run_state(state: State, context: TickContext) -> State:
-    """Run the state's handler and return the next state; a request for another state takes
-    precedence.
+    """Run the state's handler.
+
+    Parameters
+    ----------
+    state : State
+    context : TickContext
+
+    Returns
+    -------
+    State
+        The next one; a request for another state takes precedence.
     """
     if context.config.states.observe:
         return states.observe(context)

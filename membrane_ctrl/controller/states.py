@@ -325,7 +325,15 @@ def observe(context: TickContext) -> State:
 
 
 def explain_way_down(context: TickContext, more: str = "") -> None:
-    """State why the mirror goes down, and at whose request; `more` follows in the sentence."""
+    """State why the mirror goes down, and at whose request.
+
+    Parameters
+    ----------
+    context : TickContext
+        Gets the reason.
+    more : str
+        What follows in the sentence.
+    """
     way = "vent" if context.venting and context.way_down == "lower" else str(context.way_down)
     who = (
         "the duration is over"
@@ -408,8 +416,15 @@ def _begin_loop(context: TickContext, leak_um_per_s: float) -> State:
 
 
 def drive_pump(context: TickContext, target_um: float) -> inner_loop.LoopOutput:
-    """Let the loop drive the pump: automatic with a new reading, the last output with one that
-    repeats, held mean flow without one.
+    """Let the loop drive the pump.
+
+    Automatic with a new reading, the last output with one that repeats, held mean flow without one.
+
+    Parameters
+    ----------
+    context : TickContext
+    target_um : float
+        Displacement to hold.
     """
     drive = context.loop.step
     if context.levels.safe_level != SafeLevel.NONE:

@@ -23,7 +23,22 @@ def make_telemetry_row(
     observation: Observation,
     shape: shape_loop.ShapeOutput,
 ) -> telemetry.TelemetryRow:
-    """The row of tick `number`; `fault` is the standing fault's code, 0 for none."""
+    """Return the row of a tick.
+
+    Parameters
+    ----------
+    context : TickContext
+        After the tick.
+    state : State
+    fault : int
+        Code of the standing fault, 0 for none.
+    number : int
+        Of the tick.
+    inputs : TickInputs
+    observation : Observation
+    shape : ShapeOutput
+        Of the shape loop.
+    """
     reading = inputs.reading or NO_READING
     out = context.output or inner_loop.LoopOutput()
     seen = context.estimate.telemetry() if context.estimate else {}

@@ -93,9 +93,16 @@ SNAPSHOT_MESSAGE_BYTES = SNAPSHOT_HEAD.size + SNAPSHOT_BYTES_MAX
 
 
 def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -> list[bytes]:
-    """Messages for the inputs ring, in order; the last one is the tick.
+    """Return the messages for the inputs ring, in order; the last one is the tick.
 
-    `tick` counts from 1, and `row` is the packed telemetry row of the outputs.
+    Parameters
+    ----------
+    tick : int
+        Its number, from 1.
+    inputs : TickInputs
+    outputs : TickOutputs
+    row : bytes
+        The packed telemetry row of the outputs.
     """
     tail = _pack_tail(inputs)
     reading, estimate = inputs.reading, inputs.estimate
@@ -117,7 +124,14 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -
 
 
 def pack_row(tick: int, row: telemetry.TelemetryRow) -> bytes:
-    """The message of a tick whose inputs cannot be packed: its row alone, a gap for a replay."""
+    """Return the message of a tick whose inputs cannot be packed: its row alone, a gap for a
+    replay.
+
+    Parameters
+    ----------
+    tick : int
+    row : TelemetryRow
+    """
     record = np.zeros(1, dtype=RECORD)
     for name, field in SAME.items():
         record[name] = getattr(row, field)
@@ -127,7 +141,15 @@ def pack_row(tick: int, row: telemetry.TelemetryRow) -> bytes:
 
 
 def pack_snapshot(tick: int, snapshot: bytes) -> bytes:
-    """The message for the ring of snapshots: what the controller remembers before a tick."""
+    """Return the message for the ring of snapshots.
+
+    Parameters
+    ----------
+    tick : int
+        The tick before which it was taken.
+    snapshot : bytes
+        What the controller remembers.
+    """
     return SNAPSHOT_HEAD.pack(tick) + snapshot
 
 
@@ -151,10 +173,21 @@ def _pack_tail(inputs: TickInputs) -> bytes:
 def unpack_tick(
     record: np.void, tail: bytes, estimates: Mapping[float, shape_estimate.ShapeEstimate]
 ) -> TickInputs:
-    """Return the bit-exact inputs of a tick; `tail` are its commands and ended tasks as JSON.
+    """Return the bit-exact inputs of a tick.
 
-    `estimates` are the run's shape estimates by time. Raises LookupError if an estimate or a tail
-    is missing.
+    Parameters
+    ----------
+    record : numpy record
+        Fixed part of the message.
+    tail : bytes
+        Its commands and ended tasks, as JSON.
+    estimates : mapping of ShapeEstimate
+        The run's shape estimates by time.
+
+    Raises
+    ------
+    LookupError
+        If an estimate or a tail is missing.
     """
     values: dict[str, Any] = dict(zip(RECORD.names or (), record.item(), strict=True))
     if len(tail) != values["tail_bytes"]:

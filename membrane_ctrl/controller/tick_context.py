@@ -112,7 +112,16 @@ class TickContext(TickContextState):
         self.trial_ended = None
 
     def explain(self, code: WhyCode, text: str, *details: object) -> None:
-        """Set why the pump is as it is; details, as who asked, make it another reason."""
+        """Set why the pump is as it is.
+
+        Parameters
+        ----------
+        code : WhyCode
+        text : str
+            For people.
+        details : object
+            What makes it another reason, as who asked.
+        """
         self.why = make_reason(code, text, *details)
 
     def drive_by(self, output: inner_loop.LoopOutput) -> None:
@@ -153,7 +162,15 @@ def collect_state_fields(memory: TickContextState) -> dict[str, Any]:
 
 
 def apply_command(context: TickContext, command: Command, state: telemetry.State) -> None:
-    """Take an accepted command's request into the context; the controller does the rest."""
+    """Take an accepted command's request into the context; the controller does the rest.
+
+    Parameters
+    ----------
+    context : TickContext
+    command : Command
+    state : State
+        Of the controller.
+    """
     match command.kind:
         case "hold":
             context.hold_wanted = True

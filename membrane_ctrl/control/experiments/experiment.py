@@ -49,4 +49,17 @@ class Experiment(Protocol):
     """A step machine."""
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
-        """Flow in µm/s until the next reading, or the end."""
+        """Run one tick.
+
+        Parameters
+        ----------
+        measurement : BenchSample
+            The reading; NaN for a lost one.
+        dt_s : float
+            Time since the last one.
+
+        Returns
+        -------
+        float or Finished
+            Flow in µm/s until the next reading, or the end with its reason.
+        """

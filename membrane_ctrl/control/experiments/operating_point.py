@@ -33,8 +33,19 @@ class OperatingPoint(StateNode):
 
 
 def choose_filters(around: OperatingPoint, rate_hz: float) -> OperatingPoint:
-    """With filters that leave the noise its share of the limit; if none does, the longest for the
-    usual delay.
+    """Return the operating point with filters that leave the noise its share of the limit.
+
+    Parameters
+    ----------
+    around : OperatingPoint
+        Its noise of a reading decides.
+    rate_hz : float
+        Ticks a second.
+
+    Returns
+    -------
+    OperatingPoint
+        With the longest filters for the usual delay if none suffices.
     """
     share_um = _IN_HAND_SHARE * around.limit_um / NOISE_MARGIN_SIGMAS
     for late_s, stretch in product((around.late_s, USUAL_LATE_S), _STRETCHES):
@@ -65,7 +76,15 @@ def require_room(around: OperatingPoint) -> tuple[float, float]:
 
 
 def describe_bleed_remedy(loss_um_per_s: float, least_um_per_s: float = 0.0) -> str:
-    """What to do where a mirror loses too little gas for the least flow of its pump."""
+    """Say what to do where a mirror loses too little gas for the least flow of its pump.
+
+    Parameters
+    ----------
+    loss_um_per_s : float
+        Leak and bleed, as speed of the centre.
+    least_um_per_s : float
+        Least flow of the running pump.
+    """
     more_um_per_s = max(0.3, 1.5 * least_um_per_s - loss_um_per_s)
     share = more_um_per_s / pump_curve.VENT_FULL_UM_PER_S
     return f"open the bleed by {more_um_per_s:.1f} µm/s (loop.bleed_fraction larger by {share:.3f})"

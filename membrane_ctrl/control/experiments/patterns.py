@@ -15,7 +15,17 @@ _SHARE = 0.25  # of the excursion limit: the weather, the pull and the laser's n
 
 
 def make_steps(around: operating_point.OperatingPoint, gain: float, hold_s: float = 2.0) -> Pattern:
-    """Up, back, down, back, each for `hold_s`: easy to judge by eye."""
+    """Make steps of the flow: up, back, down, back. Easy to judge by eye.
+
+    Parameters
+    ----------
+    around : OperatingPoint
+        Its range and its limit bound the steps.
+    gain : float
+        k of the mirror, as known so far.
+    hold_s : float
+        Duration of each level.
+    """
     up, down = operating_point.require_room(around)
     size = min(up, down, _SHARE * around.limit_um / (gain * hold_s))
     levels = (size, 0.0, -size, 0.0)
@@ -25,10 +35,19 @@ def make_steps(around: operating_point.OperatingPoint, gain: float, hold_s: floa
 def make_doublets(
     around: operating_point.OperatingPoint, gain: float, pulse_s: float = 0.3
 ) -> Pattern:
-    """Short pulses up, each followed by an equal one down: many steep edges, which separate dead
-    time from lag.
+    """Make doublets: short pulses up, each followed by an equal one down.
 
-    The downward flow is limited by the leak, so it takes longer; the mean flow is the holding flow.
+    Their many steep edges separate dead time from lag. The downward flow is limited by the leak, so
+    it takes longer; the mean flow is the holding flow.
+
+    Parameters
+    ----------
+    around : OperatingPoint
+        Its range and its limit bound the pulses.
+    gain : float
+        k of the mirror, as known so far.
+    pulse_s : float
+        Duration of a pulse up.
     """
     up, down = operating_point.require_room(around)
     size = min(up, _SHARE * around.limit_um / (gain * pulse_s))

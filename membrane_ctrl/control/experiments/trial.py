@@ -37,7 +37,16 @@ class TrialState(StateNode):
 def begin_trial(
     spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float
 ) -> TrialState:
-    """The state of an experiment that begins about `centre_um`."""
+    """Return the state of an experiment that begins.
+
+    Parameters
+    ----------
+    spec : ExperimentSpec
+    loop, pump : LoopConfig, PumpConfig
+        Range and rate of the flow.
+    centre_um : float
+        Displacement about which the mirror moves.
+    """
     around = operating_point.OperatingPoint(
         holding_flow_um_per_s=spec.holding_flow_um_per_s,
         least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
@@ -100,7 +109,20 @@ class Trial:
         return self.spec.kind == "pump_map"
 
     def step(self, measurement: experiment.BenchSample, dt_s: float) -> float | experiment.Finished:
-        """One tick: what to put out until the next reading, or the end."""
+        """Run one tick.
+
+        Parameters
+        ----------
+        measurement : BenchSample
+            The reading; NaN for a lost one.
+        dt_s : float
+            Time since the last one.
+
+        Returns
+        -------
+        float or Finished
+            What to put out until the next reading, or the end with its reason.
+        """
         self.memory.left_s -= dt_s
         if self.raw and self.memory.left_s < 0:
             return experiment.Finished(
