@@ -30,13 +30,27 @@ class Reconstructor(Protocol):
     def measure_full(
         self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray
     ) -> ShapeEstimate:
-        """Figure from sinusoids, Gray codes, white and black, in the order of the full sequence."""
+        """Measure a full cycle: sinusoids, Gray codes, white and black, in the order of the
+        full sequence.
+
+        Parameters
+        ----------
+        frames : sequence of (height, width) arrays
+        time_s, displacement_um : (frames,) arrays
+            Of each exposure; NaN where there is no laser reading.
+        """
 
     def measure_fringes(
         self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray
     ) -> ShapeEstimate:
-        """Figure from the frames after a full cycle alone,
-        tracked against the last absolute phase.
+        """Measure a cycle of the frames after a full cycle alone, tracked against the last
+        absolute phase.
+
+        Parameters
+        ----------
+        frames : sequence of (height, width) arrays
+        time_s, displacement_um : (frames,) arrays
+            Of each exposure; NaN where there is no laser reading.
         """
 
     def prepare(self) -> None:

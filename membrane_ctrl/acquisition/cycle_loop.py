@@ -30,9 +30,20 @@ def keep_cycling(
 ) -> None:
     """Take cycles until stopped.
 
-    A cycle must end early when `remote.interrupts()`; one longer than `period_s()` skips the
-    deadlines it covers. `publish` gets every estimate, whatever its verdict. `keep` writes the
-    frames of a cycle and returns the set's folder, or raises OSError with the reason.
+    Parameters
+    ----------
+    taking : ShapeCycle
+        Takes one cycle; it must end early when `remote.interrupts()`.
+    remote : Remote
+        The other end of the process: stop, requests, reports.
+    publish : callable
+        Gets every estimate, whatever its verdict.
+    clock : CycleClock
+    period_s : callable
+        The period at present; a longer cycle skips the deadlines it covers.
+    keep : callable
+        Writes the frames of a cycle and returns the set's folder, or raises OSError with the
+        reason.
     """
     due_s = clock.now()
     while not remote.stop:
@@ -68,7 +79,16 @@ def keep_cycling(
 
 
 def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
-    """The first of `last_s + k period_s`, k >= 1, that is not before `earliest_s`."""
+    """The first of `last_s + k period_s`, k >= 1, that is not too early.
+
+    Parameters
+    ----------
+    last_s : float
+        The last deadline.
+    period_s : float
+    earliest_s : float
+        The result is not before it.
+    """
     return last_s + max(1, math.ceil((earliest_s - last_s) / period_s)) * period_s
 
 

@@ -48,7 +48,20 @@ class DisplayTest:
         self.settle_s = LONG_S
 
     def check_exposure(self, full_scale_adu: int, exposure_ms: float) -> str:
-        """The problem with the camera's exposure; empty without one."""
+        """Find what is wrong with the camera's exposure.
+
+        Parameters
+        ----------
+        full_scale_adu : int
+            Count of a saturated pixel.
+        exposure_ms : float
+            For the message.
+
+        Returns
+        -------
+        str
+            The problem, for people; empty without one.
+        """
         white = self._expose_still(self._make_grey(255))
         black = self._expose_still(self._make_grey(0))
         return exposure_check.explain_exposure(white, black, full_scale_adu, exposure_ms)

@@ -89,9 +89,25 @@ class Exposures:
     def expose_patterns(
         self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]
     ) -> list[Frame] | None:
-        """Take frames of these patterns, in order; None if `stopping` before an exposure.
+        """Take frames of patterns, in order.
 
-        Raises StageError ("screen" or "camera", and the failure).
+        Parameters
+        ----------
+        patterns : sequence of Pattern
+        cycle : int
+            Number that the frames carry.
+        stopping : callable
+            Whether to give up, asked before each exposure.
+
+        Returns
+        -------
+        list of Frame or None
+            None if it was stopped.
+
+        Raises
+        ------
+        StageError
+            "screen" or "camera", and the failure.
         """
         try:
             return self._expose_in_order(patterns, cycle, stopping)

@@ -23,7 +23,15 @@ _SCREEN = "devices.screen"
 
 
 def format_finding(name: str, measure: Callable[[], str]) -> str:
-    """A finding with its subject, or an empty text. A failed measurement is a finding."""
+    """Measure something, and return a finding with its subject; a failed measurement is a finding.
+
+    Parameters
+    ----------
+    name : str
+        The subject.
+    measure : callable
+        Returns the finding, empty without one.
+    """
     try:
         problem = measure()
     except ValueError as error:
@@ -47,10 +55,20 @@ class OpticalBench:
 
 
 def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
-    """The drivers named in `[devices.camera]` and `[devices.screen]`, not yet open.
+    """Return the drivers named in `[devices.camera]` and `[devices.screen]`, not yet open.
 
-    Raises LinkError if the configuration names none, or the patterns do not fit on the screen;
-    InputError for a driver that is not installed, does not load or refuses its settings.
+    Parameters
+    ----------
+    config : Config
+    clock : CycleClock
+        The drivers wait by it.
+
+    Raises
+    ------
+    LinkError
+        If the configuration names none, or the patterns do not fit on the screen.
+    InputError
+        For a driver that is not installed, does not load or refuses its settings.
     """
     devices = config.devices
     if devices is None or devices.camera is None:
@@ -64,10 +82,21 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
 
 
 def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> OpticalBench:
-    """The twin's camera and screen; drivers of other packages that have an emulator take their
-    places.
+    """Return the twin's camera and screen.
 
-    Raises InputError for a driver or emulator that does not load or refuses its settings.
+    Drivers of other packages that have an emulator take their places.
+
+    Parameters
+    ----------
+    config : Config
+    clock : CycleClock
+    optics : TwinOptics
+        Renders the frames.
+
+    Raises
+    ------
+    InputError
+        For a driver or emulator that does not load or refuses its settings.
     """
     camera: Any = optics.camera
     screen: Any = optics.screen
@@ -160,8 +189,23 @@ class BenchFindings:
 def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchFindings:
     """Connect the camera and screen, and measure the screen with the camera.
 
-    Problems found do not stop a run, as each cycle is judged. Raises LinkError if camera or screen
-    is missing or unusable.
+    Problems found do not stop a run, as each cycle is judged.
+
+    Parameters
+    ----------
+    bench : OpticalBench
+    config : Config
+    clock : CycleClock
+
+    Returns
+    -------
+    BenchFindings
+        Identities, and problems for people.
+
+    Raises
+    ------
+    LinkError
+        If camera or screen is missing or unusable.
     """
     who = ""
     if isinstance(bench.camera, GuardedCamera):

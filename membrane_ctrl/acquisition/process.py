@@ -20,8 +20,19 @@ def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
     """Measure the shape until stopped: target of a `spawn`ed process.
 
     Ends on "stop" over `control`, on `processes.STOP`, and when the parent has died. Reports go
-    back over `control` as lines of events (`run_events.AcquisitionState`). Raises SystemExit with 1
-    if it cannot work at all (after a report of the reason).
+    back over `control` as lines of events (`run_events.AcquisitionState`).
+
+    Parameters
+    ----------
+    spec : AcquisitionSpec
+        What to measure, and the rings.
+    control : Connection
+        Pipe to the control process.
+
+    Raises
+    ------
+    SystemExit
+        With 1 if it cannot work at all, after a report of the reason.
     """
     os.nice(max(0, _NICENESS - os.nice(0)))
     signal.signal(signal.SIGINT, signal.SIG_IGN)

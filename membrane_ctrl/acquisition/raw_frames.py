@@ -128,9 +128,23 @@ class RawFrames:
             self._reference_needed = is_due
 
     def write_capture(self, estimate: ShapeEstimate, turned_deg: float | None = None) -> Path:
-        """Write a cycle's frames and wait; returns the set's folder. Raises OSError.
+        """Write a cycle's frames and wait.
 
-        `turned_deg` is the angle of a mirror that was turned about its axis, which the set states.
+        Parameters
+        ----------
+        estimate : ShapeEstimate
+            Of the cycle whose frames are written.
+        turned_deg : float or None
+            Angle of a mirror that was turned about its axis, which the set states.
+
+        Returns
+        -------
+        path
+            The set's folder.
+
+        Raises
+        ------
+        OSError
         """
         kept = self._copy_and_queue(estimate.cycle)
         wait(write.done for write in self._writing)

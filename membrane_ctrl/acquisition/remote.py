@@ -83,10 +83,20 @@ class Remote:
         cycle: int | None = None,
         traceback: str | None = None,
     ) -> None:
-        """Send a report that differs from the last one: in weeks of recording, good cycles need no
-        reports.
+        """Send a report that differs from the last one.
 
-        It is dropped if the other end does not read: the cycle must never wait.
+        In weeks of recording, good cycles need no reports. It is dropped if the other end does not
+        read: the cycle must never wait.
+
+        Parameters
+        ----------
+        state : AcquisitionState
+        message : str
+            For people.
+        cycle : int, optional
+            The cycle that it is about.
+        traceback : str, optional
+            Of an unexpected error, for the log.
         """
         if (state, message) == self._said:
             return

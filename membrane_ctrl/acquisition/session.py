@@ -42,6 +42,12 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
     released and a compiling kernel cannot check for it; afterwards it ends the cycle at its next
     exposure.
 
+    Parameters
+    ----------
+    spec : AcquisitionSpec
+    remote : Remote
+        The other end of the process.
+
     Raises
     ------
     LinkError

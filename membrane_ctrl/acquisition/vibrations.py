@@ -28,8 +28,14 @@ def make_vibration_handler(
     """Make the function that gets each figure and returns the events of the mirror's vibrations.
 
     The modes continue from the run's last acquisition, or from the newest earlier run with the same
-    devices in the folder of runs: a film that moved in between is reported, too. They are stored in
-    the run's folder.
+    devices in the folder of runs: a film that moved in between is reported, too.
+
+    Parameters
+    ----------
+    config : Config
+    clock : RunClock
+    run_dir : path or None
+        Where they are stored; None: nowhere.
     """
     known = None
     if run_dir is not None:

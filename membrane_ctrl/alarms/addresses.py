@@ -50,11 +50,20 @@ def require_sendable(config: AlarmsConfig) -> None:
 
 
 def apprise_senders(config: AlarmsConfig, run: str) -> list[Send]:
-    """One sender for `urls_file`, one for `escalation_urls_file` if it is set; every message names
-    the run.
+    """Return one sender for `urls_file`, and one for `escalation_urls_file` if it is set.
 
-    Raises DeviceError without Apprise, InputError for a bad file or URL. The error gives only the
-    URL's line: it may hold a password.
+    Parameters
+    ----------
+    config : AlarmsConfig
+    run : str
+        Name of the run, which every message names.
+
+    Raises
+    ------
+    DeviceError
+        Without Apprise.
+    InputError
+        For a bad file or URL. The error gives only the URL's line: it may hold a password.
     """
     apprise = _import_apprise()
     assert config.urls_file is not None

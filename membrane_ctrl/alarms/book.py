@@ -39,7 +39,14 @@ class Sign:
 
 
 def signs_of(changes: NoticeChanges, condition_s: float = math.nan) -> list[Sign]:
-    """Signs in the notices that an event closes and opens; `condition_s` is the event's time."""
+    """Return the signs in the notices that an event closes and opens.
+
+    Parameters
+    ----------
+    changes : NoticeChanges
+    condition_s : float
+        Time of the event.
+    """
     cleared = [Sign(key.alarm, False, about=key.subject) for key in changes.closed]
     appeared = [
         Sign(
@@ -58,9 +65,20 @@ def signs_of(changes: NoticeChanges, condition_s: float = math.nan) -> list[Sign
 
 
 def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:
-    """Sign of a telemetry value for a rule whose condition was `standing`; None if nothing changes.
+    """Return the sign of a telemetry value for a rule.
 
-    NaN changes nothing: missing values are the safety table's task.
+    Parameters
+    ----------
+    rule : AlarmRule
+    value : float
+        NaN changes nothing: missing values are the safety table's task.
+    standing : bool
+        Whether the rule's condition was there before.
+
+    Returns
+    -------
+    Sign or None
+        None if nothing changes.
     """
     if math.isnan(value):
         return None

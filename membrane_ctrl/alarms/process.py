@@ -42,9 +42,14 @@ class AlarmsSpec:
 
 
 def alarms_main(spec: AlarmsSpec, status: Any) -> None:
-    """Watch until the run ends or the control process has gone.
+    """Watch until the run ends or the control process has gone: target of a `spawn`ed process.
 
-    Target of a `spawn`ed process; `status` is its end of a pipe, for events about sent messages.
+    Parameters
+    ----------
+    spec : AlarmsSpec
+        Rings of the run, and its configuration.
+    status : Connection
+        Its end of a pipe, for events about sent messages.
     """
     child.leave_at_stop()
     senders = apprise_senders(spec.config, spec.run_dir.name)
@@ -58,8 +63,17 @@ def watch_run(
     report: Callable[[Event], None],
     parent_lives: Callable[[], bool],
 ) -> None:
-    """Run the process's loop; `senders` are the one for all messages and the one for escalated
-    ones.
+    """Run the process's loop.
+
+    Parameters
+    ----------
+    spec : AlarmsSpec
+    senders : sequence of Send
+        The one for all messages, and the one for escalated ones.
+    report : callable
+        Gets events about sent messages.
+    parent_lives : callable
+        Whether the control process is still there.
     """
     clock = spec.clock
     with (

@@ -55,8 +55,18 @@ class Service:
 
 
 def send_to_all(services: Sequence[Service], title: str, body: str, kind: str) -> bool:
-    """Send a message to every service; one success suffices: a dead chat server must not repeat the
-    mail forever.
+    """Send a message to every service.
+
+    Parameters
+    ----------
+    services : sequence of Service
+    title, body, kind : str
+        As Apprise takes them.
+
+    Returns
+    -------
+    bool
+        Whether one accepted it: a dead chat server must not repeat the mail forever.
     """
     until_s = time.monotonic() + SERVICE_S
     for service in services:

@@ -111,7 +111,16 @@ class SentLog:
             os.pwrite(self._lock, f"{time.monotonic():016.3f}\n".encode(), 0)
 
     def note_attempt(self, message: AlarmMessage, to: str, at_s: float, accepted: bool) -> None:
-        """Record an attempt to send a message to a list of services."""
+        """Record an attempt to send a message.
+
+        Parameters
+        ----------
+        message : AlarmMessage
+        to : str
+            Name of the list of services.
+        at_s : float
+        accepted : bool
+        """
         fields = asdict(message)
         if math.isnan(message.condition_s):
             fields["condition_s"] = None

@@ -41,12 +41,26 @@ class Watcher:
         return self._status.ended
 
     def start_sending(self, sent: Sequence[SentMessage], now_s: float) -> None:
-        """Become the sender, after others that have sent messages of this run."""
+        """Become the sender, after others that have sent messages of this run.
+
+        Parameters
+        ----------
+        sent : sequence of SentMessage
+            Those of the others.
+        now_s : float
+        """
         self.is_sender = True
         self._book.adopt_sent(sent, now_s)
 
     def process_news(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
-        """Take rows and events, and send due messages."""
+        """Take rows and events, and send due messages.
+
+        Parameters
+        ----------
+        rows, events : sequence of bytes
+            As they were in the rings.
+        now_s : float
+        """
         self.take_news(rows, events, now_s)
         self.send_due(now_s)
 

@@ -11,9 +11,21 @@ _ENDS_S = 10.0
 
 
 def start_autotune(socket: Path | None, run_dir: Path) -> Callable[[], None]:
-    """Start a tuning session, which waits for the hold, on trial; returns how to end it.
+    """Start a tuning session, which waits for the hold, on trial.
 
     It is another program, as if a person had started it: a hold needs no tuner, and outlives it.
+
+    Parameters
+    ----------
+    socket : path or None
+        Control port of the hold.
+    run_dir : path
+        Gets `autotune.log`.
+
+    Returns
+    -------
+    callable
+        Ends the session.
     """
     words = [
         "--short",

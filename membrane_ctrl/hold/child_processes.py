@@ -44,7 +44,17 @@ class Rings:
 
 
 def make_rings(config: Config, truth: RingAddress | None, stack: ExitStack) -> Rings:
-    """Make the rings; the stack frees their memory."""
+    """Make the rings of a run.
+
+    Parameters
+    ----------
+    config : Config
+        Their sizes follow from its rates.
+    truth : RingAddress or None
+        The ring of the twin's true states, if there is one.
+    stack : ExitStack
+        Frees their memory.
+    """
     kept = round(_TELEMETRY_KEPT_S * config.loop.rate_hz)
     rows = stack.enter_context(open_ring(kept, telemetry.ROW_BYTES))
     events = stack.enter_context(open_ring(_EVENTS_KEPT, EVENT_BYTES))

@@ -73,8 +73,17 @@ class RunEnd:
             self.fault = standing_fault_after(self.fault, event)
 
     def judge_exit(self, finished: errors.Exit, is_standby: bool) -> errors.Exit:
-        """Return the exit code of a run that has ended: one whose duration is over before it has
-        held has not done what it was started for, unless it was to wait in standby.
+        """Return the exit code of a run that has ended.
+
+        A run whose duration is over before it has held has not done what it was started for, unless
+        it was to wait in standby.
+
+        Parameters
+        ----------
+        finished : Exit
+            What the last tick gave.
+        is_standby : bool
+            Whether the run was to wait in standby.
         """
         if finished is errors.Exit.DONE and not self.has_held and not is_standby:
             return errors.Exit.REJECTED
@@ -117,7 +126,16 @@ class PageAtEnd:
 def print_closing_report(
     run_dir: Path, as_json: bool, closing: RunEnd | None = None, page: PageAtEnd | None = None
 ) -> None:
-    """Print how the run ended, a fault first, then its result, its folder and the page's link."""
+    """Print how the run ended, a fault first, then its result, its folder and the page's link.
+
+    Parameters
+    ----------
+    run_dir : path
+    as_json : bool
+    closing : RunEnd or None
+        None if the ticks never ran.
+    page : PageAtEnd or None
+    """
     if closing is not None:
         for line in make_closing_lines(closing):
             print(line, file=sys.stderr)

@@ -26,10 +26,30 @@ _CONSOLE_STOPS_S = 3.0
 
 
 def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) -> int:
-    """Play a scenario, given its name or its file, and record it as a run in `logs_dir`.
+    """Play a scenario and record it as a run.
 
-    Raises InputError for an unknown or invalid scenario, DeviceError if the folder cannot be
-    written.
+    Parameters
+    ----------
+    word : str
+        Its name or its file.
+    logs_dir : path
+        Folder of the runs.
+    name : str or None
+        Of the run folder; that of the scenario by default.
+    real_time : bool
+        Play it in real time, with the console.
+
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    InputError
+        For an unknown or invalid scenario.
+    DeviceError
+        If the folder cannot be written.
     """
     path = scenarios.find_scenario(word)
     played = scenario_file.load_scenario(path, scenario_file.Scenario)

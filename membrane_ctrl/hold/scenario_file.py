@@ -120,7 +120,17 @@ class Scenario(Section):
 
 
 def load_scenario(path: Path, model: type[S]) -> S:
-    """Read a scenario. Raises InputError: one line that names the file, the field and what would be
-    right.
+    """Read a scenario.
+
+    Parameters
+    ----------
+    path : path
+    model : type
+        Its schema.
+
+    Raises
+    ------
+    InputError
+        One line that names the file, the field and what would be right.
     """
     return toml_file.load_toml(path, model)

@@ -41,10 +41,23 @@ def require_possible(devices: DevicesConfig, lab: bool) -> None:
 def open_latched_fault(
     config: Config, logs_dir: Path, options: HoldOptions
 ) -> latched_fault.LatchedFile | None:
-    """The file of a latched fault, which outlives a run; the twin has one only if configured.
+    """Open the file of a latched fault, which outlives a run.
 
-    Raises DeviceError if a fault is latched, unless it is to be cleared or the run starts in
-    standby.
+    Parameters
+    ----------
+    config : Config
+    logs_dir : path
+    options : HoldOptions
+
+    Returns
+    -------
+    LatchedFile or None
+        The twin has one only if configured.
+
+    Raises
+    ------
+    DeviceError
+        If a fault is latched, unless it is to be cleared or the run starts in standby.
     """
     if options.twin and not config.states.latch_twin_faults:
         return None
@@ -66,11 +79,22 @@ def open_latched_fault(
 
 
 def find_locks(config: Config, options: HoldOptions) -> LockStorage | None:
-    """Return where the run keeps its locks, with those that are set; the twin keeps them only if
-    configured.
+    """Find where the run keeps its locks, with those that are set.
 
-    Raises DeviceError if there are any, unless the run starts in standby, where a person can remove
-    them.
+    Parameters
+    ----------
+    config : Config
+    options : HoldOptions
+
+    Returns
+    -------
+    LockStorage or None
+        The twin keeps them only if configured.
+
+    Raises
+    ------
+    DeviceError
+        If there are any, unless the run starts in standby, where a person can remove them.
     """
     if options.twin and not config.states.latch_twin_faults:
         return None
@@ -101,8 +125,19 @@ async def identify_board(
     options: HoldOptions,
     resumes: latched_fault.ResumeLog | None = None,
 ) -> BoardAtStart:
-    """Identify the devices and check their fitness before making a run folder. Raises DeviceError
-    or InputError.
+    """Identify the devices and check their fitness before making a run folder.
+
+    Parameters
+    ----------
+    bench : Bench
+    config : Config
+    options : HoldOptions
+    resumes : ResumeLog or None
+        Restarts by the resume rule so far.
+
+    Raises
+    ------
+    DeviceError, InputError
     """
     devices = config.devices
     assert devices is not None

@@ -134,8 +134,16 @@ class Supervisor:
     async def tick(
         self, now_s: float, dt_s: float, late_s: float
     ) -> tuple[TickInputs, TickOutputs]:
-        """Run one tick: read, decide, write, record. It starts at `now_s`, `late_s` after its
-        deadline.
+        """Run one tick: read, decide, write, record.
+
+        Parameters
+        ----------
+        now_s : float
+            When it starts.
+        dt_s : float
+            Time since the last one.
+        late_s : float
+            Time since its deadline.
         """
         wiring = self._wiring
         self.ticks += 1

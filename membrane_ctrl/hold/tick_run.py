@@ -54,7 +54,15 @@ class HoldResources:
 
 
 async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
-    """Run the ticks; `closing` gets the exit code and the fault in which the run ends."""
+    """Run the ticks until one ends the run.
+
+    Parameters
+    ----------
+    parts : HoldResources
+        Everything that was opened for them.
+    closing : RunEnd
+        Gets the exit code and the fault in which the run ends.
+    """
     from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 
     bench, config, options = parts.bench, parts.config, parts.options

@@ -15,9 +15,18 @@ from membrane_ctrl.model.errors import InputError
 
 
 def make_bench(devices: DevicesConfig, observe: bool = False) -> roles.Bench:
-    """The configured bench, not yet connected; one that is only read if it is to `observe`.
+    """Make the configured bench, not yet connected.
 
-    Raises InputError for impossible devices.
+    Parameters
+    ----------
+    devices : DevicesConfig
+    observe : bool
+        Whether it is only to be read.
+
+    Raises
+    ------
+    InputError
+        For impossible devices.
     """
     require_separate_ports(devices)
     links = modbus_rtu.ModbusLinks()

@@ -18,7 +18,16 @@ T = TypeVar("T")
 async def connect_bench(bench: roles.Bench, devices: DevicesConfig) -> roles.BenchIdentity:
     """Open the bench; retry while a device is absent, fail at once if it is the wrong device.
 
-    Raises DeviceError, naming the device and the problem in one line.
+    Parameters
+    ----------
+    bench : Bench
+    devices : DevicesConfig
+        For the messages.
+
+    Raises
+    ------
+    DeviceError
+        Naming the device and the problem in one line.
     """
     # a bench of roles names the role itself
     return await retry_connecting(bench.open, devices.board or "devices")

@@ -20,7 +20,18 @@ def name_of(section: Any) -> str:
 def check_settings(section: Any, where: str, kind: driver_kind.DriverKind) -> settings.Section:
     """Return the settings that a driver gets; a package's own class checks the table of its driver.
 
-    Raises InputError (no such driver, one without settings, or a key that its class refuses).
+    Parameters
+    ----------
+    section : Section
+        The table, as the configuration has it.
+    where : str
+        Its name, for the messages.
+    kind : DriverKind
+
+    Raises
+    ------
+    InputError
+        No such driver, one without settings, or a key that its class refuses.
     """
     if not isinstance(section, settings.ExternalSection):
         checked: settings.Section = section  # when the configuration was read

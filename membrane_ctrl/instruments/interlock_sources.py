@@ -22,7 +22,19 @@ Member = tuple[int, settings.ModbusInputConfig | settings.GpioLineConfig]
 
 
 def list_polled_sources(devices: DevicesConfig, links: ModbusLinks) -> list[PolledSource]:
-    """The sources, not yet opened. Raises InputError for a link or a missing package."""
+    """List the sources of interlocks, not yet opened.
+
+    Parameters
+    ----------
+    devices : DevicesConfig
+    links : ModbusLinks
+        Serial lines that several devices share.
+
+    Raises
+    ------
+    InputError
+        For a link or a missing package.
+    """
     return [_make_source(members, links) for members in _by_device(devices).values()]
 
 

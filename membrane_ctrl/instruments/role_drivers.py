@@ -13,9 +13,18 @@ from membrane_ctrl.model.errors import InputError
 def make_role_devices(
     devices: DevicesConfig, links: modbus_rtu.ModbusLinks | None = None
 ) -> role_bench.RoleDevices:
-    """The drivers named in the tables, not yet connected; those on one serial bus share it.
+    """Make the drivers named in the tables, not yet connected.
 
-    Raises InputError for a port, URL, preset or setting that the driver does not accept.
+    Parameters
+    ----------
+    devices : DevicesConfig
+    links : ModbusLinks, optional
+        Serial lines: drivers on one of them share it.
+
+    Raises
+    ------
+    InputError
+        For a port, URL, preset or setting that the driver does not accept.
     """
     links = links or modbus_rtu.ModbusLinks()
     made: dict[str, Any] = {}

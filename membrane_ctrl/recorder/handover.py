@@ -65,10 +65,19 @@ class RecorderState(StateNode):
 
 
 def save_state(run_dir: Path, state: RecorderState) -> None:
-    """Write the state atomically. Raises OSError.
+    """Write the state atomically.
 
     Not synced: it serves after a killed recorder, not after a power cut, which also loses the
     rings.
+
+    Parameters
+    ----------
+    run_dir : path
+    state : RecorderState
+
+    Raises
+    ------
+    OSError
     """
     part = run_dir / f"{_NAME}.part"
     with files.fresh_file(part) as file:

@@ -53,7 +53,14 @@ class Housekeeping:
                 self._optimizer.add_segment(path)
 
     def watch_disk(self, now_s: float, closed: list[Path]) -> None:
-        """Watch the disk and continue pending work; `closed` are segments to optimise."""
+        """Watch the disk and continue pending work.
+
+        Parameters
+        ----------
+        now_s : float
+        closed : list of path
+            Segments that were closed since, to be optimised.
+        """
         self._errors.run_guarded("disk check", self._watch_disk)
         self._queue_segments(closed)
         self._errors.run_guarded("optimise", self._optimizer.poll_worker)

@@ -22,7 +22,14 @@ class RecorderErrors:
         self._trouble: dict[str, str] = {}
 
     def run_guarded(self, what: str, action: Callable[[], None]) -> None:
-        """Run a call; report its failure and let the recorder continue."""
+        """Run a call; report its failure and let the recorder continue.
+
+        Parameters
+        ----------
+        what : str
+            Identifies it in reports.
+        action : callable
+        """
         try:
             action()
         except (OSError, RecordingError) as error:
@@ -40,7 +47,17 @@ class RecorderErrors:
     def report_error(
         self, what: str, message: str, as_: type[RecorderError | DiskLow] = RecorderError
     ) -> None:
-        """Report an error once until it changes; `what` identifies it for `report_recovered`."""
+        """Report an error once, until it changes.
+
+        Parameters
+        ----------
+        what : str
+            Identifies it for `report_recovered`.
+        message : str
+            For people.
+        as_ : type of event
+            `RecorderError` or `DiskLow`.
+        """
         if self._trouble.get(what) != message:
             self._trouble[what] = message
             self.errors += as_ is RecorderError
@@ -52,8 +69,14 @@ class RecorderErrors:
             self.report(RecorderRecovered(what, f"{what} works again"))
 
     def clear_errors(self, prefix: str, but: set[str]) -> None:
-        """Report as over all errors that start with `prefix` and are not in `but`: their cause has
-        gone.
+        """Report some errors as over: their cause has gone.
+
+        Parameters
+        ----------
+        prefix : str
+            How they begin.
+        but : set of str
+            Those that stay.
         """
         for what in [what for what in self._trouble if what.startswith(prefix) and what not in but]:
             self.report_recovered(what)

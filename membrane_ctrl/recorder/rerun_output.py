@@ -65,7 +65,24 @@ class RerunOutput:
         thumbnails: Sequence[Thumbnail],
         detail: DetailLevel,
     ) -> bool:
-        """Send one second of data and sync it; False if Rerun lost it."""
+        """Send one second of data and sync it.
+
+        Parameters
+        ----------
+        now_s : float
+        rows : Rows
+            Telemetry.
+        events : list of EventLine
+        shapes : list of ShapeEstimate
+        thumbnails : sequence of Thumbnail
+        detail : DetailLevel
+            What is left out where the disk is nearly full.
+
+        Returns
+        -------
+        bool
+            False if Rerun lost it.
+        """
         self._errors.run_guarded("shape reference", lambda: self._watch_hold(rows))
         if detail == DetailLevel.ESSENTIAL:
             self._pause_output()

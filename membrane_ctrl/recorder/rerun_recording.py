@@ -162,7 +162,16 @@ class Recording:
     def send_columns(
         self, path: str, time_s: FloatArray, columns: Iterable[rr.ComponentColumn]
     ) -> None:
-        """Send rows of one entity at (n,) times of the run."""
+        """Send rows of one entity.
+
+        Parameters
+        ----------
+        path : str
+            Of the entity.
+        time_s : (n,) array
+            Times of the run.
+        columns : iterable of ComponentColumn
+        """
         nanoseconds = np.round(time_s * 1e9).astype("timedelta64[ns]")
         indexes = [
             rr.TimeColumn(RUN_TIME, duration=nanoseconds),
@@ -171,13 +180,31 @@ class Recording:
         self._stream.send_columns(path, indexes=indexes, columns=columns)
 
     def send_scalars(self, path: str, time_s: FloatArray, values: FloatArray) -> None:
-        """Send (n, m) values of one entity at (n,) times of the run."""
+        """Send values of one entity.
+
+        Parameters
+        ----------
+        path : str
+            Of the entity.
+        time_s : (n,) array
+            Times of the run.
+        values : (n, m) array
+        """
         self.send_columns(path, time_s, rr.Scalars.columns(scalars=values))
 
     def send_measurements(
         self, path: str, time_s: FloatArray, values: FloatArray, variances: FloatArray
     ) -> None:
-        """Send (n, m) values of one entity with their variances at (n,) times of the run."""
+        """Send values of one entity with their variances.
+
+        Parameters
+        ----------
+        path : str
+            Of the entity.
+        time_s : (n,) array
+            Times of the run.
+        values, variances : (n, m) arrays
+        """
         self.send_columns(path, time_s, rr.Measurements.columns(values=values, variances=variances))
 
     def log_component(self, path: str, time_s: float, archetype: rr.AsComponents) -> None:

@@ -39,7 +39,15 @@ CHANGES = {
 
 
 def colour_span(values: AnyArray, least_um: float | None) -> tuple[float, float]:
-    """Range of colours for nearly all of some maps: from 0, or around it if `least_um` is given."""
+    """Range of colours for nearly all of some maps.
+
+    Parameters
+    ----------
+    values : array
+        Of any shape; NaN is left out.
+    least_um : float or None
+        Least half width of a range around 0; None: the range begins at 0.
+    """
     most = float(np.nanquantile(np.abs(values), _NEARLY_ALL))
     if least_um is None:
         return (0.0, most)

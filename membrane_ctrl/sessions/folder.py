@@ -74,8 +74,20 @@ class SessionFolder:
         return text
 
     def read_result(self, step: str, name: str, kind: type[T]) -> T:
-        """Read a step's result. Raises InputError if the step is not done,
-        or the file is damaged.
+        """Read a step's result.
+
+        Parameters
+        ----------
+        step : str
+        name : str
+            Of its file.
+        kind : type
+            What the file holds.
+
+        Raises
+        ------
+        InputError
+            If the step is not done, or the file is damaged.
         """
         self.require_done(step)
         return read_session_file(self.file_path(name), kind)
@@ -107,7 +119,16 @@ class SessionFolder:
 def restart_session(
     session: SessionFolder, before: schema.LoopConfig, pump: schema.PumpConfig
 ) -> SessionFolder:
-    """Restart the session on other gains and another curve of the pump, which are in use."""
+    """Restart the session on other gains and another curve of the pump, which are in use.
+
+    Parameters
+    ----------
+    session : SessionFolder
+    before : LoopConfig
+        The gains from which it starts.
+    pump : PumpConfig
+        The curve.
+    """
     session.begin_step(STEPS[0])
     head = replace(session.head, before=before)
     config = session.config.model_copy(update={"loop": before, "pump": pump})
@@ -150,9 +171,25 @@ class Head(Protocol):
 def begin_session(
     parent: Path, name: str, head: Head, config: schema.Config, head_schema: str = SCHEMA
 ) -> Path:
-    """Make the folder of a session; `head_schema`: format with version of its `session.json`.
+    """Make the folder of a session.
 
-    Raises InputError for a bad name, DeviceError if it cannot be written.
+    Parameters
+    ----------
+    parent : path
+        Folder of the sessions.
+    name : str
+    head : Head
+        Content of its `session.json`.
+    config : Config
+    head_schema : str
+        Format of that file, with its version.
+
+    Raises
+    ------
+    InputError
+        For a bad name.
+    DeviceError
+        If it cannot be written.
     """
     path = make_session_folder(parent, name, datetime.fromisoformat(head.created_utc))
     with errors.convert_write_errors(path, errors.DeviceError):
@@ -162,8 +199,20 @@ def begin_session(
 
 
 def read_session(path: Path, kind: type[H], head_schema: str = SCHEMA) -> tuple[H, schema.Config]:
-    """Read head and configuration of a session whose `session.json` has the format `head_schema`.
-    Raises InputError if it is not one.
+    """Read head and configuration of a session.
+
+    Parameters
+    ----------
+    path : path
+    kind : type
+        Of the head.
+    head_schema : str
+        Format that its `session.json` must have.
+
+    Raises
+    ------
+    InputError
+        If it is not one.
     """
     head = read_session_file(path / "session.json", kind, head_schema)
     return head, toml_file.load_toml(path / "config.toml", schema.Config)
@@ -182,7 +231,24 @@ def create_session(
     config: schema.Config,
     before: schema.LoopConfig,
 ) -> SessionFolder:
-    """Start a tuning session; raises like `begin_session`."""
+    """Start a tuning session.
+
+    Parameters
+    ----------
+    logs : path
+        Folder of the runs.
+    name, author : str
+    source : str
+        Name of the hold, or "twin".
+    config : Config
+    before : LoopConfig
+        The gains in use.
+
+    Raises
+    ------
+    InputError, DeviceError
+        As `begin_session`.
+    """
     head = SessionHead(name, author, source, now_utc(), before)
     return SessionFolder(begin_session(logs / "tuning", name, head, config), head, config)
 

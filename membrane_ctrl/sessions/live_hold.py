@@ -212,11 +212,27 @@ def _read_settings(kind: type[_S], answer: Message, key: str) -> _S:
 def live_hold(
     where: Where, take_over: bool, needs_operate: str = "", wait: bool = False, session: str = ""
 ) -> Iterator[LiveHold]:
-    """Yield a link to the selected hold; InputError if `needs_operate` names a command and the role
-    is read.
+    """Yield a link to the selected hold.
 
-    `wait` for a run that starts, until its mirror is held; DeviceError if it ends before. With
-    `session`, command is claimed under this name.
+    Parameters
+    ----------
+    where : Where
+        The hold.
+    take_over : bool
+        Take command from the client that has it.
+    needs_operate : str
+        Name of the command that needs the role `operate`; empty if it only reads.
+    wait : bool
+        Wait for a run that starts, until its mirror is held.
+    session : str
+        Name under which command is claimed; empty: it is not.
+
+    Raises
+    ------
+    InputError
+        If the role does not suffice.
+    DeviceError
+        If there is no hold, or it ends before its mirror is held.
     """
     socket = socket_path(where)
     until_s = time.monotonic() + (_STARTS_S if wait else 0.0)

@@ -71,8 +71,18 @@ class LiveLog:
         self._append_entry({what: line, "utc": folder.now_utc(), **more})
 
     def pop_answer(self, question: str, among: Sequence[str]) -> "PageAnswer | None":
-        """Take the answer to a question from the page; None if there is none, or it is to another,
-        or not `among`.
+        """Take the answer to a question from the page.
+
+        Parameters
+        ----------
+        question : str
+        among : sequence of str
+            The answers that count.
+
+        Returns
+        -------
+        PageAnswer or None
+            None if there is none, or it is to another question.
         """
         path = self._path.with_name(ANSWER)
         try:

@@ -33,8 +33,17 @@ class Progress:
     def begin_step(
         self, step: str, planned_s: float, after_s: float, longest_s: float = 0.0
     ) -> None:
-        """Start a step with its planned duration, and that of the later steps; `longest_s` is its
-        duration where the planned one does not suffice.
+        """Start a step.
+
+        Parameters
+        ----------
+        step : str
+        planned_s : float
+            Its expected duration.
+        after_s : float
+            That of the later steps.
+        longest_s : float
+            Its duration where the planned one does not suffice.
         """
         self._step = step
         self._planned_s = planned_s
@@ -88,10 +97,20 @@ class Progress:
             print(line, file=sys.stderr, flush=True)
 
     def ask_question(self, question: str, among: Sequence[str] = ()) -> str:
-        """Ask on the terminal, and on the page too if the answers are `among` some; the first
-        answer counts.
+        """Ask on the terminal, and on the page too; the first answer counts.
 
-        It is empty at the end of the input, and for none of them. Ctrl-C interrupts at once.
+        Ctrl-C interrupts at once.
+
+        Parameters
+        ----------
+        question : str
+        among : sequence of str
+            The answers that the page offers; empty: it does not ask.
+
+        Returns
+        -------
+        str
+            Empty at the end of the input, and for none of them.
         """
         if self.log is not None:
             self.log.pop_answer("", ())  # one that came too late for the last question
