@@ -149,15 +149,18 @@ def parse_values(data: bytes) -> list[tuple[int, int, bytes]]:
     chained = False
     last_group = False
     while at < len(data):
+        # A process number begins a group; its top bit announces another group.
         if not chained:
             if last_group:
                 raise ValueError("bytes after the last process")
             group, last_group = data[at] & 0x7F, not data[at] & 0x80
             at += 1
+        # A parameter: its number, its type, and whether another one of this process follows.
         index = data[at] & 0x1F
         kind = data[at] & 0x60
         chained = bool(data[at] & 0x80)
         at += 1
+        # A string has its length in front, or ends with a zero; other types have fixed sizes.
         if kind == 0x60:
             size, at = data[at], at + 1
             if size == 0:  # ends with a 0

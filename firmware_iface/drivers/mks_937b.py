@@ -62,6 +62,7 @@ class Mks937b(line_link.LineDriver):
 
     async def _begin(self) -> roles.DeviceIdentity:
         config = self._config
+        # Is it the configured instrument?
         model, serial, firmware = [
             await self._query_gauge(command) for command in ("MD?", "SN?", "FV6?")
         ]
@@ -73,6 +74,7 @@ class Mks937b(line_link.LineDriver):
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: {model} is not a {' or '.join(_MODELS)}"
             )
+        # Does its channel have a manometer? Each module has two channels.
         module = "ABC"[(config.channel - 1) // 2]
         kinds = _SENSORS.fullmatch(await self._query_gauge(f"ST{module}?"))
         kind = kinds[1 + (config.channel - 1) % 2] if kinds else "none"
@@ -82,6 +84,7 @@ class Mks937b(line_link.LineDriver):
                 f"{_MANOMETER}, "
                 "a capacitance manometer"
             )
+        # Its unit, set and read back.
         await self._query_gauge("U!PASCAL")
         await self._require_pascal()
         await self._reading_pa()  # the gate wants a second reading to confirm the first

@@ -248,12 +248,14 @@ class SerialExchange:
 
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
+        # Bytes that belong to no present question: a late answer, an echo, or noise.
         self._last_byte_s = asyncio.get_running_loop().time()
         is_late = self._completes_abandoned(data)
         if self._answer is None or self._answer.done() or self._question is None:
             self._noisy |= bool(data.strip(self._blank))  # unsolicited
             self._echoes |= self._is_second_copy(data)
             return
+        # More than the answer and an echo can have.
         question = self._question
         self._buffer += data
         if len(self._buffer) > question.answer_bytes + _EXTRA_BYTES_MAX:
@@ -261,11 +263,13 @@ class SerialExchange:
                 LinkError(f"{self.port.name}: {len(self._buffer)} bytes without an answer")
             )
             return
+        # An adapter that echoes gives the question first.
         is_echo = self._buffer.startswith(question.data)
         if is_echo and not question.answer_repeats:
             if len(self._buffer) > len(question.data):
                 self._answer.set_exception(DeviceRefusedError(f"{question.what}: {_ECHO}"))
             return
+        # A whole answer ends the exchange; a bad one is explained by the likeliest cause.
         try:
             answer = question.extract_answer(self._buffer)
         except LinkError as error:

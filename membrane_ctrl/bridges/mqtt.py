@@ -260,6 +260,7 @@ async def _publish_and_obey(
         else:
             _handle_command(message, bridge, reports)
 
+    # The broker announces the bridge as offline if its connection breaks.
     availability = Availability()
     reports = Reports(publish_answer, _REPORT_PAUSE_S)
     will = aiomqtt.Will(f"{base}/availability", "offline", qos=1, retain=True)
@@ -271,6 +272,7 @@ async def _publish_and_obey(
         if config.discovery_prefix:
             topic = f"{config.discovery_prefix}/device/membrane_{bridge.settings.name}/config"
             await client.publish(topic, json.dumps(discovery(bridge, base)), qos=1, retain=True)
+        # Until the connection ends; the values are published meanwhile.
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(_wait_for_disconnect(client))

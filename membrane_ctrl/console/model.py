@@ -183,6 +183,7 @@ class ConsoleModel:
 
     def make_view(self, now_s: float) -> ConsoleView:
         """The content at a time of the run's clock."""
+        # State and next step, once there is a tick.
         status, row = self._status, self._status.row
         state = telemetry.State.STANDBY
         next_step = ""
@@ -195,6 +196,7 @@ class ConsoleModel:
             )
             age_s = now_s - row.mono_s
             held_s = now_s - self._started_s
+        # Figures of the last minute's error.
         errors_um = self._error.finite_values()
         std_um = in_band = math.nan
         if errors_um:

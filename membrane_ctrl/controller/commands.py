@@ -90,18 +90,21 @@ def explain_refusal(command: Command, state: State, config: Config) -> str:
     str
         Empty if it can.
     """
+    # What no person sends: the start of a run tells the tick of earlier runs.
     if command.kind == "resumed" or command.kind == "latched":
         return (
             ""
             if command.who == AT_START
             else "only the start of a run may report earlier resumes and faults"
         )
+    # Allowed in this run, and in this state?
     if config.states.observe and command.kind not in _OBSERVING:
         return "this run only observes (states.observe): it commands neither pump nor vent"
     rule = TABLE[command.kind]
     if state not in rule.states:
         where = ", ".join(sorted(s.name.lower() for s in rule.states))
         return f"{command.kind} is not allowed in state {state.name.lower()}; allowed in {where}"
+    # Values that the present configuration does not allow.
     if command.kind == "shape_off" and config.by_optics:
         return "the mirror is held by the optics alone (estimator.process_value)"
     if command.kind == "setpoint":

@@ -512,6 +512,7 @@ class Controller:
         """Enter the safe level of the verdict; every level below HOLD_FLOW latches the fault."""
         levels, losses, now_s = self._context.levels, self._short_losses, self._context.now_s
         events += losses.report_count(now_s)
+        # No rule trips: a level that only held the flow is over; deeper ones stay latched.
         rule = verdict.rule
         if rule is None:
             if levels.safe_level == SafeLevel.HOLD_FLOW:
@@ -523,12 +524,14 @@ class Controller:
                     events += losses.end_fault(self.fault.code, cleared, now_s)
                 self.fault = None
             return
+        # A fault begins, or a deeper one takes its place.
         if verdict.safe_level > SafeLevel.HOLD_FLOW >= levels.safe_level:
             self.fault = rule
             events.append(rule.fault(verdict.seen, verdict.safe_level))
         elif self.fault is None:
             self.fault = rule
             events += losses.begin_fault(rule.fault(verdict.seen, verdict.safe_level), now_s)
+        # The level deepens with time, too: a fault that held the flow becomes one that ramps down.
         levels.enter(verdict.safe_level, now_s)
         is_deeper = levels.step(now_s) > SafeLevel.HOLD_FLOW
         if losses.must_list(now_s, is_deeper):

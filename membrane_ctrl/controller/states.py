@@ -182,12 +182,14 @@ def tune(context: TickContext) -> State:
     """Run an experiment inside its guard; however it ends, the loop resumes at the holding flow."""
     trial = context.trial
     assert trial is not None  # made by the command that leads here
+    # The reading that the experiment and its guard follow.
     given = _make_loop_input(context, context.setpoint_um)
     measuring_um = math.nan if context.laser_doubted else context.observer.moving_laser_um
     seen_um = given.displacement_um if context.config.by_optics else measuring_um
     if context.config.by_optics and given.estimate is not None and math.isfinite(seen_um):
         seen_um = given.estimate.um  # a figure is of a moment ago
     measurement = BenchSample(seen_um, given.ambient_pressure_pa, given.air_temperature_c)
+    # The experiment ends by a person, by the safety table, or by itself; else it asks for a flow.
     wanted: float | Finished
     if context.hold_wanted:
         wanted = Finished(ExperimentEnd.INTERRUPTED, f"ended by {context.asked_by}")
@@ -195,6 +197,7 @@ def tune(context: TickContext) -> State:
         wanted = Finished(ExperimentEnd.INTERRUPTED, "the safety table holds the mean flow")
     else:
         wanted = trial.step(measurement, context.dt_s)
+    # At its end the loop takes over at the mean flow, not at the flow of a moment.
     if isinstance(wanted, Finished):
         context.drive_by(
             context.loop.resume_at_mean(given, trial.spec.holding_flow_um_per_s, context.dt_s)
@@ -264,6 +267,7 @@ def fault(context: TickContext) -> State:
     )
     context.hold_wanted = False
     context.vent_fraction = float(context.venting or safe_level == SafeLevel.VENT)
+    # The pump's command falls evenly from where it was; in the other levels it is off.
     if safe_level == SafeLevel.RAMP_DOWN:
         if context.state_age_s == 0:
             context.ramp_from_fraction = context.last_pump_fraction
@@ -272,6 +276,8 @@ def fault(context: TickContext) -> State:
         )
         context.pump_fraction = left * context.ramp_from_fraction
         return State.FAULT
+    # Out of the fault: acknowledged by a person, or by the resume rule; the pump must have been
+    # seen to stand still.
     stops = context.way_down == "stop"
     stand = context.standstill
     silent = stand.silent_s > context.config.states.lower_timeout_s
@@ -282,6 +288,7 @@ def fault(context: TickContext) -> State:
         context.hold_wanted = True
         context.explain(WhyCode.RESUMING, "the cause is gone; resuming automatically")
         return State.STANDBY
+    # Or the run ends, once the mirror is at rest.
     may_end = stops or not (context.config.states.stay_after_trip or context.resume_possible)
     if may_end and (stand.at_rest or silent or _is_lowered(context, safe_level)):
         context.finished = Exit.SAFETY_TRIP

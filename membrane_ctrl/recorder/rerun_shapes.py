@@ -98,6 +98,7 @@ class ShapeStreams:
 
         Of single frames of one verdict, one a second is sent.
         """
+        # Single frames come faster than anybody sees.
         if (
             estimate.kind == "track"
             and estimate.verdict == self._verdict
@@ -105,6 +106,7 @@ class ShapeStreams:
         ):
             return
         self._next_frame_s = estimate.time_s + FRAME_INTERVAL_S
+        # Quality and verdict, of rejected ones as well.
         time_s = np.array([estimate.time_s])
         for stream, values in _make_quality_scalars(estimate).items():
             self._recording.send_scalars(stream.path, time_s, np.array([values]))
@@ -123,6 +125,7 @@ class ShapeStreams:
             self._next_difference_s = -math.inf
             self._next_map_s = -math.inf
             self._scatter = shapes.Scatter()
+        # Terms, and their change since the reference.
         self._scatter.add(estimate.coeffs_um)
         self._recording.send_scalars(streams.ZERNIKE.path, time_s, estimate.coeffs_um[np.newaxis])
         for stream, (values, variances) in _make_change_scalars(estimate, self.reference).items():
@@ -133,6 +136,7 @@ class ShapeStreams:
             self._fall.append(
                 (estimate.coeffs_um - self.reference.coeffs_um)[shapes.WATERFALL_TERMS]
             )
+        # Maps, unless pictures are omitted on a full disk.
         if self.pictures:
             self._send_maps(estimate, self.reference)
             self._send_fall(estimate.time_s, estimate.time_s - self.reference.time_s < EARLY_S)

@@ -143,6 +143,7 @@ def replay_command(
     """
     if from_s >= to_s:
         raise InputError(f"--from {from_s:g}s is not before --to {to_s:g}s")
+    # Replay the part.
     run = open_recorded(folder)
     started_s = time.perf_counter()
     begin, found = _replay_part(run, from_s, to_s)
@@ -154,6 +155,7 @@ def replay_command(
         raise InputError(f"{folder}: no tick to replay{part}{why}")
     if found.last_s < from_s:
         raise InputError(f"{folder}: --from {from_s:g}s: the record ends at {found.last_s:.1f} s")
+    # Report it.
     report = _make_report(run, found, begin, to_s)
     remembered = found.state if state else None
     if as_json:
@@ -166,6 +168,7 @@ def replay_command(
         if remembered is not None:
             print(f"state      after the tick at {found.last_s:.3f} s:")
             print("\n".join(describe_tree(remembered)))
+    # Make a test of it, if asked for.
     rate = found.ticks / took_s if took_s else math.inf
     print(f"{found.ticks} ticks in {took_s:.1f} s ({rate:.0f} a second)", file=sys.stderr)
     if to_test is not None:
@@ -339,6 +342,7 @@ def write_incident(
     Raises InputError if the name is invalid or taken, the folder is missing, or the test is too
     large for a repository.
     """
+    # A name of its own in the project's folder.
     if not _NAME.fullmatch(name):
         raise InputError(f"--to-test {name!r}: use small letters, digits, '-' and '_'")
     if not incidents.is_dir():
@@ -347,6 +351,7 @@ def write_incident(
     if folder.exists():
         raise InputError(f"{folder}: already exists; choose another name")
     folder.mkdir()
+    # Its inputs, as a run of the part alone.
     kept = RunTables(folder)
     for frame in _select_between(run.inputs.start_at_snapshot(found.begin_s), begin, to_s):
         kept.add_ticks(
@@ -356,6 +361,7 @@ def write_incident(
             kept.add_shape(estimate)
         kept.sync_tables()
     kept.close()
+    # What it is, and the decisions that it must reproduce.
     about = {
         **file_origin(SCHEMA),
         "what": f"replay of {run.folder.resolve().name}",
@@ -367,6 +373,7 @@ def write_incident(
     }
     (folder / "incident.toml").write_text(tomli_w.dumps(about), encoding="utf-8")
     (folder / "config.toml").write_text(toml_file.dump_toml(run.config), encoding="utf-8")
+    # Too large for a repository?
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     if size > _BYTES_MAX:
         shutil.rmtree(folder)

@@ -451,15 +451,18 @@ def thinned(series: Series, span_s: float) -> Series:
     """The series in windows of equal length, at most `_POINTS_MAX`; a NaN row after each gap."""
     if not series.utc_s.size:
         return series
+    # The first row of each window.
     window_s = max(1.0, math.ceil(span_s / _POINTS_MAX))
     number = np.floor(series.utc_s / window_s)
     starts = np.flatnonzero(np.diff(number, prepend=number[0] - 1))
+    # Extremes and mean of the known values of each window.
     low = np.fmin.reduceat(series.low, starts)
     high = np.fmax.reduceat(series.high, starts)
     known = np.isfinite(series.mean)
     total = np.add.reduceat(np.where(known, series.mean, 0.0), starts)
     with np.errstate(invalid="ignore"):
         mean = total / np.add.reduceat(known.astype(float), starts)
+    # A gap is longer than several of the usual steps.
     utc_s = number[starts] * window_s
     step_s = max(window_s, float(np.median(np.diff(utc_s)))) if utc_s.size > 1 else window_s
     gaps = np.flatnonzero(np.diff(utc_s) > _GAP * step_s) + 1

@@ -115,11 +115,13 @@ class LoginMiddleware:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
+        # Requests that no browser of ours sends end here.
         headers = _texts(scope)
         refusal = malformation(scope) or self._foreign(headers)
         if refusal is not None:
             await self._refuse(scope, send, refusal)
             return
+        # Who is it? A person by the session's cookie, or a program by its token.
         cookies = _cookies(headers)
         user = self._accounts.user_of_session(scope["session"])
         authorization = headers.get("authorization", "")
@@ -131,6 +133,7 @@ class LoginMiddleware:
                 return
         if user is not None:
             self._guard.mark_known(scope.get("client"))
+        # A login, a known user, or somebody who has neither.
         if scope.get("method") == "POST" and self._address.path_inside(scope["path"]) == LOGIN_PATH:
             await self._log_in(scope, receive, send, cookies.get(DEVICE_COOKIE, ""))
         elif user is not None:

@@ -31,6 +31,7 @@ class _HoldCollector(Collector):
         for name, seen in self._holds.items():
             up.add_metric([name], float(not seen.silent))
         yield up
+        # Further metrics are of holds that answer: state, locks, recording.
         known = {name: seen.status for name, seen in self._holds.items() if not seen.silent}
         states = GaugeMetricFamily(
             "membrane_in_state", "1: the hold is in this state", labels=("hold", "state")
@@ -46,6 +47,7 @@ class _HoldCollector(Collector):
             locks.add_metric([name], float(len(status.get("locks") or ())))
             recording.add_metric([name], float(bool(status.get("recording_ok", True))))
         yield from (states, locks, recording)
+        # One metric for each telemetry column.
         for column in COLUMNS.values():
             about = f"{column.title}: {column.description}"
             family = CounterMetricFamily if column.name in _COUNTERS else GaugeMetricFamily

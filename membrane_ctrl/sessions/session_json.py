@@ -55,6 +55,7 @@ def build_value(kind: type[T], data: Any) -> T:
 
 
 def _build_plain(kind: Any, data: Any) -> Any:
+    # Generic types: optional, one of several words, tuples, arrays.
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         if data is None:
@@ -71,6 +72,7 @@ def _build_plain(kind: Any, data: Any) -> Any:
         return tuple(_build_plain(a, item) for a, item in zip(inner, data, strict=True))
     if origin is np.ndarray:
         return np.array(data, dtype=float)
+    # Objects, field by field.
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return kind.model_validate(data)
     if is_dataclass(kind):
@@ -78,6 +80,7 @@ def _build_plain(kind: Any, data: Any) -> Any:
         return cast(Any, kind)(
             **{f.name: _build_plain(hints[f.name], data[f.name]) for f in fields(kind)}
         )
+    # Plain values.
     value = kind(data)
     if isinstance(value, float) and _LARGEST < abs(value) < math.inf:
         raise ValueError(f"{value:g} is not a plausible quantity")

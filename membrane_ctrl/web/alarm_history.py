@@ -106,6 +106,7 @@ def find_alarms(
 
     for each in log:
         event, time_s = each.event, began_s + each.mono_s
+        # A fault ends when it is cleared, and when another one takes its place.
         before, fault = fault, standing_fault_after(fault, event)
         if fault is None and before is not None:
             end_alarm("fault", time_s)
@@ -113,6 +114,7 @@ def find_alarms(
             end_alarm("fault", time_s)
             standing["fault"] = PastAlarm(event.name, event.sentence, time_s, math.nan, run, True)
             continue
+        # Notices that the event closes and opens.
         changes = event.notice_changes({}) if _may_change(event) else None
         for key in changes.closed if changes else ():
             end_alarm(key, time_s)

@@ -45,6 +45,7 @@ def stack_panels(
         Title and options of the vertical axis, and the lines, which name their panel as
         `xAxisIndex` and `yAxisIndex`; from the top.
     """
+    # All panels have the same height, in per cent of the chart.
     title, axis = horizontal
     count = len(panels)
     height = 80.0 / count - 3.0
@@ -52,6 +53,7 @@ def stack_panels(
     for place, (y_title, y_axis, lines) in enumerate(panels):
         top = 8.0 + place * (height + 5.0)
         grids.append({"left": 64, "right": 16, "top": f"{top:.1f}%", "height": f"{height:.1f}%"})
+        # Only the lowest one has times.
         is_lowest = place == count - 1
         x_axis = {**make_axis(title if is_lowest else "", 26), **axis, "gridIndex": place}
         if not is_lowest:

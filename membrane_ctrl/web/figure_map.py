@@ -73,6 +73,7 @@ def make_figure_map(
     radius_mm : float or None
         Of the mirror, for the axes.
     """
+    # The map, without the removed terms.
     is_change = reference is not None
     if reference is not None:
         height_um = shapes.difference_map_um(figure, reference)
@@ -81,6 +82,7 @@ def make_figure_map(
     indices = [index for name, group in REMOVABLE.items() if name in removed for index in group]
     if indices:
         height_um = shapes.without_noll_terms(height_um, indices)
+    # Its figures, and the range of its colours.
     measured = np.isfinite(height_um)
     values_um = height_um[measured].astype(np.float64)
     peak_to_valley_um = float(np.ptp(values_um))
@@ -90,6 +92,7 @@ def make_figure_map(
         high_um = max(abs(low_um), abs(high_um), _LEAST_SCALE_UM)
         low_um = -high_um
     span_um = max(high_um - low_um, _LEAST_SCALE_UM)
+    # Heights as steps of that range: a browser needs no floats.
     steps = np.round(_STEPS * (height_um - low_um) / span_um)
     title = "change" if is_change else "height above the vertex"
     without = f" without {', '.join(sorted(removed))}" if removed else ""

@@ -248,6 +248,7 @@ class GainsViews:
         from tuning.proposal.candidate import PRESENT, find_refusal
         from tuning.proposal.gain_search import Demands
 
+        # The gains that were asked for, as the sliders can give them.
         loaded = self._load(hold, name)
         of = loaded.of
         named = of.named_gains
@@ -259,6 +260,7 @@ class GainsViews:
         else:
             gains = Sliders(*setting).within_reach(of.model, dt_s).make_gains(of.model, dt_s)
         gains = gains.round_to_four_digits()
+        # Curves of the present gains, of those that the sliders began at, and of theirs.
         shown = {each: named[each] for each in dict.fromkeys((PRESENT, start))}
         duration_s = max(find_duration_s(each, of.model) for each in shown.values())
         found = {each: loaded.compute_named(each, duration_s) for each in shown}

@@ -149,6 +149,7 @@ def _list_findings(
     model, sigma = identified.model, identified.sigma
     refused: list[FitFinding] = []
     degraded: list[FitFinding] = []
+    # Is there a record, and does it show an answer?
     if record.lost_fraction > _LOST_MAX:
         lost = f"{record.lost_fraction:.0%} of the readings were lost"
         refused.append(FitFinding(f"{lost}: check the laser (without one, the camera), repeat"))
@@ -156,6 +157,7 @@ def _list_findings(
         known = f"k = {model.gain:.2f} +- {sigma.gain:.2f}"
         refused.append(_suspect_pump(f"the mirror did not answer the pump ({known})"))
         return refused, degraded
+    # Jumps, and parameters that are hardly known.
     if identified.largest_residual > JUMP_SIGMAS:
         at_s = float(np.argmax(np.abs(identified.residual_um))) * record.dt_s
         refused.append(FitFinding(f"the mirror jumped at {at_s:.1f} s (a door?): repeat the relay"))
@@ -173,7 +175,9 @@ def _list_findings(
         refused.append(
             FitFinding(f"the delay is known to {sigma.delay_s:.2f} s only: {LARGER_LIMIT}")
         )
+    # One gain for the whole range of the pump?
     refused.extend(find_bent_curve(record, identified))
+    # Residuals of the right model are white, and independent of the flow.
     if identified.independence_p < _P_MIN:
         degraded.append(
             _suspect_pump("the residuals follow the flow (a saturating or sticking pump?)")

@@ -48,6 +48,7 @@ def try_time_constant(
     `earlier` shapes let both trackers settle. If the session ends, or is killed, the hold takes it
     back by itself.
     """
+    # Hold with the new one, on trial: the hold itself restores the former if this session ends.
     before_s, after_s = times_s
     why = "shape loop: time constant"
     rig.set_gains(rig.loop, why, duration_s + _SPARE_S, after_s)
@@ -57,12 +58,14 @@ def try_time_constant(
     except BaseException:  # Ctrl-C above all
         rig.set_gains(rig.loop, f"{why}: interrupted", _BACK_S)
         raise
+    # What either time constant would have predicted of each next shape.
     during = [shape for shape in rig.shapes[begun:] if shape.verdict != "rejected"]
     tracking = float(np.mean([row.shape_state == ShapeState.TRACKING for row in rows]))
     gaps = compute_gaps_um([*earlier, *during], assumed)
     error_before_um, error_um = (
         _prediction_error(*gaps, memory_s, len(during)) for memory_s in (before_s, after_s)
     )
+    # Kept only if the loop tracked, and predicts as well as before.
     reason = ""
     if len(during) < LEAST_CYCLES or tracking < _TRACKING_LEAST:
         reason = (

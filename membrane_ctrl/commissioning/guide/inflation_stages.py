@@ -140,6 +140,7 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
             "laser against gauge", "the mirror was filled already: fewer than three depths"
         )
         return
+    # Weighted least squares for the gauge's zero p0 and the factor c.
     cubes = np.array([point.sag_mm**3 for point in points])
     pressures_pa = np.array([point.pressure_pa for point in points])
     weights = 1.0 / np.maximum(_LAW_PA, 0.02 * pressures_pa)
@@ -147,6 +148,7 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
     fitted, *_ = np.linalg.lstsq(matrix * weights[:, None], pressures_pa * weights, rcond=None)
     zero_pa, factor = float(fitted[0]), float(fitted[1])
     expected_pa = matrix @ fitted
+    # Each depth against the fit, as a share of its pressure.
     scatter = np.abs(pressures_pa - expected_pa) / np.maximum(expected_pa, 0.1 * expected_pa[-1])
     context.judge(
         "pressure against depth, difference from the film's law",
@@ -154,6 +156,7 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
         thresholds.FIT_SCATTER,
         "laser or gauge is not linear, or the laser's zero is not where the bowl has its depth",
     )
+    # The stiffness that the factor shows, against the stated one.
     design = derive_design(context.facts)
     ratio = factor * context.facts.sag_mm**3 / design.pressure_pa
     context.judge(
@@ -164,6 +167,7 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
     )
     context.note("gauge zero by the fit", f"{zero_pa:+.1f} Pa")
     context.note("pressure at the last depth", f"{pressures_pa[-1]:.1f} Pa")
+    # The pressure at the full depth is measured now.
     if abs(points[-1].sag_mm - context.facts.sag_mm) < _FULL_SHARE * context.facts.sag_mm:
         context.set_keys("optics.mirror", pressure_pa=round(float(pressures_pa[-1]), 1))
 
@@ -175,6 +179,7 @@ def measure_leak(context: StageContext) -> None:
             hold_depth(context, link, context.config.loop.setpoint_um)
             held = collect_rows(link, context.plan.settled_s)
             link.send_command(Command("lower", _WHO))
+            # Ticks with the pump off.
             rows = [
                 row
                 for row in collect_rows(link, context.plan.leak_s)
@@ -184,6 +189,7 @@ def measure_leak(context: StageContext) -> None:
         raise StageFailedError(f"the controller ended it: {error}") from None
     if len(rows) < 10:
         raise StageFailedError("the pump did not stay off")
+    # The mirror sinks evenly in a minute: the slope of a straight line.
     times_s = np.array([row.mono_s for row in rows])
     leak_um_per_s = -float(np.polyfit(times_s, [row.displacement_um for row in rows], 1)[0])
     context.judge(
@@ -206,6 +212,7 @@ def measure_leak(context: StageContext) -> None:
     )
     estimated = float(np.mean([row.leak_um_per_s for row in held]))
     context.note("leak as the controller estimates it", f"{estimated:.2f} µm/s")
+    # w0 / (3 T) is the speed: with it the twin leaks as this mirror does.
     time_constant_s = 1e3 * context.facts.sag_mm / (3.0 * max(leak_um_per_s, 1e-6))
     context.set_keys("twin", leak_time_constant_s=float(f"{time_constant_s:.4g}"))
     context.note("time constant of the leak", format_duration(time_constant_s))

@@ -80,6 +80,7 @@ def measure_figure(context: StageContext) -> None:
     try:
         with context.access.start_hold(context.folder, context.config, "figure") as link:
             hold_depth(context, link, context.config.loop.setpoint_um)
+            # Figures come with the news of the hold, every two seconds.
             found: list[ShapeEstimate] = []
             waited_s = 0.0
             while len(found) < _FIGURES and waited_s < _FIGURES_WITHIN_S:

@@ -25,6 +25,7 @@ SCHEMA = "membrane-report/1"
 def make_verdict(analysis: Analysis) -> tuple[Word, str]:
     """A word that selects the colour, and the verdict as a sentence."""
     run, ticks = analysis.run, analysis.ticks
+    # The simulated bench knows the true error; a real one has the readings.
     series = analysis.true or analysis.reading
     whole = format_span(ticks.end_s - ticks.start_s)
     names = [anomaly.name for anomaly in analysis.anomalies]
@@ -43,6 +44,7 @@ def make_verdict(analysis: Analysis) -> tuple[Word, str]:
         seconds.std_um,
         seconds.in_band,
     )
+    # What there was besides the hold.
     parts = []
     if ticks.unread_s >= _UNREAD_LEAST_S:
         parts.append(f"{format_span(ticks.unread_s)} of it without a reading")

@@ -98,6 +98,7 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
     InputError
         If the part has no ticks.
     """
+    # The 1 s level shows events, the figure, and what could not be judged.
     seconds = run.level(1.0, start_s, end_s, LEVEL_COLUMNS)
     if not seconds["time_s"].size:
         known = "".join(f"; {note}" for note in run.notes)
@@ -108,9 +109,11 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
     found, shape = _find_events_and_shape(run, seconds, start_s, end_s)
     unjudged = list_unjudged(seconds)
     del seconds  # a month takes a quarter of a GB, and the next steps need more
+    # One pass over the ticks; a coarser level for the pictures of a long run.
     ticks = hold_pass(run, span_s, (start_s, end_s))
     level_s = next((w for w in (1.0, 10.0) if (span_s[1] - span_s[0]) / w <= _PICTURE_ROWS), 60.0)
     level = run.level(level_s, start_s, end_s)
+    # The figures of the error, and what is unusual in them.
     reading = describe_error(run, ticks, READING)
     true = describe_error(run, ticks, TRUE)
     benefit = _compute_benefit(run, ticks, true is not None)

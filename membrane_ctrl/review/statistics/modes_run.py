@@ -122,6 +122,7 @@ def _read_frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
     """Times, terms (n, terms) with NaN where rejected, and the UTC of time 0.
     Raises CommandError.
     """
+    # From a run's tables, or from the result of tracking.
     if is_run(folder):
         run = open_run(folder)
         shapes, origin_s = run.shapes(), run.origin_utc.timestamp()
@@ -149,6 +150,7 @@ def _read_frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
                 f"{path}: coeffs_um: {found} numbers where times x terms are {wanted}"
             )
         origin_s, verdict = 0.0, np.full(time_s.size, "")  # rejected frames are NaN
+    # Accepted frames in the order of their times.
     good = (
         np.isfinite(time_s)
         & (verdict != "rejected")
@@ -161,6 +163,7 @@ def _read_frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
     )
     if time_s.size < 2:
         raise errors.RejectedError(f"{folder}: no usable figures")
+    # Slow figures alias all vibrations.
     interval_s = float(np.median(np.diff(time_s)))
     if not interval_s * LEAST_RATE_HZ <= 1:
         raise errors.RejectedError(
