@@ -72,6 +72,7 @@ def make_record(table: Mapping[str, Any]) -> bytes:
         raise BoardSettingsError(f'parity is {parity!r}, expected "N", "E" or "O"')
     channels = table.get("channel", {})
     _check_keys("channel.", channels, set(CHANNELS))
+    # The common settings, each channel's scale, and the guards of the pump, in words of 32 bits.
     body = struct.pack(
         ">6I",
         _read_whole(table, "unit_id", 1, 247, 1),

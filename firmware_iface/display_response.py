@@ -61,6 +61,7 @@ def make_measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayRes
         or np.any(np.diff(shown) <= 0)
     ):
         raise ValueError("a ramp has rising levels from 0 to 255, and one reading each")
+    # The camera must see a ramp that rises and does not saturate.
     swing_adu = seen[-1] - seen[0]
     if not np.isfinite(seen).all() or swing_adu < _LEAST_SWING_ADU:
         raise ValueError(
@@ -73,5 +74,6 @@ def make_measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayRes
         )
     if np.count_nonzero(light > 0.995) > 2:
         raise ValueError("the ramp saturates; lower the camera's exposure_ms")
+    # Noise may let it fall a little: an inverse needs a rising curve.
     rising = np.maximum.accumulate(light) + 1e-9 * np.arange(light.size)
     return DisplayResponse(shown, (rising - rising[0]) / (rising[-1] - rising[0]))

@@ -92,16 +92,19 @@ class RoleBench:
                 await self._devices.pump.open()
                 await self._devices.pump.set_pump(0.0)
                 self._commanded = 0.0
+        # Each device, or none: a bench that lacks one is closed again.
         for role, device in self._devices.by_role().items():
             try:
                 self.identities[role] = await answer(role, device.open())
             except roles.LinkError as error:
                 await self.close()
                 raise type(error)(f"{role}: {error}") from error
+        # The watchdog runs in this program, because single instruments have none.
         await self._stop_watchdog()
         self._fed_s = self._clock()
         self._commanded = 0.0
         self._watchdog = asyncio.create_task(self._run_watchdog(), name="software watchdog")
+        # What the devices state of themselves, as of one bench.
         kinds = ", ".join(f"{role} {identity.kind}" for role, identity in self.identities.items())
         firmware = ", ".join(
             dict.fromkeys(i.firmware for i in self.identities.values() if i.firmware)

@@ -87,6 +87,7 @@ def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bo
     Raises ValueError (an unknown preset, a missing key, an address or a raw value that the device
     does not have).
     """
+    # Keys of the configuration over those of the preset.
     defaults = load_preset(preset_name) if preset_name else {}
     raw_limits = defaults.pop("raw_limits", None)
     address_limits = defaults.pop("address_limits", None)
@@ -99,6 +100,7 @@ def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bo
         key: tuple(found) if isinstance(found, list) else found for key, found in keys.items()
     }
     made = ValueMap(**settings)
+    # What the device of the preset has.
     if address_limits and not address_limits[0] <= made.address <= address_limits[1]:
         raise ValueError(
             f"address = {made.address}: {preset_name} has {address_limits[0]} .. "

@@ -64,6 +64,7 @@ def explain_state(
     """
     state = State(int(row.state))
     safe_level = SafeLevel(int(row.safe_level))
+    # The safety table first, then states that give their reason, then the loop.
     if safe_level != SafeLevel.NONE:
         return f"{_level_words(safe_level, row, config)}: {fault or reported or 'unknown fault'}"
     if state in _STATES:
@@ -73,6 +74,7 @@ def explain_state(
         return f"{_LEVELS[SafeLevel.HOLD_FLOW]}: {reported or fault or 'no valid laser reading'}"
     if paused:
         return reported
+    # How far the mirror is from where it is to be.
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
         phase = "filling" if to_go_um > 0 else "waiting for the leak"

@@ -78,10 +78,13 @@ class ErrorCorrelation:
         if math.isfinite(error_um):
             memory.total_um += error_um
             memory.count += 1
+        # A mean over a part of the horizon is one sample.
         if memory.time_s < self.horizon_s / _PARTS - 1e-9 or memory.count == 0:
             return
         memory.samples += 1
         memory_s = max(_MEMORY_LEAST_S, _MEMORY_HORIZONS * self.horizon_s)
+        # Its mean and its products with earlier samples are running means; at first all samples
+        # weigh the same.
         share = max(lag_step_fraction(memory.time_s, memory_s), 1.0 / memory.samples)
         mean_um = memory.total_um / memory.count
         memory.mean_um += share * (mean_um - memory.mean_um)

@@ -339,6 +339,7 @@ class Controller:
         context = self._context
         self.memory.ticks += 1
         nominal_s = 1.0 / self._config.loop.rate_hz
+        # The time since the last tick, within what the loop's numerics stand.
         context.now_s = inputs.now_s
         context.dt_s = min(max(inputs.dt_s, _DT_RANGE[0] * nominal_s), _DT_RANGE[1] * nominal_s)
         if self.memory.ticks == 1:
@@ -348,6 +349,7 @@ class Controller:
         context.state_age_s = inputs.now_s - self.memory.state_since_s
         context.found_response = None
         context.found_pump = None
+        # Interlocks before commands: a circuit that opens refuses them.
         events += context.interlocks.observe_reading(inputs.reading, self.state)
         self._answers = []
         self._clear_mask = 0
@@ -355,6 +357,7 @@ class Controller:
         for command in command_precedence.sort_commands(inputs.commands):
             if self._handle_command(command, obeyed, events):
                 obeyed.add(command.kind)
+        # Gains on trial that nobody kept go back.
         if self._gains.is_overdue(context.now_s):
             self._revert_gains("the trial expired before they were kept", events)
         context.loop.may_probe = not self._gains.on_trial
@@ -542,6 +545,7 @@ class Controller:
 
     def _step_shape(self, inputs: TickInputs, events: list[Event]) -> shape_loop.ShapeOutput:
         context = self._context
+        # May the figure move the setpoint?
         settled = self.state == State.HOLD and context.levels.safe_level == SafeLevel.NONE
         if self._consistency.laser_moved and self._shape.on:
             self._shape.lock(inputs.now_s)
@@ -560,6 +564,7 @@ class Controller:
         except (ValueError, ArithmeticError, LinAlgError) as error:
             self.memory.tick_error = f"shape loop: {type(error).__name__}: {error}"
             shape = self._shape.output(inputs.now_s)
+        # The trim, and an event if the loop's state has changed.
         context.trim_um = shape.trim_um if self.state in state_sets.MOVING else 0.0
         reported = ReportedShape(shape.state, shape.reason.code)
         if reported != self.memory.reported_shape:
@@ -656,6 +661,7 @@ class Controller:
     def _enter_state(self, state: State, why: str, events: list[Event]) -> None:
         context = self._context
         events.append(StateEntered(state.name.lower(), self.state.name.lower(), why))
+        # What ends with the former state: an experiment, gains on trial, a fault.
         if self.state == State.TUNE:
             self._report_experiment(why, events)
         if state != State.TUNE:
@@ -670,6 +676,7 @@ class Controller:
             self.memory.tick_error = ""
             context.levels.leave()
             context.acknowledged = False
+        # What the new state begins with.
         if state == State.STANDBY:
             context.venting = False
         context.manual_wanted = context.paused = False  # they end with their hold

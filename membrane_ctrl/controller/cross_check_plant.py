@@ -359,6 +359,8 @@ def judge_gauge(config: Config, findings: ConfigFindings) -> None:
 def judge_film(config: Config, findings: ConfigFindings) -> None:
     """Judge the film's data, which serve to judge gas, laser and gauge."""
     limits, mirror = config.limits, config.optics.mirror
+    # The growth of the leak that is a fault: within what the pump gives, and beyond what weather
+    # shows.
     most = 1.0 + flow_um_per_s(config) / leak_growth.LEAK_LEAST_UM_PER_S
     growth, why = (
         "limits.leak_growth_max",
@@ -372,6 +374,7 @@ def judge_film(config: Config, findings: ConfigFindings) -> None:
         "the weather's effect on a leak trips it",
         least,
     )
+    # Depth and range.
     why = f"no film of {mirror.radius_mm:g} mm radius is this deep"
     findings.error(
         mirror.sag_mm >= 0.5 * mirror.radius_mm,
@@ -386,6 +389,7 @@ def judge_film(config: Config, findings: ConfigFindings) -> None:
         why,
         "raise it",
     )
+    # The pressure at displacement 0, by which laser and gauge are compared.
     pressure, why = (
         "optics.mirror.pressure_pa",
         f"laser and gauge are not compared below {film_monitor.TAUT_PA:g} Pa",

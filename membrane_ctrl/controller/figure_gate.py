@@ -134,6 +134,7 @@ class FigureGate:
             return FigureDefect.REJECTED
         if figure.kind == "full" and self._tracks:  # shows another sag than the frames after it
             return FigureDefect.ANCHOR
+        # Is it a figure of this mirror, with an error bar, newer than the last one?
         if not math.isfinite(figure.sag_um):
             return FigureDefect.NOT_FINITE
         if not self._sag_um / _SAG_FACTOR <= figure.sag_um <= _SAG_FACTOR * self._sag_um:
@@ -142,6 +143,7 @@ class FigureGate:
             return FigureDefect.SIGMA
         if not figure.time_s <= now_s or figure.time_s <= self.memory.newest_s:
             return FigureDefect.TIME
+        # A jump that no film makes; after a gap the film may have moved.
         if now_s - self.memory.newest_s > _GUARD_AGE_S and math.isfinite(laser_um):
             self.memory.jumps.reset()  # the film may have moved meanwhile; the laser judges
         if self.memory.jumps.is_jump(figure.sag_um, self._step_max_um):

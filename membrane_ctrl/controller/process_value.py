@@ -369,6 +369,7 @@ class ProcessValueChoice:
         """Add this tick's reading to the comparison."""
         memory = self.memory
         error_um = facts.setpoint_um - facts.laser_um
+        # Both loops need some integral times before their errors are comparable.
         if math.isnan(memory.compares_from_s):
             warm_up_s = _WARM_UP_S + _WARM_UP_INTEGRAL_TIMES * self._loop.ti_s
             memory.compares_from_s = facts.now_s + warm_up_s
@@ -378,10 +379,12 @@ class ProcessValueChoice:
             assert facts.estimate is not None  # the optics hold it
             by_camera_um = facts.setpoint_um - facts.estimate.um
             self._comparison_by_camera.step(by_camera_um, by_camera_um, facts.dt_s)
+        # The PI holds the mirror: its error is measured.
         if not memory.follows_estimate:
             if facts.now_s >= memory.compares_from_s:
                 self._comparison.step(error_um, error_um, facts.dt_s)
             return
+        # The estimate holds it: what the PI would have done is predicted.
         if not self._prediction.runs:
             assert facts.estimate is not None  # it is followed
             self._prediction.start(

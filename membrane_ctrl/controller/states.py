@@ -234,12 +234,14 @@ def lower(context: TickContext) -> State:
     context.vent_fraction = float(context.venting)
     stand = context.standstill
     explain_way_down(context, ": pump off")
+    # A stop ends the run once the pump has been seen to stand still.
     if context.way_down == "stop":
         if stand.silent_s > context.config.states.lower_timeout_s:
             context.finished = Exit.DEVICE_FAILED  # the pump's state is unknown
         elif stand.at_rest:
             context.finished = context.stop_exit
         return State.LOWER
+    # A vent is over when the pressure has gone.
     if context.venting:
         reading = context.observer.reading
         pressure_pa = reading.gauge_pressure_pa if reading else math.nan
@@ -251,6 +253,7 @@ def lower(context: TickContext) -> State:
         context.explain(WhyCode.VENTING, venting, late)
         if not pressure_pa < context.config.states.vented_pressure_pa:
             return State.LOWER
+    # Then, or at once without a vent: standby.
     if not stand.seen_off:
         return State.LOWER
     context.way_down = None

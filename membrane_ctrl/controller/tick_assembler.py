@@ -42,6 +42,7 @@ class TickAssembler:
         tails: dict[int, bytes] = {}
         snapshots: dict[int, bytes] = {}
         for message in messages:
+            # A tick's message is its last: pieces before it are its tail.
             if message[:1] == TICK:
                 records.append(message[1:ROW_OFFSET])
                 rows.append(message[ROW_OFFSET:])

@@ -94,6 +94,7 @@ class ChildProcesses:
         from membrane_ctrl.console.process import ConsoleSpec
         from membrane_ctrl.recorder.process import RecorderSpec
 
+        # What each child gets when it starts; a console that is replaced begins at the present.
         self._clock = clock
         self._summary = run_dir / "summary.json"
         self._keyboard = Keyboard.of_stdin()
@@ -131,6 +132,7 @@ class ChildProcesses:
             _make_child_factory("recorder", "recorder", 5, lambda n: replace(recorder, resumes=n))
         )
         self._acquisition = self._alarms = None
+        # Only with a camera; only with addresses for alarms.
         if rings.shapes is not None and rings.frames is not None:
             from membrane_ctrl.acquisition.spec import AcquisitionSpec
 

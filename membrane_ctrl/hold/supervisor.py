@@ -109,6 +109,8 @@ class Supervisor:
         self._waits.stalls.start()
         try:
             while True:
+                # Deadlines are a grid: a late tick does not delay those after it, and passed ones
+                # are counted.
                 deadline_s += self._period_s
                 await asyncio.sleep(max(0.0, deadline_s - self._clock.now()))
                 now_s = round(self._clock.now(), 6)  # whole microseconds take half the bytes
@@ -116,6 +118,7 @@ class Supervisor:
                 skipped = max(0, int(late_s / self._period_s))
                 self.missed_ticks += skipped
                 deadline_s += skipped * self._period_s
+                # The end of the duration is a command like any other.
                 if now_s >= ends_s:
                     self.queue_command(Command("stop", AT_END))
                     ends_s = math.inf

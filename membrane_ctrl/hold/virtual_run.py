@@ -119,6 +119,7 @@ class VirtualRun:
 
     def run_tick(self, commands: tuple[Command, ...] = ()) -> VirtualTick | None:
         """Advance one period and run a tick; None if the control process does not run."""
+        # The bench moves on, whether or not the program runs.
         self._steps += 1
         self.now_s = self._steps * self._period_s  # no sum, which would drift
         self._bench.advance(self._period_s)
@@ -129,6 +130,7 @@ class VirtualRun:
             return None
         for command in commands:
             self._supervisor.queue_command(command)
+        # One tick, as late as the scenario wants it.
         dt_s = self.now_s - self._last_s
         late_s = 1e-3 * self._bench.wrong.late_ms + max(0.0, dt_s - 1.5 * self._period_s)
         inputs, outputs = virtual_bench.at_once(self._supervisor.tick(self.now_s, dt_s, late_s))

@@ -152,6 +152,7 @@ def _require_valid(head: Any) -> None:
     """Reduce `head` to the estimate's fields. Raises ValueError if one is missing, unknown or of a
     wrong type.
     """
+    # Exactly the known fields: the message may come from a damaged file.
     if not isinstance(head, dict) or set(head) != _KEYS:
         raise ValueError("shape estimate: missing or unknown fields in the first line")
     terms = head.pop("terms")
@@ -159,6 +160,7 @@ def _require_valid(head: Any) -> None:
         raise ValueError(
             f"shape estimate of {str(terms)[:12]} Zernike terms; this program has {ZERNIKE_TERMS}"
         )
+    # Numbers, then words, then the rest.
     for name in NUMBERS:
         value = head[name]
         if type(value) not in (float, int) or abs(value) > _LARGEST:

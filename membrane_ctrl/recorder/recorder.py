@@ -159,12 +159,14 @@ class Recorder:
         """Write everything since the last call to disk, and sync it."""
         now_s = self._clock.now()
         self._errors.run_guarded("new run folder", lambda: self._watch_folder(now_s))
+        # Take what has come; a failure below must not bring it twice.
         batch = self._assembler.add_messages(self._messages)
         rows, shapes, new_events = batch.rows, self._shapes, self._events
         self._messages = []
         self._shapes = []
         self._events = []
         self.urgent = False
+        # The exact tables first, then the Rerun recording, which may be omitted.
         guarded = self._errors.run_guarded
         guarded("summary", lambda: self._summary.add_rows(rows))
         guarded("table of ticks", lambda: self._tables.add_ticks(batch))

@@ -162,6 +162,7 @@ class ShapeStreams:
     ) -> None:
         time_s = estimate.time_s
         early = time_s - reference.time_s < EARLY_S
+        # Height, uncertainty and scatter change slowly.
         if time_s >= self._next_map_s:
             interval_s = DIFFERENCE_INTERVAL_S if early else MAP_INTERVAL_S
             self._next_map_s = time_s + interval_s
@@ -170,6 +171,7 @@ class ShapeStreams:
                 "uncertainty", "µm", time_s, shapes.uncertainty_map_um(estimate.covariance_um2)
             )
             self._send_map("scatter", "µm", time_s, self._scatter.map_um())
+        # The change since the reference, at first more often.
         if time_s >= self._next_difference_s:
             interval_s = DIFFERENCE_EARLY_S if early else DIFFERENCE_INTERVAL_S
             self._next_difference_s = time_s + interval_s

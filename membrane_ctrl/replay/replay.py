@@ -251,6 +251,7 @@ def recorded_ticks(
     last, last_s = begin - 1, 0.0
     for frame in frames:
         estimates |= frame.estimates
+        # Each tick with its inputs; a gap where one is missing or cannot be read.
         for record in frame.records[frame.records["tick"] >= begin]:
             tick = int(record["tick"])
             try:
@@ -263,6 +264,7 @@ def recorded_ticks(
                 snapshot = frame.snapshots.get(tick, b"") if snapshots else b""
                 yield RecordedTick(tick, inputs, int(record["output_crc"]), snapshot)
             last, last_s = tick, float(record["now_s"])
+        # A tick refers to a recent estimate: older ones are not needed.
         while len(estimates) > _SHAPES_KEPT:
             del estimates[next(iter(estimates))]
 

@@ -75,6 +75,7 @@ class InputsReader:
     def __iter__(self) -> Iterator[InputsFrame]:
         """Yield all frames in order, each with the rare parts and shapes up to its end."""
         last = 0
+        # Rare parts, snapshots and shapes are in tables of their own, in order of time.
         rare = _Ahead((row.time_s, row) for row in self._iterate_texts(table_specs.RARE))
         kept = _Ahead((row.time_s, row) for row in self._iterate_texts(table_specs.SNAPSHOTS))
         cycles = _Ahead(
@@ -84,6 +85,7 @@ class InputsReader:
             (estimate.time_s, estimate) for estimate in self._iterate_estimates(table_specs.TRACKED)
         )
         for block in self._iterate_records():
+            # Ticks may be in two parts after a crash: each counts once.
             records = block[(block["tick"] > last) & (block["now_s"] >= self._from_s)]
             if not len(records):
                 continue
@@ -113,6 +115,7 @@ class InputsReader:
         """Records of ticks, from the table of inputs and from their telemetry rows; of ticks that
         both have.
         """
+        # The same ticks are in two tables: what went in, and the row that came out.
         rows = _TickRows(
             self._open_reader(table_specs.TICKS).iterate_tables(
                 ["tick", *_ROW_COLUMNS.values()], self._from_s
@@ -129,6 +132,7 @@ class InputsReader:
             _, here, there = np.intersect1d(
                 numbers, _record_column(same, "tick"), return_indices=True
             )
+            # Their columns, side by side.
             records = np.zeros(here.size, dtype=RECORD)
             records["tick"] = numbers[here]
             for name in table_fields.INPUT_FIELDS:

@@ -63,8 +63,10 @@ def first_level(ticks: Mapping[str, Column]) -> Columns:
     if not time_s.size:
         return {name: np.empty(0) for name in NAMES}
     starts, window = _find_windows(time_s, WINDOWS_S[0])
+    # Times, numbers of ticks, and codes at the end of each window.
     level: Columns = {"time_s": window, "rows": _count_rows(starts, time_s.size)}
     level |= _reduce_codes(ticks, starts)
+    # Extremes and means of the signals, and the spread of some.
     for name in SIGNALS:
         if name == TRUE_ERROR_COLUMN.name:
             values = telemetry.true_error_um(ticks)

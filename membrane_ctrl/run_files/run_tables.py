@@ -86,6 +86,7 @@ class RunTables:
             spec = table_specs.TRACKED
         else:
             spec = table_specs.SHAPES
+        # The row of the table, with the terms' sigmas and the upper half of the covariance.
         row = {
             name: getattr(estimate, name) for name in spec.schema.names if hasattr(estimate, name)
         }
@@ -98,6 +99,7 @@ class RunTables:
         }
         self._add_dicts(spec, [{**row, **numbers, **arrays}])
         self._add_figure_minute(self._windows.figures.add_figure(estimate))
+        # The whole covariance once in a while: it hardly changes.
         if estimate.verdict != "rejected" and estimate.time_s >= self._covariance_due_s:
             self._covariance_due_s = estimate.time_s + table_specs.COVARIANCE_INTERVAL_S
             covariance = np.asarray(estimate.covariance_um2, dtype=np.float32).ravel()

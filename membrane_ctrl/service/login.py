@@ -198,12 +198,14 @@ class LoginMiddleware:
 
     async def _log_in(self, scope: Scope, receive: Receive, send: Send, device: str) -> None:
         """Evaluate a name and a password."""
+        # Name and password of the form.
         body = await _form_body(receive)
         if isinstance(body, Refusal):
             await self._refuse(scope, send, body)
             return
         given = parse_qs(body.decode("utf-8", "replace"))
         name, password = (given.get(key, [""])[0] for key in ("name", "password"))
+        # Too many guesses wait, those of a known device least.
         guess = self._accounts.guess_of(name, self._source(scope), device)
         admission = self._accounts.throttle.admit(guess)
         if not admission.granted:
@@ -211,6 +213,8 @@ class LoginMiddleware:
             text = f"Too many tries. Wait {math.ceil(admission.wait_s)} s."
             await self._show_form(scope, send, HTTPStatus.TOO_MANY_REQUESTS, text, admission.wait_s)
             return
+        # Passwords take a tenth of a second of a processor: a pool bounds how many are checked at
+        # once.
         pool = KNOWN_PASSWORDS if guess.device else STRANGERS_PASSWORDS
         try:
             user = await pool.run(self._accounts.evaluate, guess, password, admission)

@@ -189,6 +189,8 @@ class LiveReader:
         if "every_s" in entry:
             self._add_points(entry, points)
             return
+        # Steps, results, questions and the end are kinds of entries; the last lines of each are
+        # kept.
         now = self.progress
         if "step" in entry:
             planned_s, after_s = float(entry["planned_s"]), float(entry["after_s"])

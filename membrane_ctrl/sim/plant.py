@@ -60,6 +60,7 @@ class Plant:
     def __init__(
         self, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent] = ()
     ) -> None:
+        # Weather and noise have random numbers of their own: one changes without the other.
         chance, noise = np.random.default_rng(twin.seed).spawn(2)
         self._sensors = Sensors(twin, noise)
         self._disturbance = Disturbance(twin, events, STEP_S, chance)
@@ -74,6 +75,7 @@ class Plant:
         self._pump_fraction = self._vent_fraction = self._inflow_ml_per_s = 0.0
         self._load_block()
         self._index = 0
+        # From flat films without gas, or at the setpoint with the pump at the flow that holds it.
         if twin.from_flat:
             self._gas = Gas(0.0, self._air_k[0], 0.0)
             return

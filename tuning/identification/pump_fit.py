@@ -293,6 +293,7 @@ class _Mirror:
         size = self._levels + len(common)
         whole = np.zeros((size, size))
         determinant = 0.0
+        # Each run contributes its products, with the numbers that only it has eliminated.
         for block in self._blocks:
             flows_of_run = np.zeros(len(block.columns) + 1)
             if flows is not None:

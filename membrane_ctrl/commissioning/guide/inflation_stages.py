@@ -70,6 +70,7 @@ def inflate_in_steps(context: StageContext) -> None:
 
 def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> DepthPoint:
     """Hold a depth for a while, and measure it."""
+    # Move there.
     link.send_command(Command("setpoint", _WHO, value=setpoint_um))
     if wait_for_row(link).state == State.STANDBY:
         link.send_command(Command("hold", _WHO))
@@ -80,6 +81,7 @@ def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> Dep
 
     timeout_s = context.config.states.inflate_timeout_s
     watch_rows(context, link, is_there, timeout_s)
+    # Measure it once it is held.
     rows = collect_rows(link, context.plan.settled_s)
     sag_mm = context.facts.sag_mm + 1e-3 * float(np.mean([row.displacement_um for row in rows]))
     pressure_pa = float(np.mean([row.gauge_pressure_pa for row in rows]))

@@ -265,6 +265,7 @@ def test_interlocks(context: StageContext) -> None:
             "wire at least the emergency stop to one (docs/how-to/operations.md, Interlocks)",
         )
         return
+    # Closed, opened by its contact, without its signal, closed again.
     for bit, interlock in enumerate(interlocks):
         name = interlock.name
         _require_mask(context, f"{name} closed", 0)

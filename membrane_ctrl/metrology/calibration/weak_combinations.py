@@ -75,12 +75,15 @@ def weak_combinations(
     tuple of Combination
         The least determined first.
     """
+    # In units of the hand measurements, so that an eigenvalue of 1 is a combination about which
+    # nothing was learned.
     covariance, free = _scale_covariance(solution)
     values, vectors = np.linalg.eigh(covariance)
     combinations = []
     for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
         if value < WEAK**2:
             break
+        # One sigma of the combination, as amounts of its parameters.
         left = float(np.sqrt(value))
         amounts = vector * np.sqrt(value) * solution.problem.sigmas[free]
         order = [k for k in np.argsort(-np.abs(vector)) if abs(vector[k]) > _LEAST_PART]

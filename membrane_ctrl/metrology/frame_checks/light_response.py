@@ -78,6 +78,7 @@ def estimate_response(
     """
     if index.size < _LEAST_BINS:
         return LightResponse.unknown()
+    # Mean light of the fringes, which is that of half the pattern for a straight response.
     means = binned.means.reshape(len(stack.patterns), -1)[:, index].astype(float)
     mean_of_axes = [stack.weights(frames)[0] @ means[frames] for frames in used]
     mean_of_fringes = np.mean(mean_of_axes, axis=0)
@@ -85,6 +86,7 @@ def estimate_response(
     pair = stack.white_and_black(excluded)
     if pair is None:
         return LightResponse(math.nan, edge_loss, side_loss)
+    # Its place between black and white shows the exponent.
     white, black = pair
     span = np.maximum(means[white] - means[black], 1e-9)
     share = float(np.median((mean_of_fringes - means[black]) / span))

@@ -37,6 +37,7 @@ def geometry_sources(
         Factor of every sigma.
     """
     jacobian = widened * linear_covariance.geometry_jacobian(bench, spread)
+    # Correlated numbers share a row: their effects are those of the root of their covariance.
     is_linked = np.count_nonzero(spread.covariance, axis=1) > 1
     if is_linked.any():
         names = [spread.names[k] for k in np.flatnonzero(is_linked)]
@@ -47,6 +48,7 @@ def geometry_sources(
         effects = jacobian[:, is_linked] @ root
         description = f"poses and optics, with their correlations: {several}"
         yield Source("geometry", description, math.nan, effects)
+    # Each other one has a row of its own.
     descriptions = {parameter.name: parameter.description for parameter in bench_parameters.ALL}
     for k in np.flatnonzero(~is_linked):
         name = spread.names[k]

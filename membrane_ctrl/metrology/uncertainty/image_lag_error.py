@@ -120,10 +120,12 @@ def image_lag_effect(
     (parameters,) array
         In mm.
     """
+    # Phase of each point in the pattern.
     scale = screen_scale.mm_per_rad(bench.optics.pattern)
     centre_rad = screen_scale.centre_phase_rad(bench.optics.pattern)
     angle = bench.screen_mm / scale + centre_rad
     off = np.zeros_like(bench.screen_mm)
+    # Error of the phase of x and of y, frame by frame, as error of the screen points.
     for axis, frames in enumerate(used):
         _, cosine, sine = phase_steps.step_weights(stack.shifts_rad(frames))
         for k, frame in enumerate(frames):

@@ -77,6 +77,7 @@ def _find_long_steps(held: found_event.Level) -> list[found_event.FoundEvent]:
 
 def _find_short_steps(held: found_event.Level) -> list[found_event.FoundEvent]:
     """The largest step, if it is far above the scatter on both sides."""
+    # The place with the largest difference of means on both sides.
     windows = levels.coarser_level(held, SHORT_WINDOW_S)
     flow = _holding_flow(windows)
     places = range(SHORT_HALF, flow.size - SHORT_HALF)
@@ -89,6 +90,7 @@ def _find_short_steps(held: found_event.Level) -> list[found_event.FoundEvent]:
     least = max(SHORT_LEAST_UM_PER_S, SHORT_LEAST_SHARE * old)
     if old <= 0 or abs(size) < least or t_value < SHORT_LEAST_T:
         return []
+    # Chance of so large a t value at any of the places.
     chance = 2.0 * len(judged) * float(special.stdtr(2 * SHORT_HALF - 2, -t_value))
     event = found_event.event_around(
         "flow step", windows, best, SHORT_WINDOW_S, 100 * size / old, "%", max(0.0, 1.0 - chance)

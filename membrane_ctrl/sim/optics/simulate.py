@@ -37,6 +37,7 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
 
     `readings_um` (frames,) are the laser's readings.
     """
+    # What a person would state of the bench: perhaps not what it is.
     geometry = _make_config_table(spec.stated_geometry or spec.optics.geometry)
     if spec.laser:
         geometry["reference_displacement_um"] = spec.reference_um
@@ -55,6 +56,7 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
         "camera": camera,
         "mirror": _make_config_table(spec.stated_mirror or spec.optics.mirror),
     }
+    # What is special about this set.
     if spec.artefact:
         table["artefact"] = dict(spec.artefact)
     if spec.screen_moved:
