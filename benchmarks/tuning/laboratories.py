@@ -1,7 +1,8 @@
 """Laboratories drawn at random, one after the other (`tests/studies/laboratory_sessions.py`).
 
-`python -m benchmarks.tuning.laboratories --count 40` adds one line of JSON for each to
-build/laboratories.jsonl; a second call continues where the first ended. It writes the page
+`python -m benchmarks.tuning.laboratories --count 40` adds lines of JSON for each to
+build/laboratories.jsonl; a second call continues where the first ended. `--part defaults` only
+holds them with the defaults, `--part sessions` only tunes them. It writes the page
 docs/measurements/tuning-laboratories.md.
 """
 
@@ -12,19 +13,31 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tests.studies.laboratory_sessions import describe_outcome, examine, format_page
+from tests.studies.laboratory_sessions import (
+    PARTS,
+    describe_outcome,
+    examine,
+    format_page,
+    is_held,
+)
 
 FILE = Path("build/laboratories.jsonl")
 PAGE = Path("docs/measurements/tuning-laboratories.md")
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Whole lines of a file of answers, in the order of the seeds."""
+    """A row for each seed, in their order: the answers of all its parts in a file of lines."""
     if not path.exists():
         return []
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    rows = [json.loads(line) for line in lines if line.endswith("\n")]
-    return sorted(rows, key=lambda row: int(row["seed"]))
+    rows: dict[int, dict[str, Any]] = {}
+    for line in path.read_text(encoding="utf-8").splitlines(keepends=True):
+        if not line.endswith("\n"):
+            continue
+        answer = json.loads(line)
+        row = rows.setdefault(int(answer["seed"]), {"parts": []})
+        row["parts"].append(answer["part"])
+        row.update(answer)
+    return [rows[seed] for seed in sorted(rows)]
 
 
 def main() -> None:
@@ -33,18 +46,23 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--file", type=Path, default=FILE)
-    parser.add_argument("--sessions-only", action="store_true")
+    parser.add_argument("--part", choices=PARTS, action="append", help="default: both")
     parser.add_argument("--page", type=Path, default=PAGE)
     given = parser.parse_args()
     given.file.parent.mkdir(parents=True, exist_ok=True)
-    known = {row["seed"] for row in read_rows(given.file)}
+    parts = given.part or PARTS
+    known = {row["seed"]: row for row in read_rows(given.file)}
     for seed in range(given.first, given.first + given.count):
-        if seed in known:
-            continue
-        row = examine(seed, judged=not given.sessions_only)
-        with given.file.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
-        print(seed, describe_outcome(row), f"{row['cpu_s']:.0f} s", flush=True)
+        for part in parts:
+            row = known.get(seed, {"parts": []})
+            if part in row["parts"]:
+                continue
+            answer = examine(seed, part, row)
+            with given.file.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(answer) + "\n")
+            known[seed] = {**row, **answer, "parts": [*row["parts"], part]}
+            outcome = describe_outcome(answer) if part == "sessions" else is_held(answer)
+            print(seed, part, outcome, f"{answer['cpu_s']:.0f} s", flush=True)
     given.page.write_text(format_page(read_rows(given.file)), encoding="utf-8")
 
 

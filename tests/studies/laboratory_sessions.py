@@ -14,7 +14,7 @@ import math
 import re
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ SETTLE_S, HOLD_S = 180.0, 600.0
 # ten minutes with gusts differ from ten others by a fifth
 GUSTY_HOLD_S = 1800.0
 LIMIT_UM = 10.0
+PARTS = ("defaults", "sessions")
 OBEYED_MOST = 2  # refusals of a laboratory; what they ask for is done
 _BLEED = re.compile(r"loop\.bleed_fraction larger by (?P<bleed>[\d.]+)")
 _LIMIT = re.compile(r"--limit-um (?P<limit>[\d.]+)")
@@ -93,32 +94,38 @@ def with_process_value(config: Config, value: str) -> Config:
     return config.model_copy(update={"estimator": estimator})
 
 
-def examine(seed: int, judged: bool = True) -> dict[str, Any]:
+def examine(seed: int, part: str, known: Mapping[str, Any]) -> dict[str, Any]:
     """Figures of one laboratory; a refusal or an error is a figure as well.
 
     Parameters
     ----------
     seed : int
-    judged : bool
-        Whether holds before and after are judged too, or the session alone.
+    part : str
+        Of `PARTS`: holds with the defaults, or a session and a hold with its gains.
+    known : mapping
+        Figures of the other part, if it was examined; without them the gains that a session kept
+        are not judged.
     """
     begun_s = time.process_time()
     laboratory = draw_laboratory(seed)
     found: dict[str, Any] = asdict(laboratory)
-    found |= {"text": laboratory.describe(), "obeyed": []}
+    found |= {"text": laboratory.describe(), "part": part}
     config = laboratory.config()
     try:
-        if judged:
-            config = _examine_defaults(laboratory, config, found)
-        _examine_sessions(laboratory, config, found, judged)
+        if part == "defaults":
+            _examine_defaults(laboratory, config, found)
+        else:
+            found["obeyed"] = []
+            config = _obey_start(config, known, found)
+            _examine_sessions(laboratory, config, found, bool(known.get("parts")))
     except Exception as error:  # one laboratory that fails must not end the others
         found["crashed"] = f"{type(error).__name__}: {error}"
     found["cpu_s"] = time.process_time() - begun_s
     return found
 
 
-def _examine_defaults(laboratory: DrawnLaboratory, config: Config, found: dict[str, Any]) -> Config:
-    """Hold by the laser and with the defaults; returns the configuration that holds the mirror."""
+def _examine_defaults(laboratory: DrawnLaboratory, config: Config, found: dict[str, Any]) -> None:
+    """Hold by the laser and with the defaults."""
     for name, value in (("laser", "laser"), ("auto", "auto")):
         chosen = with_process_value(config, value)
         try:
@@ -128,8 +135,12 @@ def _examine_defaults(laboratory: DrawnLaboratory, config: Config, found: dict[s
             continue
         found[f"by_{name}_um"] = std_um
         found[f"by_{name}_held"] = held_share
-    if _SLOWER in found.get("by_auto_error", ""):
-        found["obeyed"].append(found["by_auto_error"])
+
+
+def _obey_start(config: Config, known: Mapping[str, Any], found: dict[str, Any]) -> Config:
+    """The configuration with slower gains, if the hold with the defaults asked for them."""
+    if _SLOWER in known.get("by_auto_error", ""):
+        found["obeyed"].append(known["by_auto_error"])
         slower = {"kp_per_s": config.loop.kp_per_s / 2, "ti_s": 2 * config.loop.ti_s}
         return config.model_copy(update={"loop": config.loop.model_copy(update=slower)})
     return config
@@ -279,22 +290,25 @@ def ended_well(row: dict[str, Any]) -> bool:
 
 def format_page(rows: Sequence[dict[str, Any]]) -> str:
     """The page of measurements."""
-    held = [row for row in rows if is_held(row)]
+    started = [row for row in rows if "defaults" in row["parts"]]
+    held = [row for row in started if is_held(row)]
+    sessions = [row for row in rows if "sessions" in row["parts"]]
     compared = [row for row in rows if "by_auto_um" in row and "by_laser_um" in row]
     ratios = np.array([row["by_auto_um"] / row["by_laser_um"] for row in compared])
     kept = [row for row in rows if "tuned_um" in row]
     predicted = np.array([row["predicted_um"] / row["tuned_um"] for row in kept])
     tuned = np.array([row["tuned_um"] / row["by_laser_um"] for row in kept if "by_laser_um" in row])
-    far = [row for row in rows if row.get("excursion_um", 0.0) > row.get("limit_um", LIMIT_UM)]
-    well = [row for row in rows if ended_well(row)]
+    far = [row for row in sessions if row.get("excursion_um", 0.0) > row.get("limit_um", LIMIT_UM)]
+    well = [row for row in sessions if ended_well(row)]
     lines = [
         _INTRODUCTION,
-        f"{len(rows)} laboratories were examined, of 200 wanted.",
+        f"{len(started)} laboratories were held with the defaults and {len(sessions)} tuned, of "
+        "200 wanted.",
         "",
         "| | reached | wanted |",
         "|---|---|---|",
-        _format_share("start and hold with the defaults", len(held), len(rows), "97 %"),
-        _format_share("sessions that end well", len(well), len(rows), "95 %"),
+        _format_share("start and hold with the defaults", len(held), len(started), "97 %"),
+        _format_share("sessions that end well", len(well), len(sessions), "95 %"),
         _format_share(
             "estimate at most 1.02 times the PI by laser",
             int(np.sum(ratios <= _NO_WORSE)),
@@ -308,7 +322,10 @@ def format_page(rows: Sequence[dict[str, Any]]) -> str:
             "90 %",
         ),
         _format_share(
-            "sessions within the limit of the excursion", len(rows) - len(far), len(rows), "99 %"
+            "sessions within the limit of the excursion",
+            len(sessions) - len(far),
+            len(sessions),
+            "99 %",
         ),
         "",
     ]
@@ -336,10 +353,10 @@ def format_page(rows: Sequence[dict[str, Any]]) -> str:
 def list_misses(row: dict[str, Any]) -> list[str]:
     """What a laboratory did not reach, in words."""
     found: list[str] = []
-    if not is_held(row):
+    if "defaults" in row["parts"] and not is_held(row):
         why = row.get("by_auto_error", f"held for {row.get('by_auto_held', 0.0):.0%} of the time")
         found.append(f"defaults: {why}")
-    if not ended_well(row):
+    if "sessions" in row["parts"] and not ended_well(row):
         ends = [row.get(name, "") for name in ("crashed", "refused", "reason")]
         found.append(f"session: {describe_outcome(row)}: {next(filter(None, ends), '')}")
     if "by_auto_um" in row and "by_laser_um" in row:
@@ -366,8 +383,11 @@ def _format_row(row: dict[str, Any]) -> str:
     def number(name: str, digits: int) -> str:
         return f"{row[name]:.{digits}f}" if name in row else "-"
 
+    outcome = "-"
+    if "sessions" in row["parts"]:
+        outcome = describe_outcome(row)
     return (
         f"| {row['seed']}: {row['text']} | {number('by_laser_um', 3)}, {number('by_auto_um', 3)} | "
-        f"{describe_outcome(row)} | {number('predicted_um', 3)}, {number('tuned_um', 3)} | "
+        f"{outcome} | {number('predicted_um', 3)}, {number('tuned_um', 3)} | "
         f"{number('excursion_um', 1)} | {number('minutes', 0)} |"
     )

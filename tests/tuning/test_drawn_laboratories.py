@@ -95,6 +95,7 @@ def make_row(**changes: Any) -> dict[str, Any]:
     """A laboratory without a miss."""
     row = {
         "seed": 5,
+        "parts": ["defaults", "sessions"],
         "text": "fan",
         "obeyed": [],
         "by_laser_um": 0.2,
