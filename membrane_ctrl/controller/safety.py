@@ -16,6 +16,7 @@ from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.controller.safety_rule import Rule, join_seen
 from membrane_ctrl.controller.state_sets import (
     ALWAYS,
+    AT_SETPOINT,
     CONNECTED,
     ESTIMATED,
     GAS_MOVES,
@@ -379,7 +380,7 @@ TABLE: tuple[Rule, ...] = (
         limit="limits.following_error_max_um",
         safe_level=SafeLevel.RAMP_DOWN,
         seen_in=(100, 100),
-        states=HOLDING,
+        states=AT_SETPOINT,
         remedy="look for a leak, a stuck pump or a mirror that is too tight",
         seen=lambda o: f"{o.error_um:.1f} µm",
         broken=lambda o, c: abs(o.error_um) > c.following_error_max_um,

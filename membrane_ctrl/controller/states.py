@@ -20,6 +20,9 @@ _LOCKS_SHOWN = 3  # in the operator's line; the status has all of them
 # by then a pump that was left running has stopped: lag 0.15 s, transport 0.1 s
 # (docs/explanation/physics.md)
 _PUMP_STANDS_S = 0.5
+# An inflation whose mirror has sunk by `limits.following_error_max_um` for so long has failed; a
+# gust is shorter.
+_SANK_S = 5.0
 _NO_VENT = "no vent is fitted, the leak lowers the mirror"
 _VENTED_S = 900.0  # twice the twin's time from 600 Pa; longer means a shut vent or a wrong gauge
 # A `stop` with a pump that does not obey: after this long with the vent open and the pump commanded
@@ -106,7 +109,12 @@ def inflate(context: TickContext) -> State:
     if math.isfinite(to_go_um) and (rises or to_go_um <= 0.0):
         context.highest_um = output.filtered_um
         context.highest_s = context.now_s
-    if context.now_s - context.highest_s > states.inflate_stall_s:
+    # A pump that takes gas instead of giving it, or a film that is torn
+    most_um = context.config.limits.following_error_max_um
+    sank_um = context.highest_um - output.filtered_um
+    if context.measure_good_time_s(to_go_um > 0.0 and sank_um > most_um) > _SANK_S:
+        context.overdue = f"the mirror sank by {sank_um:.0f} µm while it was to rise"
+    elif context.now_s - context.highest_s > states.inflate_stall_s:
         context.overdue = (
             f"no rise in {states.inflate_stall_s:g} s, {to_go_um:.0f} µm below the setpoint"
         )

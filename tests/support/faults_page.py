@@ -15,6 +15,7 @@ from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.controller.safety_rule import Rule
 from membrane_ctrl.controller.state_sets import (
     ALWAYS,
+    AT_SETPOINT,
     CONNECTED,
     ESTIMATED,
     GAS_MOVES,
@@ -37,6 +38,7 @@ _STATES: tuple[tuple[str, Collection[State]], ...] = (
     ("check, inflate, settle, hold, manual, tune, lower, fault", GAS_MOVES | {State.FAULT}),
     ("inflate, settle, hold, manual, tune", MOVING),
     ("hold", HOLDING),
+    ("settle, hold", AT_SETPOINT),
     ("settle, hold, manual, tune", ESTIMATED),
     ("standby, check, lower, fault", ALWAYS - MOVING),
 )
