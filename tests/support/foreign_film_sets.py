@@ -35,7 +35,6 @@ class TurnedSet:
 
 
 _REACH_MM = 475.0
-_STEP_MM = 1.0
 
 
 def make_foreign_film(
@@ -81,11 +80,10 @@ def _trace(
     rays, t = rays[:, reaches], t[reaches]
     for _ in range(5):
         place = start + t * rays
-        normal = _normal(mirror, moved_um, place)
-        height_mm = mirror.height_mm(place[0], place[1], moved_um)
+        height_mm, normal = mirror.surface_mm(place[0], place[1], moved_um)
         t = t - (place[2] + 1e-3 * moved_um - height_mm) / np.sum(rays * normal, axis=0)
     place = start + t * rays
-    normal = _normal(mirror, moved_um, place)
+    _, normal = mirror.surface_mm(place[0], place[1], moved_um)
     leaves = rays - 2 * np.sum(rays * normal, axis=0) / np.sum(normal**2, axis=0) * normal
     axes = geometry.screen_axes
     from_screen = place - geometry.screen_origin_mm[:, None]
@@ -94,16 +92,3 @@ def _trace(
     inside = np.zeros(column.size, bool)
     inside[reaches[met]] = True
     return (axes[:2] @ (from_screen + reach * leaves))[:, met] / bench.pitch, inside
-
-
-def _normal(mirror: Mirror, moved_um: float, place: FloatArray) -> FloatArray:
-    """Normals (3, n), not of unit length; slopes by differences of fourth order."""
-    slopes = []
-    for dx, dy in ((_STEP_MM, 0.0), (0.0, _STEP_MM)):
-        near, far = (
-            mirror.height_mm(place[0] + k * dx, place[1] + k * dy, moved_um)
-            - mirror.height_mm(place[0] - k * dx, place[1] - k * dy, moved_um)
-            for k in (1, 2)
-        )
-        slopes.append((8 * near - far) / (12 * _STEP_MM))
-    return np.stack([-slopes[0], -slopes[1], np.ones_like(slopes[0])])

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -92,6 +93,14 @@ class Ring:
     wider: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
 
+def _powers(base: NDArray[Any], count: int) -> NDArray[Any]:
+    """Powers 0 to count - 1 of values (...), (count, ...)."""
+    out = np.ones((count, *base.shape), base.dtype)
+    for power in range(1, count):
+        out[power] = out[power - 1] * base
+    return out
+
+
 @dataclass(frozen=True)
 class Field:
     """A displacement of the disc: Re sum over m of (X + iY)^m p_m(r^2)."""
@@ -113,19 +122,20 @@ class Field:
     def _polynomial(
         self, x: FloatArray, y: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        square = x * x + y * y
-        place = x + 1j * y
-        value = np.zeros_like(place)
-        along, radial = np.zeros_like(place), np.zeros_like(place)
-        power, lower = np.ones_like(place), np.zeros_like(place)  # place^m, m place^(m-1)
-        for order, row in enumerate(self.coefficients):
-            form = polynomial.polyval(square, row)
-            slope = polynomial.polyval(square, polynomial.polyder(row))
-            value += power * form
-            along += lower * form
-            radial += power * slope
-            lower = (order + 1) * power
-            power = power * place
+        orders, powers = self.coefficients.shape
+        place_powers = _powers(x + 1j * y, orders)
+        square_powers = _powers(x * x + y * y, powers)
+
+        # p_m(r^2) and its derivative, (orders, points).
+        slope_rows = self.coefficients[:, 1:] * np.arange(1, powers)
+        forms = np.tensordot(self.coefficients, square_powers, axes=1)
+        slopes = np.tensordot(slope_rows, square_powers[:-1], axes=1)
+
+        value = np.sum(place_powers * forms, axis=0)
+        radial = np.sum(place_powers * slopes, axis=0)
+        along = np.zeros_like(value)
+        for order in range(1, orders):
+            along += order * place_powers[order - 1] * forms[order]
         by_x = along.real + 2 * x * radial.real
         by_y = -along.imag + 2 * y * radial.real
         return value.real, by_x, by_y

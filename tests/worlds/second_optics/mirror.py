@@ -109,24 +109,43 @@ class Mirror:
     def height_mm(self, x_mm: FloatArray, y_mm: FloatArray, displacement_um: float) -> FloatArray:
         """Height above the centre of the film at places of the world."""
         wanted = np.stack(np.atleast_1d(x_mm, y_mm))
-        place = self._place_over(wanted, displacement_um)
+        place, _, _ = self._place_over(wanted, displacement_um)
+        return np.asarray(place[2] - self._centre_height_mm(displacement_um))
+
+    def surface_mm(
+        self, x_mm: FloatArray, y_mm: FloatArray, displacement_um: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Height as `height_mm`, and normals (3, n) with z = 1."""
+        wanted = np.stack(np.atleast_1d(x_mm, y_mm))
+        place, along_x, along_y = self._place_over(wanted, displacement_um)
+        normal = np.cross(along_x, along_y, axis=0)
+        return place[2] - self._centre_height_mm(displacement_um), normal / normal[2]
+
+    def _centre_height_mm(self, displacement_um: float) -> float:
+        """Height of the centre in the world."""
         zero = np.zeros(1)
         if self.seat is None:
             centre, _, _ = self.position_mm(zero, zero, displacement_um)
         else:
-            centre = self._place_over(np.zeros((2, 1)), displacement_um)
-        return np.asarray(place[2] - centre[2])
+            centre, _, _ = self._place_over(np.zeros((2, 1)), displacement_um)
+        return float(centre[2, 0])
 
-    def _place_over(self, wanted: FloatArray, displacement_um: float) -> FloatArray:
-        """The film's points (3, n) at places (2, n) of the world."""
+    def _place_over(
+        self, wanted: FloatArray, displacement_um: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The film's points (3, n) at places (2, n) of the world, with their derivatives by the
+        material: Newton's method.
+        """
         material = self.own_axes(wanted) / self.radius_mm
         for _ in range(40):
-            place, _, _ = self.position_mm(material[0], material[1], displacement_um)
-            off = wanted - place[:2]
-            material = material + self.own_axes(off) / self.radius_mm
+            found = self.position_mm(material[0], material[1], displacement_um)
+            off = wanted - found[0][:2]
             if np.abs(off).max() < 1e-10:
                 break
-        return self.position_mm(material[0], material[1], displacement_um)[0]
+            (xx, yx, _), (xy, yy, _) = found[1], found[2]
+            solved = np.stack([yy * off[0] - xy * off[1], xx * off[1] - yx * off[0]])
+            material = material + solved / (xx * yy - xy * yx)
+        return found
 
     def rim_sag_um(self, displacement_um: float) -> float:
         """Mean height of the ring above the centre."""
