@@ -27,6 +27,7 @@ from tests.studies.second_world_errors import MeasuredSurface, measure_surface
 from tests.worlds.second_optics import (
     FRAME_S,
     HAND_SIGMAS,
+    PITCH,
     YAW,
     Bench,
     Effects,
@@ -39,7 +40,6 @@ from tests.worlds.second_optics import (
     World,
     Wrinkles,
     drawn_errors,
-    ramp_motion,
 )
 
 FloatArray = NDArray[np.float64]
@@ -65,8 +65,10 @@ OWN_ROWS = (
     "image_lag_noise",
     "moment_um",
     "second_image",
+    "phase_drift",
 )
 FRAMES = 18
+MIDDLE_S = 5.5 * FRAME_S  # of the sinusoids of a full set
 DISC = 0.95  # analysis radius over the ring's
 QUIET = Sensor(bits=16, read_adu=0.5, full_well=0.0)
 STILL = Effects(sensor=QUIET, psf_px=0.0, laser_noise_um=0.0)
@@ -137,6 +139,14 @@ def _walk(seed: int, step_um: float) -> Callable[[float], float]:
 def _later(step_um: float) -> Callable[[float], float]:
     """The film is deeper in the y frames (from frame 8)."""
     return lambda time_s: step_um * (time_s > 7.5 * FRAME_S)
+
+
+def _camera_turning(degree: int, turn_rad: float) -> Callable[[int], Effects]:
+    """The camera turns steadily during the set, about its stated pose."""
+    per_s = np.zeros(6)
+    per_s[degree] = turn_rad / (FRAMES * FRAME_S)
+    effects = replace(STILL, camera_motion=lambda time_s: per_s * (time_s - MIDDLE_S))
+    return lambda _: effects
 
 
 def _geometry_plants() -> list[Plant]:
@@ -256,10 +266,13 @@ PLANTS = (
         "panel of 12 % less contrast at the mirror's edge",
         effects=lambda _: replace(STILL, panel=Panel(contrast_falloff=0.12)),
     ),
-    Plant(
-        OWN_ROWS,
-        "camera yaws by 5 µrad during the set",
-        effects=lambda _: replace(STILL, camera_motion=ramp_motion(YAW, 5e-6, FRAMES * FRAME_S)),
+    *(
+        Plant(
+            ("phase_drift",),
+            f"camera {name} by 20 µrad during the set",
+            effects=_camera_turning(degree, 20e-6),
+        )
+        for name, degree in (("yaws", YAW), ("pitches", PITCH))
     ),
     Plant(("slope_urad",), "20 spots of dust", effects=lambda _: replace(STILL, dust=20), trials=3),
     Plant(

@@ -14,6 +14,7 @@ from membrane_ctrl.metrology.frame_checks import (
     light_response,
     second_reflection,
 )
+from membrane_ctrl.metrology.frame_checks.phase_drift import PhaseShifts
 from membrane_ctrl.metrology.phase import frame_stack
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.reconstruction import tracked_points
@@ -64,6 +65,8 @@ class Checked:
         about its mean.
     film_noise_um : float
         Standard uncertainty of each of these displacements.
+    shifts : two PhaseShifts
+        Shifts of the phases of the used sinusoids of x and of y beyond the film's motion.
     light_left : float
         RMS difference between the light of the used sinusoids and the light with which the phases
         were computed, relative.
@@ -85,6 +88,7 @@ class Checked:
     flags: tuple[frame_faults.Flag, ...]
     film_um: FloatArray
     film_noise_um: float
+    shifts: tuple[PhaseShifts, PhaseShifts]
     light_left: float
     lag: image_lag.ImageLag = field(default_factory=image_lag.ImageLag.unknown)
     second: second_reflection.SecondReflection = field(

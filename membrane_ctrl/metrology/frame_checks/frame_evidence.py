@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from membrane_ctrl.metrology.frame_checks.phase_drift import PhaseShifts
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.phase.gray_code import gray_bit
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
@@ -167,13 +168,35 @@ def measure_frames(
     return evidence
 
 
+@dataclass(frozen=True)
+class LightAndFilm:
+    """Light of the used sinusoids, where the film was, and how the picture shifted.
+
+    Attributes
+    ----------
+    light : (2, frames) array
+        Level and swing of the used sinusoids about the mean of their axis; 1 for other frames.
+    film_um : (used,) array
+        Displacement of the film during the used sinusoids of x, and then of y.
+    film_noise_um : float
+        Its standard uncertainty, RMS over the frames.
+    shifts : two PhaseShifts
+        Shifts of the phases of x and of y that the film's motion does not explain.
+    """
+
+    light: FloatArray
+    film_um: FloatArray
+    film_noise_um: float
+    shifts: tuple[PhaseShifts, PhaseShifts]
+
+
 def estimate_light_and_film(
     stack: FrameStack,
     binned: Binned,
     scene: SampledBins,
     used: tuple[list[int], list[int]],
     phase_rad: FloatArray,
-) -> tuple[FloatArray, FloatArray, float]:
+) -> LightAndFilm:
     """Estimate the light of each used sinusoid, and where the film was during it.
 
     Each frame is compared with the light that the other axis saw: in that of its own axis it leaves
@@ -192,12 +215,7 @@ def estimate_light_and_film(
 
     Returns
     -------
-    light : (2, frames) array
-        Level and swing of the used sinusoids about the mean of their axis; 1 for other frames.
-    film_um : (used,) array
-        Displacement of the film during the used sinusoids of x, and then of y.
-    sigma_um : float
-        Its standard uncertainty, RMS over the frames.
+    LightAndFilm
     """
     scene = scene.thin_to(_SAMPLED_PX // binned.bin_px**2)
     readings_um = np.nan_to_num(stack.displacement_um - stack.mean_reading_um)
@@ -222,7 +240,8 @@ def estimate_light_and_film(
     light = np.ones((2, len(stack.patterns)))
     film_um = np.empty(0)
     sigma_um = np.empty(0)
-    for own, others in (used, used[::-1]):
+    shifts = []
+    for axis, (own, others) in enumerate((used, used[::-1])):
         light_of_others = stack.weights(others)[0] @ means[others]
         found = []
         for k in own:
@@ -230,13 +249,19 @@ def estimate_light_and_film(
             columns = np.vstack([model.columns, model.columns[1] * contrast])
             model = replace(model, columns=columns)
             found.append(_make_evidence(means[k], model, light_of_others, 0.0, k))
+        sensitivity = scene.sensitivity_rad_per_um[axis]
+        places_um = readings_um[own] + [each.moved_um for each in found]
+        shift_rad = [each.step_rad - sensitivity.mean() * each.moved_um for each in found]
+        film_rad = float(np.sqrt(np.mean(sensitivity**2)) * np.std(places_um))
+        shifts.append(PhaseShifts(np.array(own, float), np.array(shift_rad), film_rad))
 
         # Light about the mean of the axis, and the film's place: the laser's reading corrected.
         level_and_swing = np.array([[each.level, each.swing] for each in found]).T
         light[:, own] = level_and_swing / level_and_swing.mean(axis=1, keepdims=True)
-        film_um = np.append(film_um, readings_um[own] + [each.moved_um for each in found])
+        film_um = np.append(film_um, places_um)
         sigma_um = np.append(sigma_um, [each.moved_sigma_um for each in found])
-    return light, film_um, float(np.sqrt(np.mean(sigma_um**2)))
+    noise_um = float(np.sqrt(np.mean(sigma_um**2)))
+    return LightAndFilm(light, film_um, noise_um, (shifts[0], shifts[1]))
 
 
 @dataclass(frozen=True)

@@ -276,13 +276,13 @@ def _check_rounds(
 
         if not fresh:
             # All frames agree. If their light differs, repeat the fit with the light of each.
-            light, film_um, film_noise_um = _estimate_light_and_film(stack, binned, attempt, optics)
-            light_error = light - (1.0 if stack.light is None else stack.light)
+            seen = _estimate_light_and_film(stack, binned, attempt, optics)
+            light_error = seen.light - (1.0 if stack.light is None else stack.light)
             allowed = _UNEVEN
             if stack.light is not None:
                 allowed = _LIGHT_KNOWN
             if np.abs(light_error).max() > allowed and done < rounds:
-                stack = replace(stack, light=light)
+                stack = replace(stack, light=seen.light)
                 continue
             named = _merge_flags(flags, known)
             confirm_orders(stack, attempt.phase_rad, binned, attempt.view, excluded, named)
@@ -296,8 +296,9 @@ def _check_rounds(
                 attempt.tracer,
                 attempt.state,
                 named,
-                film_um,
-                film_noise_um,
+                seen.film_um,
+                seen.film_noise_um,
+                seen.shifts,
                 light_left=float(np.sqrt(np.mean(np.square(light_error[:, used])))),
                 lag=lag,
             )
@@ -341,7 +342,7 @@ def _estimate_light_and_film(
     binned: frame_stack.Binned,
     attempt: "_Attempt",
     optics: OpticsConfig,
-) -> tuple[FloatArray, FloatArray, float]:
+) -> frame_evidence.LightAndFilm:
     """As `frame_evidence.estimate_light_and_film`, away from the pattern's edge where possible."""
     scene = attempt.scene
     is_inner = np.all(inside_pattern(scene.phase_rad, optics.pattern, _BLURRED_RAD), axis=0)

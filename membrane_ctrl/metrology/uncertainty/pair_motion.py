@@ -39,14 +39,9 @@ class PairMotion:
     parameters_mm: FloatArray
 
     @classmethod
-    def from_bench(cls, bench: TrialBench) -> "PairMotion":
-        """Of a set. Raises ArithmeticError if a fit does not converge."""
+    def from_changes(cls, bench: TrialBench, changes: FloatArray) -> "PairMotion":
+        """Of a set with its `motion_changes`. Raises ArithmeticError if a fit diverges."""
         nominal = bench.geometry()
-        tracer, points = traced_points(bench, nominal.geometry)
-        tracer.intersect(points, bench.surface, newton=3)
-        changes = bench_motions.screen_changes(
-            nominal.geometry, points.rays, points.t_mm, bench.surface, bench.vertex_z_mm
-        )
         found = [bench.solve(nominal, _AMOUNT * change, linear=True) for change in changes]
         figure_mm = (np.stack(found, axis=1) - bench.surface.parameters[:, None]) / _AMOUNT
         none = np.zeros((bench_motions.COMPONENTS, 2, 0))
@@ -67,3 +62,15 @@ class PairMotion:
         moved_mm = self.parameters_mm - earlier.parameters_mm
         none = np.zeros(bench_motions.COMPONENTS)
         return test.find_motions(ring @ moved_mm, np.zeros(2), none)
+
+
+def motion_changes(bench: TrialBench) -> FloatArray:
+    """Change (components, 2, n) of the screen points of a set by each motion of the bench, in mm
+    per µm or µrad.
+    """
+    geometry = bench.geometry().geometry
+    tracer, points = traced_points(bench, geometry)
+    tracer.intersect(points, bench.surface, newton=3)
+    return bench_motions.screen_changes(
+        geometry, points.rays, points.t_mm, bench.surface, bench.vertex_z_mm
+    )

@@ -26,7 +26,8 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_sources
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
-from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
+from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_changes
+from membrane_ctrl.metrology.uncertainty.phase_drift_error import phase_drift_source
 from membrane_ctrl.metrology.uncertainty.response_harmonics import find_response_harmonics
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
 from membrane_ctrl.metrology.uncertainty.second_reflection_error import second_reflection_source
@@ -140,11 +141,13 @@ def assemble_budget(
     # One row for each input.
     slope_variance = full.slope_variance(optics, shifts, noise_adu)
     light = math.hypot(frame_effects.LIGHT, checked.light_left)
+    changes_mm = motion_changes(bench)
     sources = [
         *bench_sources.geometry_sources(bench, spread, widening),
         *bench_sources.bench_sources(bench, sigmas),
         *film_rows,
         *moment_rows,
+        phase_drift_source(bench, changes_mm, checked.shifts),
         _vertex_source(bench, sigmas, checked, film_rows[0].sigma),
         *film_shape_sources(full, slope_variance),
         blur,
@@ -153,7 +156,7 @@ def assemble_budget(
         *image_lag_sources(bench, checked.stack, checked.view.used, checked.lag),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
-    whole = budget.Budget(tuple(sources), disc, PairMotion.from_bench(bench))
+    whole = budget.Budget(tuple(sources), disc, PairMotion.from_changes(bench, changes_mm))
     return SetBudget(whole, tuple(doubts), rim, slopes)
 
 

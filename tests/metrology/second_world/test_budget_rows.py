@@ -27,6 +27,7 @@ QUICK = (
     "bow_mm 1.5",
     "glass_mm 1",
     "air_k_per_m 0.5",
+    "camera pitches by 20 µrad during the set",
 )
 
 

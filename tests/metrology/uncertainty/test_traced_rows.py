@@ -15,7 +15,7 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
 from membrane_ctrl.metrology.uncertainty.image_blur import blur_source, estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.motion_evidence import ring_tilt_urad
-from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion
+from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_changes
 from membrane_ctrl.metrology.uncertainty.residual_patches import Patches
 from membrane_ctrl.metrology.uncertainty.slope_misfit import measure_curl_urad
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, predicted_mm
@@ -86,7 +86,7 @@ def test_a_blur_is_found_by_the_swings_of_its_fringes(sigma_px: float) -> None:
 
 def test_signatures_of_a_pair_are_the_changes_of_the_fitted_surface(bench: TrialBench) -> None:
     """A motion of 10 µm or µrad, and the fit to the screen points after it."""
-    signatures = PairMotion.from_bench(bench).effects.figure_mm
+    signatures = PairMotion.from_changes(bench, motion_changes(bench)).effects.figure_mm
     geometry = bench.geometry().geometry
     rays = geometry.rays(bench.column_px, bench.row_px)
     changes = bench_motions.screen_changes(geometry, rays, bench.t_mm, FILM, 0.0)
