@@ -20,6 +20,7 @@ def derive_estimator_levels(session: folder.SessionFolder) -> dict[str, float]:
     levels = {"pump_delay_s": model.dead_time_s, "pump_lag_s": model.lag_s}
     if not session.config.by_optics:  # a figure states its own noise
         levels["laser_noise_um"] = seen.laser_um
+    # A random walk has the density (w_s / w)^2: taken where the estimator follows the weather.
     for name, unit, walk, weather in (
         ("barometer", "pa", "pressure", seen.barometer),
         ("thermometer", "k", "air", seen.air),
@@ -28,5 +29,6 @@ def derive_estimator_levels(session: folder.SessionFolder) -> dict[str, float]:
             levels[f"{name}_noise_{unit}"] = weather.noise
             density = float(weather.psd(np.array([_WALK_RAD_PER_S]))[0])
             levels[f"{walk}_walk_{unit}_per_root_s"] = _WALK_RAD_PER_S * math.sqrt(density)
+    # Only what was measured.
     rounded = {key: float(f"{value:.3g}") for key, value in levels.items()}
     return {key: value for key, value in rounded.items() if value > 0 and math.isfinite(value)}

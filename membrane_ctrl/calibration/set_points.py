@@ -123,6 +123,7 @@ def edges_of(figure: SetFigure) -> FloatArray | None:
     bad = {flag.frame for flag in figure.checked.flags} | set(stack.unusable)
     if not {"white", "black"} <= {name for k, name in enumerate(names) if k not in bad}:
         return None
+    # The rim is where the light of the screen ends.
     white = stack.frames[names.index("white")].astype(float)
     black = stack.frames[names.index("black")].astype(float)
     rim_z_mm = figure.checked.tracer.vertex_z_mm + figure.figure.fit.surface.sag_mm

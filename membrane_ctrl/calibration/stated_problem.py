@@ -55,11 +55,13 @@ def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions
 
     Raises InputError if the stated geometry cannot be calibrated.
     """
+    # The stated bench, and how well each of its parameters is known.
     known = known_sigmas(bundle.optics, free)
     try:
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:
         raise errors.InputError(str(error)) from None
+    # What is known besides the fringes: laser, film and rim.
     references = set_state.References(
         bundle.reference_um, options.laser_sigma_um, film=options.film
     )

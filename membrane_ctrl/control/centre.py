@@ -200,6 +200,7 @@ class CentreFilter:
         """
         config, memory = self._config, self.memory
         memory.start_afresh()
+        # The states, and how little is known of each.
         memory.x[_GAS] = displacement_um - mount_um
         memory.x[_LEAK] = flow_um_per_s
         memory.x[_MOUNT] = mount_um
@@ -214,6 +215,7 @@ class CentreFilter:
         )
         for i, variance in enumerate(variances):
             memory.p[i, i] = variance
+        # The pump has given this flow for long; a known zero of the optics locks them at once.
         self._transit = self._make_transit()
         self._transit.place(flow_um_per_s)
         if math.isfinite(sag_zero_um):

@@ -99,6 +99,7 @@ class LoopComparison:
 
     def _end_block(self) -> None:
         memory = self.memory
+        # Mean errors of the block; differences of successive readings show the noise in them.
         own_um, other_um = memory.own_um / memory.readings, memory.other_um / memory.readings
         noise_um2 = memory.steps_um2 / (2 * memory.steps * memory.readings)
         memory.own_um2 += own_um**2 - noise_um2
@@ -108,6 +109,7 @@ class LoopComparison:
         memory.block_s = memory.own_um = memory.other_um = memory.steps_um2 = 0.0
         memory.readings = memory.steps = 0
         memory.last_um = math.nan
+        # Several blocks are a span, whose mean squares are compared.
         if memory.span_s >= _SPAN_S:
             _append(memory.own_spans_um2, memory.own_um2 / memory.blocks)
             _append(memory.difference_spans_um2, memory.difference_um2 / memory.blocks)

@@ -124,6 +124,7 @@ class PredictedPi:
             The reading that the PI would have seen, µm; NaN without one.
         """
         memory = self.memory
+        # The gas that the PI would have added beyond the present loop moves its mirror.
         extra_um_per_s = memory.flow_um_per_s - last_flow_um_per_s
         memory.moved_um += self._transit.advance(extra_um_per_s, dt_s)
         seen_um = reading_um + memory.moved_um
@@ -131,6 +132,7 @@ class PredictedPi:
         if math.isnan(seen_um):
             memory.kept_s += dt_s
             return seen_um
+        # Then a tick of that PI, as `InnerLoop.step` does it.
         since_s = memory.kept_s + dt_s
         memory.kept_s = 0.0
         before_um = memory.measured.value

@@ -37,6 +37,7 @@ class PumpHealth:
         """
         memory = self.memory
         memory.count += 1
+        # A certain change beyond the limit; a smaller one withdraws the warning.
         change = known.scale - 1.0
         threshold = max(self._change_max, _PUMP_SIGMAS * known.sigma)
         if memory.warned:

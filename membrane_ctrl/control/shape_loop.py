@@ -203,6 +203,7 @@ class ShapeLoop:
         disagree.
         """
         memory, reference = self.memory, self.memory.reference
+        # The reference is a mean of several shapes; tracking begins once it is complete.
         if memory.state == telemetry.ShapeState.WAITING:
             memory.admitted_s = estimate.time_s
             reference.add_estimate(estimate)
@@ -215,6 +216,7 @@ class ShapeLoop:
                 memory.drift.begin(reference.time_s)
                 reference.taken.clear()  # their mean is all that is needed
             return
+        # What the laser saw beyond the figure's change of sag is a drift of its mount.
         change = compute_sag_change(
             estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity
         )

@@ -283,11 +283,13 @@ class CentreEstimation:
         ended.
         """
         memory = self.memory
+        # A shape loop that is switched on again has another reference.
         off = shape == ShapeState.OFF and not self._by_optics
         if memory.locking and not off:
             centre.relock()
             self._mount_drift.start(memory.estimate.mount_um if memory.estimate else 0.0)
         memory.locking = off
+        # While all sensors agree, the mount is known: a jump of the camera is undone to it.
         if consistency.sensors_agree and memory.estimate is not None:
             memory.agreed_mount.update(memory.estimate.mount_um, dt_s, REFERENCE_S)
             memory.slowly_agreed_mount.update(memory.estimate.mount_um, dt_s, SLOW_REFERENCE_S)
@@ -296,6 +298,7 @@ class CentreEstimation:
                 memory.slowly_agreed_mount if consistency.camera_drifts else memory.agreed_mount
             )
             centre.undo_optics_jump(agreed.value)
+        # Figures that a fault of the camera has moved are of no use.
         unusable = off or bool(consistency.camera_fault_text) or self._mount_drift.beyond_limit
         return None if unusable else figure
 

@@ -107,6 +107,7 @@ def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
         )
     if not locks:
         return Unlocking(refused="no lock is set")
+    # Without a word: the sender's own lock, if there is no doubt which.
     own = [lock for lock in locks if is_author(command, lock)]
     word = command.text.strip().lower()
     if not word:
@@ -118,6 +119,7 @@ def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
             else f"none of the locks is set by the login of {command.who}"
         )
         return Unlocking(refused=f"{whose}: give the word of one: {describe_locks(locks)}")
+    # With a word: that lock.
     found = next((lock for lock in locks if lock.word == word), None)
     if found is None:
         return Unlocking(refused=f"no lock has the word {word!r}: {describe_locks(locks)}")

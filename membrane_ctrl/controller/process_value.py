@@ -318,15 +318,18 @@ class ProcessValueChoice:
     def _judge_estimate(self, facts: ProcessValueFacts, estimate: CentreEstimate) -> list[Event]:
         """Compare the loops; begin or end a fall-back."""
         memory = self.memory
+        # Only a steady mirror with a sound laser shows which loop is better.
         laser = estimate.sensors[Sensor.LASER]
         if not facts.steady or facts.laser_doubted or not laser.fresh:
             self._stop_comparing()
             return []
+        # What is compared: innovations, sensors, and the errors of both loops.
         self._innovations.step(laser.innovation, facts.dt_s)
         apart_um = self._compare_sensors(facts, estimate)
         self._compare_loops(facts)
         if memory.tries_pi:
             return self._end_trial(facts)
+        # The PI is tried if the estimate may be the worse one.
         if memory.follows_estimate:
             self._correlation.step(facts.setpoint_um - estimate.um, facts.dt_s)
             if memory.noticed:
@@ -408,6 +411,7 @@ class ProcessValueChoice:
         errors, estimate_error = self._comparison.errors, memory.estimate_error
         if errors is None or estimate_error is None or self._comparison.spans < _TRIAL_SPANS:
             return []
+        # Each fall-back lasts twice as long as the one before, up to a limit.
         memory.tries_pi = False
         doublings = min(memory.trials, _DOUBLINGS_MOST)
         until_s = facts.now_s + min(_FALL_BACK_S * 2.0**doublings, _FALL_BACK_MOST_S)
@@ -416,6 +420,7 @@ class ProcessValueChoice:
             memory.trusted_until_s = until_s
             self._correlation.reset()
             return []
+        # The PI stays, and a person is told why.
         memory.fall_back_until_s = until_s
         memory.noticed = True
         message = (

@@ -113,6 +113,7 @@ class RedundancyWatch:
             return f"{names} left, without a gauge"
         if len(followed) > 1:
             return "laser, optics and gauge are left"
+        # One sensor and the gauge: how far off it may be before the gauge shows it.
         (sensor,) = followed
         bounds = [
             find_bound(

@@ -489,6 +489,7 @@ class SafetyTable:
         deepest = SafeLevel.NONE
         histories = self.memory.history
         for rule in self._table:
+            # A rule that does not apply forgets.
             if state not in rule.states:
                 histories.pop(rule.code, None)
                 continue
@@ -497,9 +498,11 @@ class SafetyTable:
                 continue  # nearly always
             if rule.unseen(observation):
                 continue
+            # A bit for each tick of the rule's window.
             history = ((histories.pop(rule.code, 0) << 1) | broken) & ((1 << rule.window) - 1)
             if history:
                 histories[rule.code] = history
+            # N of M ticks: the deepest level wins, then the first rule.
             safe_level = rule.find_safe_level(observation)
             if history.bit_count() >= rule.needed_ticks and safe_level > deepest:
                 tripped, deepest = rule, safe_level

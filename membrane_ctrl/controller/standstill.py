@@ -189,6 +189,7 @@ class Standstill:
 
     def _watch_mirror(self, now_s: float, reading: BenchReading) -> None:
         memory, block = self.memory, self.memory.open_block
+        # Means over a block, of readings without an error code.
         if math.isnan(block.ends_s):
             block.ends_s = now_s + _BLOCK_S
         block.displacement_um.add(
@@ -199,6 +200,7 @@ class Standstill:
         block.air_temperature_c.add(reading.air_temperature_c)
         if now_s < block.ends_s:
             return
+        # At its end it is compared with earlier ones.
         means = (
             block.displacement_um.mean,
             block.gauge_pressure_pa.mean,
@@ -215,6 +217,7 @@ class Standstill:
         """Rise beyond the weather's in both laser and gauge; if one is missing,
         the other decides.
         """
+        # The newest block, and one that is a window older.
         blocks = self.memory.blocks
         last = blocks[-1]
         first = next(
@@ -225,6 +228,7 @@ class Standstill:
         over_s = last.end_s - first.end_s
         rise_um = last.displacement_um - first.displacement_um
         rise_pa = last.gauge_pressure_pa - first.gauge_pressure_pa
+        # What barometer and thermometer explain, as the loop's feed-forward does.
         most_um = (
             _RISE_MAX_UM
             + abs(self._loop.barometer_gain_um_per_pa)
@@ -232,6 +236,7 @@ class Standstill:
             + abs(self._loop.temperature_gain_um_per_k)
             * _find_range(block.air_temperature_c for block in blocks)
         )
+        # Every sensor that is there must show it.
         checks = ((rise_um, most_um), (rise_pa, _PA_PER_UM * most_um))
         rises = [rise > most for rise, most in checks if math.isfinite(rise)]
         if not rises or not all(rises):

@@ -321,6 +321,7 @@ def anchor_head(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
     where = head.folder / "capture.toml"
     if reference.kind == "fringes":
         raise InputError(f"{where}: reference: {reference.folder} is a set of fringes alone")
+    # Both must be of one camera and one pattern.
     for section in ("camera", "pattern"):
         a = getattr(ours, section)
         b = getattr(theirs, section)

@@ -71,6 +71,7 @@ def measured_figure(
     seen = full.map()
     if np.count_nonzero(np.isfinite(seen.height_mm)) < LEAST_CELLS:
         return None
+    # The figure, and its bars: each error is added to it and evaluated as the figure is.
     evaluate = FigureOf(seen, aperture)
     found = evaluate(seen)
     trials = FigureTrials(evaluate, seen, found, mirror.radius_mm)

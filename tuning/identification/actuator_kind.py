@@ -125,6 +125,7 @@ class _Fit:
 
 def _search(fit: Callable[[float], _Fit], bounds: tuple[float, float]) -> tuple[float, _Fit]:
     """The value in the bounds with the least cost, searched in its logarithm, and its fit."""
+    # A coarse grid finds the valley, a bounded search its bottom.
     low, high = (math.log(bound) for bound in bounds)
     coarse = np.linspace(low, high, 6)
     costs = [fit(math.exp(at)).cost for at in coarse.tolist()]

@@ -117,6 +117,7 @@ def judge_fit(
     -------
     FitQuality
     """
+    # Findings of the fit, and of its prediction of other data.
     refused, degraded = _list_findings(record, identified)
     if validation is not None and validation.innovation_ratio > _WORSE_MAX:
         worse = (
@@ -132,6 +133,7 @@ def judge_fit(
         degraded.append(
             FitFinding("new residuals still follow the flow: repeat with the doublets experiment")
         )
+    # The worst of them.
     verdict: Literal["ok", "degraded", "refused"] = "ok"
     if refused:
         verdict = "refused"

@@ -329,12 +329,14 @@ class PumpSurvey:
         """Commands to reach from above: two for hysteresis, all if there is any; below the start
         for the stall.
         """
+        # Reachable commands near some shares of the full flow.
         fractions, flows, _ = self._branches[True].columns
         reached = np.array([f for f in fractions.tolist() if self._is_reachable(Level(f))])
         found = []
         for share in _PLAY_PROBES:
             distance = np.abs(flows[: reached.size] - share * self.full_um_per_s)
             found.append(float(reached[np.argmin(distance)]))
+        # The stall is between the start and half of it.
         start = self.find_start()
         if start is not None:
             found += [_round_fraction(start[1] / 2), start[1]]

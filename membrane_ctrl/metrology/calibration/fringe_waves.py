@@ -44,6 +44,7 @@ def remove_fringe_waves(
     -------
     tuple of SetPhases
     """
+    # Waves of each set, in units of its noise.
     waves_mm = [
         _fit_waves_mm(bench, phases, state) for phases, state in zip(sets, states, strict=True)
     ]
@@ -53,6 +54,7 @@ def remove_fringe_waves(
             for of_set, phases in zip(waves_mm, sets, strict=True)
         ]
     )
+    # Sets whose waves are far above those of the others.
     is_strong = sizes > np.maximum(_LEAST_SIZE, _LEAST_RATIO * np.median(sizes))
     cleaned = list(sets)
     for k, phases in enumerate(sets):

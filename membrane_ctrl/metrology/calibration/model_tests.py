@@ -284,11 +284,13 @@ def _free_screen_moves(solution: solver.Solution, k: int) -> FloatArray:
 def find_camera_bumps(solution: solver.Solution) -> tuple[CameraBump, ...]:
     """Turns of the camera for one set, or from one set on; only sure ones, the strongest first."""
     count = len(solution.states)
+    # Groups of sets that one bump may have moved.
     single = {(k,) for k in range(count)}
     from_one_on = {tuple(range(k, count)) for k in range(1, count)}
     sigmas = np.full(len(_CAMERA), _CAMERA_SIGMA_DEG)
     bumps = []
     for group in sorted(single | from_one_on):
+        # The camera's three angles are free for this group alone.
         share = np.isin(np.arange(count), group).astype(float)
         amounts, fall = _free_motion(solution, _CAMERA, share, sigmas)
         yaw, pitch, roll = amounts

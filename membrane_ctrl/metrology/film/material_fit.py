@@ -318,12 +318,14 @@ def _fit_round(
         the answer there. Raises ValueError if it does not converge.
         """
         for _ in range(_ITERATIONS):
+            # The law about the present unknowns: its slopes, and what it leaves.
             finite_mm[:] = _finite_terms_mm(*make_bowls(x), reach)
             slopes = _numerical_slopes(predict, x)
             rest = target - predict(x)
             solved = average_over_misfits(
                 slopes, rest, noise, tried_misfits, known - x, precision, seen_mm
             )
+            # Near the solution a step is far below its error; before, it is limited.
             sigmas = np.sqrt(np.diag(solved.covariance)[:3])
             if np.all(np.abs(solved.mean[:3]) < _NEAR_SIGMAS * sigmas):
                 return x + solved.mean, replace(solved, mean=x + solved.mean)

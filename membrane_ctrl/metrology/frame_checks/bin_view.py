@@ -137,5 +137,6 @@ def _median_of_maps(maps: list[FloatArray], where: BoolArray | None = None) -> F
     scaled = [m * (medians[0] / own) for m, own in zip(maps, medians, strict=True)]
     if len(scaled) == 2:
         return np.asarray((scaled[0] + scaled[1]) / 2)
+    # Median of three, bin by bin.
     a, b, c = scaled
     return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))

@@ -153,12 +153,14 @@ def measure_frames(
     dict
         The evidence by frame.
     """
+    # What each frame should show, with the film where the laser saw it.
     scene = scene.thin_to()
     readings_um = np.nan_to_num(stack.displacement_um - np.nan_to_num(stack.mean_reading_um))
     models = [
         _make_model(stack, scene, k, float(reading_um)) for k, reading_um in enumerate(readings_um)
     ]
     waves = [model.wave() for model in models]
+    # What it shows: the pattern that it is most like, and the parameters of its own.
     evidence = {}
     for k in readable:
         seen = binned.means[k].reshape(-1)[scene.index].astype(float)

@@ -190,6 +190,7 @@ def _all_series(
     """
     for k, axis in enumerate(pattern_sequence.AXES):
         for period in sorted({pattern.period_mm for pattern in stack.patterns}):
+            # One axis and period; its steps must determine a phase.
             frames = _make_series(stack, axis, period, left_out)
             shifts = stack.shifts_rad(frames)
             period_mm = period or optics.pattern.period_mm
@@ -210,11 +211,14 @@ def _locate_bins(series: list[_Series], axis: int, optics: OpticsConfig) -> Floa
     """Places (bins,) from the pattern's low edge, mm; NaN where the periods do not determine
     them.
     """
+    # The phases of all periods of this axis.
     own = [each for each in series if each.axis == axis]
     wrapped_rad = np.stack([np.angle(each.phasor) + np.pi for each in own])
     periods_mm = [each.period_mm for each in own]
     side_mm = optics.pattern.periods * optics.pattern.period_mm
     best_mm = np.full(wrapped_rad.shape[1], np.nan)
+    # A larger assumed noise finds fewer places that are wrong, and more that remain open: the
+    # smallest that leaves most of them is used.
     for sigma_rad in _SIGMAS_RAD:
         places = multi_period.places_mm(wrapped_rad, periods_mm, (0.0, side_mm), sigma_rad)
         if np.isfinite(places.place_mm).sum() > np.isfinite(best_mm).sum():

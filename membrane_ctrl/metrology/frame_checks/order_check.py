@@ -42,10 +42,12 @@ def confirm_orders(
         For the error.
     """
     for k, axis in enumerate(AXES):
+        # Axes of which a Gray frame was left out.
         gray = stack.gray(axis)
         good = [bit for bit, frame in enumerate(gray, start=1) if frame not in excluded]
         if not gray or len(good) == len(gray):
             continue
+        # Shifts of all orders by whole periods that the remaining bits allow as well.
         seen = np.isfinite(phase_rad[k])
         phase = phase_rad[k][seen]
         bits = {bit: (binned.means[gray[bit - 1]] > view.light)[seen] for bit in good}

@@ -96,6 +96,7 @@ def sensitivity_mm_per_um(
     """
     traced = []
     for sign in (1.0, -1.0):
+        # The same rays on a bowl that is deeper, or less deep, with the ring where it is.
         deeper_mm = sign * step_um * 1e-3
         bowl = Surface.hencky_bowl(deeper_mm, surface.radius_mm)
         moved = Surface.from_parameters(surface.parameters + bowl.parameters, surface.radius_mm)

@@ -53,6 +53,7 @@ def light_faults(saturated: float, light: float, covered: BoolArray) -> list[Fin
         Squares of the mirror with wrong light.
     """
     share = float(np.mean(covered))
+    # Faults that reject the frame come first.
     faults = []
     if saturated > shape_estimate.SATURATED_REJECTED_FRACTION:
         faults.append(Finding("rejected", f"saturated: {saturated:.0%} of the bins"))

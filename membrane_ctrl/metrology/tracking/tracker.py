@@ -130,10 +130,12 @@ class Tracker:
         bins = scene.index.size
         no_residual = np.zeros(bins, np.float32)
         full_weights = np.ones(bins, np.float32)
+        # The fit of this scene; the derivatives hardly change from scene to scene.
         self._fitter = FrameFitter(scene, self._bands, self._fitter.jacobian)
         self._swing_adu = float(np.median(scene.light_adu[1]))
         self._robust = RobustFitter(self._fitter, self._noise_adu, self._swing_adu)
         self._last = FrameFit(shape, light, no_residual, full_weights, True)
+        # Nothing is known of frames of this scene yet.
         self._light = math.nan
         self._shown_rad = (math.nan, math.nan)
         self._covariance.drop_request()

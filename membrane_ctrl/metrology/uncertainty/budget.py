@@ -79,12 +79,14 @@ class Source:
             return [self.known_mm]
         if not (self.paired and earlier.paired):
             return [self.known_mm, earlier.known_mm]
+        # A limit counts as the smaller of both: the same thing hides in either set.
         own_mm = self.effects_mm
         earlier_mm = earlier.effects_mm
         if self.is_limit and earlier.is_limit:
             lower = min(self.sigma, earlier.sigma)
             own_mm = own_mm * (lower / max(self.sigma, _TINY))
             earlier_mm = earlier_mm * (lower / max(earlier.sigma, _TINY))
+        # The same error in both: the difference of what it does.
         columns = max(own_mm.shape[1], earlier_mm.shape[1])
         difference = replace(
             self,

@@ -64,6 +64,7 @@ def find_response_harmonics(
     exponent : float
         Exponent of the response; NaN if unknown.
     """
+    # A straight response makes none, and all steps together cancel them.
     is_linear = _LINEAR[0] <= exponent <= _LINEAR[1]
     if is_linear or math.isnan(exponent):
         return None
@@ -71,6 +72,7 @@ def find_response_harmonics(
     axis = int(np.argmax(power))
     if used[axis] >= taken[axis]:
         return None
+    # Share of the residuals that waves at multiples of the fringes' phase explain.
     left = bench.residual_mm[axis] - _fit_waves(bench, axis)
     share = 1 - float(left @ left) / float(power[axis])
     if share < _LEAST_SHARE:

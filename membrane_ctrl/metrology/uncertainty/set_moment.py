@@ -155,6 +155,7 @@ def moment_source(
     """
     used = [np.array(frames, float) for frames in checked.view.used]
     stack = checked.stack
+    # With a laser, only frames that are left out move the moment.
     if math.isfinite(film.x_to_y_sigma_um):
         count_used = sum(frames.size for frames in used)
         if not film.is_worth_correcting or count_used == stack.readings_um.size:
@@ -162,6 +163,7 @@ def moment_source(
         sigma_um = left_out_sigma_um(count_used, stack.readings_um.size, LASER_NOISE_UM)
         description = "the laser's noise where a frame is left out while the film moves"
     else:
+        # Without one: the drift and its unevenness, and a step between the axes beyond the drift.
         frames = used[0], used[1]
         count_frames = len(stack.patterns)
         sigma_um = moment_sigma_um(frames, checked.film_um, checked.film_noise_um, count_frames)
@@ -171,6 +173,7 @@ def moment_source(
             stepped_um = step_sigma_um(frames, step_um, seen.sigma_um, count_frames)
             sigma_um = math.hypot(sigma_um, stepped_um)
         description = "motion of the film during the set, without a laser"
+    # Another moment is another depth of the bowl.
     deeper_mm = Surface.hencky_bowl(1e-3 * sigma_um, radius_mm).parameters
     return Source(
         "moment_um", description, sigma_um, deeper_mm[:, None], common=False, paired=False
