@@ -108,7 +108,7 @@ def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> Opt
     if isinstance(devices.screen, ExternalScreenConfig) and drivers.has_emulator(
         devices.screen.name, drivers.SCREENS
     ):
-        raster = _make_raster(config, devices.screen)
+        raster = make_raster(config, devices.screen)
         panel = driver_loading.make_emulator(
             devices.screen,
             _SCREEN,
@@ -156,10 +156,10 @@ def _make_screen(config: Config, section: Any, clock: CycleClock, *library: Any)
     shown = driver_loading.make_driver(section, _SCREEN, drivers.SCREENS, *library)
     waits = optical_roles.DriverClock(clock.now, clock.sleep)
     name = f"screen {driver_loading.name_of(section)}"
-    return PatternScreen(shown, _make_raster(config, section), patterns, waits, name)
+    return PatternScreen(shown, make_raster(config, section), patterns, waits, name)
 
 
-def _make_raster(config: Config, screen: ScreenSection) -> display_patterns.ScreenRaster:
+def make_raster(config: Config, screen: ScreenSection) -> display_patterns.ScreenRaster:
     """The screen's pixels and the pattern region. Raises LinkError if the region does not fit."""
     pattern = config.optics.pattern
     try:

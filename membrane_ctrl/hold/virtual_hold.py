@@ -1,8 +1,12 @@
 """A hold on the twin in virtual time that begins in standby, as a session sees a hold."""
 
+from collections.abc import Callable
+
+from firmware_iface.optical_roles import Pixels
+from membrane_ctrl.acquisition.virtual_camera import VirtualCamera
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.command import Command
-from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
+from membrane_ctrl.hold.virtual_run import ShapeSource, TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import events, shape_estimate, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, News
@@ -13,14 +17,32 @@ _ENDS_S = 60.0
 
 
 class VirtualHold:
-    """A `HoldLink`; time passes only while the caller waits for news."""
+    """A `HoldLink`; time passes only while the caller waits for news.
 
-    def __init__(self, config: Config, bench: virtual_bench.VirtualBench, name: str) -> None:
+    Parameters
+    ----------
+    config : Config
+    bench : VirtualBench
+    name : str
+        Of the run.
+    alter_picture : callable, optional
+        Figures come from rendered frames, altered by it; without it, from the twin's truth.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        bench: virtual_bench.VirtualBench,
+        name: str,
+        alter_picture: Callable[[Pixels], Pixels] | None = None,
+    ) -> None:
         self.config = config
         self.name = name
         self._rate_hz = config.loop.rate_hz
-        source = None
-        if config.shape.enabled:
+        source: ShapeSource | None = None
+        if config.shape.enabled and alter_picture is not None:
+            source = VirtualCamera(config, bench.plant, alter_picture)
+        elif config.shape.enabled:
             source = TruthShape(bench, config, config.twin.seed)
         self._source = source
         self._shapes: list[shape_estimate.ShapeEstimate] = []

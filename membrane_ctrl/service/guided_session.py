@@ -48,6 +48,9 @@ _UNITS_REFUSAL = (
 )
 
 
+ShownMessage = StageMessage | LineMessage | CheckMessage
+
+
 @dataclass(frozen=True, slots=True)
 class SessionEntry:
     """A session in the folder."""
@@ -74,7 +77,9 @@ class SeenSession:
     question : QuestionMessage or None
         The one that waits for its answer.
     messages : tuple
-        Lines and checks of the present stage.
+        Heads of stages, lines and checks since the start.
+    dropped : int
+        Messages before these that are no longer kept.
     ended : str
         How the last start ended; empty while it runs.
     """
@@ -84,7 +89,8 @@ class SeenSession:
     plan: tuple[StageProgress, ...] = ()
     stage: StageHead | None = None
     question: QuestionMessage | None = None
-    messages: tuple[LineMessage | CheckMessage, ...] = ()
+    messages: tuple[ShownMessage, ...] = ()
+    dropped: int = 0
     ended: str = ""
 
 
@@ -113,7 +119,6 @@ class GuidedSession:
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
         self._seen = SeenSession()
-        self._messages: list[LineMessage | CheckMessage] = []
 
     @property
     def seen(self) -> SeenSession:
@@ -163,7 +168,6 @@ class GuidedSession:
                     errors="replace",
                     start_new_session=True,
                 )
-            self._messages = []
             self._seen = SeenSession(name, is_running=True)
             self._reader = threading.Thread(
                 target=self._follow, args=(self._process, name, folder), daemon=True
@@ -223,14 +227,18 @@ class GuidedSession:
         match message:
             case PlanMessage():
                 self._update(plan=message.plan)
-            case StageMessage():
-                self._messages = []
-                self._update(stage=message.stage, messages=())
             case QuestionMessage():
                 self._update(question=message)
+            case StageMessage():
+                self._update(stage=message.stage)
+                self._keep_message(message)
             case _:
-                self._messages = [*self._messages[1 - _MESSAGES_MOST :], message]
-                self._update(messages=tuple(self._messages))
+                self._keep_message(message)
+
+    def _keep_message(self, message: ShownMessage) -> None:
+        kept = (*self._seen.messages, message)
+        surplus = max(0, len(kept) - _MESSAGES_MOST)
+        self._update(messages=kept[surplus:], dropped=self._seen.dropped + surplus)
 
     def _update(self, **changed: Any) -> None:
         self._seen = replace(self._seen, **changed)

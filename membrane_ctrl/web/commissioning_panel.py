@@ -18,7 +18,11 @@ from membrane_ctrl.commissioning.guide.dialogue import (
     StageProgress,
     StageResult,
 )
-from membrane_ctrl.commissioning.guide.session_messages import CheckMessage, LineMessage
+from membrane_ctrl.commissioning.guide.session_messages import (
+    CheckMessage,
+    LineMessage,
+    StageMessage,
+)
 from membrane_ctrl.commissioning.guide.session_state import (
     HTML,
     PDF,
@@ -28,7 +32,12 @@ from membrane_ctrl.commissioning.guide.session_state import (
 from membrane_ctrl.control_port.sender import role_includes
 from membrane_ctrl.controller.command import Role
 from membrane_ctrl.model import errors
-from membrane_ctrl.service.guided_session import GuidedSession, SeenSession, SessionEntry
+from membrane_ctrl.service.guided_session import (
+    GuidedSession,
+    SeenSession,
+    SessionEntry,
+    ShownMessage,
+)
 from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.service.work_pool import PoolFullError
 from membrane_ctrl.service.work_pools import RUN_LISTS
@@ -72,7 +81,8 @@ class CommissioningPanel:
         self._user = user
         self._shown = SeenSession()
         self._entries: list[SessionEntry] = []
-        self._lines = 0  # of the present stage, as shown
+        self._count = 0  # of messages that are shown
+        self._former_head = ""  # of the stage whose results are shown
         ui.add_css(_CSS)
         self._build_start()
         self._ended = ui.label().classes("text-subtitle1 membrane-guide-line")
@@ -82,12 +92,13 @@ class CommissioningPanel:
             self._plan = ui.column().classes("gap-0 max-lg:order-last")
             with ui.column().classes("min-w-0 w-full"):
                 self._head = ui.column().classes("gap-0 w-full")
-                self._found = ui.column().classes("gap-1 w-full").props('aria-label="checks"')
+                self._present = ui.column().classes("w-full").props('aria-label="checks"')
                 self._question = ui.column().classes("w-full")
                 self._stop = ui.button(
                     "Stop safely, resume later", icon="pause_circle", on_click=self._confirm_stop
                 )
                 self._stop.props("no-caps outline color=negative")
+                self._before = ui.column().classes("w-full").props('aria-label="results so far"')
         self._show(self._session.seen)
         ui.timer(_LOOK_S, self._look)
 
@@ -143,7 +154,10 @@ class CommissioningPanel:
 
     async def _confirm_stop(self) -> None:
         does = "The pump is switched off. The session can be resumed, here or in a terminal."
-        if await confirm("Stop the session?", (does,), "Stop", "negative") and self._may:
+        if (
+            await confirm("Stop the session?", (does,), "Stop the session", "negative")
+            and self._may
+        ):
             await self._try(lambda: self._session.stop(self._user.name))
 
     async def _give(self, number: int, text: str) -> None:
@@ -179,17 +193,15 @@ class CommissioningPanel:
         self._ended.set_text(seen.ended)
         if seen.plan != before.plan or seen.stage != before.stage:
             self._show_plan(seen)
-        if seen.stage != before.stage or before.name != seen.name:
+        if seen.stage != before.stage:
             self._show_head(seen)
-            self._found.clear()
-            self._lines = 0
-        if len(seen.messages) < self._lines:  # the stage begins again
-            self._found.clear()
-            self._lines = 0
-        with self._found:
-            for message in seen.messages[self._lines :]:
-                _show_message(message)
-        self._lines = len(seen.messages)
+        if seen.dropped + len(seen.messages) < self._count:  # another start
+            self._present.clear()
+            self._before.clear()
+            self._count = 0
+        for message in seen.messages[max(0, self._count - seen.dropped) :]:
+            self._show_message(message)
+        self._count = seen.dropped + len(seen.messages)
         if seen.question != before.question:
             self._show_question(seen)
         if seen.ended != before.ended:
@@ -216,6 +228,26 @@ class CommissioningPanel:
             ui.label(head).classes("text-h6").props('role="heading"')
             ui.label(f"It {seen.stage.does}.")
             ui.label(f"To be seen: {seen.stage.look_for}.").classes("text-bold")
+
+    def _show_message(self, message: ShownMessage) -> None:
+        """Show a message in the present stage's part; a new stage moves it below, newest first."""
+        if not isinstance(message, StageMessage):
+            with self._present:
+                _show_result(message)
+            return
+        former = list(self._present.default_slot.children)
+        if former and self._former_head:
+            with self._before:
+                card = ui.card().classes("w-full gap-1")
+            card.move(self._before, target_index=0)
+            with card:
+                ui.label(self._former_head).classes("text-bold")
+            for element in former:
+                element.move(card)
+        else:
+            self._present.clear()
+        stage = message.stage
+        self._former_head = f"{stage.step}. {stage.title}: {_plain(stage.name)}"
 
     def _show_question(self, seen: SeenSession) -> None:
         self._question.clear()
@@ -289,7 +321,7 @@ def _show_stage(stage: StageProgress, is_present: bool) -> None:
         ui.label(words).classes("text-bold" if is_present else "")
 
 
-def _show_message(message: LineMessage | CheckMessage) -> None:
+def _show_result(message: LineMessage | CheckMessage) -> None:
     if isinstance(message, CheckMessage):
         _show_check(message.check)
     elif message.text.strip():

@@ -613,7 +613,9 @@ class WebPage:
         does = "The pump of the guided session is switched off; it can be resumed."
         self._stopping = True
         try:
-            is_sure = await confirm("STOP the guided session?", (does,), "Stop", "negative", True)
+            is_sure = await confirm(
+                "STOP the guided session?", (does,), "Stop the session", "negative", True
+            )
         finally:
             self._stopping = False
         if is_sure and self._guided is not None and self._can_stop_guided:

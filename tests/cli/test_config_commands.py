@@ -89,7 +89,7 @@ def test_a_folder_that_is_not_there_is_named(
 
 def test_a_board_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
-    assert answered(monkeypatch, path, "tcp://10.0.0.9:502", "", "") == 0
+    assert answered(monkeypatch, path, "", "tcp://10.0.0.9:502", "", "") == 0
     config = load_toml(path, Config)
     assert config.devices is not None
     assert config.devices.board == "tcp://10.0.0.9:502"
@@ -101,22 +101,14 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "lab.toml"
-    laser = ["optoncdt", "optoncdt1420", "usb:0403:6001"]  # a typing error first
-    pump = [
-        "bronkhorst_modbus",
-        "/dev/x",
-        "3",
-        "bronkhorst_modbus",
-        "rtu:///dev/ttyUSB1",
-        "3",
-    ]  # no URL first
+    laser = ["optoncdt", "optoncdt1420", "1"]  # a typing error first; then the connected port
+    # no URL first: the other answers are kept
+    pump = ["bronkhorst_modbus", "/dev/x", "3", "", "rtu:///dev/ttyUSB1", ""]
     gauge = ["bronkhorst_modbus", "rtu:///dev/ttyUSB1", "5"]
     screen = ["pygame", "1920", "1080", "0.4961"]
-    vent = ["modbus_map", "tcp://10.0.0.1:502", "0", "[0, 20000]", "[0.0, 1.0]"]
-    assert (
-        answered(monkeypatch, path, "", *laser, *pump, *gauge, *vent, "", "", "uvc", *screen, "")
-        == 0
-    )
+    vent = ["modbus_map", "none", "tcp://10.0.0.1:502", "0", "0, 20000", "[0.0, 1.0]"]
+    answers = ["2", *laser, *pump, *gauge, *vent, "", "", "uvc", *screen, ""]
+    assert answered(monkeypatch, path, *answers) == 0, capsys.readouterr().err
     config = load_toml(path, Config)
     assert config.devices is not None
     assert {*config.devices.roles()} == {"displacement", "pump", "gauge_pressure", "vent"}
@@ -129,9 +121,49 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
     assert not config.loop.feedforward_temperature
     assert config.pump.start_fraction == 0.0
     output = capsys.readouterr().err
-    assert "did you mean optoncdt1420?" in output
+    assert "choose a number from 1 to" in output
+    assert "usb:0403:6001" in output
+    assert "two numbers separated by a comma, such as 4000, 20000" in output
     assert "pump: link" in output
     assert "# Modbus address of the device." in path.read_text()
+
+
+def test_a_slip_is_taken_back_and_an_end_loses_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lab.toml"
+    kept = path.with_name("lab.toml.answers")
+    first = ["2", "optoncdt1420", "2", "/dev/wrong", "back", "/dev/laser", "ventus"]
+    assert answered(monkeypatch, path, *first) == 130  # the end of the input, as by Ctrl-C
+    assert not path.exists()
+    assert "nothing is lost" in capsys.readouterr().err
+    rest = ["2", "/dev/pump", "mks_937b", "2", "/dev/gauge", "", "", "", "", ""]
+    assert answered(monkeypatch, path, *rest) == 0
+    shown = capsys.readouterr().err
+    assert "continuing after 5 answers" in shown
+    assert "what drives the pump?" not in shown
+    config = load_toml(path, Config)
+    assert config.devices is not None
+    assert config.devices.displacement is not None
+    assert config.devices.displacement.model_dump()["port"] == "/dev/laser"
+    assert not kept.exists()
+
+
+def test_a_preset_replaces_the_keys_that_it_has(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lab.toml"
+    laser, gauge = ["optoncdt1420", "1"], ["mks_937b", "2", "/dev/gauge"]
+    pump = ["modbus_map", "waveshare_ao8", "rtu:///dev/ttyUSB1", "", "0", "0, 1"]
+    answers = ["2", *laser, *pump, *gauge, "", "", "", "", ""]
+    assert answered(monkeypatch, path, *answers) == 0, capsys.readouterr().err
+    shown = capsys.readouterr().err
+    assert "raw (" not in shown
+    assert "an answer is needed" in shown
+    config = load_toml(path, Config)
+    assert config.devices is not None
+    assert config.devices.pump is not None
+    assert config.devices.pump.model_dump()["preset"] == "waveshare_ao8"
 
 
 def test_interlocks_are_asked_for_one_after_the_other(
@@ -140,8 +172,8 @@ def test_interlocks_are_asked_for_one_after_the_other(
     path = tmp_path / "lab.toml"
     stop = ["board_input", "stop", "the emergency stop is pressed", "0"]
     door = ["modbus_input", "Door", "x", "tcp://10.0.0.7", "3"]  # a capital letter first
-    door += ["modbus_input", "door", "the door is open", "tcp://10.0.0.7", "3"]
-    assert answered(monkeypatch, path, "tcp://10.0.0.9:502", "", *stop, *door, "") == 0
+    door += ["", "door", "the door is open", "", ""]
+    assert answered(monkeypatch, path, "1", "tcp://10.0.0.9:502", "", *stop, *door, "") == 0
     config = load_toml(path, Config)
     assert config.devices is not None
     assert [(each.driver, each.name, each.text) for each in config.devices.interlocks] == [
@@ -149,8 +181,8 @@ def test_interlocks_are_asked_for_one_after_the_other(
         ("modbus_input", "door", "the door is open"),
     ]
     printed = capsys.readouterr().err
-    assert "interlock 1 (emergency stop, door, oxygen monitor): driver, board_input or" in printed
-    assert "once more" in printed
+    assert "interlock 1 (emergency stop, door, oxygen monitor, supply pressure): which" in printed
+    assert "the answers are kept" in printed
     assert path.read_text().count("[[devices.interlocks]]") == 2
 
 
@@ -158,12 +190,12 @@ def test_an_input_of_the_board_is_no_interlock_of_single_instruments(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "lab.toml"
-    laser, pump = ["optoncdt1420", "/dev/x"], ["ventus", "/dev/y"]
-    gauge = ["mks_937b", "/dev/z"]
+    laser, pump = ["optoncdt1420", "2", "/dev/x"], ["ventus", "2", "/dev/y"]
+    gauge = ["mks_937b", "2", "/dev/z"]
     line = ["board_input", "gpio_line", "stop", "the emergency stop is pressed", "17"]
-    answers = ["", *laser, *pump, *gauge, "", "", "", "", *line, ""]
+    answers = ["2", *laser, *pump, *gauge, "", "", "", "", *line, ""]
     assert answered(monkeypatch, path, *answers) == 0
-    assert "'board_input' is no driver" in capsys.readouterr().err
+    assert "board_input " not in capsys.readouterr().err
     config = load_toml(path, Config)
     assert config.devices is not None
     assert [each.driver for each in config.devices.interlocks] == ["gpio_line"]
@@ -174,12 +206,15 @@ def test_answers_that_contradict_each_other_write_nothing(
 ) -> None:
     path = tmp_path / "lab.toml"
     answers = [
-        "",
+        "2",
         "optoncdt1420",
+        "2",
         "/dev/x",
         "ventus",
+        "2",
         "/dev/x",
         "bronkhorst_propar",
+        "2",
         "/dev/y",
         "",
         "",
@@ -196,10 +231,10 @@ def test_a_pump_and_a_gauge_on_one_register_write_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "lab.toml"
-    laser = ["optoncdt1420", "/dev/x"]
-    pump = ["modbus_map", "tcp://10.0.0.1", "7", "[0, 20000]", "[0.0, 1.0]"]
-    gauge = ["modbus_map", "tcp://10.0.0.1:502", "7", "[0, 20000]", "[0.0, 1000.0]"]
-    assert answered(monkeypatch, path, "", *laser, *pump, *gauge, "", "", "", "", "") == 2
+    laser = ["optoncdt1420", "2", "/dev/x"]
+    pump = ["modbus_map", "none", "tcp://10.0.0.1", "7", "[0, 20000]", "[0.0, 1.0]"]
+    gauge = ["modbus_map", "none", "tcp://10.0.0.1:502", "7", "[0, 20000]", "[0.0, 1000.0]"]
+    assert answered(monkeypatch, path, "2", *laser, *pump, *gauge, "", "", "", "", "") == 2
     output = capsys.readouterr().err
     assert (
         "devices.pump.address and devices.gauge_pressure.address name the same holding register 7"
@@ -216,12 +251,15 @@ def test_two_names_of_one_serial_port_write_nothing(
     port.touch()
     other.symlink_to(port)
     answers = [
-        "",
+        "2",
         "optoncdt1420",
+        "2",
         str(port),
         "ventus",
+        "2",
         str(other),
         "mks_937b",
+        "2",
         "/dev/y",
         "",
         "",

@@ -52,7 +52,7 @@ def test_a_confirmation_acts_once(guided: GuidedSession, tmp_path: Path) -> None
     with pytest.raises(InputError, match="answered already"):
         guided.answer(number, "y", "ann")  # a page from before a reload
     assert told_in(tmp_path / "lab-1") == ["fill y"]
-    assert [message.kind for message in guided.seen.messages] == ["check", "line"]
+    assert [message.kind for message in guided.seen.messages] == ["stage", "check", "line"]
 
 
 def test_a_stop_reaches_a_stage_that_runs(guided: GuidedSession, tmp_path: Path) -> None:

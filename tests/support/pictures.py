@@ -27,6 +27,7 @@ from membrane_ctrl.model.arrays import AnyArray
 from tests.support.browser import Tab, browser_tab
 from tests.support.recording_picture import screenshot
 from tests.support.review_runs import written
+from tests.web.test_commissioning_panel import click, wait_for_text
 from tests.web.test_page import PRESS, served
 from tests.worlds.designed_session import make_designed_session
 from tests.worlds.fleet_file import fleet_file
@@ -223,6 +224,31 @@ async def _configuration_picture(tab: Tab, target: Path) -> bytes:
     return await asyncio.to_thread(target.read_bytes)
 
 
+def commission_picture(folder: Path) -> dict[str, bytes]:
+    """A stage of the guided session in the page."""
+    return {"web-commission": asyncio.run(_commission_picture(folder))}
+
+
+async def _commission_picture(folder: Path) -> bytes:
+    (folder / "logs").mkdir()
+    target = folder / "commission.png"
+    async with (
+        served(folder / "logs", "--commissioning", str(folder / "sessions")) as link,
+        browser_tab(link, folder / "profile") as tab,
+    ):
+        for label in ("commission", "practise on the emulated bench", "begin or resume"):
+            await click(tab, label)
+        await wait_for_text(tab, "Which mirror?")
+        await click(tab, "choose")
+        await wait_for_text(tab, "Change any of its data?")
+        await tab.click("No")
+        await wait_for_text(tab, "none is fitted")
+        await tab.click("Enter")
+        await wait_for_text(tab, "What drives the pump?")
+        await tab.screenshot(target, whole=False)
+    return target.read_bytes()
+
+
 def tune_picture(folder: Path) -> dict[str, bytes]:
     """The sliders of the tab *Tune*, on a session with made-up data."""
     return {"tune-explore": asyncio.run(_tune_picture(folder))}
@@ -308,6 +334,7 @@ MAKERS: dict[tuple[str, ...], Callable[[Path], dict[str, bytes]]] = {
     ("tutorial-fault",): tutorial_picture,
     ("calibration-bowed-screen",): bowed_picture,
     ("web", "web-phone", "web-configuration"): page_pictures,
+    ("web-commission",): commission_picture,
     ("tune-explore",): tune_picture,
     ("web-fleet",): fleet_picture,
 }

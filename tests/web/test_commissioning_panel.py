@@ -51,6 +51,6 @@ async def test_a_reload_shows_the_question_and_does_not_answer_it(tmp_path: Path
         state = json.loads((sessions / "lab-1" / "session.json").read_text())
         assert state["answers"] == {"mirror.preset": "paper"}
         await click(tab, "stop safely, resume later")
-        await click(tab, "stop")
+        await click(tab, "stop the session")
         await wait_for_text(tab, "lab-1: stopped")
         await tab.screenshot(tmp_path / "stopped.png")

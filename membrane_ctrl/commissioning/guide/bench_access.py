@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from firmware_iface import roles
+from membrane_ctrl.acquisition.mirror_pictures import MirrorPictures
 from membrane_ctrl.commissioning.check import DeviceProbe
 from membrane_ctrl.commissioning.devices import FoundDevice
 from membrane_ctrl.config.schema import Config
@@ -28,6 +29,7 @@ class HandAct(Enum):
     OPEN_CIRCUIT = "open circuit"  # of a named interlock
     LOSE_SIGNAL = "lose signal"
     CLOSE_CIRCUIT = "close circuit"
+    TURN_FOCUS = "turn focus ring"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,10 @@ class BenchAccess(Protocol):
         """Probe camera and screen: exposure, pattern, settling; empty without one."""
         ...
 
+    def photograph(self, config: Config) -> MirrorPictures:
+        """Take the mirror with the screen white and black. Raises DeviceError."""
+        ...
+
     def act(self, config: Config, action: Action[T]) -> T:
         """Open the bench, do something with it, and leave it with the pump off.
 
@@ -94,11 +100,12 @@ class BenchAccess(Protocol):
         ...
 
     def start_hold(
-        self, folder: Path, config: Config, name: str
+        self, folder: Path, config: Config, name: str, by_frames: bool = False
     ) -> AbstractContextManager[HoldLink]:
         """Start the controller in standby; it is stopped at the end of the block.
 
-        Raises DeviceError if it does not start.
+        An emulated bench measures figures from rendered frames only if `by_frames`: they cost
+        seconds of processor time. Raises DeviceError if it does not start.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Questions to the person at the bench. `back` and `stop` are accepted as every answer."""
+"""Questions to the person at the bench. `back` and `quit` are accepted as every answer."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,8 +10,9 @@ from pydantic import BaseModel, ConfigDict
 from membrane_ctrl.commissioning.guide.session_state import CheckRecord
 
 T = TypeVar("T")
-BACK, STOP = "back", "stop"
-_BACK, _STOP = (BACK, "b"), (STOP, "quit")
+BACK, QUIT = "back", "quit"
+# Accepted as well where no text is asked for: an interlock may be named `stop`
+_SHORT_BACK, _STOP = "b", "stop"
 
 
 class GoBackError(Exception):
@@ -154,10 +155,16 @@ class Dialogue:
         for line in lines:
             self.display.show_line(line)
 
-    def ask_text(self, key: str, question: str, default: str = "") -> str:
-        """Ask for a text; an empty answer is the default."""
+    def ask_text(self, key: str, question: str, default: str = "", is_needed: bool = False) -> str:
+        """Ask for a text; an empty answer is the default, or asked again if one is needed."""
+
+        def parse(text: str) -> str:
+            if is_needed and not text:
+                raise ValueError("an answer is needed; `back` returns")
+            return text
+
         asked = Question(key=key, kind=QuestionKind.TEXT, text=question, default=default)
-        return self._ask(asked, lambda text: text)
+        return self._ask(asked, parse)
 
     def ask_number(
         self, key: str, question: str, default: float, low: float, high: float, unit: str = ""
@@ -237,8 +244,10 @@ class Dialogue:
 
     def _read(self, asked: Question) -> str:
         typed = self.display.ask_question(asked).strip()
-        if typed.lower() in _BACK:
+        is_free = asked.kind == QuestionKind.TEXT
+        word = typed.lower()
+        if word == BACK or (word == _SHORT_BACK and not is_free):
             raise GoBackError
-        if typed.lower() in _STOP:
+        if word == QUIT or (word == _STOP and not is_free):
             raise StopSessionError
         return typed

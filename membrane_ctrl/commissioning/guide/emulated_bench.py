@@ -14,6 +14,8 @@ from typing import TypeVar
 
 from firmware_iface import roles
 from firmware_iface.drivers.pump_board import PumpBoard
+from firmware_iface.optical_roles import Pixels
+from membrane_ctrl.acquisition.mirror_pictures import MirrorPictures, take_mirror_pictures
 from membrane_ctrl.commissioning import check
 from membrane_ctrl.commissioning.devices import FoundDevice
 from membrane_ctrl.commissioning.guide import instrument_lab
@@ -23,6 +25,7 @@ from membrane_ctrl.commissioning.guide.bench_access import (
     HandMotion,
     OpenBench,
 )
+from membrane_ctrl.commissioning.guide.emulated_optics import EmulatedLens, EmulatedOptics
 from membrane_ctrl.commissioning.guide.real_bench import stop_outputs
 from membrane_ctrl.commissioning.guide.session_state import CONFIGURATION
 from membrane_ctrl.commissioning.guide.shown_program import run_shown
@@ -33,7 +36,8 @@ from membrane_ctrl.sim import plant, virtual_bench
 from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks
 
 T = TypeVar("T")
-MakeHold = Callable[[Config, virtual_bench.VirtualBench, str], HoldLink]
+AlterPicture = Callable[[Pixels], Pixels]
+MakeHold = Callable[[Config, virtual_bench.VirtualBench, str, AlterPicture | None], HoldLink]
 _TICK_S = 0.02
 _HAND_PA = 20.0  # what a hand on the film adds
 
@@ -44,24 +48,24 @@ class EmulatedBench:
     Parameters
     ----------
     make_hold : callable
-        Starts a hold of a configuration on a virtual bench, with a name (`hold/virtual_hold.py`).
-    mirror : Plant, optional
-        Another plant than the twin of the session's configuration.
+        Starts a hold of a configuration on a virtual bench, with a name and, if it measures figures
+        from rendered frames, what alters these (`hold/virtual_hold.py`).
 
     Attributes
     ----------
     laser_sign : int
         -1: the laser is mounted or configured the wrong way round.
+    lens : EmulatedLens
     """
 
     simulated = True
 
-    def __init__(self, make_hold: MakeHold, mirror: plant.Plant | None = None) -> None:
+    def __init__(self, make_hold: MakeHold) -> None:
         self._make_hold = make_hold
-        self._mirror = mirror
         self._made: virtual_bench.VirtualBench | None = None
         self._interlocks = VirtualInterlocks()
         self.laser_sign = 1
+        self.lens = EmulatedLens()
 
     @property
     def bench(self) -> virtual_bench.VirtualBench:
@@ -70,13 +74,17 @@ class EmulatedBench:
             raise DeviceError("the emulated bench has not been used yet")
         return self._made
 
+    def use_mirror(self, bench: virtual_bench.VirtualBench) -> None:
+        """Use another bench than the twin of the session's configuration, which begins flat."""
+        self._made = bench
+
     def _use_bench(self, config: Config) -> virtual_bench.VirtualBench:
         """The bench with the circuits that are configured now; the mirror is flat at first."""
         if config.devices is None:
             raise DeviceError("no devices are configured")
         if self._made is None:
             twin = config.twin.model_copy(update={"from_flat": True})
-            mirror = self._mirror or plant.Plant(twin, config.pump)
+            mirror = plant.Plant(twin, config.pump)
             self._made = virtual_bench.VirtualBench(mirror, config.devices.watchdog_s)
         interlocks = VirtualInterlocks(config.interlocks)
         interlocks.open_names = self._interlocks.open_names
@@ -101,8 +109,21 @@ class EmulatedBench:
         return [asyncio.run(check.probe_board(board, devices.board, not config.by_optics))]
 
     def probe_optics(self, config: Config) -> list[check.DeviceProbe]:
-        """The twin in virtual time has no camera frames."""
-        return []
+        """Probe the emulated screen with the rendered camera."""
+        if config.devices is None or config.devices.screen is None:
+            return []
+        return [self._make_optics(config).probe_bench()]
+
+    def photograph(self, config: Config) -> MirrorPictures:
+        """Render the mirror with the screen white and black. Raises DeviceError."""
+        try:
+            return take_mirror_pictures(self._make_optics(config).bench)
+        except roles.LinkError as error:
+            raise DeviceError(str(error)) from None
+
+    def _make_optics(self, config: Config) -> EmulatedOptics:
+        self.lens.full_scale_adu = float((1 << config.optics.camera.bits) - 1)
+        return EmulatedOptics(config, self._use_bench(config).plant, self.lens)
 
     def act(self, config: Config, action: Action[T]) -> T:
         """Open the board, do something with it, and leave it with the pump off."""
@@ -150,12 +171,18 @@ class EmulatedBench:
             case HandAct.CLOSE_CIRCUIT:
                 self._interlocks.open_names.discard(motion.name)
                 self._interlocks.lost_names.discard(motion.name)
+            case HandAct.TURN_FOCUS:
+                self.lens.turn_ring()
+                return  # a hold runs, whose time passes only with its ticks
         self.bench.advance(1.0)
 
     @contextlib.contextmanager
-    def start_hold(self, folder: Path, config: Config, name: str) -> Iterator[HoldLink]:
+    def start_hold(
+        self, folder: Path, config: Config, name: str, by_frames: bool = False
+    ) -> Iterator[HoldLink]:
         """Start the controller in standby, in virtual time."""
-        link = self._make_hold(config, self._use_bench(config), name)
+        alter = self.lens.alter_picture if by_frames else None
+        link = self._make_hold(config, self._use_bench(config), name, alter)
         try:
             yield link
         finally:

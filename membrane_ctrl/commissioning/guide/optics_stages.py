@@ -1,10 +1,17 @@
-"""Step 5: camera, screen, geometry, first figure."""
+"""Step 5: focus, screen, geometry, first figure."""
+
+import contextlib
+import math
+from collections.abc import Iterator
 
 import numpy as np
 
 from membrane_ctrl.commissioning.guide import thresholds
+from membrane_ctrl.commissioning.guide.bench_access import HandAct, HandMotion
+from membrane_ctrl.commissioning.guide.dialogue import Choice
 from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth
-from membrane_ctrl.commissioning.guide.session_state import SessionState, TomlTable
+from membrane_ctrl.commissioning.guide.rim_edge import measure_rim_edge_px
+from membrane_ctrl.commissioning.guide.session_state import SessionState, TomlTable, read_tables
 from membrane_ctrl.commissioning.guide.stage import (
     StageContext,
     StageFailedError,
@@ -14,6 +21,14 @@ from membrane_ctrl.config import sight
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sessions.live_hold import HoldError
 
+_TURN_KEY = "focus_turn"
+_TURN, _FIXED = "turn", "fixed"
+_TURNS = (
+    Choice(name=_TURN, meaning="turn the focus ring a little, and measure again"),
+    Choice(name=_FIXED, meaning="both rings are fixed with their screws"),
+)
+_TURNS_MOST = 20
+_IMPROVED = 0.95  # of the edge before: less is noise
 _FIGURES = 5
 _FIGURES_WITHIN_S = 300.0
 _FULL_8_BITS = 255.0
@@ -59,17 +74,68 @@ def ask_geometry(context: StageContext) -> None:
         context.require(f"optics.{doubt.table}.{doubt.key}", False, doubt.why, doubt.remedy)
 
 
-def test_screen(context: StageContext) -> None:
-    """Focus and exposure by hand, then the pattern, settling and response of the screen."""
-    context.dialogue.wait(
-        "focus",
-        "Focus on the mirror's rim, close the diaphragm by two stops from open, and fix both rings",
+@contextlib.contextmanager
+def hold_without_camera(context: StageContext, name: str) -> Iterator[None]:
+    """Hold the mirror at its depth while this session, and not the hold, uses the camera."""
+    context.set_keys("shape", enabled=False)
+    try:
+        with context.access.start_hold(context.folder, context.config, name) as link:
+            hold_depth(context, link, context.config.loop.setpoint_um)
+            context.set_keys("shape", enabled=True)
+            yield
+    except HoldError as error:
+        raise StageFailedError(f"the controller ended it: {error}") from None
+    finally:
+        context.set_keys("shape", enabled=True)
+
+
+def focus_camera(context: StageContext) -> None:
+    """Measure the sharpness of the mirror's rim while a person turns the focus ring."""
+    dialogue = context.dialogue
+    dialogue.wait("focus", "Aim at the whole mirror; close the diaphragm by two stops from open")
+    with hold_without_camera(context, "focus"):
+        edges_px: list[float] = []
+        while True:
+            pictures = context.access.photograph(context.config)
+            edges_px.append(measure_rim_edge_px(pictures))
+            if not math.isfinite(edges_px[-1]):
+                raise StageFailedError(
+                    "no lit mirror in the picture: aim, lens cap, screen, light on the film"
+                )
+            best_px = min(edges_px)
+            dialogue.show(f"  rim's edge: {edges_px[-1]:.1f} px; the best so far {best_px:.1f} px")
+            context.state.answers.pop(_TURN_KEY, None)
+            answer = dialogue.ask_choice(
+                _TURN_KEY, "the narrower the edge, the sharper", _TURNS, _find_advice(edges_px)
+            )
+            if answer == _FIXED:
+                break
+            context.access.move_hand(HandMotion(HandAct.TURN_FOCUS))
+    context.judge(
+        "width of the mirror's rim in the picture, 10 to 90 %",
+        edges_px[-1],
+        thresholds.RIM_EDGE,
+        "focus on the rim, not on the screen's reflection; close the diaphragm further",
     )
-    probes = context.access.probe_optics(context.config)
-    if not probes:
+
+
+def _find_advice(edges_px: list[float]) -> str:
+    """Whether to turn on: while the edge is too wide, or still becomes narrower."""
+    if not thresholds.RIM_EDGE.is_met(edges_px[-1]):
+        return _TURN
+    still_improves = len(edges_px) < 2 or edges_px[-1] < _IMPROVED * edges_px[-2]
+    return _TURN if still_improves and len(edges_px) < _TURNS_MOST else _FIXED
+
+
+def test_screen(context: StageContext) -> None:
+    """Measure exposure, pattern, settling and response of the screen with the camera."""
+    if "screen" not in read_tables(context.folder)["devices"]:
         context.leave_out(
-            "exposure, pattern, settling and response", "this emulation has no camera frames"
+            "exposure, pattern, settling and response", "this camera brings its own patterns"
         )
+        return
+    with hold_without_camera(context, "screen"):
+        probes = context.access.probe_optics(context.config)
     for probe in probes:
         seen = probe.problem or f"{probe.identity}: {probe.reading}; {probe.notes}"
         context.require(f"camera and screen on {probe.device}", not probe.problem, seen)
@@ -78,7 +144,9 @@ def test_screen(context: StageContext) -> None:
 def measure_figure(context: StageContext) -> None:
     """Hold the mirror and judge its first figures."""
     try:
-        with context.access.start_hold(context.folder, context.config, "figure") as link:
+        with context.access.start_hold(
+            context.folder, context.config, "figure", by_frames=True
+        ) as link:
             hold_depth(context, link, context.config.loop.setpoint_um)
             # Figures come with the news of the hold, every two seconds.
             found: list[ShapeEstimate] = []
@@ -115,7 +183,7 @@ def measure_figure(context: StageContext) -> None:
         "focus, expose longer, or brighten the screen",
     )
     if context.access.simulated:
-        context.note("origin of these figures", "the twin's truth, not camera frames")
+        context.note("origin of these figures", "frames rendered of the twin's film")
     context.note("calibration", "by hand; `membrane-ctrl calibrate` refines it with capture sets")
 
 

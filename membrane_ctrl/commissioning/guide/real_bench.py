@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from firmware_iface import roles
+from membrane_ctrl.acquisition import optical_bench
+from membrane_ctrl.acquisition.mirror_pictures import MirrorPictures, take_mirror_pictures
+from membrane_ctrl.acquisition.waiting_clock import WaitingClock
 from membrane_ctrl.commissioning import check
 from membrane_ctrl.commissioning.devices import (
     FoundDevice,
@@ -33,6 +36,7 @@ from membrane_ctrl.instruments import (
     lock_keys,
     lock_store,
 )
+from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.sessions.live_hold import HoldLink, live_hold
 
@@ -63,6 +67,19 @@ class RealBench:
         """Probe camera and screen together."""
         return check.probe_optics(config)
 
+    def photograph(self, config: Config) -> MirrorPictures:
+        """Take the mirror with the screen white and black. Raises DeviceError."""
+        try:
+            optics = optical_bench.configured_bench(config, WaitingClock(RunClock.start()))
+        except roles.LinkError as error:
+            raise DeviceError(str(error)) from None
+        try:
+            return take_mirror_pictures(optics)
+        except roles.LinkError as error:
+            raise DeviceError(str(error)) from None
+        finally:
+            optics.close()
+
     def act(self, config: Config, action: Action[T]) -> T:
         """Open the bench, do something with it, and leave it with the pump off."""
         devices = config.devices
@@ -88,7 +105,9 @@ class RealBench:
         """The person has done it."""
 
     @contextlib.contextmanager
-    def start_hold(self, folder: Path, config: Config, name: str) -> Iterator[HoldLink]:
+    def start_hold(
+        self, folder: Path, config: Config, name: str, by_frames: bool = False
+    ) -> Iterator[HoldLink]:
         """Start `hold --standby` with the session's configuration, and stop it at the end."""
         logs = folder / "logs"
         logs.mkdir(parents=True, exist_ok=True)

@@ -40,7 +40,7 @@ from membrane_ctrl.model.account import account_name
 
 _AGAIN, _ON, _BACK = "again", "continue", "back"
 _HELP = (
-    "At every prompt: `back` returns to the stage before, `stop` or Ctrl-C ends; nothing is lost."
+    "At every prompt: `back` returns to the stage before, `quit` or Ctrl-C ends; nothing is lost."
 )
 
 

@@ -132,6 +132,14 @@ STAGES: tuple[CommissioningStage, ...] = (
     ),
     CommissioningStage(
         step=5,
+        name="focus",
+        does="holds the mirror, and measures the sharpness of its rim while you turn the focus",
+        look_for="the narrowest edge, at most 6 px",
+        run=optics_stages.focus_camera,
+        is_needed=optics_stages.has_camera,
+    ),
+    CommissioningStage(
+        step=5,
         name="screen",
         does="takes pictures of a checkerboard, of steps and of a ramp of grey",
         look_for="a good exposure, single pixels, a settling time, a gamma",

@@ -90,6 +90,12 @@ LEAK_SHARE = Threshold(
     "",
     "beyond, the notice maintenance_pump_reserve is raised: gusts would saturate the pump",
 )
+RIM_EDGE = Threshold(
+    "width of the mirror's rim in the picture, 10 to 90 %",
+    6.0,
+    "px",
+    "a figure averages bins of 4 px; a wider blur mixes slopes of neighbouring bins",
+)
 VALID_FRACTION = Threshold(
     "part of the mirror that a figure measures",
     0.8,

@@ -67,17 +67,17 @@ def questions() -> list[str]:
     """What the wizard asks somebody who answers no optional question."""
     asked: list[str] = []
     needed = {
-        "displacement: driver": "keyence_dl_rs1a",
-        "pump: driver": "ventus",
-        "gauge_pressure: driver": "mks_937b",
+        "devices.kind": "instruments",
+        "displacement.driver": "keyence_dl_rs1a",
+        "pump.driver": "ventus",
+        "gauge_pressure.driver": "mks_937b",
     }
 
-    def prompt(text: str, **_: object) -> str:
-        asked.append(text)
-        answer = next((name for start, name in needed.items() if text.startswith(start)), "")
-        return f"/dev/tty{len(asked)}" if text.strip().startswith("port") else answer
+    def read_answer(key: str, prompt: str) -> str:
+        asked.append(key)
+        return needed.get(key, f"/dev/tty{len(asked)}" if key.endswith(".port") else "")
 
-    wizard.typer.prompt = prompt  # type: ignore[assignment]
+    wizard._read_answer = read_answer
     path = Path("first.toml")
     wizard.write_first_config(path, twin=False, ask=True)
     return asked

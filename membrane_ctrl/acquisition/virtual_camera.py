@@ -1,14 +1,17 @@
 """The measurement cycle on the twin's camera in virtual time: real frames, real reconstruction, no
 waiting.
 
-The film stands still while the frames of a cycle are taken (the virtual plant does not advance
-meanwhile); motion between frames is the business of runs in real time and of `simulate`.
+The film stands still while the frames of a cycle are taken, because the virtual plant does not
+advance meanwhile; motion between frames belongs to runs in real time and to `simulate`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
+from firmware_iface.optical_roles import Pixels
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
@@ -18,8 +21,7 @@ from membrane_ctrl.sim.plant import Plant
 
 
 class VirtualCamera:
-    """A `virtual_run.ShapeSource`: call it with the time, it takes a cycle of the plant as it is
-    then.
+    """A source of shapes (`virtual_run.ShapeSource`): each call takes one cycle.
 
     Parameters
     ----------
@@ -27,9 +29,14 @@ class VirtualCamera:
         The run's configuration.
     plant : Plant
         The twin's physics.
+    alter : callable, optional
+        What a lens out of focus, or another fault, makes of a picture.
     """
 
-    def __init__(self, config: Config, plant: Plant) -> None:
+    def __init__(
+        self, config: Config, plant: Plant, alter: Callable[[Pixels], Pixels] | None = None
+    ) -> None:
+        self._alter = alter
         self._config = config
         self._plant = plant
         self._now_s = 0.0
@@ -51,7 +58,8 @@ class VirtualCamera:
         frames, readings_um = [], []
         for shown in sequence:
             self._optics.screen.show(shown)
-            frames.append(self._optics.camera.grab().pixels.copy())
+            pixels = self._optics.camera.grab().pixels
+            frames.append(pixels.copy() if self._alter is None else self._alter(pixels))
             readings_um.append(self._plant.sample().displacement_um)
         take = (
             self._reconstructor.measure_full if self._full else self._reconstructor.measure_fringes
