@@ -30,6 +30,7 @@ def start_autotune(socket: Path | None, run_dir: Path) -> Callable[[], None]:
     words = [
         "--short",
         "--wait",
+        "--yes",
         "--choose",
         "same-load",
         "--name",

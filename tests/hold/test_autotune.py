@@ -30,7 +30,7 @@ def test_it_starts_a_session_and_ends_it_with_the_hold(
     end = autotune.start_autotune(tmp_path / "control.sock", tmp_path)
     end()
     assert words[2:5] == ["membrane_ctrl", "tune", "run"]
-    assert {"--short", "--wait", "same-load", str(tmp_path / "control.sock")} <= set(words)
+    assert {"--short", "--wait", "--yes", "same-load", str(tmp_path / "control.sock")} <= set(words)
     assert (tmp_path / "autotune.log").read_bytes() == b""
 
 

@@ -12,6 +12,7 @@ import signal
 import sys
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder, create_session, open_session
 from membrane_ctrl.sessions.progress import Progress
 from tuning import connection, estimator_levels, journal, twin_hold
-from tuning.commands import run
+from tuning.commands import choose, run
 from tuning.commands.compare import compare_sessions as compare
 from tuning.gains_file import load_gains
 from tuning.identification.closed_loop import Gains
@@ -584,6 +585,25 @@ def test_the_least_variance_is_the_same_load_where_it_answers_a_load_no_worse(
     monkeypatch.setattr(design, "load_candidates", lambda folder: (tuple(rows), rows[0]))
     apply.select_candidate(opened, name)
     assert load_gains(opened.file_path("gains.toml")).candidate == "least-variance"
+
+
+def test_a_named_candidate_without_benefit_is_applied_only_for_a_person(
+    done: SessionFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`hold --autotune` verified gains for five minutes that were predicted to be no better."""
+    rows, proposed = design.load_candidates(done)
+    present = next(row for row in rows if row.name == "present")
+    better = replace(present, name="same-load")
+    assert present.predicted is not None
+    for share, applied in ((1.0, False), (0.8, True)):
+        predicted = replace(present.predicted, std_um=share * present.predicted.std_um)
+        same_load = replace(better, predicted=predicted)
+        loaded = ((present, same_load), proposed)
+        monkeypatch.setattr(design, "load_candidates", lambda folder, loaded=loaded: loaded)
+        assert choose.choose_candidate(done, False, "same-load", Progress()) == "same-load"
+        chosen = choose.choose_candidate(done, True, "same-load", Progress())
+        assert chosen == ("same-load" if applied else None)
+    assert "the present gains are as good as same-load" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["fast", "ziegler-nichols", "present"])

@@ -36,7 +36,8 @@ def choose_candidate(folder: SessionFolder, yes: bool, name: str, progress: Prog
         Apply the gains in `gains.toml` without asking, unless they are a proposal that is no better
         than the present gains.
     name : str
-        The candidate to apply without asking; empty to ask.
+        The candidate to apply without asking, with `yes` unless it is no better than the present
+        gains; empty to ask.
     progress : Progress
         Asks the person.
 
@@ -58,7 +59,12 @@ def choose_candidate(folder: SessionFolder, yes: bool, name: str, progress: Prog
     screen = terminal.table_console(stderr=True, width=width)
     screen.print(candidate_table.format_terminal(rows, title, model.leak_um_per_s))
     if name:
-        return design.find_candidate(folder, name).name
+        chosen = design.find_candidate(folder, name).name
+        no_benefit = design.explain_no_benefit_of(folder, name) if yes else ""
+        if not no_benefit:
+            return chosen
+        progress.print_line(no_benefit)
+        return None
     if not yes:
         return _ask_for_candidate(folder, progress)
     if no_benefit := design.explain_no_benefit(folder):

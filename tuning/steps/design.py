@@ -140,12 +140,26 @@ def explain_no_benefit(session: folder.SessionFolder) -> str:
         return ""
     if load_gains(session.file_path("gains.toml")).candidate:
         return ""
-    growth = now.figures.std_um / present.figures.std_um
+    return _compare_benefit(now, present)
+
+
+def explain_no_benefit_of(session: folder.SessionFolder, name: str) -> str:
+    """Why a named candidate is not worth a trial; empty if it is. Raises like `find_candidate`."""
+    chosen = find_candidate(session, name)
+    rows, _ = load_candidates(session)
+    present = next((row for row in rows if row.name == candidate.PRESENT), None)
+    if present is None:
+        return ""
+    return _compare_benefit(chosen, present)
+
+
+def _compare_benefit(chosen: candidate.Candidate, present: candidate.Candidate) -> str:
+    growth = chosen.figures.std_um / present.figures.std_um
     lacks_margin = candidate.find_refusal(present) != ""
     if lacks_margin or not growth > verification.GROWTH_OF_BENEFIT:
         return ""
     return (
-        f"the present gains are as good as the proposal: its predicted std is {growth:.2f} of "
+        f"the present gains are as good as {chosen.name}: its predicted std is {growth:.2f} of "
         "theirs, and a verification shows no smaller difference than "
         f"{1 - verification.GROWTH_OF_BENEFIT:.0%}"
     )
