@@ -23,11 +23,13 @@ def explain_checkerboard(seen: ArrayLike, white: ArrayLike, black: ArrayLike) ->
     """The problem and its remedy, from frames (H, W) of checkerboard, white and black; empty if
     none.
     """
+    # Blocks that see the screen.
     dark = block_means(black)
     full = block_means(white) - dark
     lit = full > _LIT_SHARE * float(np.max(full))
     if float(np.max(full)) <= 0 or np.mean(lit) < _LEAST_LIT:
         return "the camera does not see the screen: no block is brighter on white than on black"
+    # Each should have half of the light: scaling makes bands, sharpening another mean.
     share = (block_means(seen) - dark)[lit] / full[lit]
     low, middle, high = (float(value) for value in np.percentile(share, (2, 50, 98)))
     if high - low > _LARGEST_BAND:

@@ -14,6 +14,7 @@ def explain_exposure(white: Pixels, black: Pixels, full_scale_adu: int, exposure
     """The problem and its remedy, from frames (H, W) of a white and a black screen;
     empty if none.
     """
+    # Brightest and darkest light without single pixels.
     saturated = float(np.mean(white >= full_scale_adu))
     bright = float(np.quantile(white, 0.99))
     dark = float(np.quantile(black, 0.99))

@@ -263,6 +263,7 @@ class ProparParameters:
     async def _transact(self, data: bytes, what: str) -> bytes:
         """Data of the answer with the question's sequence number; a status other than 0 raises."""
         what = f"{self.name}: {what}"
+        # A second question fences off the answers to the first, should it be late.
         question = self._make_question(data, what)
         fence = self._make_question(
             make_request([MEASURE]), f"{self.name}: asking again after a loss"
@@ -271,6 +272,7 @@ class ProparParameters:
         message = split_binary(answer)[0][-1]
         if message.data[0] != STATUS:
             return message.data
+        # A status instead of data.
         code = message.data[1] if len(message.data) > 1 else 255
         if code == 0:
             return message.data

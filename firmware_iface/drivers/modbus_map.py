@@ -55,11 +55,13 @@ class ValueMap:
         """A value to registers. Raises ValueError outside the limits."""
         if not self.allows(value):
             raise ValueError(f"{value:g} is not within {self.limits[0]:g} .. {self.limits[1]:g}")
+        # A straight line through the two stated points.
         raw_0, raw_1 = self.raw
         value_0, value_1 = self.value
         raw = raw_0 + (value - value_0) * (raw_1 - raw_0) / (value_1 - value_0)
         if self.type != "f32":
             raw = round(raw)
+        # In the words and the order of the device.
         packed = struct.pack(">" + _FORMATS[self.type], raw)
         words = list(struct.unpack(f">{self.words}H", packed))
         if self.word_order == "big":
@@ -152,6 +154,7 @@ class ModbusValue:
         """
         if not self._link.connected:
             await self._link.connect()
+        # Is it the configured device?
         version, detail = "", "not checked: the map names no identity register"
         if self._map.identity is not None:
             address, wanted = self._map.identity
@@ -164,6 +167,7 @@ class ModbusValue:
         if self._map.version_address is not None:
             (number,) = await self._link.read_holding(self._map.version_address, 1)
             version = f"{number / 100:.2f}"
+        # An actuator at rest, and a value that can be read.
         if self._rest is not None:
             await self._write_value(self._rest)
         await self._read_value()

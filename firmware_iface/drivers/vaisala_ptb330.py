@@ -179,6 +179,7 @@ def decode_message(message: re.Match[str], name: str) -> BarometerMessage:
 
     Raises LinkError (wrong checksum, or a pressure that the instrument cannot measure).
     """
+    # The sum of all characters, then what the instrument says of its own state.
     checked, pressure, flags, counter, serial, checksum = message.groups()
     if sum(checked.encode("ascii")) % 2**16 != int(checksum, 16):
         raise roles.LinkError(f"{name}: wrong checksum; noise on the line")

@@ -266,6 +266,7 @@ def _read_file(file: Path) -> StoredLock:
     is gone.
     """
     try:
+        # Whatever is wrong with the file, it remains a lock.
         table = json.loads(files.read_text(file, _FILE_BYTES_MOST))
         if table["schema"] != SCHEMA:
             raise ValueError("another schema")

@@ -92,6 +92,7 @@ def find_expired(
         `recording.keep_gb` and `keep_days`; None: no limit.
     now_utc : datetime
     """
+    # Oldest first, until age and size are within their limits.
     total = present_bytes + sum(run.size_bytes for run in runs)
     expired: list[tuple[OldRun, str]] = []
     for place, run in enumerate(runs):

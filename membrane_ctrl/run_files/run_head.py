@@ -42,6 +42,7 @@ def read_run_head(folder: Path, notes: list[str]) -> RunHead:
     except (OSError, ValueError) as error:
         notes.append(f"{HEAD_FILE}: cannot be read ({error})")
         return RunHead()
+    # Of our schema, and not damaged or edited.
     found = None
     if isinstance(table, dict):
         found = _SCHEMA.fullmatch(str(table.get("schema")))

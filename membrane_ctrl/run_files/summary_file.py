@@ -24,6 +24,7 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
     except (OSError, ValueError) as error:
         notes.append(f"summary.json: cannot be read ({error})")
         return None
+    # Of our schema, with its checksum, and plausible.
     if not isinstance(summary, dict) or summary.get("schema") != _SUMMARY_SCHEMA:
         notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
         if not isinstance(summary, dict):

@@ -152,6 +152,7 @@ class GuidedSession:
         with self._lock:
             if self._seen.is_running:
                 raise errors.InputError(f"the session {self._seen.name} runs; stop it first")
+            # The program that a terminal would run, with messages instead of text.
             words = [*self._command, str(folder), "--messages"]
             if simulated:
                 words.append("--twin")
@@ -168,6 +169,7 @@ class GuidedSession:
                     errors="replace",
                     start_new_session=True,
                 )
+            # A thread follows it, so that no viewer waits.
             self._seen = SeenSession(name, is_running=True)
             self._reader = threading.Thread(
                 target=self._follow, args=(self._process, name, folder), daemon=True

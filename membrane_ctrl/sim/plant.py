@@ -167,6 +167,7 @@ class Plant:
 
     def _load_block(self) -> None:
         """Surroundings and creep of the next block, as lists: indexing them gives plain floats."""
+        # Surroundings.
         block = self._disturbance.next_steps(_BLOCK_STEPS)
         age_s = self._loaded_s + block.time_s
         self._ambient_pa: list[float] = block.ambient_pa.tolist()
@@ -174,6 +175,7 @@ class Plant:
         self._leak: list[float] = block.leak_factor.tolist()
         self._laser_bias_um: list[float] = block.laser_bias_um.tolist()
         self._laser_lost: list[float] = block.laser_lost.tolist()
+        # Sag and volume of the films over the cube root of the pressure, as they creep.
         self._sag: list[float] = film.MIRROR_FILM.sag_mm_per_root_pa(age_s).tolist()
         self._back_sag: list[float] = film.BACK_FILM.sag_mm_per_root_pa(age_s).tolist()
         volume = film.MIRROR_FILM.volume_m3_per_root_pa(

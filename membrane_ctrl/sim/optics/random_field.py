@@ -54,11 +54,13 @@ class RandomField:
 
     def evaluate_at(self, time_s: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """The field at places of the square; beyond it that of its edge."""
+        # Each amplitude is a first-order process of unit variance.
         if time_s > self._time_s:
             keep = math.exp(-(time_s - self._time_s) / self._memory_s)
             fresh = self._rng.standard_normal(2 * _WAVES)
             self._amplitudes = keep * self._amplitudes + math.sqrt(1.0 - keep * keep) * fresh
             self._time_s = time_s
+        # The field on its nodes, interpolated.
         field = np.tensordot(self._amplitudes, self._basis, 1).astype(np.float32)
         column = ((x_mm + self._half_side_mm) * self._nodes_per_mm).astype(np.float32)
         row = ((y_mm + self._half_side_mm) * self._nodes_per_mm).astype(np.float32)
