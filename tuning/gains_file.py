@@ -27,7 +27,7 @@ _NO_GAINS = {"setpoint_um", "bleed_fraction", "flow_max_um_per_s"}
 
 
 class PlantSection(Section):
-    """The plant the gains were designed for (`loop_model.PlantModel`), with standard errors."""
+    """The plant the gains were designed for (`plant_model.PlantModel`), with standard errors."""
 
     gain: Positive
     dead_time_s: Annotated[float, Field(ge=0, le=10)]
@@ -65,7 +65,13 @@ class GainsFile(OriginSection):
 
 
 def save_gains(path: Path, gains: GainsFile) -> None:
-    """Write a gains file atomically, without the setpoint, which belongs to the hold."""
+    """Write a gains file atomically, without the setpoint, which belongs to the hold.
+
+    Parameters
+    ----------
+    path : path
+    gains : GainsFile
+    """
     origin = program.file_origin(SCHEMA)
     table = gains.model_dump(mode="json", by_alias=True, exclude={"loop": {"setpoint_um"}})
     files.write_text_atomic(files.resolve_user_path(path), tomli_w.dumps({**table, **origin}))
@@ -79,8 +85,19 @@ def load_gains(path: Path) -> GainsFile:
 def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     """Refuse gains that must not be applied.
 
-    Raises InputError if the loop is unstable or has too little margin on the file's own plant, or
-    its tick rate differs from that of the hold (`running`); `where` names the file.
+    Parameters
+    ----------
+    gains : GainsFile
+    where : str
+        Name of the file, for the message.
+    running : LoopConfig
+        The settings of the hold.
+
+    Raises
+    ------
+    InputError
+        If the loop is unstable or has too little margin on the file's own plant, or its tick rate
+        differs from that of the hold.
     """
     dt_s = 1 / gains.loop.rate_hz
     found = margins.compute_margins(
@@ -103,7 +120,13 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
 
 
 def adapt_to_hold(gains: LoopConfig, running: LoopConfig) -> LoopConfig:
-    """The gains for a hold, which keeps its own setpoint, bleed and limit of the flow: those are
-    not gains.
+    """Return the gains for a hold.
+
+    Parameters
+    ----------
+    gains : LoopConfig
+        The gains to apply.
+    running : LoopConfig
+        The settings of the hold, whose setpoint, bleed and limit of the flow stay.
     """
     return LoopConfig.model_validate(gains.model_dump() | running.model_dump(include=_NO_GAINS))

@@ -77,10 +77,12 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     if config.devices is not None:
         bench.require_separate_ports(config.devices)
         driver_check.require_optics(config.devices)
+    # Each device is opened alone and asked what it is; facts of several may contradict each other.
     probes, circuits = probe_all_devices(config)
     for probe in probes:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
     missing = list_missing_packages(config)
+    # What `hold` would do with this configuration.
     would = _describe_hold(config)
     if samples := _describe_samples(config, probes):
         would["samples"] = samples
@@ -106,6 +108,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
         warnings = [finding.line(source) for finding in findings if finding.severity == "warning"]
         warnings += [f"{source}: {each.missing_line}" for each in missing]
         _print_probes(source, probes, circuits, would, warnings)
+    # The exit code tells the worst finding: configuration, then devices, then interlocks.
     refused = [finding.line(source) for finding in findings if finding.severity == "error"]
     if refused:
         raise errors.FindingsError(refused)

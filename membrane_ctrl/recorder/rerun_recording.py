@@ -109,10 +109,12 @@ class Recording:
     def _send_statics(self) -> None:
         """Send what holds for the whole run: names, colours, lanes, masks of maps."""
         stream = self._stream
+        # Which run this is, and which program wrote it.
         stream.send_recording_name(self._run_dir.name)
         origin: dict[str, Any] = {"name": self._run_name, "started_utc": str(self._origin)}
         origin |= file_origin("membrane-recording/1")
         stream.send_property("run", rr.AnyValues(**origin))
+        # Names, colours and widths of the lines of each stream.
         for block in (
             *streams.STREAMS,
             *streams.DERIVED,
@@ -133,6 +135,7 @@ class Recording:
                 _style_lines(rr.SeriesLines, block, aggregation_policy="Off"),
                 static=True,
             )
+        # The bars of the Zernike coefficients are counted by their Noll index.
         bars = rr.BarChart(
             np.zeros(ZERNIKE_TERMS - 1), abscissa=NOLL_INDICES[1:]
         ).as_component_batches()
@@ -140,6 +143,7 @@ class Recording:
             part for part in bars if part.component_descriptor().component == "BarChart:abscissa"
         ]
         stream.log(shapes.BARS_PATH, abscissa, static=True)
+        # The words of each lane of states, with their colours.
         for lane in LANES:
             words = list(lane.colours)
             colours = np.array([lane.colours[word] for word in words], dtype=np.uint32)
@@ -153,6 +157,7 @@ class Recording:
             rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (OUTSIDE_CLASS, "", (24, 24, 24, 255))]),
             static=True,
         )
+        # Maps are square; a mask greys what lies outside of the mirror's disc.
         outside = rr.SegmentationImage(
             shapes.outside_disc() * OUTSIDE_CLASS, opacity=1.0, draw_order=1.0
         )

@@ -226,6 +226,7 @@ class WebPage:
                     lambda: on_behalf(self._user, self._session),
                     self._wanted_gains,
                 )
+            # Panels load their tables when their tab is opened first, not with the page.
             loads = {
                 look_back.props["name"]: load_runs,
                 alarms.props["name"]: load_alarms,
@@ -244,6 +245,7 @@ class WebPage:
                 await loads[event.value]()
 
         tabs.on_value_change(load)
+        # The address of the page may name the tab to open.
         by_name = {name.lower(): name for name in loads}
         if self._first_tab in by_name:
             tabs.set_value(by_name[self._first_tab])

@@ -96,6 +96,7 @@ def runs_panel(
     logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]
 ) -> Callable[[], Awaitable[None]]:
     """Fill the tab; returns the function that lists the runs again."""
+    # A table of runs; a narrow window shows each run as a card.
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
         for name, label in (

@@ -118,10 +118,12 @@ def _run_server(
     guided: GuidedSession,
     idle_s: float,
 ) -> None:
+    # Where the page is reached, who may connect, and what it may edit.
     address = public_address(page)
     guard = ConnectionGuard(raise_file_limit())
     editor = ConfigurationEditor(Path(page.configurations))
     session_key = read_or_make_secret("session-key")
+    # The login goes around the whole application: it sees each request first.
     build_inside = app.build_middleware_stack
 
     def build_middleware_stack() -> ASGIApp:
@@ -133,6 +135,7 @@ def _run_server(
         return with_login(inside, accounts, address, session_key, tokens, guard)
 
     app.build_middleware_stack = build_middleware_stack  # type: ignore[method-assign]
+    # What runs beside the pages: the end of an unused service, the alarms, a feed for each hold.
     idle_end = IdleEnd(idle_s, time.monotonic())
     folders = {feed.logs for feed in feeds.values() if feed.logs is not None}
     alarms = AlarmChild(sorted(folders), page.heartbeat)
@@ -155,6 +158,8 @@ def _run_server(
         app.on_startup(feed.open)
         app.on_shutdown(feed.close)
 
+    # The page itself, and the data that its elements ask for afterwards. Long work runs in pools of
+    # threads; a full pool answers with 503, and the page asks again.
     views = SharedViews(feeds)
 
     @ui.page("/", title="membrane_ctrl")
@@ -231,6 +236,7 @@ def _run_server(
         except PoolFullError as error:
             return PlainTextResponse(str(error), 503)
 
+    # Without accounts the link carries the secret that logs in.
     link = address.base_url + ("" if accounts.users else f"?key={accounts.secret}")
     print(f"membrane-ctrl serve: open {link}", file=sys.stderr, flush=True)
     print(draw_link_code(link), end="", file=sys.stderr, flush=True)

@@ -13,8 +13,19 @@ _COLUMNS_ELSEWHERE = 170  # of the table, if it is not shown on a terminal
 
 
 def require_answer(yes: bool, name: str) -> None:
-    """Raises InputError before anything moves if no person can choose the gains, or the name is no
-    candidate's.
+    """Refuse a command, before anything moves, that could not choose the gains at its end.
+
+    Parameters
+    ----------
+    yes : bool
+        Apply the proposal without asking.
+    name : str
+        The candidate to apply without asking; empty to ask.
+
+    Raises
+    ------
+    InputError
+        If no person can choose the gains, or the name is no candidate's.
     """
     if not (yes or name or sys.stdin.isatty()):
         raise InputError(

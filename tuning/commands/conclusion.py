@@ -10,7 +10,19 @@ from tuning.steps import verify
 
 
 def conclude(folder: SessionFolder, options: TuneOptions) -> int:
-    """Print where the session is, and return the exit code: rejected if its gains were not kept."""
+    """Print where the session is, and return the exit code.
+
+    Parameters
+    ----------
+    folder : SessionFolder
+    options : TuneOptions
+        `json` prints the finished steps on stdout.
+
+    Returns
+    -------
+    int
+        Rejected if the gains of the session were not kept.
+    """
     if options.json:
         done = [step for step in STEPS if folder.is_done(step)]
         print(json.dumps({"session": str(folder.path), "done": done}))

@@ -12,6 +12,7 @@ from tuning.rigs.hold_rig import HoldRig
 
 def roll_back(options: TuneOptions) -> int:
     """Restore the gains from before the last kept session."""
+    # Set the gains that were there before it.
     kept = journal.find_roll_back(options.logs)
     progress = Progress()
     with connection.connect_to_hold(options) as link:
@@ -24,6 +25,7 @@ def roll_back(options: TuneOptions) -> int:
             )
         except HoldError as error:
             raise DeviceError(str(error)) from None
+    # Note it, also that a configuration may still have the others.
     entry_values = (
         kept.session,
         options.author,

@@ -29,8 +29,7 @@ _MODULES: dict[str, ModuleType] = {
 }
 _NO_GAINS = (
     "the hold follows the estimate, whose loop has no gains to design: `membrane-ctrl tune "
-    "save {} --config FILE` "
-    "hands pump and noise levels to [estimator]"
+    "save {} --config FILE` hands pump and noise levels to [estimator]"
 )
 _OF_GAINS = frozenset({"design", "preview", "apply", "verify"})
 _MOVES = frozenset({"characterise", "observe", "apply", "verify"})
@@ -62,10 +61,23 @@ def run_session(options: TuneOptions) -> int:
 
 
 def run_step(step: str, options: TuneOptions) -> int:
-    """Run one step of the named or newest session; `characterise` starts a new one.
+    """Run one step of the named or newest session.
 
-    Raises InputError, DeviceError or RejectedError, and then holds the mirror with the last good
-    gains.
+    Parameters
+    ----------
+    step : str
+        One of `STEPS`; `characterise` starts a new session.
+    options : TuneOptions
+
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    InputError, DeviceError, RejectedError
+        The mirror is then held with the last good gains.
     """
     if step == "apply":
         choose.require_answer(options.yes, options.choose)

@@ -26,13 +26,16 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
     Raises InputError if the gains were not kept, or are not for this configuration.
     """
     config = toml_file.load_toml(path, schema.Config)
+    # A hold without PI loop has tuned only its estimator.
     if not config.has_pi:
         return _save_estimator(
             path, find_newest_session(logs) if name is None else open_session(name), config, yes
         )
+    # Which kinds of results the session has kept: gains, curve of the pump, time constant.
     folder, shape_s = _find_session(name, logs)
     keys: tuple[str, ...] = GAIN_KEYS
     gains, pump = config.loop, config.pump
+    # Gains hold for the bench that they were found on; a time constant only for the same devices.
     if shape_s is None or folder.is_done("verify") or map_pump.has_pump_map(folder):
         gains, pump = _load_kept_gains(folder), folder.config.pump
         same = config
@@ -43,6 +46,7 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
         require_same_bench(path, same, folder)
     else:
         require_same_devices(path, config, folder)
+    # Only the entries that differ are edited, so the comments of the file stay.
     before = files.read_text(path, follow=True)
     shape = config.shape.model_copy(
         update={"time_constant_s": shape_s or config.shape.time_constant_s}
@@ -56,6 +60,7 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
         measured = _find_estimator(folder, config)
         changed["estimator"] = list_changes(config.estimator, measured)
     after = edit_text(before, changed, path)
+    # The whole configuration that would result is checked before anyone is asked.
     loop = schema.LoopConfig.model_validate(config.loop.model_dump() | changed["loop"])
     require_sound(config.model_copy(update={"loop": loop, "pump": pump, "shape": shape}), str(path))
     if not any(changed.values()):
@@ -63,6 +68,7 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
         return errors.Exit.DONE
     if not confirm_and_replace(path, before, after, folder, yes):
         return errors.Exit.DONE
+    # The journal of the sessions keeps who saved which gains where.
     entry = journal.make_entry(
         "saved", folder.path.name, author, str(path.resolve()), folder.head.before, gains
     )

@@ -26,6 +26,8 @@ def tune_shape_loop(options: TuneOptions) -> int:
         progress,
     ):
         before_s = folder.config.shape.time_constant_s
+        # Noise and drift of the figure come from a quiet hold, the sag per µm of the laser from
+        # steps of the setpoint.
         progress.begin_step(
             "shape loop", shape_loop_fit.TYPICAL_S + options.observe_s, options.verify_s
         )
@@ -44,6 +46,7 @@ def tune_shape_loop(options: TuneOptions) -> int:
             f"{found.drift_um_per_sqrt_h:.2f} µm/sqrt(h): shape.time_constant_s = "
             f"{found.time_constant_s:.0f}"
         )
+        # Nothing to try if the fit is too poor, or the present time constant is as good.
         if not _to_be_tried(
             shape_loop_fit.find_unfit_reason(found),
             found.time_constant_s,
@@ -52,10 +55,13 @@ def tune_shape_loop(options: TuneOptions) -> int:
             progress,
         ):
             return conclude(folder, options)
+        # The trial predicts each next shape with both time constants, and takes the new one back if
+        # it is worse.
         progress.begin_step("trial of the time constant", options.verify_s, 0.0)
         earlier = [*steady, *(shape for level in levels for shape in level)]
         times_s = (before_s, found.time_constant_s)
         done = shape_loop_trial.try_time_constant(rig, times_s, earlier, assumed, options.verify_s)
+        # Keep a record of it: in the journal of the sessions, and in the folder of this one.
         what: journal.What = "taken_back" if done.reason else "kept"
         entry_values = (
             folder.path.name,

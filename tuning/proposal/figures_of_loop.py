@@ -19,7 +19,24 @@ def compute_loop_figures(
     loop: LoopConfig,
     step_um_per_s: float,
 ) -> loop_figures.LoopFigures:
-    """The figures on one plant; infinite for an unstable loop."""
+    """Compute the figures of a loop on one plant.
+
+    Parameters
+    ----------
+    gains : Gains
+    model : PlantModel
+    disturbance : DisturbanceModel
+        Noise of the readings, and weather.
+    loop : LoopConfig
+        Its feed-forward and its limits.
+    step_um_per_s : float
+        Step of the leak.
+
+    Returns
+    -------
+    LoopFigures
+        Infinite for an unstable loop.
+    """
     dt_s = disturbance.rest.dt_s
     ms = margins.find_sensitivity_peak(gains, model, dt_s)
     if not math.isfinite(ms):

@@ -65,7 +65,15 @@ class ModelBench:
         self.true_um: list[float] = []
 
     def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
-        """Run one tick. The vent is assumed as during the identification of the leak."""
+        """Run one tick.
+
+        Parameters
+        ----------
+        pump_fraction : float
+            Command of the pump.
+        vent_fraction : float
+            Has no effect: the leak was identified with the vent as it is.
+        """
         step_s, step_um_per_s = self._leak_step
         leak_um_per_s = self._model.leak_um_per_s
         if self._ticks * self._dt_s >= step_s:

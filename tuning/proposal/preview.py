@@ -45,8 +45,28 @@ def preview_loop(
     duration_s: float = 180.0,
     load_step_um_per_s: float = 0.6,
 ) -> Preview:
-    """Hold on the fitted twin in its weather, and once more without
-    weather for a step of the leak.
+    """Hold on the fitted twin in its weather, and once more without weather for a step of the leak.
+
+    Parameters
+    ----------
+    loop : LoopConfig
+        The gains to preview.
+    pump : PumpConfig
+        The pump's curve.
+    model : PlantModel
+        The fitted plant.
+    disturbance : DisturbanceModel
+        Noise of the readings, and weather.
+    seed : int
+        Of both.
+    duration_s : float
+        Of the hold in its weather.
+    load_step_um_per_s : float
+        Step of the leak.
+
+    Returns
+    -------
+    Preview
     """
     # In its weather, at the rate of fresh readings.
     loop = loop.model_copy(update={"rate_hz": 1.0 / disturbance.rest.dt_s})

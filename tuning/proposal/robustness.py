@@ -57,7 +57,20 @@ def evaluate_robustness(
     loop: LoopConfig,
     count: int = 60,
 ) -> Robustness:
-    """Evaluate gains on sampled plants; an unstable one counts as infinitely bad."""
+    """Evaluate gains on sampled plants; an unstable one counts as infinitely bad.
+
+    Parameters
+    ----------
+    gains : Gains
+    identified : Identified
+        The fit, whose covariance the plants are drawn from.
+    disturbance : DisturbanceModel
+        Noise of the readings, and weather.
+    loop : LoopConfig
+        Its feed-forward and its limits.
+    count : int
+        Number of plants.
+    """
     plants = sample_plants(identified, count)
     dt_s = disturbance.rest.dt_s
     peaks = np.array([margins.find_sensitivity_peak(gains, plant, dt_s) for plant in plants])

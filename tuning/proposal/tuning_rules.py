@@ -9,7 +9,15 @@ from tuning.identification import closed_loop, plant_model
 
 
 def compute_effective_delay_s(model: plant_model.PlantModel, dt_s: float, filter_s: float) -> float:
-    """Delay of the integrator-with-delay that stands for the loop."""
+    """Delay of the integrator-with-delay that stands for the loop.
+
+    Parameters
+    ----------
+    model : PlantModel
+        Dead time and lag.
+    dt_s, filter_s : float
+        Sample time, of which half counts, and the filter of the reading.
+    """
     return model.delay_s + dt_s / 2 + filter_s
 
 
@@ -36,8 +44,9 @@ def make_simc_gains(
 def make_amigo_gains(
     model: plant_model.PlantModel, dt_s: float, filter_s: float
 ) -> closed_loop.Gains:
-    """AMIGO PI for an integrating process: K = 0.35 / (k d), Ti = 13.4 d (Astrom and Hagglund 2006,
-    eq. 7.3).
+    """AMIGO PI for an integrating process: K = 0.35 / (k d), Ti = 13.4 d.
+
+    Astrom and Hagglund 2006, eq. 7.3. Parameters as of `make_simc_gains`.
     """
     delay_s = compute_effective_delay_s(model, dt_s, filter_s)
     return closed_loop.Gains(0.35 / (model.gain * delay_s), 13.4 * delay_s, 0.0, filter_s)
@@ -46,7 +55,16 @@ def make_amigo_gains(
 def make_lambda_gains(
     model: plant_model.PlantModel, dt_s: float, filter_s: float, factor: float = 3.0
 ) -> closed_loop.Gains:
-    """Lambda PI, lambda = factor x delay: Ti = 2 lambda + d, K = Ti / (k (lambda + d)^2)."""
+    """Lambda PI: Ti = 2 lambda + d, K = Ti / (k (lambda + d)^2).
+
+    Parameters
+    ----------
+    model : PlantModel
+    dt_s, filter_s : float
+        Sample time, and the filter of the reading.
+    factor : float
+        lambda over the delay d.
+    """
     delay_s = compute_effective_delay_s(model, dt_s, filter_s)
     lambda_s = factor * delay_s
     ti_s = 2 * lambda_s + delay_s
@@ -57,8 +75,12 @@ def make_lambda_gains(
 def make_ziegler_nichols_gains(
     ultimate_gain_per_s: float, ultimate_period_s: float
 ) -> closed_loop.Gains:
-    """The Ziegler-Nichols PID from a relay: K = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8,
-    no filter on D.
+    """Ziegler-Nichols PID from a relay: K = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8, no filter on D.
+
+    Parameters
+    ----------
+    ultimate_gain_per_s, ultimate_period_s : float
+        Ku and Tu of the relay's limit cycle.
     """
     return closed_loop.Gains(
         0.6 * ultimate_gain_per_s, ultimate_period_s / 2, ultimate_period_s / 8, 0.0

@@ -24,7 +24,17 @@ def load_checked_gains(session: folder.SessionFolder) -> schema.LoopConfig:
 def select_candidate(session: folder.SessionFolder, name: str) -> None:
     """Put a candidate into `gains.toml`, and preview it if the preview was of other gains.
 
-    Raises InputError if it is unknown or must not be applied.
+    Parameters
+    ----------
+    session : SessionFolder
+        With a finished design.
+    name : str
+        Of the candidate.
+
+    Raises
+    ------
+    InputError
+        If it is unknown or must not be applied.
     """
     selected = design.find_candidate(session, name)
     assert selected.predicted is not None  # else refused

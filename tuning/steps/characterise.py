@@ -22,9 +22,7 @@ class ExperimentsHead:
 
 
 class PumpUnknownError(errors.RejectedError):
-    """The experiments fail, or contradict themselves, in a way that
-    the pump's curve may explain.
-    """
+    """The experiments fail or contradict themselves, as the pump's curve may explain."""
 
 
 def run_characterise(
@@ -33,9 +31,21 @@ def run_characterise(
     limit_um: float = 10.0,
     plan: experiments.Plan = experiments.FULL,
 ) -> experiments.Experiments:
-    """Run the experiments on the mirror. Raises RejectedError with a remedy if none completes.
+    """Run the experiments on the mirror.
 
-    It is a PumpUnknownError if the pump's curve may be the cause.
+    Parameters
+    ----------
+    session : SessionFolder
+    rig : HoldRig
+    limit_um : float
+        How far the mirror may move from its setpoint.
+    plan : Plan
+        How long the parts of the experiments last.
+
+    Raises
+    ------
+    RejectedError
+        With a remedy if none completes; PumpUnknownError if the pump's curve may be the cause.
     """
     session.begin_step("characterise")
     try:

@@ -84,14 +84,35 @@ def describe_result(session: folder.SessionFolder) -> str:
 
 
 def describe_losses(record: Record, by_optics: bool) -> str:
-    """How often and how long the sensor of the displacement had no reading; empty if it never
-    had.
+    """How often and how long the sensor of the displacement had no reading.
+
+    Parameters
+    ----------
+    record : Record
+        Of the experiments.
+    by_optics : bool
+        Whether the sensor is the camera; otherwise it is the laser.
+
+    Returns
+    -------
+    str
+        Empty if it never lost its reading.
     """
     return describe_gaps(record.gaps_s, record.duration_s, by_optics)
 
 
 def describe_gaps(gaps_s: Sequence[float], duration_s: float, by_optics: bool) -> str:
-    """As `describe_losses`, for times without a reading in a time of experiments."""
+    """As `describe_losses`, for several records.
+
+    Parameters
+    ----------
+    gaps_s : sequence of float
+        Duration of each time without a reading.
+    duration_s : float
+        Of all experiments.
+    by_optics : bool
+        As of `describe_losses`.
+    """
     if not gaps_s:
         return ""
     sensor = "camera" if by_optics else "laser"

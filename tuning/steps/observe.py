@@ -30,8 +30,21 @@ _PICTURE = "weather.png"
 def run_observe(
     session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S
 ) -> DisturbanceModel:
-    """Observe a quiet hold, in a short session the one before its experiments: laser noise and
-    weather.
+    """Observe a quiet hold for laser noise and weather, in a short session the one before its
+    experiments.
+
+    Parameters
+    ----------
+    session : SessionFolder
+        With an identified plant.
+    rig : HoldRig
+    duration_s : float
+        Of the hold, unless it was recorded before the experiments.
+
+    Raises
+    ------
+    RejectedError
+        If the record does not show them.
     """
     model = load_identified(session).identified.model
     session.begin_step("observe")
