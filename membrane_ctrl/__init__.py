@@ -6,7 +6,7 @@ import contextlib
 import os
 from pathlib import Path
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 # Compiled kernels beside the modules would outlive `pip uninstall`. Without a home directory they
 # are not stored (`model/kernel_cache.py`).

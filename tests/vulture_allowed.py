@@ -156,6 +156,8 @@ _.reason_code  # compared with the rest of its dataclass
 stated_kp_per_s, stated_ti_s  # of an event, written as a whole
 _.FIXED_POINTS  # a reading of the paper: all members are computed
 _.beside_heading  # read by the template of a report page
+_.commissioning_report  # a route of the page
+_.use_mirror  # another bench than the twin, for tests
 (_.status_code, _.in_contact, _.has_report)  # of HTTP answers, written as a whole
 (
     _.stated_kp_per_s,

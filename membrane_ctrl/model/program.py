@@ -38,7 +38,7 @@ def program_commit() -> str:
 
 
 def program_identity() -> str:
-    """Name, version and commit in one line: `membrane-ctrl 0.1.0 (0123456789ab)`."""
+    """Name, version and commit in one line: `membrane-ctrl 1.0.0 (0123456789ab)`."""
     return stated_program(file_origin(""))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from membrane_ctrl.commissioning.guide.bench_access import BenchAccess
 from membrane_ctrl.commissioning.guide.dialogue import SessionDisplay
 from membrane_ctrl.commissioning.guide.emulated_bench import EmulatedBench
 from membrane_ctrl.commissioning.guide.session import CommissioningSession
@@ -87,7 +88,7 @@ def make_session(
 
 
 def run_stages(
-    folder: Path, bench: EmulatedBench, person: Person, *names: str, plan: SessionPlan = SHORT
+    folder: Path, bench: BenchAccess, person: Person, *names: str, plan: SessionPlan = SHORT
 ) -> Exit:
     """Run the named stages, or all, of a session in a folder."""
     stages = tuple(stage for stage in STAGES if not names or stage.name in names)
