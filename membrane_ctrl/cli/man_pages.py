@@ -69,6 +69,7 @@ def _list_commands(command: Any) -> list[tuple[str, Any]]:
 
 def _make_page(command: Any, words: Sequence[str], context: Any) -> str:
     name = "-".join(words)
+    # The help text of the command: its first paragraph is the summary.
     paragraphs = [part.replace("\n", " ") for part in (command.help or "").split("\n\n")]
     summary = paragraphs[0].rstrip(".")
     lines = [
@@ -82,6 +83,7 @@ def _make_page(command: Any, words: Sequence[str], context: Any) -> str:
     ]
     for paragraph in paragraphs:
         lines += [".PP", _format_help(paragraph)]
+    # Arguments, options and subcommands, as `--help` lists them.
     records: dict[str, list[tuple[str, str]]] = {"argument": [], "option": []}
     for each in command.get_params(context):
         record = each.get_help_record(context)
@@ -94,9 +96,11 @@ def _make_page(command: Any, words: Sequence[str], context: Any) -> str:
         "COMMANDS",
         [(f"{' '.join(words)} {sub}", each.get_short_help_str(200)) for sub, each in subs],
     )
+    # Only the program's own page explains the exit codes.
     if len(words) == 1:
         codes = [(f"{code.value}", meaning) for code, meaning in _EXIT_MEANINGS.items()]
         lines += _format_records("EXIT STATUS", codes)
+    # Refer to the subcommands, or from a lowest command to the one above it.
     others = [f"{name}-{sub}" for sub, _ in subs] or ["-".join(words[:-1])]
     references = ", ".join(f"\\fB{_escape_roff(other)}\\fP({_SECTION})" for other in others)
     lines += [".SH SEE ALSO", references]

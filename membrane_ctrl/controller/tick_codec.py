@@ -189,10 +189,12 @@ def unpack_tick(
     LookupError
         If an estimate or a tail is missing.
     """
+    # The fixed part by name; commands and ended tasks are a JSON tail, which most ticks lack.
     values: dict[str, Any] = dict(zip(RECORD.names or (), record.item(), strict=True))
     if len(tail) != values["tail_bytes"]:
         raise LookupError(f"commands of tick {values['tick']} are missing")
     rest = json.loads(tail) if tail else {"commands": [], "dead_tasks": [], "link": {}}
+    # The shape estimate is recorded once, under its time, not in each tick that saw it.
     estimate_time_s = values["estimate_time_s"]
     if not math.isnan(estimate_time_s) and estimate_time_s not in estimates:
         raise LookupError(f"the shape of {estimate_time_s:.3f} s is missing")

@@ -73,6 +73,7 @@ class SetSeries:
 
 def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> SetSeries:
     """One full set, and fringes sets after it, each computed from its frames."""
+    # The bench: frames of the film as it moves, read by the laser with its noise.
     renderer = OpticsRenderer(
         bench.optics,
         bench.film,
@@ -84,9 +85,11 @@ def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> SetSeries:
     live = LiveReconstructor(bench.optics, bin_px, laser_noise_um=_LASER_NOISE_UM)
     full = pattern_sequence.full_sequence(bench.optics.pattern)
     fringes = pattern_sequence.fringe_sequence(bench.optics.pattern)
+    # The film's displacement at each frame, µm, and what the laser reads of it.
     film_um = _draw_displacements(random, len(full) + (sets - 1) * len(fringes))
     readings_um = film_um + _LASER_NOISE_UM * random.standard_normal(film_um.size)
 
+    # A full cycle first; each later one takes as many frames of the series as it has patterns.
     parameters_mm, middle_s, moved_um = [], [], []
     rejected = 0
     begin = 0

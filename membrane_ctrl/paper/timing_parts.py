@@ -20,11 +20,14 @@ _FRINGES_CYCLE_S = 4.0
 def compare_timings(bench: MeasuredBench) -> PartResult:
     """Seconds of the paper's steps here, each also in copies of the set's frames."""
     stack = bench.stack
+    # The unit that makes machines comparable: the time to copy the frames of a set.
     copy_s = min(_measure_time(stack.frames.copy) for _ in range(3))
+    # The steps of `measure` alone: checks, phases, surface.
     check_s = _measure_time(lambda: check_set(stack, bench.optics, None))
     pixels_s = _measure_time(lambda: measure_pixels(bench.optics, bench.checked))
     solve_s = _measure_time(lambda: reconstruct_full(bench.optics, bench.checked, bench.pixels))
 
+    # The same in a hold: a full cycle first, then fringes-only cycles that begin at its figure.
     live = LiveReconstructor(bench.optics)
     readings_um = np.zeros(len(stack.frames))
     time_s = np.arange(len(stack.frames), dtype=float)
@@ -37,6 +40,7 @@ def compare_timings(bench: MeasuredBench) -> PartResult:
         _measure_time(lambda: live.measure_fringes(fringes, time_s[:count], readings_um[:count]))
         for _ in range(3)
     )
+    # What the paper states of each step, and the seconds here.
     rows = {
         "frame checks and phases of the bins": ("", check_s),
         "phases of all pixels": ("", pixels_s),

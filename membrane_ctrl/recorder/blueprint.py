@@ -174,6 +174,7 @@ def _make_map(kind: str, name: str) -> rrb.Spatial2DView:
 
 
 def _make_shape_tab(config: Config) -> rrb.Vertical:
+    # The maps on top, from the whole shape to what a cycle's noise leaves uncertain.
     maps = rrb.Horizontal(
         _make_map("height", "Height, mm"),
         _make_map("difference", "Change since hold began, µm"),
@@ -186,6 +187,7 @@ def _make_shape_tab(config: Config) -> rrb.Vertical:
         _make_map("uncertainty", "Noise of a cycle, 1σ, µm"),
         rrb.TextDocumentView(name="Colours", origin="/shape/legend"),
     )
+    # Below them sag and low orders in time, then what tells the quality of a cycle.
     band_um = config.limits.band_um
     rows = [
         maps,
@@ -215,6 +217,7 @@ def _make_shape_tab(config: Config) -> rrb.Vertical:
             *(_make_ticks_plot(plot) for plot in plots_of(Group.SHAPE) if plot != columns.TRIM),
         ),
     ]
+    # A shape from each frame shows vibrations too.
     if config.shape.mode == "track":
         terms = f"Z{zernike_terms.FIRST_FIGURE_INDEX} (top) to Z{zernike_terms.ZERNIKE_TERMS}"
         fall = f"{terms}, change since hold began; a column a second, now on the right"

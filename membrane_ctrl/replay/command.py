@@ -272,6 +272,7 @@ def _make_verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) 
 
 def _format_report(report: dict[str, Any]) -> list[str]:
     """The report as lines of text."""
+    # What was compared, and with what the run was recorded.
     lines = [
         f"verdict    {report['verdict']}: {report['compared']} of {report['ticks']} ticks "
         "compared bit by bit"
@@ -286,6 +287,7 @@ def _format_report(report: dict[str, Any]) -> list[str]:
             "           with columns that this program does not have: "
             f"{', '.join(report['unknown_columns'])}"
         )
+    # Differences that another processor explains.
     if report["near"]:
         lines.append(
             f"numbers    {report['near']} ticks have other last bits; decisions are the "
@@ -294,6 +296,7 @@ def _format_report(report: dict[str, Any]) -> list[str]:
         )
     if report["from_snapshot"]:
         lines.append(f"begins     at {report['begin_s']:.2f} s, from a snapshot of the controller")
+    # Real differences: the first tick with one, and its values then and now.
     first = report["first_different"]
     if first is not None:
         lines.append(
@@ -310,12 +313,14 @@ def _format_report(report: dict[str, Any]) -> list[str]:
         for name, (then, now) in (report["fields"] or {}).items():
             lines.append(f"           {name}: recorded {then!r}, today {now!r}")
     lines += [f"decision   {sentence}" for sentence in report["decisions"]]
+    # A snapshot tells the whole state of the controller, more than a tick's row.
     if (state := report["state_differences"]) is not None:
         lines.append(
             f"state      differs from the snapshot at {state['time_s']:.2f} s in "
             f"{len(state['fields'])} fields:"
         )
         lines += [f"           {each}" for each in state["fields"][:_FIELDS_SHOWN]]
+    # What could not be compared.
     for gap in report["gaps"]:
         lines.append(
             f"gap        {gap['ticks']} ticks after tick {gap['after_tick']} at "

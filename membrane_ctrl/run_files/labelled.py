@@ -97,6 +97,7 @@ def make_cycles_dataset(
         Attributes of the dataset.
     """
     xarray = import_optional("xarray", "data", "a dataset")
+    # Covariances are recorded less often than cycles, and have their own times.
     found = found.select_cycles((found.time_s >= part_s[0]) & (found.time_s < part_s[1]))
     kept = (found.covariance_time_s >= part_s[0]) & (found.covariance_time_s < part_s[1])
     labels = labels_of(table_specs.SHAPES) | labels_of(table_specs.COVARIANCES)

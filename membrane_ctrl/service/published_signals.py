@@ -57,10 +57,12 @@ def table_lines(published: Sequence[Published]) -> list[str]:
 
 def signal_values(seen: HoldSeen) -> dict[str, Value]:
     """The values of `SIGNAL_TABLE`; None, or `no contact`, instead of old ones."""
+    # A hold that does not answer has no values, not its last ones.
     found: dict[str, Value] = {each.name: None for each in SIGNAL_TABLE}
     found["run"] = seen.name
     if seen.silent:
         return {**found, "state": "no contact", "why": seen.silent}
+    # What `ctl status` tells, and the newest tick.
     status, row = seen.status, seen.status.get("row") or {}
     found |= {
         "state": str(status.get("state", "")),
@@ -71,6 +73,7 @@ def signal_values(seen: HoldSeen) -> dict[str, Value]:
         "notices": "; ".join(notice_lines(status)),
     }
     found |= {each.name: row.get(each.name) for each in _TICK}
+    # The newest figure with its age, s.
     if seen.figure is not None:
         age_s = (row.get("mono_s") or math.nan) - seen.figure.time_s
         found |= {"figure_verdict": seen.figure.verdict, "figure_age_s": age_s}

@@ -235,12 +235,14 @@ class Lab:
 
     def _map_devices(self) -> None:
         """One device for all maps that name the same unit of the same link."""
+        # Roles by the link and unit of their device.
         units: defaultdict[tuple[str, int], list[tuple[str, settings.ModbusMapConfig]]] = (
             defaultdict(list)
         )
         for role, section in self._devices.roles().items():
             if isinstance(section, settings.ModbusMapConfig):
                 units[section.link, section.unit_id].append((role, section))
+        # One table of registers for each unit: sensors to read, actuators to write, constants.
         for (link, unit_id), members in units.items():
             sensors: dict[ValueMap, Callable[[], float]] = {}
             outputs: dict[ValueMap, Callable[[float], None]] = {}

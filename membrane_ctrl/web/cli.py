@@ -95,10 +95,12 @@ def serve(
     from membrane_ctrl.control_port import ctl
     from membrane_ctrl.processes.command_process import end_with_parent
 
+    # Imported here: other commands need no web libraries.
     for library in PAGE_LIBRARIES:
         require_installed(library, "web", "`serve`")
     from membrane_ctrl.web.server import serve
 
+    # An option that was given replaces the entry of the service's file.
     given: dict[str, Any] = {
         "logs": logs,
         "configurations": configurations,
@@ -122,6 +124,7 @@ def serve(
     if with_hold:
         end_with_parent()
     idle_s = math.inf if idle_end is None else durations.parse_duration_s(idle_end)
+    # Without a fleet, the one hold that runs in the folder of the runs.
     holds = {"": ctl.Where(logs=Path(page.logs))} if fleet is None else ctl.fleet(fleet)
     serve(holds, page, idle_s)
 

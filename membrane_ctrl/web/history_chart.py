@@ -52,15 +52,18 @@ def make_history_chart(
     moments : sequence of ChartLine
         Oldest first.
     """
+    # Panels of equal height, in per cent of the chart, with a gap between them.
     count = len(found)
     height = (100.0 - _TOP - _BOTTOM - (count - 1) * _GAP) / count
     shift_ms = 0.0 if utc else 1e3 * _find_offset_s(found)
     lines = [_make_line(each, shift_ms) for each in moments[-_MARKS_MOST:]]
+    # All panels show the same time, from the first to the last value of any signal.
     ends_s = [float(each.utc_s[place]) for _, each in found if each.utc_s.size for place in (0, -1)]
     span = (
         {"min": min(ends_s) * 1e3 + shift_ms, "max": max(ends_s) * 1e3 + shift_ms} if ends_s else {}
     )
     grids, x_axes, y_axes, series = [], [], [], []
+    # One grid with its axes and lines for each signal; only the lowest labels the time.
     for place, (signal, values) in enumerate(found):
         column = COLUMNS[signal]
         is_lowest = place == count - 1

@@ -90,6 +90,7 @@ def load_from_run(path: Path, logs: Path) -> Workpiece:
     columns = {
         name: np.concatenate([block[name] for block in blocks] or [np.empty(0)]) for name in names
     }
+    # The longest stretch of undisturbed hold.
     quiet = (columns["state"] == telemetry.State.HOLD) & (
         columns["safe_level"] == telemetry.SafeLevel.NONE
     )
@@ -99,6 +100,7 @@ def load_from_run(path: Path, logs: Path) -> Workpiece:
         raise errors.InputError(
             f"{path}: no undisturbed hold of {SHORTEST_S:.0f} s; choose another run or a session"
         )
+    # Weather is what the plant's model does not explain of it.
     model, whose = _find_plant(logs, float(np.nanmedian(columns["leak_um_per_s"][part])))
     record = Record(dt_s, *(columns[name][part].astype(float) for name in _COLUMNS))
     try:

@@ -136,6 +136,7 @@ def _describe_fit(session: folder.SessionFolder) -> list[PageBlock]:
     found = load_identified(session)
     fit = found.identified
     model, sigma = fit.model, fit.sigma
+    # Whether the data may be used, and what they lack.
     mark = TextMark.BAD if found.quality.verdict == "refused" else TextMark.GOOD
     reasons = "; ".join(found.quality.reasons)
     lossy = describe_losses(load_experiments(session).record, session.config.by_optics)
@@ -146,6 +147,7 @@ def _describe_fit(session: folder.SessionFolder) -> list[PageBlock]:
         ("delay, both (s)", f"{model.delay_s:.3f}", f"{sigma.delay_s:.3f}"),
         ("leak (µm/s)", f"{model.leak_um_per_s:.2f}", f"{sigma.leak_um_per_s:.2f}"),
     ]
+    # White residuals, independent of the flow: the model explains what the pump did.
     tests = (
         f"Residuals: whiteness p = {fit.whiteness_p:.3g}, independence of the flow p = "
         f"{fit.independence_p:.3g}, largest {fit.largest_residual:.1f} sigma. "

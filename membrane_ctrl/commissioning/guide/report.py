@@ -88,6 +88,7 @@ def _make_page(
     reasons: list[str],
     signed_by: str,
 ) -> ReportPage:
+    # The verdict with its reasons comes first,
     verdict = "Accepted." if not reasons else f"Not accepted: {len(reasons)} reasons."
     mark = TextMark.BAD if reasons else TextMark.GOOD
     first: list[PageText | PageLines | PageFacts] = [PageText(verdict, mark)]
@@ -97,6 +98,7 @@ def _make_page(
         first.append(PageLines(reasons))
     first.append(PageFacts(_list_facts(folder, state, signed_by)))
     sections = [PageSection("", first)]
+    # then the mirror's data with what follows from them,
     if state.facts is not None:
         lines = explain_design(state.facts, derive_design(state.facts))
         data = [(name, f"{value:g}") for name, value in state.facts.model_dump().items()]
@@ -106,11 +108,13 @@ def _make_page(
                 [PageFacts(data), PageLines([line.strip() for line in lines])],
             )
         )
+    # the checks of each step in the order of the procedure,
     for step, title in STEP_TITLES.items():
         rows = _list_rows(stages, state, step)
         if rows:
             head = ("check", "measured", "limit", "result", "to do")
             sections.append(PageSection(f"{step}. {title}", [PageTable(head, rows)]))
+    # and the limits by which they were judged.
     limits = [(each.name, each.words, each.reason) for each in ALL_THRESHOLDS]
     sections.append(PageSection("Limits", [PageTable(("of", "limit", "why"), limits)]))
     return ReportPage("Commissioning report", sections, footer=program.program_identity())

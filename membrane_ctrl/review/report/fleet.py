@@ -163,11 +163,13 @@ def fleet_command(options: FleetOptions) -> int:
     --help`.
     """
     folders, out = list_fleet_folders(options.runs), options.out.resolve()
+    # Runs are named by their path below the folder that all have in common.
     common = Path(os.path.commonpath([folder.parent for folder in folders]))
     workers = options.workers or min(os.cpu_count() or 1, len(folders))
     job = partial(run_report, options.start, options.end)
     rows = []
     entries = []
+    # Runs are reported in parallel; one that cannot be is an entry with its problem.
     with (
         errors.convert_write_errors(out, errors.DeviceError, "; choose another folder with --out"),
         run_jobs(job, folders, workers, options.scheduler) as results,
@@ -181,6 +183,7 @@ def fleet_command(options: FleetOptions) -> int:
                 write_report(out / name, report.text, report.page)
             entries.append(entry)
             rows.append(_make_row(entry, report.curve))
+        # Refuse only if no run could be reported.
         if all("problem" in entry for entry in entries):
             raise errors.FindingsError(
                 [f"{entry['name']}: {entry['problem']}" for entry in entries]
@@ -205,6 +208,7 @@ def _make_row(entry: dict[str, Any], curve: str) -> list[str]:
     if "problem" in entry:
         cells = [entry["name"], "", "", _NOT_REPORTED, entry["problem"]]
         return cells + [""] * (len(_HEAD) - len(cells))
+    # How long the mirror was held, and what the rest of the time was.
     in_band = "–"
     if entry["in_band"] is not None and math.isfinite(entry["in_band"]):
         in_band = f"{100 * entry['in_band']:.4g} %"

@@ -76,6 +76,7 @@ def compare_analyses(ours: Analysis, theirs: Analysis) -> list[Difference]:
 def _compare_series(
     name: str, a: ErrorSeries, b: ErrorSeries, offset_um: float, tracks: bool
 ) -> list[Difference]:
+    # Mean, scatter of single seconds, and drift.
     first = a.windows[0], b.windows[0]
     mean = mean_p(a.seconds_um, b.seconds_um, offset=offset_um)
     found = [
@@ -98,6 +99,7 @@ def _compare_series(
             f"{name}, drift", "µm/h", a.drift.per_hour, b.drift.per_hour, _slope_p(a.drift, b.drift)
         ),
     ]
+    # Scatter of longer windows, from their means.
     for x, y in zip(a.windows[1:], b.windows[1:], strict=True):
         parts = [
             np.stack(window_means(series.seconds_um[0], series.seconds_um[1], x.window_s))
@@ -120,12 +122,15 @@ def _of_mean(offset_um: float, tracks: bool) -> str:
 
 def _compare_loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
     ours_ticks, theirs_ticks = ours.ticks, theirs.ticks
+    # Means of the windows in which each run held; lateness is compared by its logarithm, whose
+    # distribution is less skewed.
     leak, pump, late = (
         [_select_held(analysis, name) for analysis in (ours, theirs)]
         for name in ("mean_leak_um_per_s", "mean_pump_fraction", "max_lateness_ms")
     )
     window_s = max(ours.level_s, theirs.level_s)
     late = [np.stack((part[0], np.log(np.maximum(part[1], 1e-6)))) for part in late]
+    # The maximum of a window grows with its length.
     same = ours.level_s == theirs.level_s
     late_p = mean_p(late[0], late[1], window_s) if same else math.nan
     late_note = f"tested by the maximum of each {window_s:g} s"

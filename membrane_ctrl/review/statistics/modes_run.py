@@ -91,6 +91,7 @@ def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pict
     """Search the frames for vibrations, write `modes.json` and pictures, report. Raises
     CommandError.
     """
+    # Search some minutes of each run by themselves: lines come and go.
     times: list[float] = []
     searches: list[tuple[VibrationMode, ...] | None] = []
     for folder in folders:
@@ -103,6 +104,7 @@ def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pict
         raise errors.RejectedError(
             f"{folders[0]}: less than {LEAST_S:g} s of frames at a steady rate"
         )
+    # A line that at least half of the searches see is a mode; the others are passing.
     modes, passing = _group_lines(
         np.array([at_s for at_s, _ in done]), [lines for _, lines in done]
     )
@@ -191,6 +193,8 @@ def _group_lines(
     many others.
     """
     modes: list[SeenMode] = []
+    # In the order of their frequencies, each line joins the first mode whose last line it
+    # resembles, unless that mode already has a line of the same search.
     seen = [(line, at_s) for at_s, lines in zip(times_s, searches, strict=True) for line in lines]
     for line, at_s in sorted(seen, key=lambda each: each[0].frequency_hz):
         near = (
@@ -202,6 +206,7 @@ def _group_lines(
             modes.append(SeenMode(np.array([at_s]), (line,)))
         else:
             modes[k] = SeenMode(np.append(modes[k].time_s, at_s), (*modes[k].lines, line))
+    # Keep modes that were seen often enough, the strongest evidence first.
     least = max(1, round(_USUAL * len(searches)))
     usual = sorted(
         (mode for mode in modes if len(mode.lines) >= least),
