@@ -27,6 +27,10 @@ class FrontFilmConfig(Section):
     """Distance of its rim in front of the mirror's. Set it to the thickness of the ring between."""
     thickness_um: Annotated[float, Field(ge=0, le=10_000)] = 10.0
     """Thickness of the film. Set it from the film's data sheet."""
+    thickness_sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.03
+    """Standard uncertainty of the thickness, and of its evenness, of its value. Set it from the
+    film's data sheet.
+    """
     index: Annotated[float, Field(gt=1, le=3)] = 1.6
     """Refractive index of the film. Set it from the film's data sheet: it gives the reflectance."""
     gas: GasName = "nitrogen"

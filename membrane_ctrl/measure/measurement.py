@@ -104,6 +104,10 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
     verdict, reason = shape_estimate.judge_quality(full.quality)
     if verdict == "ok":
         verdict, reason = checked.verdict
+    reflections = full.reflections
+    if reflections is not None and reflections.doubt and verdict != "rejected":
+        reasons = [part for part in (reason, reflections.doubt) if part]
+        verdict, reason = "degraded", "; ".join(reasons)
     timing = {"load": loaded - begin, "phase": middle - loaded, "reconstruct": end - middle}
 
     # What follows needs no frames: they are large.

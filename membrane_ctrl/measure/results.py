@@ -16,6 +16,7 @@ from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
 from membrane_ctrl.measure.result_files import number_or_null, write_arrays, write_json
 from membrane_ctrl.metrology.figure import radial_profile
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
+from membrane_ctrl.metrology.figure.reflection_fit import ReflectionFit
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.metrology.rays.rim_outline import Outline
@@ -256,6 +257,8 @@ def details_table(
             "zonal_residual_max_um": float(np.max(np.abs(residual_um - residual_um.mean()))),
             "motion_taken_out": full.moved,
         }
+        if full.reflections is not None:
+            table["front_film"] = _front_film_table(full.reflections)
     if profile is not None:
         table |= {"hencky_sag_mm": profile.sag_mm, "pressure_equivalent_pa": profile.pressure_pa}
 
@@ -275,6 +278,22 @@ def details_table(
             "size_ratio": outline.size_ratio,
         }
     return table
+
+
+def _front_film_table(fit: ReflectionFit) -> dict[str, Any]:
+    """The reflections of the screen by the front film, and its errors of form that they show."""
+    raised_mm, tilt_x_mrad, tilt_y_mrad, *saddles_mm = fit.errors.tolist()
+    return {
+        "reflections": fit.state.value,
+        "shares": fit.shares.tolist(),
+        "bulge_less_stated_mm": raised_mm,
+        "tilt_mrad": [tilt_x_mrad, tilt_y_mrad],
+        "saddles_mm": saddles_mm,
+        "ripple_rad": {
+            "before": number_or_null(fit.before_rad),
+            "after": number_or_null(fit.after_rad),
+        },
+    }
 
 
 def _light_table(checked: Checked) -> dict[str, Any]:
@@ -299,6 +318,10 @@ def _light_table(checked: Checked) -> dict[str, Any]:
             "share": number_or_null(second.share),
             "sigma": number_or_null(second.sigma),
             "shift_mm": [number_or_null(second.mm_per_rad * s) for s in second.shift_rad],
+        },
+        "film_image": {
+            "share": checked.image.share,
+            "place_mm": [number_or_null(checked.image.x_mm), number_or_null(checked.image.y_mm)],
         },
         "clip_levels_adu": {
             "white": clip.white_adu,

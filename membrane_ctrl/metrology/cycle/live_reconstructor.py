@@ -37,6 +37,7 @@ from membrane_ctrl.metrology.phase import (
 from membrane_ctrl.metrology.phase.clip_levels import ClipLevels, find_clip_levels
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.rays import geometry, ray_tracing, surface
+from membrane_ctrl.metrology.rays.film_reflections import find_reflecting_rays
 from membrane_ctrl.metrology.reconstruction import (
     bin_grid,
     film_motion,
@@ -144,9 +145,10 @@ class LiveReconstructor:
         size = (optics.camera.height_px, optics.camera.width_px)
         self._binner = bin_sums.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
         self._grid = bin_grid.BinGrid(self._geometry, optics.camera, bin_px)
-        self._near = np.flatnonzero(
-            self._grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
-        )
+        # Bins on the mirror, without those in which a front film may show the pattern again.
+        near = self._grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
+        near &= ~find_reflecting_rays(self._geometry, optics, self._grid.rays)
+        self._near = np.flatnonzero(near)
         self._reference_um = optics.geometry.reference_displacement_um
         self._mm_per_rad = screen_scale.mm_per_rad(optics.pattern)
         self._pixel_sigma_adu = slope_noise.pixel_sigma_adu(optics.camera.noise_adu)

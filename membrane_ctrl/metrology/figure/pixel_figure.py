@@ -7,6 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology.figure.reflection_fit import (
+    ReflectionFit,
+    fit_reflections,
+    remove_reflections,
+)
 from membrane_ctrl.metrology.figure.set_motion import FilmMotion, combine_axis_steps
 from membrane_ctrl.metrology.figure.set_quality import set_quality
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
@@ -16,11 +21,12 @@ from membrane_ctrl.metrology.phase import full_decoder, pattern_sequence, phase_
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.phase.pixel_phases import PixelPhases, pixel_phases
 from membrane_ctrl.metrology.rays import ray_tracing
+from membrane_ctrl.metrology.rays.film_reflections import map_reflections
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction import film_motion, slope_noise, surface_fit, zonal_map
 from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
-from membrane_ctrl.model.arrays import FloatArray, Image, IntArray, Singles
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
 _START_SAG_MM = 40.0  # the paper's starting parabola
@@ -64,6 +70,8 @@ class FullResult:
         Quality of the fit, for the verdict.
     moved : bool
         Whether the film's motion was corrected.
+    reflections : ReflectionFit, optional
+        What was found and removed of a front film's reflections.
     """
 
     fit: surface_fit.Fit
@@ -76,6 +84,7 @@ class FullResult:
     residual_mm: FloatArray
     quality: Quality
     moved: bool
+    reflections: ReflectionFit | None = None
 
     @property
     def surface(self) -> Surface:
@@ -154,6 +163,8 @@ class PixelPoints:
         Standard deviation of a pixel in one frame, as the frames show it; NaN for three steps.
     moved : bool
         Whether the film's motion was corrected.
+    reflections : ReflectionFit, optional
+        What was found and removed of a front film's reflections.
     """
 
     index: IntArray
@@ -161,6 +172,7 @@ class PixelPoints:
     swing_adu: Singles
     noise_adu: float
     moved: bool
+    reflections: ReflectionFit | None = None
 
 
 def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
@@ -219,13 +231,62 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     keep &= ~(x_phases.saturated | y_phases.saturated)
     swing_adu = np.minimum(x_phases.swing_adu, y_phases.swing_adu)
     keep &= swing_adu > full_decoder.FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
+
+    # Without the reflections of a front film, and pixels that show their edges.
+    reflections = None
+    if tracer.geometry.cushion is not None:
+        reflections, lost = _remove_reflections(optics, checked, points, keep)
+        keep &= ~lost
     index = index[keep]
     swing_adu = swing_adu[keep]
     noise_adu = pixel_noise.estimate_pixel_noise_adu(stack, checked.view.used, index)
 
     # The copies of the points take the most memory of a measurement: free what is not needed.
     del x_phases, y_phases, phase_rad, x_mm, y_mm, in_bin, sensitivity_rad_per_um
-    return PixelPoints(index, points.subset(keep), swing_adu, noise_adu, moved)
+    return PixelPoints(index, points.subset(keep), swing_adu, noise_adu, moved, reflections)
+
+
+def _remove_reflections(
+    optics: OpticsConfig, checked: Checked, points: ray_tracing.Points, usable: BoolArray
+) -> tuple[ReflectionFit | None, BoolArray]:
+    """Fit the reflections of a front film to the usable pixels, and remove them from the screen
+    points, in place; with the pixels that must be left out.
+    """
+    tracer = checked.tracer
+    surface = checked.state.surface
+    lost = np.zeros(usable.size, bool)
+    front = optics.mirror.front_film
+    images = map_reflections(tracer.geometry, surface, tracer.vertex_z_mm, optics.pattern)
+    if front is None or images is None:
+        return None, lost
+
+    # The pixels that may show them.
+    position_mm = np.array(tracer.position_mm(points))
+    place = np.flatnonzero(usable & images.shows_pattern(position_mm))
+    some = points.subset(place)
+    if not place.size:
+        return None, lost
+    pixel_mm = float(np.median(some.t_mm)) / tracer.geometry.focal_px
+    expected_mm = tracer.predict_screen(some, surface)
+    fit = fit_reflections(
+        tracer.geometry,
+        surface,
+        tracer.vertex_z_mm,
+        optics.pattern,
+        front.bulge_sigma_mm,
+        position_mm[:, place],
+        some.screen_mm,
+        expected_mm,
+        pixel_mm,
+    )
+    if fit is None:
+        return None, lost
+    seen_mm = some.screen_mm
+    lost[place] = remove_reflections(
+        fit, optics.pattern, position_mm[:, place], seen_mm, expected_mm, pixel_mm
+    )
+    points.screen_mm[:, place] = seen_mm
+    return fit, lost
 
 
 def _trace_pixel_rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
@@ -365,6 +426,7 @@ def reconstruct_full(
         residual_mm=zonal_map.integrate_residual(grid),
         quality=set_quality(optics, checked, fit, float(np.median(pixels.swing_adu))),
         moved=pixels.moved,
+        reflections=pixels.reflections,
     )
 
 

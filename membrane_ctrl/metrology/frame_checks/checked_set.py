@@ -9,6 +9,7 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.frame_checks import (
     band_removal,
     bin_view,
+    film_image,
     frame_faults,
     image_lag,
     light_response,
@@ -76,6 +77,8 @@ class Checked:
         A second image of the screen.
     response : LightResponse
         Response of panel and camera, and how even the light is.
+    image : FilmImage
+        A part of the mirror that shows the screen a second time.
     """
 
     stack: frame_stack.FrameStack
@@ -97,6 +100,7 @@ class Checked:
     response: light_response.LightResponse = field(
         default_factory=light_response.LightResponse.unknown
     )
+    image: film_image.FilmImage = film_image.NO_FILM_IMAGE
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
@@ -108,6 +112,7 @@ class Checked:
             band_removal.describe_bands(self.stack.gain),
             image_lag.describe_image_lag(self.lag),
             second_reflection.describe_second_reflection(self.second),
+            self.image.describe(),
             light_response.describe_response(self.response),
         )
         reason = "; ".join(doubt for doubt in doubts if doubt)

@@ -20,6 +20,7 @@ from membrane_ctrl.metrology.frame_checks import (
     band_removal,
     bin_view,
     clipping,
+    film_image,
     frame_evidence,
     frame_faults,
     frame_inspection,
@@ -40,6 +41,7 @@ from membrane_ctrl.metrology.phase import frame_stack
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.metrology.phase.screen_scale import centre_phase_rad, inside_pattern, mm_per_rad
 from membrane_ctrl.metrology.rays import ray_tracing
+from membrane_ctrl.metrology.rays.film_reflections import find_reflecting_rays
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.reconstruction import bin_grid, tracked_points
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
@@ -373,7 +375,39 @@ def _measure_light_path(
         excluded,
         checked.view.used,
     )
-    return replace(checked, second=second, response=response)
+    image = _find_film_image(checked, excluded, optics)
+    return replace(checked, second=second, response=response, image=image)
+
+
+def _find_film_image(
+    checked: Checked, excluded: set[int], optics: OpticsConfig
+) -> film_image.FilmImage:
+    """A second reflection of the screen in a part of the mirror, if the bench has no front film and
+    the set has a white and a black frame.
+    """
+    pair = checked.stack.white_and_black(excluded)
+    geometry = checked.tracer.geometry
+    if pair is None or geometry.cushion is not None:
+        return film_image.NO_FILM_IMAGE
+    white, black = pair
+
+    # Bins on the mirror, about where their rays cross the middle of the bowl's depth.
+    index = np.flatnonzero(checked.view.mask & checked.near)
+    rays = geometry.rays(*checked.places_px(index))
+    depth_mm = checked.state.surface.sag_mm / 2
+    t = (depth_mm - geometry.pinhole_mm[2]) / rays[2]
+    position_mm = geometry.pinhole_mm[:2, None] + t * rays[:2]
+    on_film = np.hypot(*position_mm) < optics.mirror.analysis_radius_mm
+    index = index[on_film]
+    light = checked.binned.means[white].astype(float) - checked.binned.means[black]
+    swing = checked.view.swing_adu.mean(axis=0)
+    return film_image.find_film_image(
+        (light.shape[0], light.shape[1]),
+        index,
+        position_mm[:, on_film],
+        light.reshape(-1)[index],
+        swing.reshape(-1)[index],
+    )
 
 
 def _find_swapped_pair(
@@ -422,12 +456,15 @@ class _Bench:
     ----------
     near : (bins,) bool array
         Bins whose rays may meet the mirror.
+    reflecting : (bins,) bool array
+        Bins in which a front film may show the pattern again: the surface is fitted without them.
     """
 
     optics: OpticsConfig
     geometry: Geometry
     grid: bin_grid.BinGrid
     near: BoolArray
+    reflecting: BoolArray
     anchor: Anchor | None
 
     @classmethod
@@ -446,7 +483,8 @@ class _Bench:
         geometry = Geometry.from_config(optics)
         grid = bin_grid.BinGrid(geometry, optics.camera, bin_px)
         near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
-        return cls(optics, geometry, grid, near, anchor)
+        reflecting = find_reflecting_rays(geometry, optics, grid.rays)
+        return cls(optics, geometry, grid, near, reflecting, anchor)
 
 
 def _attempt_without_lag(
@@ -501,7 +539,7 @@ def _attempt_fit(
     phase_rad = absolute_phases_of_bins(stack, binned, view, anchor, optics)
 
     # The surface that explains them.
-    candidates = np.flatnonzero(bench.near)
+    candidates = np.flatnonzero(bench.near & ~bench.reflecting)
     phase_of_candidates_rad = phase_rad.reshape(2, -1)[:, candidates]
     state = tracked_points.select_points(
         bench.grid,

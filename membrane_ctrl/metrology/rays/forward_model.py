@@ -358,6 +358,10 @@ def _intersect_screen(
     # S, and the normal N = normal - w_x s_x - w_y s_y there.
     screen_point = start + k * along
     _w, by_x, by_y = geometry.face.heights(screen_point[:2])
+    screen_mm = screen_point[:2]
+    if surface is not None and geometry.gas_lens is not None:
+        x_mm, y_mm, _z_mm = film_point
+        screen_mm = screen_mm + geometry.gas_lens.find_shift_mm(x_mm, y_mm, surface.sag_mm)
     s_x, s_y, plane_normal = axes
     face_normal = plane_normal[:, None] - by_x * s_x[:, None] - by_y * s_y[:, None]
     return _Meeting(
@@ -369,7 +373,7 @@ def _intersect_screen(
         reach_mm=k,
         from_origin=axes.T @ screen_point,
         face_normal=face_normal,
-        screen_mm=screen_point[:2],
+        screen_mm=screen_mm,
     )
 
 

@@ -6,12 +6,15 @@ looking at O without roll, image down is world -y, forward is -F / a, and image 
 vector normal to both that points towards +x: (sin alpha, 0, -cos alpha).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.config.schema import GeometryConfig, MirrorConfig, OpticsConfig
 from membrane_ctrl.config.sight import compute_poses
+from membrane_ctrl.metrology.rays.cushion import Cushion
+from membrane_ctrl.metrology.rays.gas_lens import GasLens, trace_gas_lens
 from membrane_ctrl.metrology.rays.lens_distortion import distort_points, undistort_points
 from membrane_ctrl.metrology.rays.screen_face import Face
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
@@ -39,6 +42,10 @@ class Geometry:
         Unit vectors of s_x and s_y in world.
     face : Face
         Deviation of the screen from the plane of s_x and s_y.
+    cushion : Cushion, optional
+        The film in front of the mirror.
+    gas_lens : GasLens, optional
+        How it moves the screen points of the mirror.
     """
 
     pinhole_mm: FloatArray
@@ -50,6 +57,8 @@ class Geometry:
     screen_s_x: FloatArray
     screen_s_y: FloatArray
     face: Face
+    cushion: Cushion | None = None
+    gas_lens: GasLens | None = None
 
     @classmethod
     def from_config(cls, optics: OpticsConfig) -> "Geometry":
@@ -66,7 +75,13 @@ class Geometry:
             screen_s_x=s_x,
             screen_s_y=s_y,
             face=Face.from_config(optics.geometry.screen),
+            cushion=Cushion.from_config(optics.mirror),
+            gas_lens=_find_gas_lens(optics.geometry, optics.mirror),
         )
+
+    def without_front_film(self) -> "Geometry":
+        """The same bench with a single film."""
+        return replace(self, cushion=None, gas_lens=None)
 
     def rays(self, columns_px: ArrayLike, rows_px: ArrayLike) -> FloatArray:
         """Rays from the pinhole through image points.
@@ -106,6 +121,17 @@ class Geometry:
         origin = self.screen_origin_mm.reshape(3, *[1] * (screen_mm.ndim - 1))
         in_screen = np.concatenate([screen_mm, self.face.heights(screen_mm)[:1]])
         return np.asarray(origin + np.tensordot(self.screen_axes.T, in_screen, axes=1))
+
+
+@lru_cache(maxsize=16)
+def _find_gas_lens(geometry: GeometryConfig, mirror: MirrorConfig) -> GasLens | None:
+    """The gas lens of a configured bench; None for a single film."""
+    cushion = Cushion.from_config(mirror)
+    if cushion is None:
+        return None
+    pinhole, _rotation, origin, s_x, s_y = compute_poses(geometry)
+    axes = np.stack([s_x, s_y, np.cross(s_x, s_y)])
+    return trace_gas_lens(cushion, pinhole, origin, axes)
 
 
 def project_points(geometry: Geometry, world_mm: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.numerics import threads
 from membrane_ctrl.metrology.rays import kernels
+from membrane_ctrl.metrology.rays.gas_lens import GasLens
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
@@ -154,6 +155,7 @@ class Tracer:
             is made.
         """
         shape = self._shape(surface)
+        screen_mm = self._screen_without_gas(points, surface)
 
         def run(start: int, stop: int) -> FloatArray:
             """Sums over a range of the points."""
@@ -161,7 +163,7 @@ class Tracer:
             fixed = (
                 points.rays,
                 points.t_mm,
-                points.screen_mm,
+                screen_mm,
                 points.weights,
                 self._pinhole,
                 self._plane,
@@ -205,6 +207,7 @@ class Tracer:
             x and y in mm, measured dh/dx and dh/dy, fitted dh/dx and dh/dy.
         """
         shape = self._shape(surface)
+        screen_mm = self._screen_without_gas(points, surface)
         out = np.empty((6, points.t_mm.size))
 
         def run(start: int, stop: int) -> None:
@@ -212,7 +215,7 @@ class Tracer:
             fixed = (
                 points.rays,
                 points.t_mm,
-                points.screen_mm,
+                screen_mm,
                 self._pinhole,
                 self._plane,
                 self._face,
@@ -245,11 +248,24 @@ class Tracer:
             kernels.predict_screen(*fixed, *shape, out, start, stop)
 
         threads.split_over_threads(run, points.t_mm.size, threads.FEW)
+        if self.geometry.gas_lens is not None:
+            out += self._gas_shift_mm(self.geometry.gas_lens, points, surface)
         return out
 
     def position_mm(self, points: Points) -> FloatArray:
         """x and y (2, n) of the points."""
         return np.asarray(self._pinhole[:2, None] + points.t_mm * points.rays[:2])
+
+    def _screen_without_gas(self, points: Points, surface: Surface) -> FloatArray:
+        """Screen points (2, n) that the rays would meet without a front film."""
+        if self.geometry.gas_lens is None:
+            return points.screen_mm
+        return points.screen_mm - self._gas_shift_mm(self.geometry.gas_lens, points, surface)
+
+    def _gas_shift_mm(self, lens: GasLens, points: Points, surface: Surface) -> FloatArray:
+        """Shift (2, n) of the screen points by a front film."""
+        x_mm, y_mm = self.position_mm(points)
+        return lens.find_shift_mm(x_mm, y_mm, surface.sag_mm)
 
     def _move_range(
         self, points: Points, shape: _Shape, newton: int, start: int, stop: int

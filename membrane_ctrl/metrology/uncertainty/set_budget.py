@@ -22,6 +22,7 @@ from membrane_ctrl.metrology.uncertainty import (
 )
 from membrane_ctrl.metrology.uncertainty.corrected_motion_error import SensitivityError
 from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_sources
+from membrane_ctrl.metrology.uncertainty.front_film_error import front_film_sources
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_sources
@@ -153,6 +154,7 @@ def assemble_budget(
         blur,
         *frame_effects.frame_sources(bench, optics, shifts, film_um, light),
         second_reflection_source(bench, checked.second),
+        *front_film_sources(bench),
         *image_lag_sources(bench, checked.stack, checked.view.used, checked.lag),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]

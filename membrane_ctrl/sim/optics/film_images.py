@@ -146,7 +146,7 @@ def _is_near_region(image_mm: FloatArray, side_mm: float) -> BoolArray:
     grown[:-1] |= near[1:]
     grown[:, 1:] |= near[:, :-1]
     grown[:, :-1] |= near[:, 1:]
-    return grown
+    return np.asarray(grown)
 
 
 def _pixels_between(nodes: IntArray, step: int, count: int) -> IntArray:

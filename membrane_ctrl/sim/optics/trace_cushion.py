@@ -16,6 +16,7 @@ from membrane_ctrl.sim.optics.trace import Trace, find_film_distance, find_plane
 
 _BEYOND = 1.1  # rays beyond this share of the radius are not traced: polynomials diverge there
 _MAX_STEPS = 20  # Newton needs 4
+_BESIDE_MM = 0.5  # for the slope of the film's thickness along z
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +111,7 @@ def _front_normal(front: FilmTerms, bulge_mm: float, p: FloatArray) -> FloatArra
     """Unit normal of the front film, towards the camera."""
     _h, hx, hy = height_and_slopes(front, bulge_mm, p[0], p[1])
     normal = np.array([hx, hy, 1.0])
-    return normal / np.sqrt(np.dot(normal, normal))
+    return normal / np.sqrt(np.dot(normal, normal))  # type: ignore[no-any-return]
 
 
 @compile_loop()
@@ -118,13 +119,13 @@ def _mirror_normal(film: FilmTerms, sag_mm: float, p: FloatArray) -> FloatArray:
     """Unit normal of the mirror, towards the camera."""
     _h, hx, hy = height_and_slopes(film, sag_mm, p[0], p[1])
     normal = np.array([-hx, -hy, 1.0])
-    return normal / np.sqrt(np.dot(normal, normal))
+    return normal / np.sqrt(np.dot(normal, normal))  # type: ignore[no-any-return]
 
 
 @compile_loop()
 def _reflect(direction: FloatArray, normal: FloatArray) -> FloatArray:
     """A ray after a mirror with this unit normal."""
-    return direction - 2.0 * np.dot(direction, normal) * normal
+    return direction - 2.0 * np.dot(direction, normal) * normal  # type: ignore[no-any-return]
 
 
 @compile_loop()
@@ -135,7 +136,7 @@ def _refract(
     along_normal = np.dot(direction, normal)
     along_face = (index_from / index_to) * (direction - along_normal * normal)
     cosine = np.sqrt(1.0 - np.dot(along_face, along_face))
-    return along_face + np.copysign(cosine, along_normal) * normal
+    return along_face + np.copysign(cosine, along_normal) * normal  # type: ignore[no-any-return]
 
 
 @compile_loop()
@@ -157,22 +158,52 @@ def _pass_film(
     point = start
     ray = direction
     for face in range(2):
+        # Where the ray meets the face, and the normal there; the inner face is found beside the
+        # outer one.
         is_outer = (face == 0) == comes_down
-        lowered = 0.0
-        if not is_outer:
-            _h, hx, hy = height_and_slopes(front, bulge_mm, point[0], point[1])
-            lowered = thickness_mm * np.sqrt(1.0 + hx * hx + hy * hy)
-        t = _front_distance(point, ray, front, bulge_mm, top_mm - lowered)
-        point = point + t * ray
-        normal = _front_normal(front, bulge_mm, point)
+        t = _front_distance(point, ray, front, bulge_mm, top_mm)
+        met = point + t * ray
+        normal = _front_normal(front, bulge_mm, met)
         index_outside = 1.0
         if not is_outer:
+            lowered, by_x, by_y = _lowered_face(front, bulge_mm, thickness_mm, met)
+            t = _front_distance(point, ray, front, bulge_mm, top_mm - lowered)
+            met = point + t * ray
+            normal = _front_normal(front, bulge_mm, met)
+            normal = normal / normal[2] + np.array([by_x, by_y, 0.0])
+            normal = normal / np.sqrt(np.dot(normal, normal))
             index_outside = gas_index
+
+        # Into the film, then out of it.
+        point = met
         if face == 0:
             ray = _refract(ray, normal, index_outside, film_index)
         else:
             ray = _refract(ray, normal, film_index, index_outside)
     return point, ray
+
+
+@compile_loop()
+def _lowered_face(
+    front: FilmTerms, bulge_mm: float, thickness_mm: float, p: FloatArray
+) -> tuple[float, float, float]:
+    """Vertical distance of the inner face from the outer one near a point, and its slopes.
+
+    A film of one thickness along its normal is thicker by sqrt(1 + slope^2) along z.
+    """
+    distances = np.empty(5)
+    for k in range(5):
+        x = p[0]
+        y = p[1]
+        if k == 1 or k == 2:
+            x += _BESIDE_MM * (2 * k - 3)
+        elif k > 2:
+            y += _BESIDE_MM * (2 * k - 7)
+        _h, hx, hy = height_and_slopes(front, bulge_mm, x, y)
+        distances[k] = thickness_mm * np.sqrt(1.0 + hx * hx + hy * hy)
+    by_x = (distances[2] - distances[1]) / (2.0 * _BESIDE_MM)
+    by_y = (distances[4] - distances[3]) / (2.0 * _BESIDE_MM)
+    return distances[0], by_x, by_y
 
 
 @compile_loop()

@@ -45,6 +45,10 @@ stated, errors by the names of `bench.HAND_SIGMAS`::
 `Stated(sigma_share=0.01)` states sigmas of a hundredth, so that the geometry's bar hides nothing.
 `Stated(camera={"distortion": [-3.0, 0.0, 0.0, 0.0]})` misstates the lens: it folds in the picture.
 
+A clear film in front of the mirror (a cushion), which the set states or not::
+
+    World(mirror, clear_film=ClearFilm(), stated=Stated(front_film={"bulge_mm": 63.4}))
+
 Tracking: a full set as reference, then a set of crossed frames at `FRAME_S` apart; time runs on
 from `begin_s`, so that a motion may begin after the reference::
 
@@ -65,6 +69,7 @@ screen every frame is traced: 0.4 s each.
 """
 
 from tests.worlds.second_optics.bench import HAND_SIGMAS, Bench, drawn_errors
+from tests.worlds.second_optics.clear_film import ClearFilm
 from tests.worlds.second_optics.effects import (
     Effects,
     Ghost,
@@ -91,6 +96,7 @@ __all__ = [
     "SHIFT_3",
     "YAW",
     "Bench",
+    "ClearFilm",
     "Effects",
     "Ghost",
     "Material",

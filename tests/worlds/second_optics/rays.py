@@ -46,13 +46,13 @@ def trace(
     rays = bench.directions(column, row)
     start = bench.camera.place_mm[:, None]
     bend = np.array([[0.0], [-AIR_PER_MM * bench.air_k_per_m], [0.0]])
-    film, path = _meet_film(mirror, start, rays, bend, displacement_um)
+    film, path = meet_film(mirror, start, rays, bend, displacement_um)
     place, along_x, along_y = mirror.position_mm(film[0], film[1], displacement_um)
     normal = np.cross(along_x, along_y, axis=0)
     normal /= np.linalg.norm(normal, axis=0)
     arriving = rays + path * bend
     leaving = arriving - 2 * np.sum(arriving * normal, axis=0) * normal
-    screen_mm, tilt = _meet_screen(bench, place, leaving, bend)
+    screen_mm, tilt = meet_screen(bench, place, leaving, bend)
     return Seen(film, screen_mm, tilt)
 
 
@@ -61,11 +61,11 @@ def trace_direct(bench: Bench, column: FloatArray, row: FloatArray) -> Seen:
     rays = bench.directions(column, row)
     start = np.repeat(bench.camera.place_mm[:, None], rays.shape[1], axis=1)
     bend = np.array([[0.0], [-AIR_PER_MM * bench.air_k_per_m], [0.0]])
-    screen_mm, tilt = _meet_screen(bench, start, rays, bend)
+    screen_mm, tilt = meet_screen(bench, start, rays, bend)
     return Seen(np.zeros_like(screen_mm), screen_mm, tilt)
 
 
-def _meet_film(
+def meet_film(
     mirror: Mirror, start: FloatArray, rays: FloatArray, bend: FloatArray, displacement_um: float
 ) -> tuple[FloatArray, FloatArray]:
     radius = mirror.radius_mm
@@ -88,7 +88,7 @@ def _meet_film(
     return film, path
 
 
-def _meet_screen(
+def meet_screen(
     bench: Bench, place: FloatArray, leaving: FloatArray, bend: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Places (2, n) on the screen and tangents of the viewing angle."""

@@ -17,6 +17,11 @@ from scipy.ndimage import gaussian_filter
 
 from tests.worlds.second_optics import patterns
 from tests.worlds.second_optics.bench import A_MM, ALPHA_DEG, B_MM, FOCAL_MM, HAND_SIGMAS, Bench
+from tests.worlds.second_optics.clear_film import (
+    ClearFilm,
+    trace_cushion,
+    trace_reflections,
+)
 from tests.worlds.second_optics.effects import Effects, Ghost
 from tests.worlds.second_optics.mirror import Mirror
 from tests.worlds.second_optics.patterns import Picture
@@ -54,12 +59,15 @@ class Stated:
         Keys that replace those of `[camera]`.
     turned_deg : float or None
         Angle of `[mirror_turned]`, without which the mirror stands as usual.
+    front_film : mapping or None
+        `[mirror.front_film]`; None: a single film is stated.
     """
 
     sigma_share: float = 1.0
     geometry: Mapping[str, Any] = field(default_factory=dict)
     camera: Mapping[str, Any] = field(default_factory=dict)
     turned_deg: float | None = None
+    front_film: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -91,6 +99,7 @@ class World:
     stated: Stated = field(default_factory=Stated)
     seed: int = 0
     samples: int = SAMPLES
+    clear_film: ClearFilm | None = None
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng((4711, self.seed))
@@ -254,11 +263,17 @@ class World:
             "pattern": _pattern_table(),
             "geometry": geometry | dict(self.stated.geometry),
             "camera": camera | dict(self.stated.camera),
-            "mirror": {
-                "radius_mm": self.mirror.radius_mm,
-                "analysis_radius_mm": 0.95 * self.mirror.radius_mm,
-            },
+            "mirror": self._mirror_table(),
         }
+
+    def _mirror_table(self) -> dict[str, Any]:
+        table: dict[str, Any] = {
+            "radius_mm": self.mirror.radius_mm,
+            "analysis_radius_mm": 0.95 * self.mirror.radius_mm,
+        }
+        if self.stated.front_film is not None:
+            table["front_film"] = dict(self.stated.front_film)
+        return table
 
     # -- light
 
@@ -273,6 +288,9 @@ class World:
             light += np.float32(panel.ghost.share) * self._panel_light(
                 picture, _ghost_screen(panel.ghost, maps.screen), maps.tilt
             )
+        if self.clear_film is not None:
+            light *= np.float32((1 - self.clear_film.reflectance) ** 2)
+            self._add_reflections(picture, light)
         film = maps.film[0] ** 2 + maps.film[1] ** 2 <= 1
         light = np.where(film, light, np.float32(SURROUNDINGS))
         for x, y in self._dust:
@@ -281,6 +299,45 @@ class World:
         n = self.samples
         height, width = light.shape[0] // n, light.shape[1] // n
         return light.reshape(height, n, width, n).mean(axis=(1, 3), dtype=np.float64)
+
+    def _add_reflections(self, picture: Picture, light: Singles) -> None:
+        """Add the images of the pattern by the clear film, of a mirror at rest."""
+        for share, part, screen_mm, tilt in self._reflections:
+            inside = np.all(np.abs(screen_mm) < patterns.PERIODS * patterns.PERIOD_MM / 2, axis=0)
+            seen = self._panel_light(picture, screen_mm, tilt)
+            light[part] += np.float32(share) * np.where(inside, seen, np.float32(0))
+
+    @cached_property
+    def _reflections(self) -> list[tuple[float, tuple[slice, slice], Singles, Singles]]:
+        """Of both images: share, part of the samples, and screen points and tilts there."""
+        assert self.clear_film is not None
+        width, height = self.bench.size_px
+        columns, rows = _samples(width, self.samples), _samples(height, self.samples)
+        found = []
+        for k in range(2):
+            # A coarse grid over the middle shows which part sees the pattern.
+            coarse_x, coarse_y = columns[:: 4 * self.samples], rows[:: 4 * self.samples]
+            near_x = coarse_x[np.abs(coarse_x - width / 2) < width / 5]
+            near_y = coarse_y[np.abs(coarse_y - height / 2) < height / 5]
+            grid = np.meshgrid(near_x, near_y)
+            traced = trace_reflections(
+                self.bench, self.mirror, self.clear_film, grid[0].ravel(), grid[1].ravel(), 0.0
+            )
+            seen = np.all(np.abs(traced[k][1].screen_mm) < 300.0, axis=0)
+            if not seen.any():
+                continue
+            low_x, high_x = np.searchsorted(columns, _reach(grid[0].ravel()[seen]))
+            low_y, high_y = np.searchsorted(rows, _reach(grid[1].ravel()[seen]))
+            part = slice(int(low_y), int(high_y)), slice(int(low_x), int(high_x))
+            x, y = np.meshgrid(columns[part[1]], rows[part[0]])
+            traced = trace_reflections(
+                self.bench, self.mirror, self.clear_film, x.ravel(), y.ravel(), 0.0
+            )
+            share, image = traced[k]
+            shape = (2, *x.shape)
+            screen_mm = image.screen_mm.reshape(shape).astype(np.float32)
+            found.append((share, part, screen_mm, image.tilt.reshape(shape).astype(np.float32)))
+        return found
 
     def _panel_light(self, picture: Picture, screen: Singles, tilt: Singles) -> Singles:
         panel = self.effects.panel
@@ -335,7 +392,11 @@ class World:
         """Screen, tilt and film (6, rows, columns) of the rays at the nodes."""
         columns, rows = self._node_places
         column, row = np.meshgrid(columns, rows)
-        seen = trace(bench, self.mirror, column.ravel(), row.ravel(), displacement_um)
+        places = column.ravel(), row.ravel()
+        if self.clear_film is None:
+            seen = trace(bench, self.mirror, *places, displacement_um)
+        else:
+            seen = trace_cushion(bench, self.mirror, self.clear_film, *places, displacement_um)
         values = np.concatenate([seen.screen_mm, seen.tilt, seen.film])
         return values.reshape(6, rows.size, columns.size)
 
@@ -378,6 +439,11 @@ def _nodes(size_px: int, step_px: float) -> FloatArray:
 def _samples(size_px: int, samples: int) -> FloatArray:
     """Places of the samples of a row or column of pixels, whose centres are whole numbers."""
     return np.asarray((np.arange(size_px * samples) + 0.5) / samples - 0.5)
+
+
+def _reach(places: FloatArray) -> tuple[float, float]:
+    """Lowest and highest place, with a margin for the coarse grid."""
+    return float(places.min()) - 6.0, float(places.max()) + 6.0
 
 
 def _ghost_screen(ghost: Ghost, screen: Singles) -> Singles:

@@ -1,0 +1,172 @@
+"""A second reflection of the screen in a part of the mirror: a film in front that nobody stated.
+
+A convex film in front shows the whole screen in a small part of the mirror. There white is brighter
+by a fifth, with sharp edges, but the fringes hardly swing more: the added light comes from other
+places of the screen, whose fringes run across each other. A bright spot of the panel raises both
+alike; a lamp in the room is in the black frame too.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.polynomial import polynomial as series
+
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+
+_DEGREE = 4  # of the smooth light of the mirror
+_ROUNDS = 4  # of its fit, each without the bins that are brighter
+_LEAST_SHARE = 0.02  # of the light
+_CLEAR_SIGMAS = 6.0
+_LEAST_BINS = 12
+_LEAST_PART, _LARGEST_PART = 5e-4, 0.3  # of the mirror's bins
+_STEEP = 0.35  # largest share of the excess beside the patch
+_FLAT = 0.7  # least share of the excess inside the patch, beside its edge
+_SWING_SHARE = 0.6  # largest excess of the swing over that of the light
+_MAD_SIGMAS = 1.4826
+
+
+@dataclass(frozen=True)
+class FilmImage:
+    """A part of the mirror that shows the screen a second time.
+
+    Attributes
+    ----------
+    share : float
+        Of the main light; 0 if there is none.
+    x_mm, y_mm : float
+        Middle of the part on the mirror.
+    width_mm, height_mm : float
+        Its size along x and along y.
+    """
+
+    share: float
+    x_mm: float = math.nan
+    y_mm: float = math.nan
+    width_mm: float = math.nan
+    height_mm: float = math.nan
+
+    @property
+    def is_found(self) -> bool:
+        """Whether there is one."""
+        return self.share > 0
+
+    def describe(self) -> str:
+        """Why a set is degraded; empty without a second reflection."""
+        if not self.is_found:
+            return ""
+        return (
+            f"a second reflection of the screen at x {self.x_mm:+.0f} mm, y {self.y_mm:+.0f} mm "
+            f"({self.width_mm:.0f} by {self.height_mm:.0f} mm), {self.share:.0%} of the light: "
+            "is there a film in front of the mirror? State it as mirror.front_film"
+        )
+
+
+NO_FILM_IMAGE = FilmImage(0.0)
+
+
+def find_film_image(
+    shape: tuple[int, int],
+    index: IntArray,
+    position_mm: FloatArray,
+    light: FloatArray,
+    swing: FloatArray,
+) -> FilmImage:
+    """Search the bins of the mirror for a part that shows the screen a second time.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of bins.
+    index : (n,) int array
+        Bins on the mirror.
+    position_mm : (2, n) array
+        Where they are on it.
+    light : (n,) array
+        Light of a white screen less that of a black one.
+    swing : (n,) array
+        Amplitude of the fringes.
+
+    Returns
+    -------
+    FilmImage
+    """
+    if index.size < _LEAST_BINS / _LARGEST_PART or not np.median(light) > 0:
+        return NO_FILM_IMAGE
+
+    # Light and swing over a smooth change that the brighter bins do not determine.
+    usual = np.ones(index.size, bool)
+    excess = np.zeros(index.size)
+    sigma = math.inf
+    for _ in range(_ROUNDS):
+        excess = _excess_over_smooth(light, position_mm, usual)
+        sigma = _MAD_SIGMAS * float(np.median(np.abs(excess[usual])))
+        usual = np.abs(excess) < max(_LEAST_SHARE / 2, 3 * sigma)
+        if np.mean(usual) < 1 - _LARGEST_PART:
+            return NO_FILM_IMAGE
+    bright = excess > max(_LEAST_SHARE, _CLEAR_SIGMAS * sigma)
+
+    # The largest connected patch of brighter bins.
+    picture = np.zeros(shape, np.uint8)
+    picture.reshape(-1)[index[bright]] = 1
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(picture, connectivity=4)
+    if count < 2:
+        return NO_FILM_IMAGE
+    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    patch = parts == largest
+    inside = patch.reshape(-1)[index]
+    size = int(np.count_nonzero(inside))
+    if size < max(_LEAST_BINS, _LEAST_PART * index.size) or size > _LARGEST_PART * index.size:
+        return NO_FILM_IMAGE
+
+    # Its edges are sharp, and its fringes do not swing more.
+    share = float(np.median(excess[inside]))
+    around = _ring_around(patch).reshape(-1)[index]
+    if not around.any() or float(np.median(excess[around])) > _STEEP * share:
+        return NO_FILM_IMAGE
+    within = _ring_within(patch).reshape(-1)[index]
+    if within.any() and float(np.median(excess[within])) < _FLAT * share:
+        return NO_FILM_IMAGE
+    swing_excess = _excess_over_smooth(swing, position_mm, usual)
+    if float(np.mean(swing_excess[inside])) > _SWING_SHARE * share:
+        return NO_FILM_IMAGE
+    x_mm, y_mm = position_mm[:, inside]
+    return FilmImage(
+        share,
+        float(np.mean(x_mm)),
+        float(np.mean(y_mm)),
+        float(np.ptp(x_mm)),
+        float(np.ptp(y_mm)),
+    )
+
+
+def _excess_over_smooth(
+    values: FloatArray, position_mm: FloatArray, usual: BoolArray
+) -> FloatArray:
+    """Values (n,) over polynomials through the usual ones, less 1."""
+    scale_mm = float(np.abs(position_mm).max())
+    x, y = position_mm / scale_mm
+    powers = series.polyvander2d(x, y, [_DEGREE, _DEGREE]).reshape(x.size, _DEGREE + 1, -1)
+    design = np.stack(
+        [powers[:, i, j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=1
+    )
+    known = design[usual]
+    solved = np.linalg.solve(known.T @ known, known.T @ values[usual])
+    return np.asarray(values / (design @ solved) - 1)
+
+
+def _ring_around(patch: BoolArray) -> BoolArray:
+    """Bins two and three beside a patch: the first one is cut by its edge."""
+    kernel = np.ones((3, 3), np.uint8)
+    near = cv2.dilate(patch.astype(np.uint8), kernel, iterations=1)
+    far = cv2.dilate(near, kernel, iterations=2)
+    return np.asarray((far > 0) & (near == 0))
+
+
+def _ring_within(patch: BoolArray) -> BoolArray:
+    """Bins of a patch that are second from its edge."""
+    kernel = np.ones((3, 3), np.uint8)
+    whole = cv2.erode(patch.astype(np.uint8), kernel)
+    core = cv2.erode(whole, kernel)
+    return np.asarray((whole > 0) & (core == 0))

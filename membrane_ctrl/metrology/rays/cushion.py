@@ -1,0 +1,232 @@
+"""A cushion: a mirror behind a clear film that bulges towards the camera, with gas between them.
+
+A ray that passes the film is refracted into the gas; both faces of the film are parallel, so that
+the film itself only shifts it. The part of n d along a face is the same on both sides (Snell). The
+film also reflects: the camera sees the screen a second time in its outside, and a third time by
+mirror, film and mirror.
+
+Derivation: section 13 of docs/explanation/metrology.md.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.config.optics import MirrorConfig
+from membrane_ctrl.metrology.rays.gas_index import compute_gas_excess
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.model.arrays import FloatArray
+
+_NEWTON_STEPS = 7  # from a plane half the bulge away to rounding
+# Errors of form of the front film, in the order of `Cushion.errors`: height of its vertex in mm,
+# slopes along x and y in mrad, and saddles x^2 - y^2 and 2 x y in mm on the rim.
+FRONT_ERRORS = 5
+
+
+@dataclass(frozen=True)
+class Cushion:
+    """The front film and its gas.
+
+    Attributes
+    ----------
+    radius_mm : float
+        Radius of both rims.
+    sag_mm : float
+        Depth of the mirror at which the film bulges as stated.
+    bulge_mm : float
+        Height of the film's vertex above its rim.
+    rim_gap_mm : float
+        Height of its rim above the mirror's.
+    thickness_mm, film_index : float
+        Of the film.
+    gas_excess : float
+        Index of the gas inside less that of the air.
+    errors : (FRONT_ERRORS,) tuple
+        Errors of form, 0 for the stated film.
+    """
+
+    radius_mm: float
+    sag_mm: float
+    bulge_mm: float
+    rim_gap_mm: float
+    thickness_mm: float
+    film_index: float
+    gas_excess: float
+    errors: tuple[float, ...] = (0.0,) * FRONT_ERRORS
+
+    @classmethod
+    def from_config(cls, mirror: MirrorConfig) -> "Cushion | None":
+        """The cushion of a configuration; None for a single film."""
+        front = mirror.front_film
+        if front is None:
+            return None
+        return cls(
+            radius_mm=mirror.radius_mm,
+            sag_mm=mirror.sag_mm,
+            bulge_mm=front.bulge_mm,
+            rim_gap_mm=front.rim_gap_mm,
+            thickness_mm=1e-3 * front.thickness_um,
+            film_index=front.index,
+            gas_excess=compute_gas_excess(front, mirror.pressure_pa),
+        )
+
+    @property
+    def reflectance(self) -> float:
+        """Of the film's two faces together, at right angles, without interference."""
+        of_face = ((self.film_index - 1) / (self.film_index + 1)) ** 2
+        return 2 * of_face / (1 + of_face)
+
+    def front_height(self, rim_z_mm: float, place: FloatArray) -> tuple[FloatArray, ...]:
+        """World z of the film's outer face over places (2, n), and its slopes along x and y."""
+        raised_mm, tilt_x, tilt_y, saddle_mm, diagonal_mm = self.errors
+        bowl = Surface.hencky_bowl(self.bulge_mm + raised_mm, self.radius_mm)
+        x, y = place / self.radius_mm
+        height = bowl.height(place[0], place[1])
+        slope_x, slope_y = bowl.slopes(place[0], place[1])
+        top = rim_z_mm + self.rim_gap_mm + self.bulge_mm + raised_mm
+        tilted = 1e-3 * (tilt_x * place[0] + tilt_y * place[1])
+        saddle = saddle_mm * (x * x - y * y) + 2 * diagonal_mm * x * y
+        saddle_x = 2 * (saddle_mm * x + diagonal_mm * y) / self.radius_mm
+        saddle_y = 2 * (diagonal_mm * x - saddle_mm * y) / self.radius_mm
+        return (
+            top - height + tilted + saddle,
+            1e-3 * tilt_x - slope_x + saddle_x,
+            1e-3 * tilt_y - slope_y + saddle_y,
+        )
+
+
+@dataclass(frozen=True)
+class CushionBench:
+    """A cushion before a screen's plane: traces rays of the camera.
+
+    Attributes
+    ----------
+    cushion : Cushion
+    mirror : Surface
+        The mirror's film.
+    vertex_z_mm : float
+        Height of its vertex in world.
+    screen_origin_mm : (3,) array
+        O' in world.
+    screen_axes : (3, 3) array
+        s_x, s_y and normal of the screen, as rows.
+    """
+
+    cushion: Cushion
+    mirror: Surface
+    vertex_z_mm: float
+    screen_origin_mm: FloatArray
+    screen_axes: FloatArray
+
+    @property
+    def _rim_z_mm(self) -> float:
+        return self.vertex_z_mm + self.mirror.sag_mm
+
+    def trace_alone(self, start: FloatArray, rays: FloatArray) -> FloatArray:
+        """Screen points (2, n) of rays (3, n) by the mirror without a film in front."""
+        point = self._meet_mirror(start, rays)
+        return self._meet_screen(point, self._reflect_at_mirror(point, rays))
+
+    def trace_through(self, start: FloatArray, rays: FloatArray) -> FloatArray:
+        """Screen points (2, n) of rays (3, n) through the film to the mirror and back."""
+        inside, ray = self._pass_film(*self._meet_front(start, rays), rays, goes_in=True)
+        point = self._meet_mirror(inside, ray)
+        up = self._reflect_at_mirror(point, ray)
+        outside, leaving = self._pass_film(*self._meet_front(point, up), up, goes_in=False)
+        return self._meet_screen(outside, leaving)
+
+    def trace_images(self, start: FloatArray, rays: FloatArray) -> FloatArray:
+        """Screen points (2, 2, n) of the two further images of the screen: by the film's outside,
+        and by mirror, film and mirror; without refraction, which moves them by micrometres.
+
+        NaN where the second meets the mirror beyond its rim.
+        """
+        outside, normal = self._meet_front(start, rays)
+        by_outside = self._meet_screen(outside, _reflect(rays, normal))
+        point = self._meet_mirror(start, rays)
+        up = self._reflect_at_mirror(point, rays)
+        under, normal = self._meet_front(point, up)
+        down = _reflect(up, normal)
+        again = self._meet_mirror(under, down)
+        by_mirror = self._meet_screen(again, self._reflect_at_mirror(again, down))
+        is_beyond = again[0] ** 2 + again[1] ** 2 > self.mirror.radius_mm**2
+        by_mirror[:, is_beyond] = np.nan
+        return np.stack([by_outside, by_mirror])
+
+    def _meet_mirror(self, start: FloatArray, rays: FloatArray) -> FloatArray:
+        """Points (3, n) of the mirror on rays that come down."""
+        t = (self._rim_z_mm - start[2]) / rays[2]
+        for _ in range(_NEWTON_STEPS):
+            x, y, z = start + t * rays
+            slope_x, slope_y = self.mirror.slopes(x, y)
+            above = z - self.vertex_z_mm - self.mirror.height(x, y)
+            t = t - above / (rays[2] - slope_x * rays[0] - slope_y * rays[1])
+        return np.asarray(start + t * rays)
+
+    def _reflect_at_mirror(self, point: FloatArray, rays: FloatArray) -> FloatArray:
+        slope_x, slope_y = self.mirror.slopes(point[0], point[1])
+        return _reflect(rays, np.stack([-slope_x, -slope_y, np.ones_like(slope_x)]))
+
+    def _meet_front(self, start: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (3, n) of the front film on rays from either side, and its normals there."""
+        middle_mm = self._rim_z_mm + self.cushion.rim_gap_mm + self.cushion.bulge_mm / 2
+        t = (middle_mm - start[2]) / rays[2]
+        for _ in range(_NEWTON_STEPS):
+            place = start + t * rays
+            z, slope_x, slope_y = self.cushion.front_height(self._rim_z_mm, place[:2])
+            approach = rays[2] - slope_x * rays[0] - slope_y * rays[1]
+            t = t - (place[2] - z) / approach
+        place = start + t * rays
+        _z, slope_x, slope_y = self.cushion.front_height(self._rim_z_mm, place[:2])
+        return place, np.stack([-slope_x, -slope_y, np.ones_like(slope_x)])
+
+    def _pass_film(
+        self, point: FloatArray, normal: FloatArray, rays: FloatArray, goes_in: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        """Points and directions behind the film of rays that meet it."""
+        gas = 1 + self.cushion.gas_excess
+        before, behind = gas, 1.0
+        if goes_in:
+            before, behind = 1.0, gas
+        unit = normal / np.linalg.norm(normal, axis=0)
+        in_film = _refract(rays, unit, before, self.cushion.film_index)
+        across = np.sum(in_film * unit, axis=0)
+        path = self.cushion.thickness_mm / np.abs(across)
+
+        # The other face there has the normal of the place beside, by as much as the ray moves
+        # along the film.
+        along_mm = path * (in_film - across * unit)
+        beside = point[:2] + along_mm[:2]
+        _z, slope_x, slope_y = self.cushion.front_height(self._rim_z_mm, beside)
+        other = np.stack([-slope_x, -slope_y, np.ones_like(slope_x)])
+        other /= np.linalg.norm(other, axis=0)
+        leaving = _refract(in_film, other, self.cushion.film_index, behind)
+        return point + path * in_film, leaving
+
+    def _meet_screen(self, point: FloatArray, rays: FloatArray) -> FloatArray:
+        """s_x and s_y (2, n) where rays cross the plane of the screen."""
+        start = self.screen_axes @ (point - self.screen_origin_mm[:, None])
+        along = self.screen_axes @ rays
+        return np.asarray(start[:2] - start[2] / along[2] * along[:2])
+
+
+def _reflect(rays: FloatArray, normal: FloatArray) -> FloatArray:
+    """Rays after a mirror with these normals, of any length."""
+    across = 2 * np.sum(rays * normal, axis=0) / np.sum(normal * normal, axis=0)
+    return np.asarray(rays - across * normal)
+
+
+def _refract(rays: FloatArray, unit: FloatArray, before: float, behind: float) -> FloatArray:
+    """Unit vectors behind a face with these unit normals: n d along the face stays (Snell)."""
+    wave = before * rays
+    across = np.sum(wave * unit, axis=0)
+    along = wave - across * unit
+    deeper = np.sqrt(behind**2 - np.sum(along * along, axis=0))
+    return np.asarray((along + np.sign(across) * deeper * unit) / behind)
+
+
+def image_shares(cushion: Cushion, mirror_reflectance: float) -> tuple[float, float]:
+    """Light of the two further images over that of the mirror seen through the film."""
+    passed = (1 - cushion.reflectance) ** 2
+    outside = cushion.reflectance / (passed * mirror_reflectance)
+    return outside, mirror_reflectance * cushion.reflectance
