@@ -121,7 +121,11 @@ class Sweep:
                     raise HoldError(f"someone else moved the setpoint to {row.target_um:g} µm")
                 if math.isnan(begin_s):
                     begin_s = row.mono_s
-                is_ramping = abs(row.setpoint_um - row.trim_um - setpoint_um) > _ARRIVED_UM
+                offset_um = row.held_offset_um
+                if math.isnan(offset_um):  # the centre is held
+                    offset_um = 0.0
+                shift_um = row.trim_um + offset_um
+                is_ramping = abs(row.setpoint_um - shift_um - setpoint_um) > _ARRIVED_UM
                 if is_commanded and not is_ramping:
                     arrived.append(row)
                 else:

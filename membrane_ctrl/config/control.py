@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from firmware_iface.settings import Fraction, Micrometres, Section
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 
 class LoopConfig(Section):
@@ -71,9 +72,34 @@ class LoopConfig(Section):
     µm/s).
     """
 
+    holds: Literal["vertex", "focus", "best_fit"] = "vertex"
+    """Which scalar of the figure stays constant: the centre; the radius of the best sphere over
+    `analysis_radius_mm`; or the depth of least RMS against `reference_figure_um`. Set it to `focus`
+    or `best_fit` on a bench with a camera whose film changes its figure, with climate or creep
+    (docs/how-to/hold-a-figure.md)."""
+    reference_figure_um: Annotated[tuple[Micrometres, ...], Field(max_length=ZERNIKE_TERMS)] = ()
+    """Zernike terms, in Noll's order, of the figure that `best_fit` holds at the setpoint 0; empty:
+    the first figures of the run, at its setpoint. Set it to `zernike.coeffs_um` of the
+    `result.json` of a set."""
+    held_offset_max_um: Annotated[float, Field(gt=0, le=1000)] = 50.0
+    """How far `focus` and `best_fit` may move the centre from the setpoint. Raise it for a film
+    whose figure changes more, within the limits of the displacement."""
+    held_keep_s: Annotated[float, Field(gt=0, le=1e6)] = 3600.0
+    """Time without usable figures for which the last offset counts as known; after it the notice
+    `held_offset` appears, and the centre stays. Change it to how long your climate is steady."""
+
     def flow_most_um_per_s(self, pump: "PumpConfig") -> float:
         """The largest flow that the loop commands: within its own limit and the pump's."""
         return min(self.flow_max_um_per_s, pump.flow_full_um_per_s)
+
+    @model_validator(mode="after")
+    def _require_all_terms(self) -> "LoopConfig":
+        if len(self.reference_figure_um) not in (0, ZERNIKE_TERMS):
+            raise ValueError(
+                f"reference_figure_um has {len(self.reference_figure_um)} terms; give all "
+                f"{ZERNIKE_TERMS}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _filter_slower_than_tick(self) -> "LoopConfig":

@@ -297,6 +297,10 @@ class MirrorConfig(Section):
     """Gauge reading at displacement 0; 0: unknown. Set it for another film."""
     front_film: FrontFilmConfig | None = None
 
+    wavelength_um: Annotated[float, Field(ge=0.01, le=1e6)] = 1000.0
+    """Wavelength at which the report shows the image of a star. Change it to the one that the
+    mirror is used at."""
+
     @model_validator(mode="after")
     def _check_radius(self) -> "MirrorConfig":
         if self.analysis_radius_mm > self.radius_mm:

@@ -36,7 +36,8 @@ class LoopInput:
     """Inputs of one tick."""
 
     target_um: float  # end of the setpoint's ramp, without the trim
-    # the shape loop's share of the setpoint; it changes slowly and is added behind the ramp
+    # the share of shape loop and held scalar in the setpoint; it changes slowly and is added behind
+    # the ramp
     trim_um: float
     displacement_um: float  # laser reading, as read
     ambient_pressure_pa: float  # NaN without a sensor

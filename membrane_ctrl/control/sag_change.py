@@ -36,6 +36,26 @@ class SagChange(StateNode):
     sigma_um: float = math.nan
 
 
+def compute_weighted_change(
+    coeffs_um: FloatArray,
+    reference_um: FloatArray,
+    covariance_um2: FloatArray,
+    weights: FloatArray,
+) -> SagChange:
+    """Return the change of one scalar of the figure, and its standard deviation.
+
+    Parameters
+    ----------
+    coeffs_um, reference_um, covariance_um2
+        As in `compute_sag_change`.
+    weights : (terms,) array
+        Of the terms, in µm of sag per µm; that of piston is 0.
+    """
+    change_um = float(weights @ (coeffs_um - reference_um))
+    variance_um2 = float(weights @ covariance_um2 @ weights)
+    return SagChange(change_um, math.sqrt(max(0.0, variance_um2)))
+
+
 def compute_sag_change(
     coeffs_um: FloatArray,
     reference_um: FloatArray,

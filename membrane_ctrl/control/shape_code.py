@@ -22,3 +22,5 @@ class ShapeCode(StrEnum):
     CAMERA_WRONG = "camera_wrong"
     NO_MOUNT = "no_mount"
     TRIM_LIMIT = "trim_limit"
+    FIGURE_JUMP = "figure_jump"
+    OFFSET_LIMIT = "offset_limit"

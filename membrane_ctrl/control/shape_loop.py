@@ -19,7 +19,11 @@ import numpy as np
 
 from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.drift_tracker import DriftTracker
-from membrane_ctrl.control.sag_change import SagChange, compute_sag_change
+from membrane_ctrl.control.sag_change import (
+    SagChange,
+    compute_sag_change,
+    compute_weighted_change,
+)
 from membrane_ctrl.control.shape_code import ShapeCode
 from membrane_ctrl.control.shape_reference import ReferenceMean
 from membrane_ctrl.model import shape_estimate, telemetry
@@ -60,13 +64,30 @@ class ShapeLoopMemory(StateNode):
 
 
 class ShapeLoop:
-    """Trim from shape estimates; off until switched on. `sensitivity` as for `sag_change`."""
+    """Trim from shape estimates; off until switched on.
+
+    Parameters
+    ----------
+    config : ShapeConfig
+    sensitivity : (terms,) array
+        As for `sag_change`.
+    memory : ShapeLoopMemory, optional
+    rim_weights : (terms,) array, optional
+        Height of the rim above the vertex per term. Where another scalar than the vertex is held,
+        the change of sag is that of this height: along `sensitivity` a change of the figure would
+        count as one of the sag.
+    """
 
     def __init__(
-        self, config: ShapeConfig, sensitivity: FloatArray, memory: ShapeLoopMemory | None = None
+        self,
+        config: ShapeConfig,
+        sensitivity: FloatArray,
+        memory: ShapeLoopMemory | None = None,
+        rim_weights: FloatArray | None = None,
     ) -> None:
         self._config = config
         self._sensitivity = sensitivity
+        self._rim_weights = rim_weights
         self._time_constant_s = config.time_constant_s
         self.memory = memory or ShapeLoopMemory()
 
@@ -217,9 +238,7 @@ class ShapeLoop:
                 reference.taken.clear()  # their mean is all that is needed
             return
         # What the laser saw beyond the figure's change of sag is a drift of its mount.
-        change = compute_sag_change(
-            estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity
-        )
+        change = self._measure_change(estimate)
         drift_um = estimate.displacement_um - reference.displacement_um - change.change_um
         disagreement_um = drift_um - memory.drift.drift_at(estimate.time_s, self._time_constant_s)
         if abs(disagreement_um) > self._config.disagreement_max_um:
@@ -234,6 +253,17 @@ class ShapeLoop:
         memory.drift.add_reading(drift_um, estimate.time_s, self._time_constant_s)
         memory.state = telemetry.ShapeState.TRACKING
         memory.reason = NO_REASON
+
+    def _measure_change(self, estimate: shape_estimate.ShapeEstimate) -> SagChange:
+        """Change of the sag since the reference."""
+        reference_um = self.memory.reference.coeffs_um
+        if self._rim_weights is not None:
+            return compute_weighted_change(
+                estimate.coeffs_um, reference_um, estimate.covariance_um2, self._rim_weights
+            )
+        return compute_sag_change(
+            estimate.coeffs_um, reference_um, estimate.covariance_um2, self._sensitivity
+        )
 
     def _move_trim(self, now_s: float, dt_s: float) -> None:
         """Move the trim to the drift, bounded in rate and range."""

@@ -25,6 +25,7 @@ from membrane_ctrl.controller import (
     command_precedence,
     commands,
     gains_trial,
+    held_scalar,
     hold_status,
     interlocks,
     locks,
@@ -63,6 +64,7 @@ from membrane_ctrl.model.events import (
     StateEntered,
     Why,
 )
+from membrane_ctrl.model.held_weights import HeldWeights
 from membrane_ctrl.model.lock import describe_locks
 from membrane_ctrl.model.reason import NO_REASON, make_reason
 from membrane_ctrl.model.telemetry import SafeLevel, State
@@ -83,7 +85,8 @@ class Controller:
     """Owns the state machine, the safety table and both loops.
 
     `sag_sensitivity` (terms,) are the Zernike coefficients of a Hencky bowl per sag, in µm per µm,
-    for the shape loop.
+    for the shape loop. `held_weights` are of the scalar that `loop.holds` names, needed unless that
+    is the vertex.
     """
 
     def __init__(
@@ -91,6 +94,7 @@ class Controller:
         config: Config,
         sag_sensitivity: arrays.FloatArray,
         memory: ControllerState | None = None,
+        held_weights: HeldWeights | None = None,
     ) -> None:
         self._config = config
         self.memory = memory = memory or make_first_state(config)
@@ -98,8 +102,12 @@ class Controller:
         self._gains = gains_trial.GainsTrial(memory.gains)
         present = self._present_config
         self._safety = safety.SafetyTable(config.limits, memory=memory.safety)
-        self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity, memory.shape)
+        self._held = held_scalar.HeldScalar(config, held_weights, memory.held)
+        self._shape = shape_loop.ShapeLoop(
+            config.shape, sag_sensitivity, memory.shape, self._held.rim_weights
+        )
         self._shape.set_memory(self._gains.present.shape_time_constant_s)
+        self._held.set_memory(self._gains.present.shape_time_constant_s)
         # A dead time and lag that the actuator test has identified replace the configured ones
         estimator = apply_response(config.estimator, memory.context.pump_response)
         self._context = TickContext(
@@ -225,6 +233,7 @@ class Controller:
         events += self._estimation.step(inputs, self.state, context, last, shape.state, consistency)
         if (estimate := self._estimation.estimate) is not None:
             shape = replace(shape, trim_um=estimate.mount_um)
+        self._step_held(events)
         context.laser_doubted = bool(consistency.laser_fault_text)
         is_held = self.state in (State.SETTLE, State.HOLD) or self._config.states.observe
         context.estimate = estimate if is_held else None
@@ -246,7 +255,14 @@ class Controller:
         return TickOutputs(
             command=command,
             row=make_telemetry_row(
-                context, self.state, fault, self.memory.ticks, inputs, observation, shape
+                context,
+                self.state,
+                fault,
+                self.memory.ticks,
+                inputs,
+                observation,
+                shape,
+                self._held.row_values,
             ),
             events=tuple(events),
             finished=context.finished,
@@ -456,7 +472,7 @@ class Controller:
         context, spec = self._context, command.experiment
         if command.kind != "tune" or spec is None:
             return ""
-        centre_um = context.setpoint_um + context.trim_um
+        centre_um = context.setpoint_um + context.setpoint_shift_um
         try:
             begun = trial.begin_trial(spec, context.loop_config, context.pump_config, centre_um)
             context.begin_trial(trial.Trial(begun, self._config.loop.rate_hz))
@@ -476,6 +492,7 @@ class Controller:
         self._process_value.set_loop(loop, pump, self._estimator)
         self._consistency.set_gains(loop, pump)
         self._shape.set_memory(self._gains.present.shape_time_constant_s)
+        self._held.set_memory(self._gains.present.shape_time_constant_s)
         self._step_setpoint()
 
     def _step_setpoint(self) -> None:
@@ -573,6 +590,18 @@ class Controller:
                 ShapeLoopState(shape.state.name.lower(), shape.reason.text, shape.reason.code)
             )
         return shape
+
+    def _step_held(self, events: list[Event]) -> None:
+        """Move the centre so that the held scalar stays; after an error the offset stays."""
+        context = self._context
+        try:
+            events += self._held.step(
+                context, self.state, self._shape.on, self._consistency.camera_distrust
+            )
+        except (ValueError, ArithmeticError, LinAlgError) as error:
+            self.memory.tick_error = f"held scalar: {type(error).__name__}: {error}"
+        if self.state not in state_sets.MOVING:
+            context.held_offset_um = 0.0
 
     def _run_state(self, events: list[Event]) -> None:
         """Run the state's handler; everything is off unless it sets it."""

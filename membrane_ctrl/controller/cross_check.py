@@ -318,6 +318,8 @@ def _check_limits(config: Config, findings: cross_check_plant.ConfigFindings) ->
     """Judge the limits of the displacement: each can trip, and none trips in a sound hold."""
     limits, setpoint_um = config.limits, config.loop.setpoint_um
     trim_um = config.shape.trim_max_um if config.shape.enabled else 0.0
+    if config.loop.holds != "vertex":
+        trim_um += config.loop.held_offset_max_um
     above_um, below_um = (
         limits.displacement_max_um - setpoint_um,
         setpoint_um - limits.displacement_min_um,

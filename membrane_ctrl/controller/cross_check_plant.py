@@ -224,6 +224,13 @@ def judge_loop(config: Config, findings: ConfigFindings) -> None:
 
 def judge_shape(config: Config, findings: ConfigFindings) -> None:
     shape = config.shape
+    holds = config.loop.holds
+    why = "the figure is not measured: shape.enabled is false"
+    needs_figures = holds != "vertex" and not shape.enabled
+    findings.error(needs_figures, "loop.holds", why, 'set it to "vertex", or measure the figure')
+    unused = bool(config.loop.reference_figure_um) and holds != "best_fit"
+    why = "a reference figure is used by best_fit only"
+    findings.warn(unused, "loop.holds", why, 'set it to "best_fit", or remove reference_figure_um')
     if not shape.enabled:
         return
     why = f"a shape comes every {shape.period_s:g} s: the last one is never fresh"

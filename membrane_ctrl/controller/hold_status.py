@@ -44,7 +44,7 @@ def hold_status(
         gauge_pressure_pa=context.observer.gauge_pressure_pa,
         setpoint_um=context.setpoint_um,
         trim_um=context.trim_um,
-        ramp_left_um=context.setpoint_um + context.trim_um - last.setpoint_um,
+        ramp_left_um=context.setpoint_um + context.setpoint_shift_um - last.setpoint_um,
         leak_um_per_s=last.leak_um_per_s,
         flow_um_per_s=last.flow_um_per_s,
         bleed_fraction=context.loop_config.bleed_fraction,

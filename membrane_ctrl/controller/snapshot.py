@@ -11,6 +11,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.state import ControllerState
 from membrane_ctrl.controller.tick_codec import SNAPSHOT_BYTES_MAX
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.held_weights import HeldWeights
 from membrane_ctrl.model.state_tree import StateError, decode_state, encode_state
 
 
@@ -31,7 +32,12 @@ def decode_snapshot(snapshot: bytes) -> ControllerState:
         raise UnknownSnapshotError(f"the snapshot cannot be used: {error}") from None
 
 
-def continue_from(snapshot: bytes, config: Config, sag_sensitivity: FloatArray) -> Controller:
+def continue_from(
+    snapshot: bytes,
+    config: Config,
+    sag_sensitivity: FloatArray,
+    held_weights: HeldWeights | None = None,
+) -> Controller:
     """Make a controller that continues from a snapshot of a run with this configuration.
 
     Raises
@@ -42,7 +48,7 @@ def continue_from(snapshot: bytes, config: Config, sag_sensitivity: FloatArray) 
     memory = decode_snapshot(snapshot)
     try:
         _require_fit(memory, config)
-        return Controller(config, sag_sensitivity, memory)
+        return Controller(config, sag_sensitivity, memory, held_weights)
     except (ValueError, LookupError, ArithmeticError, TypeError) as error:
         what = f"{type(error).__name__}: {error}"
         raise UnknownSnapshotError(f"the snapshot does not fit the configuration: {what}") from None

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control.held_offset import HeldOffsetMemory
 from membrane_ctrl.control.inner_loop import InnerLoopState
 from membrane_ctrl.control.shape_loop import ShapeLoopMemory
 from membrane_ctrl.controller.centre_estimation import CentreEstimationState
@@ -63,6 +64,7 @@ class ControllerState(StateNode):
     sample_rate: SampleRateState = field(default_factory=SampleRateState)
     loop: InnerLoopState = field(default_factory=InnerLoopState)
     shape: ShapeLoopMemory = field(default_factory=ShapeLoopMemory)
+    held: HeldOffsetMemory = field(default_factory=HeldOffsetMemory)
     estimation: CentreEstimationState = field(default_factory=CentreEstimationState)
     process_value: ProcessValueState = field(default_factory=ProcessValueState)
 

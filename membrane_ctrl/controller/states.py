@@ -91,14 +91,14 @@ def inflate(context: TickContext) -> State:
     states = context.config.states
     lag = abs(context.loop.lag_um) / states.inflate_pause_um
     output = drive_pump(context, context.loop.ramp_um if lag > 1.0 else context.setpoint_um)
-    to_go_um = context.setpoint_um - output.filtered_um
+    to_go_um = context.setpoint_um + context.setpoint_shift_um - output.filtered_um
     unseen = NO_REASON if math.isfinite(to_go_um) else context.observer.missing_reason
     to_go = f"{to_go_um:.1f} µm to go" if math.isfinite(to_go_um) else unseen.text or "no reading"
     # A waiting ramp starts and stops at the limit, several times a second: the reason must not.
     waits = lag > 0.8
     inflating = f"inflating: {to_go}{', the ramp waits for the mirror' if waits else ''}"
     context.explain(WhyCode.INFLATING, inflating, unseen.code, waits)
-    ramp_left_um = context.setpoint_um + context.trim_um - output.setpoint_um
+    ramp_left_um = context.setpoint_um + context.setpoint_shift_um - output.setpoint_um
     if (
         abs(ramp_left_um) < context.config.limits.band_um
         and abs(to_go_um) < context.config.limits.band_um
@@ -458,7 +458,7 @@ def _make_loop_input(context: TickContext, target_um: float) -> inner_loop.LoopI
     reading = context.observer.reading
     return inner_loop.LoopInput(
         target_um=target_um,
-        trim_um=context.trim_um,
+        trim_um=context.setpoint_shift_um,
         displacement_um=context.observer.displacement_um,
         ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,
         air_temperature_c=reading.air_temperature_c if reading else math.nan,

@@ -1,6 +1,7 @@
 """The telemetry row of a tick, from what the controller and its inputs hold."""
 
 import math
+from collections.abc import Mapping
 
 from firmware_iface.roles import NO_READING
 from membrane_ctrl.control import inner_loop, shape_loop
@@ -22,6 +23,7 @@ def make_telemetry_row(
     inputs: tick.TickInputs,
     observation: Observation,
     shape: shape_loop.ShapeOutput,
+    held: Mapping[str, float],
 ) -> telemetry.TelemetryRow:
     """Return the row of a tick.
 
@@ -38,6 +40,8 @@ def make_telemetry_row(
     observation : Observation
     shape : ShapeOutput
         Of the shape loop.
+    held : mapping of str to float
+        Columns of the held scalar.
     """
     reading = inputs.reading or NO_READING
     out = context.output or inner_loop.LoopOutput()
@@ -81,6 +85,7 @@ def make_telemetry_row(
         truth_laser_bias_um=inputs.truth_laser_bias_um,
         interlocks_open=_interlocks_open(context.interlocks),
         **seen,
+        **held,
         **{name: getattr(reading, name) for name in tick_codec.AS_READ},
     )
 

@@ -65,6 +65,9 @@ class TickContextState(StateNode):
     # of the last tick
     last_pump_fraction: float = 0.0
     trim_um: float = 0.0
+    # by how much the vertex is moved so that another scalar stays; NaN sigma before it is known
+    held_offset_um: float = 0.0
+    held_offset_sigma_um: float = math.nan
     laser_doubted: bool = False  # optics and gauge contradict it
     output: inner_loop.LoopOutput | None = None
     why: Reason = NO_REASON
@@ -136,12 +139,19 @@ class TickContext(TickContextState):
         self.vent_fraction = self.loop_config.bleed_fraction
 
     @property
+    def setpoint_shift_um(self) -> float:
+        """What the loop adds to the ramped setpoint: the drift of the laser's mount, and the offset
+        of the held scalar.
+        """
+        return self.trim_um + self.held_offset_um
+
+    @property
     def beyond_manual_range(self) -> bool:
         """Whether the mirror has moved too far from its setpoint while no loop holds it.
 
         By laser or optics, whichever shows more: one of them may be frozen.
         """
-        target_um = self.setpoint_um + self.trim_um
+        target_um = self.setpoint_um + self.setpoint_shift_um
         shown_um = (self.observer.guard_um, self.observer.optics_guard_um)
         # false for a sensor without a reading
         return any(abs(um - target_um) > self.config.states.manual_range_um for um in shown_um)

@@ -63,6 +63,7 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
     closing : RunEnd
         Gets the exit code and the fault in which the run ends.
     """
+    from membrane_ctrl.metrology.figure.held_quantities import find_held_weights
     from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 
     bench, config, options = parts.bench, parts.config, parts.options
@@ -70,7 +71,9 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
     assert config.devices is not None
     with contextlib.ExitStack() as stack:
         wiring = _make_wiring(parts, stack)
-        controller = Controller(config, zernike_projection())
+        controller = Controller(
+            config, zernike_projection(), held_weights=find_held_weights(config)
+        )
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         settings = (lambda: controller.loop_config, lambda: controller.pump_config)
         keeper = parts.make_keeper(

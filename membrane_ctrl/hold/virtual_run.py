@@ -18,6 +18,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.controller import controller, tick
 from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.metrology.figure.held_quantities import find_held_weights
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import arrays, clock, errors, events, run_events, shape_estimate, telemetry
 from membrane_ctrl.processes import ring
@@ -113,7 +114,9 @@ class VirtualRun:
             shapes=self._newest_shape if shape else None,
             truth=self._record_truth,
         )
-        self._controller = controller.Controller(config, sag_sensitivity)
+        self._controller = controller.Controller(
+            config, sag_sensitivity, held_weights=find_held_weights(config)
+        )
         self._supervisor = Supervisor(self._controller, wiring, self.clock, config.loop.rate_hz)
         bench.open()
 

@@ -34,6 +34,7 @@ MISSING = "–"  # shown for a value that is not known
 UNIT_SUFFIXES: dict[str, str] = {
     "_um_per_s": "µm/s",
     "_um": "µm",
+    "_mm": "mm",
     "_pa": "Pa",
     "_c": "°C",
     "_urad": "µrad",
@@ -501,6 +502,23 @@ class ColumnValues:
         colour=VIOLET,
         width=2.0,
         published=True,
+    )
+    held_offset_um: float = declare_column(
+        "offset of the held scalar",
+        "how far the centre is moved so that focus or figure stay; missing where the centre is "
+        "held",
+        TRIM,
+        "/shape/held_offset",
+        colour=GREEN,
+        width=2.0,
+        aggregation=_EXTREMES,
+    )
+    held_offset_sigma_um: float = declare_column(
+        "offset of the held scalar, 1 σ",
+        "its standard deviation by the noise of the figures",
+        RECORD,
+        "/shape/held_offset_sigma",
+        decimals=3,
     )
     truth_displacement_um: float = declare_column(
         "true centre",

@@ -130,6 +130,19 @@ class ShapeLoopState(Event, kind="shape", sentence="Shape loop {state}[: {reason
     code: str = ""
 
 
+class HeldScalarState(Event, kind="held", sentence="Held {holds}: {state}[: {reason}]"):
+    """What is held besides the centre is followed, or the centre is held at the last offset, and
+    why; `code` names the reason.
+    """
+
+    holds: str
+    state: str
+    offset_um: float
+    reason: str
+    code: str = ""
+    sigma_um: float | None = None
+
+
 class CommandTaken(
     Event,
     kind="command",

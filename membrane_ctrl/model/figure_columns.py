@@ -23,6 +23,8 @@ from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 TERMS = Plot("Zernike terms", Group.SHAPE)
 LOW_ORDERS = Plot("Low orders, change ± 1σ", Group.SHAPE)
 SAG_CHANGE = Plot("Sag change by camera and laser", Group.SHAPE)
+FOCUS = Plot("Focus ± 1σ", Group.SHAPE)
+FIGURE_RMS = Plot("RMS against the first figure ± 1σ", Group.SHAPE)
 SLOPE_RESIDUAL = Plot("Slope residual", Group.SHAPE)
 FRINGE_QUALITY = Plot("Fringe quality", Group.SHAPE)
 MODULATION = Plot("Modulation of the fringes", Group.SHAPE)
@@ -125,6 +127,32 @@ _DRAWN = (
         "change of the laser's reading between the same cycles",
         SAG_CHANGE,
         "/shape/sag_change",
+        ORANGE,
+    ),
+    TelemetryColumn(
+        "focus_mm",
+        "focus ± 1σ",
+        "half the radius of the best sphere over the used aperture",
+        FOCUS,
+        "/shape/focus",
+        BLUE,
+        2.0,
+    ),
+    TelemetryColumn(
+        "figure_rms_um",
+        "RMS of the change ± 1σ",
+        "RMS of the change of the figure without piston and tilt",
+        FIGURE_RMS,
+        "/shape/figure_rms",
+        BLUE,
+        2.0,
+    ),
+    TelemetryColumn(
+        "least_rms_um",
+        "at the best depth",
+        "RMS that no depth can remove: the limit of one actuator",
+        FIGURE_RMS,
+        "/shape/figure_rms",
         ORANGE,
     ),
     TelemetryColumn(

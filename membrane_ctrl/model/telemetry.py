@@ -124,8 +124,13 @@ def get_columns(rows: Rows) -> dict[str, Column]:
 def true_error_um(ticks: Mapping[str, Column]) -> Column:
     """Target minus true centre, with the sign of `error_um` (setpoint minus value); NaN on a real
     bench.
+
+    Where another scalar than the centre is held, its offset belongs to the target.
     """
-    return ticks["target_um"] - ticks["truth_displacement_um"]
+    target_um = ticks["target_um"]
+    if "held_offset_um" in ticks:
+        target_um = target_um + np.nan_to_num(ticks["held_offset_um"])
+    return target_um - ticks["truth_displacement_um"]
 
 
 def find_changes(codes: FloatArray, before: float) -> list[tuple[int, int]]:

@@ -211,6 +211,8 @@ def _make_shape_tab(config: Config) -> rrb.Vertical:
             ),
         ),
         rrb.Horizontal(
+            _figure_plot(figure_columns.FOCUS),
+            _figure_plot(figure_columns.FIGURE_RMS),
             _figure_plot(figure_columns.SLOPE_RESIDUAL),
             _figure_plot(figure_columns.FRINGE_QUALITY),
             _figure_plot(figure_columns.LATENCY),

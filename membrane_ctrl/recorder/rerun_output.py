@@ -7,6 +7,7 @@ from pathlib import Path
 import rerun as rr
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.metrology.figure.held_quantities import find_held_scalars
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import EventLine
@@ -44,7 +45,7 @@ class RerunOutput:
         self._summary = summary
         self._next_summary_s = -math.inf
         self._telemetry = rerun_telemetry.TelemetryStreams(recording, config, overview_every_s)
-        self.shapes = rerun_shapes.ShapeStreams(recording)
+        self.shapes = rerun_shapes.ShapeStreams(recording, find_held_scalars(config))
         self.state = math.nan  # the controller's, in the last row
         self.closed: list[Path] = []  # closed segments, until taken from here
         self._alive = False

@@ -126,6 +126,8 @@ class Recording:
             streams.make_band(self._config.limits.band_um),
             streams.CHANGE,
             streams.SAG,
+            streams.FOCUS,
+            streams.FIGURE_RMS,
             streams.PUMP,
         ):
             stream.log(block.path, _style_lines(rr.Measurements.from_fields, block), static=True)

@@ -6,6 +6,7 @@ from collections import deque
 import numpy as np
 import rerun as rr
 
+from membrane_ctrl.metrology.figure import held_quantities
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 from membrane_ctrl.model.figure_columns import LOW_ORDER_COLUMNS
@@ -66,10 +67,21 @@ def map_picture(values: AnyArray, span: tuple[float, float]) -> rr.DepthImage:
 class ShapeStreams:
     """Sends estimates to a recording. Changes are against the first
     good one that `set_reference` lets be.
+
+    Parameters
+    ----------
+    recording : Recording
+    scalars : HeldScalars, optional
+        Of the mirror, for focus and RMS.
     """
 
-    def __init__(self, recording: rerun_recording.Recording) -> None:
+    def __init__(
+        self,
+        recording: rerun_recording.Recording,
+        scalars: held_quantities.HeldScalars | None = None,
+    ) -> None:
         self._recording = recording
+        self._scalars = scalars
         self.reference: shape_estimate.ShapeEstimate | None = None
         self.pictures = True
         self._reference_from_s = -math.inf
@@ -132,6 +144,8 @@ class ShapeStreams:
             self._recording.send_measurements(
                 stream.path, time_s, np.array([values]), np.array([variances])
             )
+        if self._scalars is not None:
+            self._send_scalars(self._scalars, estimate, self.reference)
         if estimate.kind == "track":
             self._fall.append(
                 (estimate.coeffs_um - self.reference.coeffs_um)[shapes.WATERFALL_TERMS]
@@ -140,6 +154,30 @@ class ShapeStreams:
         if self.pictures:
             self._send_maps(estimate, self.reference)
             self._send_fall(estimate.time_s, estimate.time_s - self.reference.time_s < EARLY_S)
+
+    def _send_scalars(
+        self,
+        scalars: held_quantities.HeldScalars,
+        estimate: shape_estimate.ShapeEstimate,
+        reference: shape_estimate.ShapeEstimate,
+    ) -> None:
+        """Send focus and RMS with their variances."""
+        found = held_quantities.measure_scalars(
+            scalars,
+            estimate.coeffs_um,
+            estimate.hencky_um,
+            estimate.covariance_um2,
+            reference.coeffs_um,
+        )
+        time_s = np.array([estimate.time_s])
+        rms = [found.rms_um, found.least_rms_um]
+        for stream, values, variances in (
+            (streams.FOCUS, [found.focus_mm], [found.focus_sigma_mm**2]),
+            (streams.FIGURE_RMS, rms, [found.rms_sigma_um**2, 0.0]),
+        ):
+            self._recording.send_measurements(
+                stream.path, time_s, np.array([values]), np.array([variances])
+            )
 
     def _send_fall(self, time_s: float, early: bool) -> None:
         """Send the terms of the last two minutes as a picture: a row for each, the newest on the

@@ -21,6 +21,7 @@ from membrane_ctrl.controller.state import ControllerState
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_checksum import ColumnChoice, output_crc
 from membrane_ctrl.controller.tick_codec import unpack_tick
+from membrane_ctrl.metrology.figure.held_quantities import find_held_weights
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Cleared, Event, Fault, ShapeLoopState, StateEntered
@@ -131,7 +132,8 @@ def replay_record(
     Raises UnknownSnapshotError if today's code cannot use the record's first snapshot, or a tick
     raises after using one.
     """
-    controller = Controller(config, sag_sensitivity)
+    held_weights = find_held_weights(config)
+    controller = Controller(config, sag_sensitivity, held_weights=held_weights)
     comparison = comparison or Comparison()
     found = Replay()
     same_past, remembered = True, False
@@ -149,11 +151,11 @@ def replay_record(
         if not found.ticks:
             found.begin_s = item.inputs.now_s
             if item.tick > 1 and item.snapshot:
-                controller = continue_from(item.snapshot, config, sag_sensitivity)
+                controller = continue_from(item.snapshot, config, sag_sensitivity, held_weights)
                 remembered = True
         elif item.snapshot and not same_past:
             with suppress(UnknownSnapshotError):  # then decisions only, as before
-                controller = continue_from(item.snapshot, config, sag_sensitivity)
+                controller = continue_from(item.snapshot, config, sag_sensitivity, held_weights)
                 same_past, remembered = True, True
         elif item.snapshot and found.state_differences is None:
             found.state_differences = _compare_state(item, controller, comparison)

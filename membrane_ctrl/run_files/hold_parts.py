@@ -18,6 +18,7 @@ FIELDS = (
     "safe_level",
     "setpoint_um",
     "trim_um",
+    "held_offset_um",
     "target_um",
     "displacement_um",
     "error_um",
@@ -58,7 +59,8 @@ class HoldParts(StateNode):
         )
         paused = hold & ~faults & open_loop
         # Ticks of `hold` in which the mirror is not settled: the first one, on the ramp, away
-        ramp_um = block["setpoint_um"] - np.nan_to_num(block["trim_um"]) - block["target_um"]
+        shift_um = np.nan_to_num(block["trim_um"]) + np.nan_to_num(block["held_offset_um"])
+        ramp_um = block["setpoint_um"] - shift_um - block["target_um"]
         arrived = np.abs(ramp_um) <= ARRIVED_UM
         was_in_hold = not math.isnan(self.since_s)
         began = hold & ~np.concatenate(([was_in_hold], hold[:-1]))

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.metrology.figure.held_quantities import find_held_scalars, measure_scalars
 from membrane_ctrl.model.colours import DIVERGING_MAP
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, zernike_labels
@@ -61,7 +63,7 @@ def make_figure_map(
     figure: ShapeEstimate,
     reference: ShapeEstimate | None,
     removed: Collection[str],
-    radius_mm: float | None,
+    config: Config | None,
 ) -> FigureMap:
     """The change of a figure since a reference, or its height without one, less some terms.
 
@@ -70,9 +72,10 @@ def make_figure_map(
     figure, reference : ShapeEstimate
     removed : collection of str
         Names of `REMOVABLE`.
-    radius_mm : float or None
-        Of the mirror, for the axes.
+    config : Config or None
+        Of the run, for the axes, and for focus and distance from the reference.
     """
+    radius_mm = None if config is None else config.optics.mirror.radius_mm
     # The map, without the removed terms.
     is_change = reference is not None
     if reference is not None:
@@ -111,8 +114,30 @@ def make_figure_map(
     words = (
         f"{figure.verdict}; {title}{without}: PV {peak_to_valley_um:.3g} µm, RMS {rms_um:.3g} µm"
     )
+    if config is not None and figure.verdict != "rejected":
+        words += f". {describe_scalars(figure, reference, config)}"
     packed = gzip.compress(json.dumps(data).encode(), 1)
     return FigureMap(packed, words, make_terms_chart(figure, reference))
+
+
+def describe_scalars(figure: ShapeEstimate, reference: ShapeEstimate | None, config: Config) -> str:
+    """Vertex, focus and RMS against a reference with their standard deviations, as a line."""
+    against = figure if reference is None else reference
+    found = measure_scalars(
+        find_held_scalars(config),
+        figure.coeffs_um,
+        figure.hencky_um,
+        figure.covariance_um2,
+        against.coeffs_um,
+    )
+    focus = f"Focus {found.focus_mm:.4f} ± {found.focus_sigma_mm:.4f} mm"
+    if reference is None:
+        return focus
+    return (
+        f"Vertex {found.vertex_um:+.3f} ± {found.vertex_sigma_um:.3f} µm of sag; {focus}; RMS "
+        f"{found.rms_um:.3f} ± {found.rms_sigma_um:.3f} µm, at the best depth "
+        f"{found.least_rms_um:.3f} µm"
+    )
 
 
 @cache

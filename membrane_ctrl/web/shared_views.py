@@ -138,9 +138,7 @@ class SharedViews:
         against = self._references[hold].get(reference)
         if reference == FIRST_FIGURE and seen.reference is not seen.figure:
             against = seen.reference
-        config = self.config(hold)
-        radius_mm = None if config is None else config.optics.mirror.radius_mm
-        return figure_map.make_figure_map(seen.figure, against, removed, radius_mm)
+        return figure_map.make_figure_map(seen.figure, against, removed, self.config(hold))
 
     def _list_alarms(self, hold: str) -> list[alarm_history.PastAlarm]:
         logs = self._feeds[hold].logs

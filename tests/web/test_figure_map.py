@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.web.figure_map import REMOVABLE, make_figure_map
@@ -29,7 +30,7 @@ def figure_of(**terms_um: float) -> ShapeEstimate:
 
 
 def shown(figure: ShapeEstimate, reference: ShapeEstimate | None, *removed: str) -> dict[str, Any]:
-    made = make_figure_map(figure, reference, removed, RADIUS_MM)
+    made = make_figure_map(figure, reference, removed, Config())
     return dict(json.loads(gzip.decompress(made.data)))
 
 
@@ -84,3 +85,11 @@ def test_words_for_a_screen_reader_have_the_figures() -> None:
     bars, sigmas = made.terms["series"]
     assert bars["data"][2] == 1.0, "Z6"
     assert set(sigmas["data"]) == {0.01}
+
+
+def test_the_words_state_focus_and_rms_with_error_bars() -> None:
+    """1 µm RMS of spherical aberration over the whole film, 10 nm of noise a term."""
+    made = make_figure_map(figure_of(z11=1.0), figure_of(), (), Config())
+    assert "Vertex +0.000 ± 0.063 µm of sag; Focus " in made.words
+    assert "RMS 0.8" in made.words
+    assert "Focus" not in make_figure_map(figure_of(), figure_of(), (), None).words

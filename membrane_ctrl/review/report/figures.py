@@ -30,7 +30,7 @@ from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.formatting import format_span, one_line
 from membrane_ctrl.review.report.json import make_timeline
 from membrane_ctrl.review.report.pump_history import PumpSeen
-from membrane_ctrl.review.statistics import power_spectrum, shape_review
+from membrane_ctrl.review.statistics import held_scalars, power_spectrum, shape_review
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.run_files.shapes import without_terms
 
@@ -448,6 +448,49 @@ def draw_stability(shape: shape_review.ShapeReview) -> Markup:
     return arrange_panels(
         draw_panel(draw, 3.1) for draw in (draw_points, draw_deviation, draw_loops, draw_drift)
     )
+
+
+def draw_scalars(series: held_scalars.HeldSeries) -> Markup:
+    """Focus and RMS over the run with error bars, and the image of a star."""
+    time, unit = hours_or_less(series.time_s, float(np.ptp(series.time_s)))
+    focus_mm = series.values_of("focus_mm")
+
+    def draw_focus(_: Figure, plot: Any) -> None:
+        change_um = 1e3 * (focus_mm - focus_mm[0])
+        sigma_um = 1e3 * np.nan_to_num(series.values_of("focus_sigma_mm"))
+        plot.errorbar(time, change_um, sigma_um, color=BLUE, lw=0.9, elinewidth=0.5)
+        plot.set(title="Change of the focus, 1 σ, µm", xlabel=unit)
+
+    def draw_rms(_: Figure, plot: Any) -> None:
+        sigma_um = np.nan_to_num(series.values_of("rms_sigma_um"))
+        rms_um = series.values_of("rms_um")
+        least_um = series.values_of("least_rms_um")
+        plot.errorbar(time, rms_um, sigma_um, color=BLUE, lw=0.9, elinewidth=0.5, label="RMS")
+        plot.plot(time, least_um, color=ORANGE, lw=0.9, label="at the best depth")
+        plot.set(title="Change of the figure without piston and tilt, 1 σ, µm", xlabel=unit)
+        plot.legend(loc="upper left", ncols=2)
+
+    panels = [draw_focus, draw_rms]
+    image = series.image
+    if image is not None and image.resolved:
+        shown = image
+
+        def draw_image(figure: Figure, plot: Any) -> None:
+            half_um = shown.pixel_um * len(shown.spread) / 2
+            extent = (-half_um, half_um, -half_um, half_um)
+            relative = np.log10(np.maximum(shown.spread / shown.spread.max(), 1e-4))
+            drawn = plot.imshow(relative, extent=extent, origin="lower", cmap=SEQUENTIAL_MAP)
+            figure.colorbar(drawn, ax=plot)
+            view_um = min(half_um, 3 * shown.radius_80_um)
+            plot.set(
+                title=f"Image of a star at {series.wavelength_um:g} µm, log10 of the peak",
+                xlabel="µm",
+                xlim=(-view_um, view_um),
+                ylim=(-view_um, view_um),
+            )
+
+        panels.append(draw_image)
+    return arrange_panels(draw_panel(draw, 3.1) for draw in panels)
 
 
 def _draw_drift(plot: Any, shape: shape_review.ShapeReview) -> None:

@@ -4,10 +4,17 @@ import math
 from dataclasses import asdict
 from typing import Any, Literal
 
+import numpy as np
+
 from membrane_ctrl.model import events, program
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.formatting import format_span, format_time_beside
-from membrane_ctrl.review.statistics import drift, power_spectrum, shape_review
+from membrane_ctrl.review.statistics import (
+    drift,
+    held_scalars,
+    power_spectrum,
+    shape_review,
+)
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
 from membrane_ctrl.run_files.event_log import LoggedEvent, parse_logged_line
@@ -116,6 +123,7 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         "found": [asdict(event) for event in analysis.found],
         "unjudged": list(analysis.unjudged),
         "shape": None if analysis.shape is None else _make_shape(analysis.shape),
+        "held": None if analysis.scalars is None else _make_scalars(analysis.scalars),
         "anomalies": [asdict(anomaly) for anomaly in analysis.anomalies],
         "notes": list(run.notes),
         "exit": None if not run.summary else run.summary.get("exit"),
@@ -161,6 +169,33 @@ def _make_series(series: ErrorSeries | None) -> dict[str, Any] | None:
 
 def _make_slope(slope: drift.FittedSlope) -> dict[str, float | bool]:
     return asdict(slope) | {"significant": slope.is_significant}
+
+
+def _make_scalars(series: held_scalars.HeldSeries) -> dict[str, Any]:
+    """What was held: the scalars of the last figure, and the image of a star."""
+    focus_mm = series.values_of("focus_mm")
+    image = None
+    if series.image is not None:
+        image = {
+            "focus_mm": series.image.focus_mm,
+            "path_rms_um": series.image.path_rms_um,
+            "resolved": series.image.resolved,
+            "strehl": series.image.strehl,
+            "strehl_sigma": series.strehl_sigma,
+            "radius_50_um": series.image.radius_50_um,
+            "radius_80_um": series.image.radius_80_um,
+            "radius_80_sigma_um": series.radius_80_sigma_um,
+        }
+    return {
+        "holds": series.holds,
+        "stored_reference": series.stored_reference,
+        "last": asdict(series.scalars[-1]),
+        "focus_change_um": 1e3 * float(focus_mm[-1] - focus_mm[0]),
+        "focus_span_um": 1e3 * float(np.ptp(focus_mm)),
+        "wavelength_um": series.wavelength_um,
+        "star_image": image,
+        "strehl_of_change": series.change_strehl,
+    }
 
 
 def _make_shape(shape: shape_review.ShapeReview) -> dict[str, Any]:

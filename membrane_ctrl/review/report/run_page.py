@@ -28,7 +28,13 @@ from membrane_ctrl.review.formatting import (
 from membrane_ctrl.review.report import figures
 from membrane_ctrl.review.report.json import make_timeline, make_verdict
 from membrane_ctrl.review.report.pump_history import PumpSeen, explain_pump_change
-from membrane_ctrl.review.statistics import compare, drift, power_spectrum, shape_review
+from membrane_ctrl.review.statistics import (
+    compare,
+    drift,
+    held_scalars,
+    power_spectrum,
+    shape_review,
+)
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
 from membrane_ctrl.run_files.held_error import format_in_band
@@ -85,6 +91,8 @@ def render_report(
     ]
     if analysis.shape is not None:
         sections.append(PageSection("Figure", _list_shape(analysis.shape)))
+    if analysis.scalars is not None:
+        sections.append(PageSection("What was held", _list_scalars(analysis.scalars)))
     if len(history) > 1:
         blocks = _list_history(history, analysis.run.config.pump.change_max)
         sections.append(PageSection("Pump over the runs", blocks))
@@ -305,6 +313,67 @@ def _list_shape(shape: shape_review.ShapeReview) -> list[PageBlock]:
     if shape.pairs:
         blocks.append(PageDrawing(figures.draw_pairs(shape)))
     return blocks
+
+
+_SCALAR_NAMES = {"vertex": "vertex", "focus": "focus", "best_fit": "best fit"}
+
+
+def _list_scalars(series: held_scalars.HeldSeries) -> list[PageBlock]:
+    """Vertex, focus and distance from the reference with error bars, and the image of a star."""
+    last = series.scalars[-1]
+    focus_mm = series.values_of("focus_mm")
+    change_um = 1e3 * (focus_mm - focus_mm[0])
+    reference = "the first settled figure"
+    if series.stored_reference:
+        reference = "the stored figure"
+    facts = [
+        ("held by the loop", _SCALAR_NAMES[series.holds]),
+        ("changes are since", reference),
+        ("vertex, last", _format_value(last.vertex_um, last.vertex_sigma_um, "µm of sag")),
+        (
+            "focus, last",
+            f"{last.focus_mm:.4f} mm, change "
+            f"{_format_value(change_um[-1], 1e3 * last.focus_sigma_mm, 'µm')}",
+        ),
+        ("focus over the run", f"from {min(change_um):+.3g} to {max(change_um):+.3g} µm"),
+        ("RMS of the change, last", _format_value(last.rms_um, last.rms_sigma_um, "µm")),
+        ("at the best depth", f"{format_number(last.least_rms_um)} µm: the limit of one actuator"),
+    ]
+    facts += _describe_image(series)
+    return [PageFacts(facts), PageDrawing(figures.draw_scalars(series))]
+
+
+def _describe_image(series: held_scalars.HeldSeries) -> list[tuple[str, str]]:
+    """The image of a star on the axis, by the last figure."""
+    image = series.image
+    if image is None:
+        return [("image of a star", "the mirror has no focus in front of it")]
+    wave = f"at {series.wavelength_um:g} µm"
+    radii = (
+        f"50 % of the light within {image.radius_50_um:.4g} µm, 80 % within "
+        f"{_format_value(image.radius_80_um, series.radius_80_sigma_um, 'µm')} (radius)"
+    )
+    strehl = _format_value(image.strehl, series.strehl_sigma, "")
+    if not image.resolved:
+        radii = f"not resolved {wave}: the paths differ by {image.path_rms_um:.3g} µm RMS"
+        strehl = "near 0"
+    return [
+        ("focus of a star", f"{image.focus_mm:.3f} mm above the vertex"),
+        (f"image of a star {wave}", radii),
+        (f"Strehl ratio {wave}", strehl),
+        (
+            f"Strehl ratio of the change {wave}",
+            f"{series.change_strehl:.4f} (optics correct the reference)",
+        ),
+    ]
+
+
+def _format_value(value: float, sigma: float, unit: str) -> str:
+    """A value with its standard deviation, if that is known."""
+    text = format_number(value)
+    if sigma == sigma:
+        text += f" ± {format_number(sigma, 2)}"
+    return f"{text} {unit}".rstrip()
 
 
 def _describe_pair(pair: shape_review.CyclePair) -> str:

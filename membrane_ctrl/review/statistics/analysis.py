@@ -11,7 +11,7 @@ from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events, list_unjudged
 from membrane_ctrl.review.events.found_event import FoundEvent
-from membrane_ctrl.review.statistics import shape_review
+from membrane_ctrl.review.statistics import held_scalars, shape_review
 from membrane_ctrl.review.statistics.anomalies import Anomaly, find_anomalies
 from membrane_ctrl.review.statistics.error_series import ErrorSeries, describe_error
 from membrane_ctrl.review.statistics.hold_pass import (
@@ -61,6 +61,8 @@ class Analysis:
     unjudged : tuple of str
         Kinds of events that the run is too short to show.
     shape : ShapeReview or None
+    scalars : HeldSeries or None
+        What was held: vertex, focus and distance from the reference.
     anomalies : tuple of Anomaly
     """
 
@@ -76,6 +78,7 @@ class Analysis:
     found: tuple[FoundEvent, ...]
     unjudged: tuple[str, ...]
     shape: shape_review.ShapeReview | None
+    scalars: held_scalars.HeldSeries | None
     anomalies: tuple[Anomaly, ...]
 
     @property
@@ -106,7 +109,7 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
             f"{run.folder}: nothing to report: no telemetry in this part of the run{known}"
         )
     span_s = (float(seconds["time_s"][0]), float(seconds["time_s"][-1]) + 1.0)
-    found, shape = _find_events_and_shape(run, seconds, start_s, end_s)
+    found, shape, scalars = _find_events_and_shape(run, seconds, start_s, end_s)
     unjudged = list_unjudged(seconds)
     del seconds  # a month takes a quarter of a GB, and the next steps need more
     # One pass over the ticks; a coarser level for the pictures of a long run.
@@ -134,20 +137,22 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
         found=found,
         unjudged=unjudged,
         shape=shape,
+        scalars=scalars,
         anomalies=anomalies,
     )
 
 
 def _find_events_and_shape(
     run: Run, seconds: Block, start_s: float, end_s: float
-) -> tuple[tuple[FoundEvent, ...], shape_review.ShapeReview | None]:
+) -> tuple[tuple[FoundEvent, ...], shape_review.ShapeReview | None, held_scalars.HeldSeries | None]:
     """Run the analyses that need the cycles, which are released before the ticks are read."""
     shapes = run.shapes()
     shapes = shapes.select_cycles((shapes.time_s >= start_s) & (shapes.time_s < end_s))
     mirror = run.config.optics.mirror
     held = held_at(seconds, shapes.time_s)
     shape = shape_review.review_shapes(shapes, held, mirror.analysis_radius_mm / mirror.radius_mm)
-    return tuple(find_events(seconds, shapes, run.config.limits.band_um)), shape
+    scalars = held_scalars.review_scalars(shapes, held, run.config)
+    return tuple(find_events(seconds, shapes, run.config.limits.band_um)), shape, scalars
 
 
 def _compute_benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:

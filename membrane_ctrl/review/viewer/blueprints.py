@@ -202,6 +202,8 @@ class ReviewBlueprint:
                 self._make_figures_page(figure_columns.LOW_ORDERS),
             ),
             rrb.Horizontal(
+                self._make_figures_page(figure_columns.FOCUS),
+                self._make_figures_page(figure_columns.FIGURE_RMS),
                 self._make_figures_page(figure_columns.SLOPE_RESIDUAL),
                 *map(self._make_level_plot, plots_of(Group.SHAPE)),
             ),

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import events
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, Colour
@@ -28,6 +29,7 @@ from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
 from membrane_ctrl.review.run_times import end_s
+from membrane_ctrl.review.statistics.held_scalars import HeldSeries, review_scalars
 from membrane_ctrl.run_files import hold_parts, plot_marks, shapes, streams
 from membrane_ctrl.run_files.run import Block, Run
 from membrane_ctrl.run_files.stream import Line, Stream, mean_path
@@ -39,6 +41,7 @@ LEVEL_ROWS_MOST = 50_000
 OVERVIEW_ROWS_MOST = 5_000
 SHAPES_MOST = 20_000
 MAPS_MOST = 40
+SCALARS_MOST = 300  # a millisecond each
 THUMBNAILS_MOST = 40  # of each pattern
 _RUN_COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, GREEN, VIOLET, RED)
 _EXTREMES = {"min": "minimum", "max": "maximum"}
@@ -147,7 +150,8 @@ class Layer:
             self._send_ticks(run, part_s)
         self._send_lanes(level)
         self._send_events(run, found, part_s)
-        self._send_figure(cycles.select_cycles(hold_parts.held_at(level, cycles.time_s)), part_s)
+        held = cycles.select_cycles(hold_parts.held_at(level, cycles.time_s))
+        self._send_figure(held, part_s, run.config)
         if not self._overview_only:
             self._send_thumbnails(run, part_s)
 
@@ -268,7 +272,9 @@ class Layer:
         ]
         self._send_columns(path, time_s, rr.TextLog.columns(text=lines, level=levels))
 
-    def _send_figure(self, cycles: shapes.Shapes, part_s: tuple[float, float]) -> None:
+    def _send_figure(
+        self, cycles: shapes.Shapes, part_s: tuple[float, float], config: Config
+    ) -> None:
         """Changes since the first cycle of the hold."""
         good = cycles.select_cycles(
             (cycles.verdict != "rejected") & np.isfinite(cycles.coeffs_um).all(axis=1)
@@ -294,12 +300,29 @@ class Layer:
         )
         sag = streams.SAG
         self._send_measured(sag.path, _names_and_colours(sag), shown.time_s, change, variances)
+        self._send_scalars_of(shown, config)
         residual_urad = shown.slope_residual_urad[:, np.newaxis]
         self._send_style(streams.RESIDUAL.path, _names_and_colours(streams.RESIDUAL))
         self._send_scalars(streams.RESIDUAL.path, shown.time_s, residual_urad)
         seen = (shown.time_s >= part_s[0]) & (shown.time_s <= part_s[1])
         seen |= ~seen.any()  # nothing measured there: show all rather than no map
         self._send_maps(shown.time_s[seen], parameters[seen])
+
+    def _send_scalars_of(self, shown: shapes.Shapes, config: Config) -> None:
+        """Focus and RMS of some cycles, against the first one."""
+        thinned = shown.select_cycles(_thin_evenly(len(shown), SCALARS_MOST))
+        series = review_scalars(thinned, np.ones(len(thinned), dtype=bool), config)
+        if series is None:
+            return
+        for stream, names in (
+            (streams.FOCUS, ("focus_mm",)),
+            (streams.FIGURE_RMS, ("rms_um", "least_rms_um")),
+        ):
+            values = np.column_stack([series.values_of(name) for name in names])
+            sigmas = np.column_stack([_find_sigmas(series, name) for name in names])
+            self._send_measured(
+                stream.path, _names_and_colours(stream), series.time_s, values, sigmas**2
+            )
 
     def _send_maps(self, time_s: Column, parameters: Column) -> None:
         """Maps of change, each kind on one scale for playback, and of the standard deviation over
@@ -455,6 +478,14 @@ def _coefficient_variances(cycles: shapes.Shapes) -> Column:
         return np.zeros_like(cycles.coeffs_um)
     place = np.searchsorted(cycles.covariance_time_s, cycles.time_s, side="right") - 1
     return np.diagonal(cycles.covariance_um2, axis1=1, axis2=2)[np.maximum(place, 0)]
+
+
+def _find_sigmas(series: HeldSeries, name: str) -> Column:
+    """Standard deviations of a scalar; 0 where none is known."""
+    sigma_names = {"focus_mm": "focus_sigma_mm", "rms_um": "rms_sigma_um"}
+    if name not in sigma_names:
+        return np.zeros(len(series.time_s))
+    return np.nan_to_num(series.values_of(sigma_names[name]))
 
 
 def _of_run(colour: Colour, number: int) -> Colour:

@@ -1,0 +1,156 @@
+"""The image of a distant point on the mirror's axis: focus, path differences, point spread function
+and Strehl ratio at a wavelength.
+
+A plane wave along the axis reaches the point P of the mirror and goes on to the focus F. Its path,
+counted from a plane in front of the mirror, is
+
+    L = |F - P| - z.
+
+F makes the mean square of L - mean(L) least, so the best focus and a tilt of the mirror are no
+error. The point spread function is the squared modulus of the Fourier transform of
+exp(2 pi i L / wavelength) over the aperture, as POPPY and prysm define it; divided by that of equal
+paths, its largest value is the Strehl ratio.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.model.arrays import FloatArray
+
+_PADDING = 4  # of the aperture: samples of the image at a quarter of wavelength over aperture
+_NEWTON_STEPS = 6
+_ENERGY_SHARES = (0.5, 0.8)
+# Neighbouring cells whose paths differ by more than half a wavelength do not show what lies between
+# them.
+_LARGEST_STEP = 0.5
+# This share of the steps must be smaller
+_RESOLVED_SHARE = 0.99
+
+
+@dataclass(frozen=True)
+class StarImage:
+    """The image of a distant point.
+
+    Attributes
+    ----------
+    focus_mm : float
+        Height of the focus above the origin.
+    path_rms_um : float
+        RMS of the path differences there: about twice the error of the surface.
+    strehl : float
+    resolved : bool
+        Whether the cells resolve the path differences at this wavelength; otherwise the point
+        spread function is not that of the mirror.
+    radius_50_um, radius_80_um : float
+        Radii around the middle of the image that hold 50 and 80 % of the energy.
+    spread : (m, m) array
+        Point spread function, 1 for the peak of equal paths.
+    pixel_um : float
+        Distance of its samples in the focal plane.
+    """
+
+    focus_mm: float
+    path_rms_um: float
+    strehl: float
+    resolved: bool
+    radius_50_um: float
+    radius_80_um: float
+    spread: FloatArray
+    pixel_um: float
+
+
+def image_star(axis_mm: FloatArray, height_mm: FloatArray, wavelength_um: float) -> StarImage:
+    """Return the image of a distant point.
+
+    Parameters
+    ----------
+    axis_mm : (n,) array
+        Middle of the cells of a square grid, evenly spaced.
+    height_mm : (n, n) array
+        Of the mirror; NaN outside the aperture.
+    wavelength_um : float
+
+    Returns
+    -------
+    StarImage
+
+    Raises
+    ------
+    ValueError
+        A mirror without a focus in front of it.
+    """
+    mask = np.isfinite(height_mm)
+    rows, columns = np.nonzero(mask)
+    points = np.stack((axis_mm[columns], axis_mm[rows], height_mm[mask]))
+    focus_mm, path_mm = _find_focus(points)
+    path_um = 1e3 * (path_mm - path_mm.mean())
+    paths = np.zeros(mask.shape)
+    paths[mask] = path_um
+    # Point spread function, padded for samples finer than the image of a perfect aperture
+    waves = np.where(mask, np.exp(2j * np.pi * paths / wavelength_um), 0.0)
+    size = _PADDING * len(axis_mm)
+    field = np.fft.fftshift(np.fft.fft2(waves, (size, size)))
+    spread = np.abs(field) ** 2 / np.count_nonzero(mask) ** 2
+    step_mm = float(axis_mm[1] - axis_mm[0])
+    distance_mm = float(focus_mm[2] - points[2].min())
+    pixel_um = wavelength_um * distance_mm / (size * step_mm)
+    radii_um = _find_energy_radii(spread, pixel_um)
+    return StarImage(
+        focus_mm=float(focus_mm[2]),
+        path_rms_um=float(np.sqrt(np.mean(path_um**2))),
+        strehl=float(spread.max()),
+        resolved=_is_resolved(paths, mask, wavelength_um),
+        radius_50_um=radii_um[0],
+        radius_80_um=radii_um[1],
+        spread=spread,
+        pixel_um=pixel_um,
+    )
+
+
+def _find_focus(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The focus (3,) and the paths (n,) to it, in mm, by Gauss-Newton steps."""
+    x, y, z = points_mm
+    # Start: the focus of the paraboloid through the points
+    square = x * x + y * y
+    columns = np.column_stack((np.ones_like(x), x, y, square))
+    curvature = np.linalg.lstsq(columns, z, rcond=None)[0][3]
+    if curvature <= 0:
+        raise ValueError("the mirror has no focus in front of it")
+    focus = np.array([0.0, 0.0, 1 / (4 * curvature)])
+    for _ in range(_NEWTON_STEPS):
+        towards = focus[:, None] - points_mm
+        distance = np.linalg.norm(towards, axis=0)
+        path = distance - z
+        gradient = (towards / distance).T
+        rows = np.column_stack((gradient, np.ones_like(x)))
+        focus = focus - np.linalg.lstsq(rows, path - path.mean(), rcond=None)[0][:3]
+    path = np.linalg.norm(focus[:, None] - points_mm, axis=0) - z
+    return focus, path
+
+
+def _is_resolved(paths_um: FloatArray, mask: FloatArray, wavelength_um: float) -> bool:
+    """Whether nearly all neighbouring cells differ by less than half a wavelength."""
+    small = []
+    for axis in (0, 1):
+        both = np.logical_and(
+            np.take(mask, range(len(mask) - 1), axis), np.take(mask, range(1, len(mask)), axis)
+        )
+        steps = np.abs(np.diff(paths_um, axis=axis))[both]
+        small.append(steps < _LARGEST_STEP * wavelength_um)
+    return bool(np.mean(np.concatenate(small)) >= _RESOLVED_SHARE)
+
+
+def _find_energy_radii(spread: FloatArray, pixel_um: float) -> tuple[float, float]:
+    """Radii around the middle of the energy that hold 50 and 80 % of it, µm."""
+    axis = np.arange(len(spread))
+    total = spread.sum()
+    row = float(spread.sum(axis=1) @ axis / total)
+    column = float(spread.sum(axis=0) @ axis / total)
+    radius = np.hypot(axis[:, None] - row, axis[None, :] - column).ravel()
+    order = np.argsort(radius)
+    energy = np.cumsum(spread.ravel()[order]) / total
+    half, most = (
+        pixel_um * float(np.interp(share, energy, radius[order])) for share in _ENERGY_SHARES
+    )
+    return half, most
