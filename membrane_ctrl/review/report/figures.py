@@ -470,7 +470,7 @@ def draw_scalars(series: held_scalars.HeldSeries) -> Markup:
         plot.set(title="Change of the figure without piston and tilt, 1 σ, µm", xlabel=unit)
         plot.legend(loc="upper left", ncols=2)
 
-    panels = [draw_focus, draw_rms]
+    panels: list[Callable[[Figure, Any], None]] = [draw_focus, draw_rms]
     image = series.image
     if image is not None and image.resolved:
         shown = image
