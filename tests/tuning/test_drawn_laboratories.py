@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from firmware_iface.emulators.pump_board import BoardSample
-from tests.studies.laboratory_sessions import ended_well, format_page, is_held, list_misses
+from tests.studies.laboratory_sessions import (
+    ended_well,
+    format_page,
+    is_held,
+    list_misses,
+    open_hold,
+)
 from tests.worlds.drawn_laboratories import (
     ACTUATORS,
     DrawnPlant,
@@ -143,3 +149,13 @@ def test_present_gains_that_are_as_good_are_no_miss() -> None:
     assert is_held(make_row())
     assert not is_held({})
     assert math.isclose(make_row()["limit_um"], 10.0)
+
+
+def test_a_session_knows_the_gains_that_the_start_has_limited() -> None:
+    """It went back to the stated ones of a quick pump, with which a slow one swings by 11 µm."""
+    laboratory = draw_laboratory(5)
+    stated = laboratory.config()
+    link = open_hold(laboratory, stated, 1)
+    assert link.config.loop.kp_per_s < 0.6 * stated.loop.kp_per_s
+    assert link.config.loop.ti_s > stated.loop.ti_s
+    assert link.config.model_copy(update={"loop": stated.loop, "pump": stated.pump}) == stated
