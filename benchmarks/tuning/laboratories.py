@@ -1,9 +1,9 @@
 """Laboratories drawn at random, one after the other (`tests/studies/laboratory_sessions.py`).
 
 `python -m benchmarks.tuning.laboratories --count 40` adds lines of JSON for each to
-build/laboratories.jsonl; a second call continues where the first ended. `--part defaults` only
-holds them with the defaults, `--part sessions` only tunes them. It writes the page
-docs/measurements/tuning-laboratories.md.
+build/laboratories.jsonl; a second call continues where the first ended. `--part start` only
+starts them, `--part defaults` holds them with the defaults, `--part sessions` tunes them. It
+writes the page docs/measurements/tuning-laboratories.md.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--file", type=Path, default=FILE)
-    parser.add_argument("--part", choices=PARTS, action="append", help="default: both")
+    parser.add_argument("--part", choices=PARTS, action="append", help="default: all")
     parser.add_argument("--page", type=Path, default=PAGE)
     given = parser.parse_args()
     given.file.parent.mkdir(parents=True, exist_ok=True)
@@ -61,8 +61,12 @@ def main() -> None:
             with given.file.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(answer) + "\n")
             known[seed] = {**row, **answer, "parts": [*row["parts"], part]}
-            outcome = describe_outcome(answer) if part == "sessions" else is_held(answer)
-            print(seed, part, outcome, f"{answer['cpu_s']:.0f} s", flush=True)
+            outcomes = {
+                "start": "start_s" in answer,
+                "defaults": is_held(answer),
+                "sessions": describe_outcome(answer),
+            }
+            print(seed, part, outcomes[part], f"{answer['cpu_s']:.0f} s", flush=True)
     given.page.write_text(format_page(read_rows(given.file)), encoding="utf-8")
 
 

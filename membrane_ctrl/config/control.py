@@ -260,8 +260,8 @@ class StatesConfig(Section):
     except to debug a bench."""
     actuator_size: Literal["stated", "any"] = "stated"
     """How strong that test wants the pump: 0.3 to 3 times its curve, or any pump that lifts the
-    mirror, up to 8 times the default curve. A hold whose file has nothing of `[pump]` takes `any`.
-    Set it to `stated` for a pump that is the default one."""
+    mirror, up to 8 times the default curve. A hold whose file states neither the full flow nor a
+    curve of the pump takes `any`. Set it to `stated` for a pump that is the default one."""
     observe: bool = False
     """Read, estimate, measure and record, and never command pump or vent. `hold --observe` sets it,
     for the first day on real hardware, or beside another controller. Set it to true for a bench

@@ -65,10 +65,8 @@ INTERLOCKS_MAX = 32  # bits of a mask that telemetry carries as a double
 NEEDED = tuple(name for name, role in ROLES.items() if role.needed)
 # keys of the estimator that state the pump's response
 _PUMP_RESPONSE_KEYS = frozenset({"pump_response", "pump_delay_s", "pump_lag_s"})
-# keys of the pump that state its curve
-_PUMP_CURVE_KEYS = frozenset(
-    {"flow_full_um_per_s", "dead_fraction", "curve_fraction", "curve_um_per_s"}
-)
+# keys of the pump that state its size
+_PUMP_SIZE_KEYS = frozenset({"flow_full_um_per_s", "curve_fraction", "curve_um_per_s"})
 
 if TYPE_CHECKING:  # `DevicesConfig.roles` gives their tables
     SensorTables = Section
@@ -420,7 +418,7 @@ def leave_to_start(config: Config) -> Config:
     if "process_value" not in estimator.model_fields_set:
         estimator = estimator.model_copy(update={"process_value": "auto"})
     states = config.states
-    curve_stated = bool(_PUMP_CURVE_KEYS & config.pump.model_fields_set)
-    if not curve_stated and "actuator_size" not in states.model_fields_set:
+    size_stated = bool(_PUMP_SIZE_KEYS & config.pump.model_fields_set)
+    if not size_stated and "actuator_size" not in states.model_fields_set:
         states = states.model_copy(update={"actuator_size": "any"})
     return config.model_copy(update={"estimator": estimator, "states": states})

@@ -259,6 +259,8 @@ def test_a_hold_of_an_unknown_pump_begins_with_the_defaults(pump: ForeignPump) -
 def test_a_stated_curve_keeps_its_limits() -> None:
     config = leave_to_start(Config(pump=PumpConfig(flow_full_um_per_s=5.3)))
     assert config.states.actuator_size == "stated"
+    proportional = PumpConfig(dead_fraction=0.0, start_fraction=0.0, stall_fraction=0.0)
+    assert leave_to_start(Config(pump=proportional)).states.actuator_size == "any"
 
 
 @pytest.mark.parametrize(

@@ -123,6 +123,7 @@ def make_row(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "miss"),
     [
+        ({"start_error": "the pump lifts nothing"}, "fan: start: the pump lifts nothing"),
         ({"by_auto_held": 0.9}, "held for 90%"),
         ({"by_auto_um": 0.23}, "estimate 1.15 times the PI"),
         ({"tuned_um": 0.25}, "predicted 0.64 of achieved"),
