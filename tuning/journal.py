@@ -65,7 +65,23 @@ def make_entry(
     traded: Traded | None = None,
     shape_s: tuple[float, float] | None = None,
 ) -> GainsEntry:
-    """Return an entry stamped with the present time."""
+    """Return an entry stamped with the present time.
+
+    Parameters
+    ----------
+    what : str
+        What happened to the gains: kept, taken back, saved and so on.
+    session : str
+        Name of the session.
+    author, reason : str
+        Who did it, and why.
+    before, after : LoopConfig
+        The loop's settings.
+    traded : Traded, optional
+        What a choice gained and lost against the proposal.
+    shape_s : (float, float), optional
+        Time constant of the shape loop before and after.
+    """
     now_utc = datetime.now(UTC).isoformat(timespec="seconds")
     return GainsEntry(now_utc, what, session, author, reason, before, after, traded, shape_s)
 

@@ -36,8 +36,18 @@ class HoldStatus:
 def hold_status(
     context: TickContext, last: inner_loop.LoopOutput, optics_hold: bool, optics_usable: bool = True
 ) -> HoldStatus:
-    """The mirror after the tick's reading was taken; `last` is what the loop gave in the tick
-    before.
+    """The mirror after the tick's reading was taken.
+
+    Parameters
+    ----------
+    context : TickContext
+        The controller's state in this tick.
+    last : LoopOutput
+        What the loop gave in the tick before.
+    optics_hold : bool
+        The mirror is held by its figure, not by the laser.
+    optics_usable : bool
+        It could be.
     """
     return HoldStatus(
         laser_um=context.observer.moving_laser_um,

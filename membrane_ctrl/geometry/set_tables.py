@@ -91,8 +91,21 @@ class MirrorTurnedTable(Section):
 def move_screen(
     geometry: GeometryConfig, shift_mm: tuple[float, float, float], turn: FloatArray | None = None
 ) -> GeometryConfig:
-    """The bench with its screen shifted in its own axes, and then turned by a matrix (3, 3) from
-    world to world.
+    """The bench with its screen at another place.
+
+    Parameters
+    ----------
+    geometry : GeometryConfig
+        The bench, of either form.
+    shift_mm : (float, float, float)
+        Shift along the screen's own axes s_x, s_y and its normal.
+    turn : (3, 3) array, optional
+        Rotation that then turns the screen about its origin, from world to world.
+
+    Returns
+    -------
+    GeometryConfig
+        In the form of two poses.
     """
     pinhole, rotation, origin, s_x, s_y = sight.compute_poses(geometry)
     origin = origin + np.array(shift_mm) @ np.stack([s_x, s_y, np.cross(s_x, s_y)])

@@ -19,7 +19,19 @@ from membrane_ctrl.model.zernike_terms import zernike_labels
 def draw_uncertainty(
     path: Path, axis_mm: FloatArray, height_um: FloatArray, rmse_um: FloatArray, pair: bool
 ) -> None:
-    """Draw the height, or its change, beside its RMSE; (n, n) maps."""
+    """Draw the height, or its change, beside its RMSE.
+
+    Parameters
+    ----------
+    path : Path
+        Picture to write.
+    axis_mm : (n,) array
+        Coordinates of the map's columns and rows.
+    height_um, rmse_um : (n, n) arrays
+        The maps.
+    pair : bool
+        The height is a change between two sets.
+    """
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     if pair:

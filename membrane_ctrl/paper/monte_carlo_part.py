@@ -248,7 +248,22 @@ def _compute_effects_um(
 
 
 def compute_pair_rmse_um(inputs: TrialInputs, to_height: FloatArray, trials: int) -> FloatArray:
-    """RMSE (points,) of the change between two sets, whose geometry has the same error."""
+    """RMSE of the change between two sets, whose geometry has the same error.
+
+    Parameters
+    ----------
+    inputs : TrialInputs
+        The bench, its first surface, and the errors to draw.
+    to_height : (points, terms) array
+        From coefficients to heights.
+    trials : int
+        How many errors are drawn.
+
+    Returns
+    -------
+    (points,) array
+        Standard deviation of the change over the trials, µm.
+    """
     moved_mm = inputs.nominal.coeffs_mm.copy()
     moved_mm[[_X_SQUARED, _Y_SQUARED]] += _PAIR_UM / 1e3
     surfaces = (inputs.nominal, PolynomialSurface(moved_mm, inputs.nominal.radius_mm))

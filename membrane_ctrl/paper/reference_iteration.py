@@ -199,8 +199,21 @@ def reconstruct(
 def predict_seen(
     geometry: PaperGeometry, rays: FloatArray, surface: PolynomialSurface
 ) -> SeenPoints:
-    """What a camera sees of a surface by its rays (3, n) from the pinhole: reflected by vectors,
-    without the paper's equations.
+    """What a camera sees of a surface, by reflection of vectors, without the paper's equations.
+
+    Parameters
+    ----------
+    geometry : PaperGeometry
+        The paper's a, b and alpha.
+    rays : (3, n) array
+        Rays of the pixels, from the pinhole.
+    surface : PolynomialSurface
+        The mirror.
+
+    Returns
+    -------
+    SeenPoints
+        The points of the screen that each ray reaches.
     """
     points_mm = _place_points(geometry, SeenPoints(rays, np.zeros((2, 0))), surface, None)
     reflected = _reflect(geometry, points_mm, surface).reflected

@@ -136,7 +136,23 @@ def compute_slope(
 def predict_screen(
     geometry: PaperGeometry, across_mm: FloatArray, height_mm: FloatArray, slope: FloatArray
 ) -> FloatArray:
-    """O'A (n,) that a point with this slope sees: the inverse of `compute_slope` (equation 11)."""
+    """The point of the screen that a point of the mirror sees: the inverse of `compute_slope`
+    (equation 11).
+
+    Parameters
+    ----------
+    geometry : PaperGeometry
+        The paper's a, b and alpha.
+    across_mm, height_mm : (n,) arrays
+        x_0 and h of the points.
+    slope : (n,) array
+        Slope of the mirror there.
+
+    Returns
+    -------
+    (n,) array
+        O'A, mm.
+    """
     path = _Path.of(geometry, across_mm, height_mm)
     tangent = np.tan(-2.0 * np.arctan(slope))
     tilted_mm = path.reach_mm * tangent

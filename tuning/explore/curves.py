@@ -37,7 +37,19 @@ class Curves:
 
 
 def compute_curves(name: str, gains: closed_loop.Gains, of: Workpiece, duration_s: float) -> Curves:
-    """Everything the page draws of a set of gains."""
+    """Everything the page draws of a set of gains.
+
+    Parameters
+    ----------
+    name : str
+        Name of the candidate.
+    gains : Gains
+        The gains.
+    of : Workpiece
+        Plant, weather and configuration that they are for.
+    duration_s : float
+        Length of the responses to steps.
+    """
     dt_s = of.weather.rest.dt_s
     demands = gain_search.Demands()
     figures = candidate.evaluate_candidate(name, gains, of.model, of.weather, of.loop, demands)
@@ -67,9 +79,20 @@ def simulate_response(
 ) -> tuple[arrays.FloatArray, arrays.FloatArray]:
     """Centre of the mirror, linear and without noise, after steps of setpoint and leak at time 0.
 
+    Parameters
+    ----------
+    gains : Gains
+        The loop's gains.
+    of : Workpiece
+        Plant and configuration.
+    duration_s : float
+        Length of the simulation.
+    setpoint_um, load_um_per_s : float
+        The steps.
+
     Returns
     -------
-    time_s, centre_um : (n,)
+    time_s, centre_um : (n,) arrays
         At each tick; the delayed flow changes once within a tick, which is taken into account.
     """
     loop, model = of.loop, of.model

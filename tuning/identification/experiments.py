@@ -130,8 +130,23 @@ def make_spec(
     duration_s: float,
     gain: float = 1.0,
 ) -> ExperimentSpec:
-    """The specification of an experiment at an operating point. Raises pydantic.ValidationError out
-    of bounds.
+    """The specification of an experiment at an operating point.
+
+    Parameters
+    ----------
+    kind : ExperimentKind
+        Which experiment.
+    around : OperatingPoint
+        Where the mirror is held, and how far it may move.
+    duration_s : float
+        Length of the experiment.
+    gain : float
+        Assumed gain of the plant: µm/s of motion for each µm/s of commanded flow.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        A value is out of bounds.
     """
     return ExperimentSpec(
         kind=kind,

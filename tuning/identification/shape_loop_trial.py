@@ -42,11 +42,23 @@ def try_time_constant(
     assumed: Series,
     duration_s: float,
 ) -> OuterTrial:
-    """Hold with the second time constant; keep it if it predicts the shapes as well as the first,
-    the present one.
+    """Hold with another time constant; keep it if it predicts the shapes as well as the
+    present one.
 
-    `earlier` shapes let both trackers settle. If the session ends, or is killed, the hold takes it
-    back by itself.
+    If the session ends, or is killed, the hold takes it back by itself.
+
+    Parameters
+    ----------
+    rig : HoldRig
+        The hold.
+    times_s : (float, float)
+        The present time constant, and the one to try.
+    earlier : sequence of ShapeEstimate
+        Shapes before the trial, with which both trackers settle.
+    assumed : (terms,) array
+        Zernike coefficients of a film of sag 1, as the hold assumes them.
+    duration_s : float
+        Length of the trial.
     """
     # Hold with the new one, on trial: the hold itself restores the former if this session ends.
     before_s, after_s = times_s

@@ -21,8 +21,14 @@ _LEAST_TESTED = 3  # blocks; fewer have no usable variance
 
 
 def block_s(a_s: Column, b_s: Column, window_s: float) -> float:
-    """Common block length of two series at these times: unequal blocks would include different
-    motion.
+    """Common block length of two series, s: unequal blocks would include different motion.
+
+    Parameters
+    ----------
+    a_s, b_s : (n,), (m,) arrays
+        Times of the two series.
+    window_s : float
+        Length of the window that a value is the mean of; a block has at least five.
     """
     shorter_s = 0.0
     if a_s.size and b_s.size:
@@ -31,8 +37,23 @@ def block_s(a_s: Column, b_s: Column, window_s: float) -> float:
 
 
 def block_statistics(time_s: Column, values: Column, length_s: float) -> tuple[Column, Column]:
-    """Mean and log variance of each block; the logarithm is corrected for its bias from the number
-    of values.
+    """Mean and log variance of each block.
+
+    Parameters
+    ----------
+    time_s : (n,) array
+        Times, increasing.
+    values : (n,) array
+        Values then; those that are not finite are left out.
+    length_s : float
+        Length of a block.
+
+    Returns
+    -------
+    means : (k,) array
+        Of the blocks that are at least half as full as usual.
+    log_variances : (m,) array
+        Of those that vary; corrected for the bias that the logarithm has with few values.
     """
     finite = np.isfinite(values)
     time_s = time_s[finite]
@@ -57,7 +78,19 @@ def block_statistics(time_s: Column, values: Column, length_s: float) -> tuple[C
 
 
 def window_means(time_s: Column, values: Column, window_s: float) -> tuple[Column, Column]:
-    """Middles and means of longer windows, those with nine tenths of their seconds."""
+    """Means of longer windows.
+
+    Parameters
+    ----------
+    time_s, values : (n,) arrays
+        One value a second.
+    window_s : float
+        Length of a window; one with fewer than nine tenths of its seconds is left out.
+
+    Returns
+    -------
+    middles_s, means : (k,) arrays
+    """
     if not time_s.size:
         return time_s, values
     number = np.floor(time_s / window_s).astype(np.int64)
@@ -69,13 +102,24 @@ def window_means(time_s: Column, values: Column, window_s: float) -> tuple[Colum
 
 
 def spread_p(a: Column, b: Column, window_s: float = 1.0) -> float:
-    """Chance of spreads as different between equal processes (2, n) of times and values; NaN: too
-    short.
+    """Chance of spreads as different between equal processes.
 
     Two tests, each of half the level. Within blocks: Welch's test of log variances, which detects
     any difference of the usual motion. Of the whole: the ratio of the variances against F with
     their effective degrees of freedom, the smaller of n / (1 + 2 sum r_k^2) and the number that
     follows from the scatter of the squares; it detects motion slower or rarer than a block.
+
+    Parameters
+    ----------
+    a, b : (2, n), (2, m) arrays
+        Times in s and values of each process.
+    window_s : float
+        Length of the window that a value is the mean of.
+
+    Returns
+    -------
+    float
+        NaN if both series are too short for either test.
     """
     length_s = block_s(a[0], b[0], window_s)
     _, log_variances_a = block_statistics(a[0], a[1], length_s)

@@ -56,10 +56,21 @@ class _LawFit:
 
 
 def fit_creep(time_s: FloatArray, y: FloatArray, ahead_s: float) -> FilmCreep:
-    """Fit the law to readings (n,) of the logarithm of the stiffness.
+    """Fit the law to readings of a film's stiffness.
 
-    Raises ValueError for fewer than `LEAST` readings, or a look ahead of more than twice their
-    time.
+    Parameters
+    ----------
+    time_s : (n,) array
+        Times of the readings, in any order.
+    y : (n,) array
+        Logarithm of the stiffness then.
+    ahead_s : float
+        How far beyond the last reading to predict the drift.
+
+    Raises
+    ------
+    ValueError
+        For fewer than `LEAST` readings, or a look ahead of more than twice their time.
     """
     order = np.argsort(time_s)
     time_s, y = _average_blocks(np.asarray(time_s, float)[order], np.asarray(y, float)[order])

@@ -28,8 +28,24 @@ class WindowStatistics:
 def window_means(
     second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
 ) -> tuple[Column, Column]:
-    """Middles (k,) in s and means of the windows with at least `count_least_ticks`, from (n,) sums
-    of `SecondSums`.
+    """Middles and means of the windows that have at least `count_least_ticks` ticks.
+
+    Parameters
+    ----------
+    second : (n,) int array
+        Number of each second of the run.
+    counts : (n,) int array
+        Its ticks.
+    sums : (n,) array
+        Sum of the signal over them, as `SecondSums` has it.
+    window_s : int
+        Length of a window.
+    rate_hz : float
+        Ticks a second.
+
+    Returns
+    -------
+    middles_s, means : (k,) arrays
     """
     if not second.size:
         return np.empty(0), np.empty(0)
@@ -44,7 +60,17 @@ def window_means(
 
 
 def describe_windows(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
-    """Statistics of the means of windows."""
+    """Statistics of the means of windows.
+
+    Parameters
+    ----------
+    means_um : (k,) array
+        Mean control error of each window, µm.
+    window_s : float
+        Length of a window.
+    band_um : float
+        Half width of the band in which the mirror counts as held, µm.
+    """
     if not means_um.size:
         return WindowStatistics(window_s, 0, math.nan, math.nan, math.nan, math.nan, math.nan)
     size_um = np.abs(means_um)

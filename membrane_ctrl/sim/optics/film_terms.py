@@ -30,7 +30,22 @@ class FilmTerms(NamedTuple):
 def height_and_slopes(
     terms: FilmTerms, sag_mm: float, x_mm: float, y_mm: float
 ) -> tuple[float, float, float]:
-    """Height above the vertex (mm) and its derivatives along x and y."""
+    """Height of the film at a point and its slopes there.
+
+    Parameters
+    ----------
+    terms : FilmTerms
+        Shape of the film.
+    sag_mm : float
+        Its sag.
+    x_mm, y_mm : float
+        The point, from the vertex.
+
+    Returns
+    -------
+    h, h_x, h_y : float
+        Height above the vertex, mm, and its derivatives along x and y.
+    """
     X = x_mm / terms.radius_mm
     Y = y_mm / terms.radius_mm
 

@@ -34,7 +34,19 @@ def cubic_weights(step: int) -> FloatArray:
 
 @compile_loop()
 def interpolate_cubic(line: FloatArray, cell: int, w: FloatArray, k: int) -> float:
-    """Value of a cubic through the nodes cell .. cell + 3, at the k-th of the places between."""
+    """Value of a cubic through four nodes, at one of the places between the inner two.
+
+    Parameters
+    ----------
+    line : (nodes,) array
+        Values at the nodes.
+    cell : int
+        First of the four nodes.
+    w : (places, 4) array
+        Weight of each node at each place.
+    k : int
+        The place.
+    """
     return float(
         w[k, 0] * line[cell]
         + w[k, 1] * line[cell + 1]
@@ -47,7 +59,21 @@ def interpolate_cubic(line: FloatArray, cell: int, w: FloatArray, k: int) -> flo
 def interpolate_row(
     nodes: FloatArray, k: int, node: int, w: FloatArray | Singles, line: FloatArray | Singles
 ) -> None:
-    """Map k at one row of the picture, at the nodes' columns."""
+    """Values of a map at one row of the picture, at the nodes' columns.
+
+    Parameters
+    ----------
+    nodes : (maps, node rows, node columns) array
+        Values at the nodes.
+    k : int
+        The map.
+    node : int
+        First of the four rows of nodes around the picture's row.
+    w : (4,) array
+        Weight of each of these.
+    line : (node columns,) array
+        Takes the values.
+    """
     for c in range(nodes.shape[2]):
         line[c] = (
             w[0] * nodes[k, node, c]

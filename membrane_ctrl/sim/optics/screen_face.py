@@ -24,8 +24,26 @@ def project_onto_face(
     bow_per_mm: float,
     height_map: HeightMapConfig | None,
 ) -> FloatArray:
-    """s_x and s_y (2, N) on the face of rays that cross the plane at `place_mm` (2, N) with
-    `tangents` (2, N).
+    """Where rays meet the face of a screen that is not flat.
+
+    Fixed point: the face stands off the plane by an amount at the point found last, and the ray
+    moves sideways by its tangent times that.
+
+    Parameters
+    ----------
+    place_mm : (2, N) array
+        s_x and s_y where the rays cross the plane.
+    tangents : (2, N) array
+        Motion along s_x and s_y for each mm along the plane's normal.
+    bow_per_mm : float
+        Height of the face at a distance r is this times r^2.
+    height_map : HeightMapConfig or None
+        Measured heights of the face, added to the bow.
+
+    Returns
+    -------
+    (2, N) array
+        s_x and s_y on the face, mm.
     """
     if bow_per_mm == 0.0 and height_map is None:
         return place_mm

@@ -90,9 +90,24 @@ def find_film_distance(
     vertex_z_mm: float,
     guess_mm: float,
 ) -> float:
-    """Path from `start` to the film along a unit vector; NaN if Newton does not converge.
+    """Path from a point to the film along a ray, by Newton's method; NaN if it does not converge.
 
     f(t) = z(t) - vertex_z - h(x(t), y(t)) = 0 with f' = d_z - h_x d_x - h_y d_y.
+
+    Parameters
+    ----------
+    start : (3,) array
+        Point in world, mm.
+    direction : (3,) array
+        Unit vector of the ray, in world.
+    film : FilmTerms
+        Shape of the film.
+    sag_mm : float
+        Its sag.
+    vertex_z_mm : float
+        Height of its vertex in world.
+    guess_mm : float
+        Path to begin with.
     """
     t = guess_mm
     for _ in range(_MAX_STEPS):
@@ -111,10 +126,25 @@ def find_film_distance(
 def find_plane_point(
     p: FloatArray, direction: FloatArray, origin: FloatArray, axes: FloatArray
 ) -> tuple[float, float, float, float]:
-    """s_x and s_y where a ray from `p` crosses the screen's plane, and its tangents; NaN if it runs
-    away from it.
+    """Where a ray crosses the screen's plane: in the screen's axes the ray is q + t r.
 
-    In the screen's axes the ray is q + t r.
+    Parameters
+    ----------
+    p : (3,) array
+        Point of the ray in world, mm.
+    direction : (3,) array
+        Unit vector of the ray, in world.
+    origin : (3,) array
+        O', the screen's origin in world, mm.
+    axes : (3, 3) array
+        The screen's axes in world: s_x, s_y and the normal, as rows.
+
+    Returns
+    -------
+    s_x, s_y : float
+        The point, mm; NaN if the ray runs away from the screen.
+    tangent_x, tangent_y : float
+        Motion along s_x and s_y for each mm along the normal.
     """
     q = axes @ (p - origin)
     r = axes @ direction
