@@ -2,7 +2,8 @@
 
 One segment at a time is optimised, in a process of lowest priority. That shrinks a segment by a
 third and makes it open at once. The original is replaced atomically, and only by a file that has
-its footer and was made without an error.
+its footer and was made without an error. Without that program, as in an installation without the
+viewer, segments stay as they are written.
 """
 
 import importlib.util
@@ -58,8 +59,9 @@ class Optimizer:
         self._source = self._part = Path()
 
     def add_segment(self, path: Path) -> None:
-        """Queue a closed segment."""
-        self._waiting.append(path)
+        """Queue a closed segment, if the program that optimises is installed."""
+        if _RERUN.exists():
+            self._waiting.append(path)
 
     def poll_worker(self) -> None:
         """Put a finished file in place and start the next. Raises OSError, also for a failed

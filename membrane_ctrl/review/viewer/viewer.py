@@ -51,8 +51,16 @@ def place_cursor(client: ViewerClient, at: CursorTime) -> None:
 def viewer_command(*arguments: str) -> list[str]:
     """The viewer's binary: the `rerun` command is a Python shim, and ending that would leave the
     viewer running.
+
+    Raises InputError in an installation without the viewer.
     """
-    return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
+    program = Path(rerun_cli.__file__).parent / "rerun"
+    if not program.exists():
+        raise errors.InputError(
+            "this installation has no viewer: copy the run to a machine that has one, or `pip "
+            "install --force-reinstall rerun-sdk`"
+        )
+    return [str(program), *arguments]
 
 
 def show_source(
