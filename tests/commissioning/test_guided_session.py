@@ -85,6 +85,17 @@ def test_a_mirror_whose_film_would_yield_is_refused(tmp_path: Path, bench: Quick
     assert "continue" not in person.text
 
 
+def test_a_clear_film_in_front_is_written_and_taken_back(tmp_path: Path, bench: QuickBench) -> None:
+    run_stages(tmp_path, bench, Person(**{"mirror.seen": "through"}), "mirror")
+    front = load_toml(tmp_path / CONFIGURATION, Config).optics.mirror.front_film
+    assert front is not None
+    # The paper's cushion: 10 µm in front of 50 µm
+    assert (front.bulge_mm, front.thickness_um) == (pytest.approx(63.4, abs=0.1), 10.0)
+    person = Person(**{"mirror.seen": "directly", "devices.kind": ["back", "board"]})
+    run_stages(tmp_path, bench, person, *DESK)
+    assert load_toml(tmp_path / CONFIGURATION, Config).optics.mirror.front_film is None
+
+
 def test_a_pump_that_can_only_switch_is_refused(tmp_path: Path, bench: QuickBench) -> None:
     person = Person(**{"mirror.pump_kind": "diaphragm"})
     assert run_stages(tmp_path, bench, person, "mirror") == Exit.INTERRUPTED

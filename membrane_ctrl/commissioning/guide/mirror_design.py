@@ -48,11 +48,20 @@ class MirrorFacts(BaseModel):
     leak_time_constant_s: Annotated[float, Field(ge=10, le=1e8)] = 10_000.0
     relief_pa: Annotated[float, Field(ge=0, le=1e5)] = 0.0
     """0: no relief valve."""
+    front_bulge_mm: Annotated[float, Field(ge=0, le=5000)] = 0.0
+    """Height of a clear film through which the camera sees the mirror; 0: the camera sees it
+    directly."""
 
     @property
     def radius_mm(self) -> float:
         """Of the ring."""
         return self.diameter_mm / 2.0
+
+
+def find_other_bulge_mm(facts: MirrorFacts) -> float:
+    """Height of the other film at the same pressure and modulus: sag goes with (p / t)^(1/3)."""
+    ratio = facts.thickness_um / facts.back_thickness_um
+    return float(facts.sag_mm * ratio ** (1.0 / 3.0))
 
 
 # The paper's mirror: PET, its modulus measured there. Yield: tabulated for biaxial PET film.

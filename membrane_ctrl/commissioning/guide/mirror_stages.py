@@ -7,6 +7,7 @@ from membrane_ctrl.commissioning.guide.mirror_design import (
     MirrorDesign,
     MirrorFacts,
     derive_design,
+    find_other_bulge_mm,
 )
 from membrane_ctrl.commissioning.guide.stage import (
     StageContext,
@@ -29,6 +30,7 @@ _QUESTIONS = (
     ("relief_pa", "opening pressure of the relief valve; 0: none is fitted", "Pa", 0.0, 1e5),
 )
 _OWN, _PAPER = "own", "paper"
+_DIRECTLY, _THROUGH = "directly", "through"
 _DIAPHRAGM, _PROPORTIONAL = "diaphragm", "proportional"
 _RAMP_SHARE = 0.65  # of the full flow: the rest is for the leak
 
@@ -69,6 +71,7 @@ def ask_mirror(context: StageContext) -> None:
         )
         asked |= {"pump_proportional": kind == _PROPORTIONAL}
     facts = MirrorFacts.model_validate(asked)
+    facts = facts.model_copy(update={"front_bulge_mm": _ask_front_bulge_mm(context, facts)})
     try:
         design = derive_design(facts)
     except ValueError as error:
@@ -82,6 +85,32 @@ def ask_mirror(context: StageContext) -> None:
 def _ask_relief(context: StageContext) -> float:
     key, question, unit, low, high = _QUESTIONS[-1]
     return context.dialogue.ask_number(f"mirror.{key}", question, 0.0, low, high, unit)
+
+
+def _ask_front_bulge_mm(context: StageContext, facts: MirrorFacts) -> float:
+    """Ask whether the camera looks through the other film, and for the height of that film."""
+    seen = context.dialogue.ask_choice(
+        "mirror.seen",
+        "how does the camera see the mirror?",
+        (
+            Choice(name=_DIRECTLY, meaning="nothing is in front of it, or there is no camera"),
+            Choice(
+                name=_THROUGH,
+                meaning="through the other film, which is clear, and the gas: the paper's cushion",
+            ),
+        ),
+        _DIRECTLY,
+    )
+    if seen == _DIRECTLY:
+        return 0.0
+    return context.dialogue.ask_number(
+        "mirror.front_bulge_mm",
+        "height of the clear film's middle above its rim, measured, or as derived",
+        round(find_other_bulge_mm(facts), 1),
+        0.1,
+        5000.0,
+        "mm",
+    )
 
 
 def explain_design(facts: MirrorFacts, design: MirrorDesign) -> list[str]:
@@ -141,6 +170,14 @@ def write_design(context: StageContext, facts: MirrorFacts, design: MirrorDesign
         sag_mm=_round(facts.sag_mm),
         pressure_pa=_round(design.pressure_pa),
     )
+    if facts.front_bulge_mm > 0.0:
+        context.set_keys(
+            "optics.mirror.front_film",
+            bulge_mm=_round(facts.front_bulge_mm),
+            thickness_um=_round(facts.back_thickness_um),
+        )
+    else:
+        context.remove_table("optics.mirror", "front_film")
     context.set_keys(
         "limits",
         displacement_min_um=design.displacement_min_um,

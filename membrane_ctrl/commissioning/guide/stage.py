@@ -88,6 +88,15 @@ class StageContext:
         target.update(keys)
         self._write(tables)
 
+    def remove_table(self, parent: str, name: str) -> None:
+        """Remove a table below another, such as `front_film` of `optics.mirror`, if it is there."""
+        tables = read_tables(self.folder)
+        target = tables
+        for part in parent.split("."):
+            target = target.get(part, {})
+        if target.pop(name, None) is not None:
+            self._write(tables)
+
     def replace_table(self, table: str, content: TomlTable) -> None:
         """Replace a top-level table of the configuration file."""
         tables = read_tables(self.folder)
