@@ -11,6 +11,7 @@ from pathlib import Path
 
 _WITHOUT_POSIX = """
 import mmap, sys
+import psutil  # of the viewer's library: it has modules of its own for each system
 
 NAMES = {"fcntl", "resource", "termios", "pwd", "grp", "tty", "pty"}
 
@@ -48,7 +49,14 @@ def test_a_simulated_set_is_measured(tmp_path: Path) -> None:
 
 def test_reviewing_commands_start(tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()
-    for words in (("runs",), ("report", "last"), ("config", "explain", "loop")):
+    commands = (
+        ("runs",),
+        ("report", "last"),
+        ("review", "last"),
+        ("review", "--all"),
+        ("config", "explain", "loop"),
+    )
+    for words in commands:
         done = run_without_posix(tmp_path, *words)
         assert "Traceback" not in done.stderr
         assert "No module" not in done.stderr

@@ -137,6 +137,12 @@ class ForeignPlant:
         self._gas = self._pressure(0) * self._sag_um / self._air[0]
         pump.balance(leak_um_per_s)
 
+    def lower(self, sag_um: float) -> None:
+        """Take gas out until the film has this sag, with the pump at rest."""
+        self._sag_um = sag_um
+        self._gas = self._pressure(0) * sag_um / self._air[0]
+        self.pump.step(0.0)
+
     @property
     def time_s(self) -> float:
         return self._steps * STEP_S

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from membrane_ctrl.commissioning.guide import thresholds
 from membrane_ctrl.commissioning.guide.mirror_design import derive_design
@@ -26,6 +27,7 @@ _WHO = "commission"
 _HELD_LEAST_SHARE = 0.99  # of the sag: limits.displacement_min_um while the mirror is filled
 _FULL_SHARE = 0.01  # of the sag: the mirror is at its depth
 _REPORT_S = 600.0  # between two lines of progress
+_DEPTHS_LEAST = 4  # three unknowns
 _LAW_PA = 2.0  # least squares: a gauge's error is a share of its reading, but not below this
 
 
@@ -136,21 +138,23 @@ def collect_rows(link: HoldLink, duration_s: float) -> list[TelemetryRow]:
 
 
 def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
-    """Compare laser and gauge by the film's law, p = p0 + c w^3."""
-    if len(points) < 3:
+    """Compare laser and gauge by the film's law, p = p0 + a w + c w^3.
+
+    The linear term is the tension that the film has been clamped with; it cannot be negative.
+    """
+    if len(points) < _DEPTHS_LEAST:
         context.leave_out(
-            "laser against gauge", "the mirror was filled already: fewer than three depths"
+            "laser against gauge", "the mirror was filled already: fewer than four depths"
         )
         return
-    # Weighted least squares for the gauge's zero p0 and the factor c.
-    cubes = np.array([point.sag_mm**3 for point in points])
+    depths_mm = np.array([point.sag_mm for point in points])
     pressures_pa = np.array([point.pressure_pa for point in points])
     weights = 1.0 / np.maximum(_LAW_PA, 0.02 * pressures_pa)
-    matrix = np.stack([np.ones_like(cubes), cubes], axis=1)
-    fitted, *_ = np.linalg.lstsq(matrix * weights[:, None], pressures_pa * weights, rcond=None)
-    zero_pa, factor = float(fitted[0]), float(fitted[1])
+    matrix = np.stack([np.ones_like(depths_mm), depths_mm, depths_mm**3], axis=1)
+    limits = [-np.inf, 0.0, -np.inf], np.inf
+    fitted = lsq_linear(matrix * weights[:, None], pressures_pa * weights, bounds=limits).x
+    zero_pa, tension, stretch = (float(value) for value in fitted)
     expected_pa = matrix @ fitted
-    # Each depth against the fit, as a share of its pressure.
     scatter = np.abs(pressures_pa - expected_pa) / np.maximum(expected_pa, 0.1 * expected_pa[-1])
     context.judge(
         "pressure against depth, difference from the film's law",
@@ -160,7 +164,9 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
     )
     # The stiffness that the factor shows, against the stated one.
     design = derive_design(context.facts)
-    ratio = factor * context.facts.sag_mm**3 / design.pressure_pa
+    sag_mm = context.facts.sag_mm
+    by_tension_pa = tension * sag_mm
+    ratio = (by_tension_pa + stretch * sag_mm**3) / design.pressure_pa
     context.judge(
         "measured over stated stiffness of the film, or the reverse",
         max(ratio, 1.0 / ratio) if ratio > 0 else float("inf"),
@@ -168,6 +174,7 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
         "check thickness, modulus, diameter, and the units of laser and gauge",
     )
     context.note("gauge zero by the fit", f"{zero_pa:+.1f} Pa")
+    context.note("pressure by the tension of clamping", f"{by_tension_pa:.1f} Pa")
     context.note("pressure at the last depth", f"{pressures_pa[-1]:.1f} Pa")
     # The pressure at the full depth is measured now.
     if abs(points[-1].sag_mm - context.facts.sag_mm) < _FULL_SHARE * context.facts.sag_mm:

@@ -21,7 +21,7 @@ _QUESTIONS = (
     ("diameter_mm", "inner diameter of the ring", "mm", 20.0, 100_000.0),
     ("sag_mm", "depth of the bowl to hold (sag)", "mm", 0.1, 10_000.0),
     ("thickness_um", "thickness of the mirror's film", "µm", 1.0, 1000.0),
-    ("back_thickness_um", "thickness of the back film", "µm", 1.0, 1000.0),
+    ("back_thickness_um", "thickness of the other film, which closes the gas", "µm", 1.0, 1000.0),
     ("modulus_gpa", "Young's modulus of the film (PET 4.1, Kapton 2.5)", "GPa", 0.01, 500.0),
     ("poisson", "Poisson ratio of the film", "", 0.0, 0.5),
     ("yield_mpa", "yield stress of the film (PET 100, Kapton 70)", "MPa", 0.1, 5000.0),
@@ -119,7 +119,7 @@ def explain_design(facts: MirrorFacts, design: MirrorDesign) -> list[str]:
     return [
         f"  pressure at {facts.sag_mm:g} mm: {design.pressure_pa:.0f} Pa (p ~ sag^3)",
         f"  stress: {design.front_stress_mpa:.0f} MPa in the mirror's film, "
-        f"{design.back_stress_mpa:.0f} MPa in the back film; it goes with p^(2/3)",
+        f"{design.back_stress_mpa:.0f} MPa in the other film; it goes with p^(2/3)",
         f"  pressure limit: {design.gauge_max_pa:.0f} Pa, a quarter above; the stress is then "
         f"{design.stress_at_limit_mpa:.0f} MPa",
         f"  a relief valve must open between {design.gauge_max_pa:.0f} and "

@@ -108,7 +108,9 @@ def test_gauge_zero(context: StageContext) -> None:
 def test_gauge_sign(context: StageContext) -> None:
     """See the gauge rise under a hand."""
     before_pa = _mean(context, "gauge_pressure_pa")
-    context.dialogue.wait("gauge_sign", "Shut the vent by hand if you can; press the back film")
+    context.dialogue.wait(
+        "gauge_sign", "Shut the vent by hand if you can; press one of the films gently"
+    )
     context.access.move_hand(HandMotion(HandAct.PRESS_FILM))
     pressed_pa = _mean(context, "gauge_pressure_pa")
     context.access.move_hand(HandMotion(HandAct.RELEASE_FILM))
