@@ -64,7 +64,7 @@ def draw_section() -> list[str]:
     clear_x = right + BULGE_MM * MM * DEEPER
     parts += [
         # laser behind, camera and screen in front
-        f'<rect x="40" y="{AXIS_Y - 14:.0f}" width="70" height="28" style="fill:#fff;stroke:#333"/>',
+        f'<rect x="40" y="{AXIS_Y - 14:.0f}" width="70" height="28" fill="#fff" stroke="#333"/>',
         text(75, AXIS_Y + 5, "laser", "middle"),
         line(
             110, AXIS_Y, mirror_x - 3, AXIS_Y, "stroke:#c00;stroke-width:1.5;stroke-dasharray:5 3"

@@ -102,7 +102,7 @@ class MirrorDesign:
 
 def derive_design(facts: MirrorFacts) -> MirrorDesign:
     """Derive pressure, stress, limits and times from a mirror's data."""
-    # The front film's sag gives the pressure, the pressure the back film's sag.
+    # The mirror's sag gives the pressure, and the pressure the other film's sag.
     front = FilmLaw(0.0, facts.poisson, _stiffness(facts, facts.thickness_um), facts.radius_mm)
     back = FilmLaw(0.0, facts.poisson, _stiffness(facts, facts.back_thickness_um), facts.radius_mm)
     front_bowl = front.with_sag(facts.sag_mm)
