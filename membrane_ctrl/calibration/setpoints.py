@@ -139,7 +139,19 @@ def plan_setpoints_um(
 def ramp_s(held: HeldMirror, from_um: float, to_um: float, config: schema.Config) -> float:
     """Duration of the setpoint's ramp, in s.
 
-    It is inf if the mirror does not sink for want of a leak, or does not rise for want of pump.
+    Parameters
+    ----------
+    held : HeldMirror
+        The mirror, with its leak.
+    from_um, to_um : float
+        Setpoints.
+    config : Config
+        Its pump, and how fast the setpoint may move.
+
+    Returns
+    -------
+    float
+        inf if the mirror does not sink for want of a leak, or does not rise for want of pump.
     """
     loop = config.loop
     pump_um_per_s = loop.flow_most_um_per_s(config.pump)

@@ -96,8 +96,27 @@ class _GaugeComparison:
         sag_um: float,
         dt_s: float,
     ) -> str:
-        """Both readings, if they contradict each other; `root` is the cube root of the gauge
-        pressure.
+        """Both readings, if they contradict each other.
+
+        Parameters
+        ----------
+        memory : ComparisonState
+            Readings that these are compared with; they follow slowly.
+        laser_um : float
+            Displacement.
+        trim_um : float
+            What the shape loop has added to the setpoint.
+        root : float
+            Cube root of the gauge pressure, Pa^(1/3), to which the sag is proportional.
+        sag_um : float
+            Sag of the film.
+        dt_s : float
+            Time since the last comparison.
+
+        Returns
+        -------
+        str
+            Empty if they agree.
         """
         if math.isnan(memory.laser_um):
             memory.laser_um = laser_um

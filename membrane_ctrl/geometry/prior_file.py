@@ -74,7 +74,26 @@ def read_prior(path: Path) -> Prior:
 def write_prior(
     path: Path, tables: dict[str, Any], made_by: str, made_of: Sequence[str], rms_px: float
 ) -> None:
-    """Write `camera`, `geometry` or `sigmas` with their origin. Raises InputError."""
+    """Write `camera`, `geometry` or `sigmas` with their origin.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    tables : dict
+        The tables.
+    made_by : str
+        Command that made them.
+    made_of : sequence of str
+        What it was given.
+    rms_px : float
+        Residual of its fit.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
     made = {
         "by": made_by,
         "date_utc": datetime.now(UTC).isoformat(timespec="seconds"),

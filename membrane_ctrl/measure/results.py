@@ -235,7 +235,19 @@ def details_table(
     outline: Outline | None,
     bars: ErrorBars | None,
 ) -> dict[str, Any]:
-    """Further results: sag, pressure, zonal residual, noise, the rim in the picture."""
+    """Further results: sag, pressure, zonal residual, noise, the rim in the picture.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The set as measured.
+    profile : RadialProfile, optional
+        Its round part, as a film under pressure.
+    outline : Outline, optional
+        The rim as the picture shows it.
+    bars : ErrorBars, optional
+        Error bars of the sag.
+    """
     full = measurement.full
     table: dict[str, Any] = {
         "set": str(measurement.head.folder),

@@ -87,7 +87,19 @@ class FrameSlot:
         self.pixels = pixels
 
     def commit(self, pattern: str, time_s: float, displacement_um: float, cycle: int) -> None:
-        """Make the frame visible to readers."""
+        """Make the frame visible to readers.
+
+        Parameters
+        ----------
+        pattern : str
+            Name of the pattern that it shows.
+        time_s : float
+            Middle of its exposure.
+        displacement_um : float
+            Laser reading then; NaN without.
+        cycle : int
+            Number of the cycle that it belongs to.
+        """
         self._writer._commit_frame(pattern, time_s, displacement_um, cycle)
 
 

@@ -339,13 +339,34 @@ def write_incident(
     to_s: float,
     incidents: Path = INCIDENTS,
 ) -> Path:
-    """Make a test from a replay: the run's inputs up to `to_s`, and the decisions found as
+    """Make a test from a replay: a part of the run's inputs, with the decisions found as
     expectations.
 
-    It starts at the tick `begin`: the run's first, or one with a snapshot of the controller.
+    Parameters
+    ----------
+    run : RecordedRun
+        The run.
+    found : Replay
+        Its replay.
+    name : str
+        Name of the test: small letters, digits, `-` and `_`.
+    begin : int
+        Tick at which it starts: the run's first, or one with a snapshot of the controller.
+    to_s : float
+        End of the part, in s of the run.
+    incidents : Path
+        Folder of these tests.
 
-    Raises InputError if the name is invalid or taken, the folder is missing, or the test is too
-    large for a repository.
+    Returns
+    -------
+    Path
+        Folder of the test.
+
+    Raises
+    ------
+    InputError
+        The name is invalid or taken, the folder is missing, or the test is too large for a
+        repository.
     """
     # A name of its own in the project's folder.
     if not _NAME.fullmatch(name):

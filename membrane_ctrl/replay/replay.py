@@ -123,14 +123,25 @@ def replay_record(
     to_s: float = math.inf,
     comparison: Comparison | None = None,
 ) -> Replay:
-    """Run recorded ticks through a new controller, from the run's first or from one with a
-    snapshot.
+    """Run recorded ticks through a new controller.
 
-    The part between `from_s` and `to_s` is compared bit by bit; earlier ticks run, but are not
-    compared.
+    Parameters
+    ----------
+    config : Config
+        Configuration of the run.
+    record : iterable of RecordedTick or Gap
+        Ticks from the run's first, or from one with a snapshot.
+    sag_sensitivity : (terms,) array
+        Change of the Zernike coefficients for each µm of sag.
+    from_s, to_s : float
+        Part that is compared bit by bit, in s of the run; earlier ticks run, but are not compared.
+    comparison : Comparison, optional
+        How outputs and state are compared.
 
-    Raises UnknownSnapshotError if today's code cannot use the record's first snapshot, or a tick
-    raises after using one.
+    Raises
+    ------
+    UnknownSnapshotError
+        Today's code cannot use the record's first snapshot, or a tick raises after using one.
     """
     held_weights = find_held_weights(config)
     controller = Controller(config, sag_sensitivity, held_weights=held_weights)

@@ -46,8 +46,14 @@ def one_line(text: str) -> str:
 def format_time_beside(
     faults_s: float, paused_s: float, moving_s: float, whole_s: float
 ) -> list[str]:
-    """What there was beside the hold, with its share of the whole time; NaN where that is not
-    known.
+    """What there was beside the hold, with its share of the whole time.
+
+    Parameters
+    ----------
+    faults_s, paused_s, moving_s : float
+        Time in faults, paused, and moving or settling; NaN where it is not known.
+    whole_s : float
+        The whole time.
     """
     parts = (
         ("faults", faults_s, 0.0),

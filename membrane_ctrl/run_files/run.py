@@ -131,11 +131,19 @@ class Run:
         end_s: float = np.inf,
         names: Sequence[str] = (),
     ) -> pa.Table:
-        """Minimum, mean and maximum of each signal in windows of 1, 10 or 60 s, all by default:
-        quick for a month.
+        """Minimum, mean and maximum of each signal in windows: quick for a month.
 
         A table like that of `ticks`: `time_s` is the start of a window, `rows` the number of its
         ticks, `state` the state at its end, `mean_error_um` the mean of a signal.
+
+        Parameters
+        ----------
+        window_s : float
+            1, 10 or 60.
+        start_s, end_s : float
+            Part of the run; by default all of it.
+        names : sequence of str
+            Columns of the table; by default all.
         """
         level = self.level(window_s, start_s, end_s, names or levels.NAMES)
         return named_tables.named_table(level, self.origin_utc)
@@ -185,13 +193,26 @@ class Run:
         end_s: float = np.inf,
         window_s: float = 10.0,
     ) -> "xr.Dataset":
-        """A table as a dataset along `time` (UTC), each variable with `units` and `long_name`; as
-        `to_pandas`.
+        """A table as a dataset along `time` (UTC), each variable with `units` and `long_name`.
 
         Of `cycles`, `coeffs_um` is an array along `time` and `noll`, and there are the recorded
         covariances.
 
-        Raises InputError if xarray is missing.
+        Parameters
+        ----------
+        table : str
+            `ticks`, `cycles` or `overview`.
+        names : sequence of str, optional
+            Columns; by default all.
+        start_s, end_s : float
+            Part of the run.
+        window_s : float
+            Window of the overview.
+
+        Raises
+        ------
+        InputError
+            xarray is missing.
         """
         about = {
             "run": self.name,
@@ -263,6 +284,24 @@ class Run:
 
         Windows missing from the level's table are computed from the next finer one, ultimately from
         the ticks.
+
+        Parameters
+        ----------
+        window_s : float
+            1, 10 or 60.
+        start_s, end_s : float
+            Part of the run.
+        names : sequence of str
+            Columns; `time_s` and `rows` are there in any case.
+
+        Returns
+        -------
+        dict of str to (windows,) array
+
+        Raises
+        ------
+        ValueError
+            There is no level of these windows.
         """
         names = tuple(dict.fromkeys(("time_s", "rows", *names)))
         if window_s not in table_specs.LEVELS:

@@ -389,8 +389,23 @@ def _list_entries(logs: Path, _turn: float) -> list[catalogue.RunEntry]:
 def marks(
     feed: HoldFeed, logs: Path | None, span_s: float, now_s: float | None = None
 ) -> list[tuple[float, str]]:
-    """UTC seconds and texts of the marks in the last `span_s` seconds, oldest first; `logs` as for
-    `history`.
+    """The marks of the last seconds, oldest first.
+
+    Parameters
+    ----------
+    feed : HoldFeed
+        The hold.
+    logs : Path or None
+        As for `history`.
+    span_s : float
+        How many seconds.
+    now_s : float, optional
+        UTC at which they end; else the newest moment that is known.
+
+    Returns
+    -------
+    list of (float, str)
+        UTC in s and text of each.
     """
     begin_s = (feed.until_s if now_s is None else now_s) - span_s
     found = list(feed.marks)

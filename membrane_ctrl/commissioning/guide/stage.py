@@ -104,7 +104,24 @@ class StageContext:
         self._write(tables)
 
     def judge(self, name: str, measured: float, threshold: Threshold, remedy: str = "") -> bool:
-        """Record a measured value against its limit; returns whether it is met."""
+        """Record a measured value against its limit.
+
+        Parameters
+        ----------
+        name : str
+            What was measured, as the report names it.
+        measured : float
+            In the unit of the threshold.
+        threshold : Threshold
+            Its limit.
+        remedy : str
+            What to do if it is not met.
+
+        Returns
+        -------
+        bool
+            Whether it is met.
+        """
         is_met = threshold.is_met(measured)
         verdict = CheckVerdict.PASSED if is_met else CheckVerdict.FAILED
         text = f"{measured:.3g} {threshold.unit}".rstrip()
@@ -120,7 +137,24 @@ class StageContext:
         return is_met
 
     def require(self, name: str, is_right: bool, seen: str, remedy: str = "") -> bool:
-        """Record what was seen, as passed or failed; returns whether it passed."""
+        """Record what was seen, as passed or failed.
+
+        Parameters
+        ----------
+        name : str
+            What was checked, as the report names it.
+        is_right : bool
+            Whether it passed.
+        seen : str
+            What was seen, in words.
+        remedy : str
+            What to do if it did not pass.
+
+        Returns
+        -------
+        bool
+            Whether it passed.
+        """
         verdict = CheckVerdict.PASSED if is_right else CheckVerdict.FAILED
         self._add(
             CheckRecord(

@@ -30,7 +30,25 @@ class FoundEvent:
 def event_around(
     kind: str, table: Level, row: int, half_s: float, size: float, unit: str, confidence: float
 ) -> FoundEvent:
-    """An event with a time range of several detection windows around it."""
+    """An event with a time range of several detection windows around it.
+
+    Parameters
+    ----------
+    kind : str
+        What happened.
+    table : Level
+        Windows of the run.
+    row : int
+        The window in which it was found.
+    half_s : float
+        Length of the detection windows before and after it.
+    size : float
+        How large it is, in `unit`.
+    unit : str
+        Unit of the size.
+    confidence : float
+        From 0 to 1.
+    """
     time_s = float(table["time_s"][row])
     return FoundEvent(
         kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, confidence

@@ -53,8 +53,21 @@ def find_steps(
 
 
 def mean_differences(values: Column, half: int, skip: int) -> Column:
-    """(n,) mean of the `half` values after a place minus that before it; NaN at the ends and at
-    gaps.
+    """How much the mean after each place differs from that before it.
+
+    Parameters
+    ----------
+    values : (n,) array
+        Values at equal distances; NaN in gaps.
+    half : int
+        Number of values before and after.
+    skip : int
+        Number of values between these two groups, which count for neither.
+
+    Returns
+    -------
+    (n,) array
+        NaN at the ends and at gaps.
     """
     result = np.full(values.size, np.nan)
     span = 2 * half + skip
