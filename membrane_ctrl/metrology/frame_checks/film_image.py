@@ -21,8 +21,7 @@ _LEAST_SHARE = 0.02  # of the light
 _CLEAR_SIGMAS = 6.0
 _LEAST_BINS = 12
 _LEAST_PART, _LARGEST_PART = 5e-4, 0.3  # of the mirror's bins
-_STEEP = 0.35  # largest share of the excess beside the patch
-_FLAT = 0.7  # least share of the excess inside the patch, beside its edge
+_STEEP = 0.2  # largest excess outside the edge of the patch over that inside it
 _SWING_SHARE = 0.6  # largest excess of the swing over that of the light
 _MAD_SIGMAS = 1.4826
 
@@ -123,10 +122,10 @@ def find_film_image(
     # Its edges are sharp, and its fringes do not swing more.
     share = float(np.median(excess[inside]))
     around = _ring_around(patch).reshape(-1)[index]
-    if not around.any() or float(np.median(excess[around])) > _STEEP * share:
-        return NO_FILM_IMAGE
     within = _ring_within(patch).reshape(-1)[index]
-    if within.any() and float(np.median(excess[within])) < _FLAT * share:
+    if not within.any():
+        within = inside
+    if not around.any() or np.median(excess[around]) > _STEEP * np.median(excess[within]):
         return NO_FILM_IMAGE
     swing_excess = _excess_over_smooth(swing, position_mm, usual)
     if float(np.mean(swing_excess[inside])) > _SWING_SHARE * share:

@@ -164,6 +164,7 @@ def residual_mm(
     (2, n) array
         In mm.
     """
+    bench = _bench_before(bench, phases)
     out = np.empty_like(phases.screen_mm)
     for _, there, _, some in screen_views(bench, [], phases, moved_screens):
         # The points that were seen with the screen in this place, and their rays.
@@ -251,6 +252,7 @@ def linearise_points(
     ------
     Chunk
     """
+    bench = _bench_before(bench, phases)
     points = place_rays(bench, phases, surface, vertex_z_mm)
     shape = _reflecting_surface(phases, surface)
     for part in _split_points(points.t_mm.size):
@@ -266,6 +268,13 @@ def linearise_points(
         at_rest_mm = meeting.screen_mm / bench.pitch
         predicted_mm = at_rest_mm + motion_mm * by_motion + deeper_mm * by_depth
         yield Chunk(part, phases.screen_mm[:, part] - predicted_mm, derivatives)
+
+
+def _bench_before(bench: BenchGeometry, phases: SetPhases) -> BenchGeometry:
+    """The bench of a set: an artefact in the mirror's place has no front film."""
+    if phases.artefact is None:
+        return bench
+    return replace(bench, geometry=bench.geometry.without_front_film())
 
 
 def _reflecting_surface(phases: SetPhases, surface: Surface) -> Surface | None:

@@ -9,6 +9,7 @@ import pytest
 
 from membrane_ctrl.config.front_film import FrontFilmConfig, GasName
 from membrane_ctrl.config.optics import MirrorConfig, OpticsConfig
+from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry
 from membrane_ctrl.metrology.rays.cushion import Cushion, CushionBench
 from membrane_ctrl.metrology.rays.film_reflections import find_reflecting_rays, map_reflections
@@ -70,6 +71,12 @@ def test_the_calibration_model_has_the_same_lens(seen: CushionPhases) -> None:
     )
     left = residual_mm(BenchGeometry(GEOMETRY, 1.0), phases, BOWL, 0.0)
     assert left == pytest.approx(np.zeros_like(left), abs=2e-5)
+
+    # An artefact in the mirror's place stands before no film.
+    sphere = Artefact(1 / 3400, 1e-7, 1e-4, 0.0, 0.1, 500.0)
+    alone = replace(phases, artefact=sphere)
+    left = residual_mm(BenchGeometry(GEOMETRY, 1.0), alone, BOWL, 0.0)
+    assert np.abs(left).max() > 4e-3
 
 
 def test_a_deeper_mirror_has_another_lens(seen: CushionPhases) -> None:
