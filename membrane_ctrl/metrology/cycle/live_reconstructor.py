@@ -22,6 +22,7 @@ from membrane_ctrl.metrology.cycle import cycle_geometry, cycle_motion
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.frame_checks import (
     band_removal,
+    film_image,
     image_lag,
     picture_orientation,
 )
@@ -77,6 +78,7 @@ _FILM_BESIDE_PLANE_MM = 25.0
 # Variance of the phases' change that is called noise, over the expected one: their scatter by
 # chance is smaller.
 _SURELY = 1.2
+_BRIGHTEST_PERCENTILE = 95  # of the light that the least light of the mirror refers to
 _EVERY = 16  # points between those of which medians are taken: a median costs more than the fit
 
 
@@ -141,6 +143,7 @@ class LiveReconstructor:
         self._bands_rad = np.zeros(0)
         self._lag = image_lag.ImageLag.unknown()
         self._doubt = ""
+        self._film_doubt = ""
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
         self._binner = bin_sums.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
@@ -198,6 +201,8 @@ class LiveReconstructor:
         phase_rad = full_decoder.decode_full(images, optics.pattern, self._shifts_rad)
         is_saturated = self._binner.saturated.ravel()[self._near] > 0
         phase_rad[:, is_saturated] = np.nan
+
+        self._film_doubt = self._search_film_image(images, ~is_saturated).describe()
 
         # The points to follow, and their surface.
         times, readings = times[sinusoids], readings[sinusoids]
@@ -414,6 +419,37 @@ class LiveReconstructor:
             # Sums are integers: the corrected ones are rounded.
             self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
 
+    def _search_film_image(self, images: Singles, usable: BoolArray) -> film_image.FilmImage:
+        """A second reflection of the screen in the bins near the mirror, by a front film that the
+        configuration does not have.
+
+        `images` (frames, n) are their means, `usable` (n,) those that are not saturated.
+        """
+        if self._geometry.cushion is not None:
+            return film_image.NO_FILM_IMAGE
+        light = images[self._slots.white].astype(float) - images[self._slots.black]
+        bright = float(np.percentile(light, _BRIGHTEST_PERCENTILE))
+        seen = np.flatnonzero(usable & (light > full_decoder.CONTRAST_SHARE * bright))
+
+        # Where their rays cross the plane half way down the bowl, inside the analysed part.
+        mirror = self._optics.mirror
+        pinhole_mm = self._geometry.pinhole_mm
+        rays = self._grid.rays[:, self._near[seen]]
+        t = (mirror.sag_mm / 2 - pinhole_mm[2]) / rays[2]
+        position_mm = pinhole_mm[:2, None] + t * rays[:2]
+        inside = np.hypot(*position_mm) < mirror.analysis_radius_mm
+        seen = seen[inside]
+
+        # Amplitude of the fringes, mean of both axes.
+        swing = np.zeros(seen.size)
+        for slots, weights in zip(self._slots.sinusoids, self._weights, strict=True):
+            _, cosine, sine = weights @ images[slots][:, seen]
+            swing += np.hypot(cosine, sine) / 2
+        shape = self._binner.saturated.shape
+        return film_image.find_film_image(
+            (shape[0], shape[1]), self._near[seen], position_mm[:, inside], light[seen], swing
+        )
+
     def _remove_lag_of_full(self, state: tracked_points.TrackedPoints) -> None:
         """Find the share of the previous picture in the frames of a full cycle, and remove it.
 
@@ -569,7 +605,7 @@ class LiveReconstructor:
         geometry_sag_sigma_mm = math.sqrt(gradient @ self._watch.common_mm2 @ gradient)
 
         verdict, reason = judge_quality(quality)
-        doubt = self._doubt or motion_doubt
+        doubt = self._doubt or self._film_doubt or motion_doubt
         if verdict == "ok" and doubt:
             verdict, reason = "degraded", doubt
         return ShapeEstimate(

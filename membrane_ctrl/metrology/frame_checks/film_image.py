@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _DEGREE = 4  # of the smooth light of the mirror
+_FITTED_BINS = 6000  # that determine it
 _ROUNDS = 4  # of its fit, each without the bins that are brighter
 _LEAST_SHARE = 0.02  # of the light
 _CLEAR_SIGMAS = 6.0
@@ -95,11 +95,12 @@ def find_film_image(
         return NO_FILM_IMAGE
 
     # Light and swing over a smooth change that the brighter bins do not determine.
+    columns = _smooth_columns(position_mm)
     usual = np.ones(index.size, bool)
     excess = np.zeros(index.size)
     sigma = math.inf
     for _ in range(_ROUNDS):
-        excess = _excess_over_smooth(light, position_mm, usual)
+        excess = _excess_over_smooth(light, columns, usual)
         sigma = _MAD_SIGMAS * float(np.median(np.abs(excess[usual])))
         usual = np.abs(excess) < max(_LEAST_SHARE / 2, 3 * sigma)
         if np.mean(usual) < 1 - _LARGEST_PART:
@@ -127,7 +128,7 @@ def find_film_image(
         within = inside
     if not around.any() or np.median(excess[around]) > _STEEP * np.median(excess[within]):
         return NO_FILM_IMAGE
-    swing_excess = _excess_over_smooth(swing, position_mm, usual)
+    swing_excess = _excess_over_smooth(swing, columns, usual)
     if float(np.mean(swing_excess[inside])) > _SWING_SHARE * share:
         return NO_FILM_IMAGE
     x_mm, y_mm = position_mm[:, inside]
@@ -140,19 +141,27 @@ def find_film_image(
     )
 
 
-def _excess_over_smooth(
-    values: FloatArray, position_mm: FloatArray, usual: BoolArray
-) -> FloatArray:
-    """Values (n,) over polynomials through the usual ones, less 1."""
-    scale_mm = float(np.abs(position_mm).max())
-    x, y = position_mm / scale_mm
-    powers = series.polyvander2d(x, y, [_DEGREE, _DEGREE]).reshape(x.size, _DEGREE + 1, -1)
-    design = np.stack(
-        [powers[:, i, j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)], axis=1
-    )
-    known = design[usual]
-    solved = np.linalg.solve(known.T @ known, known.T @ values[usual])
-    return np.asarray(values / (design @ solved) - 1)
+def _smooth_columns(position_mm: FloatArray) -> FloatArray:
+    """Polynomials (n, k) of the place on the mirror."""
+    x, y = position_mm / float(np.abs(position_mm).max())
+    columns = []
+    power_x = np.ones_like(x)
+    for i in range(_DEGREE + 1):
+        monomial = power_x
+        for _ in range(_DEGREE + 1 - i):
+            columns.append(monomial)
+            monomial = monomial * y
+        power_x = power_x * x
+    return np.stack(columns, axis=1)
+
+
+def _excess_over_smooth(values: FloatArray, columns: FloatArray, usual: BoolArray) -> FloatArray:
+    """Values (n,) over the smooth change through some of the usual ones, less 1."""
+    place = np.flatnonzero(usual)
+    some = place[:: max(1, place.size // _FITTED_BINS)]
+    known = columns[some]
+    solved = np.linalg.solve(known.T @ known, known.T @ values[some])
+    return np.asarray(values / (columns @ solved) - 1)
 
 
 def _ring_around(patch: BoolArray) -> BoolArray:
