@@ -5,7 +5,8 @@ from pathlib import Path
 
 from membrane_ctrl.model import errors
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.run_times import end_s, make_outside_error, moment_s
+from membrane_ctrl.review.run_span import end_s, make_outside_error
+from membrane_ctrl.review.run_times import moment_s
 from membrane_ctrl.run_files.annotations import add_mark
 from membrane_ctrl.run_files.run import open_run
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from membrane_ctrl.model.run_events import Ended
 from membrane_ctrl.processes.published_rings import is_control_alive
-from membrane_ctrl.review import run_times
+from membrane_ctrl.review import run_span
 from membrane_ctrl.run_files.run import Run
 
 
@@ -21,4 +21,4 @@ def find_end_s(run: Run) -> float:
             return math.nan
     began_s = run.origin_utc.timestamp()
     ends_s = [each.mono_s for each in run.log if isinstance(each.event, Ended)]
-    return began_s + (ends_s[0] if ends_s else run_times.end_s(run))
+    return began_s + (ends_s[0] if ends_s else run_span.end_s(run))

@@ -17,7 +17,7 @@ from rerun_bindings import CatalogClientInternal
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import errors, events, job_control, telemetry
-from membrane_ctrl.review import catalogue, run_times
+from membrane_ctrl.review import catalogue, run_span, run_times
 from membrane_ctrl.review.viewer import blueprints, screenshot, viewer
 from membrane_ctrl.review.viewer.layer import ALL, APPLICATION, Layer
 from membrane_ctrl.run_files.run import Run, open_run
@@ -138,6 +138,7 @@ def _show_every_run(options: ReviewOptions) -> int:
 
 def _require_sense(options: ReviewOptions) -> None:
     """Refuse unknown values, and options that would be silently ignored."""
+    # Values that mean nothing.
     if bool(options.runs) == options.every:
         raise errors.InputError("review: name one run or several, or give --all for all of them")
     if options.tab not in blueprints.TABS:
@@ -146,6 +147,7 @@ def _require_sense(options: ReviewOptions) -> None:
         raise errors.InputError(f"--align {options.align}: known: hold, start, utc")
     if options.around is not None and not options.around.strip():
         raise errors.InputError("--around: name an event, e.g. --around hold")
+    # Options that exclude each other, or go only with another one.
     moments = (options.at, options.around, options.start or options.end)
     if sum(moment is not None for moment in moments) > 1:
         raise errors.InputError("--at, --around, --from with --to: only one of these at a time")
@@ -159,6 +161,7 @@ def _require_sense(options: ReviewOptions) -> None:
         )
     if not options.live:
         return
+    # The view of a hold in progress follows it alone, with nothing chosen from the past.
     if len(options.runs) != 1:
         raise errors.InputError("--live: one run at a time")
     if any(part is not None for part in (*moments, options.save, options.screenshot)):
@@ -202,22 +205,26 @@ def make_review(
         Where to put the time cursor: the requested moment, or the start of the part.
     """
     runs = _with_telemetry(runs)
+    # Which part of the first run is asked for, and which second of each run is zero.
     span_s = _requested_part(runs[0], options)
     zeros_s = _find_zero_seconds(runs, options.align)
     labels = blueprints.labels_of([run.name for run in runs])
     layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(labels))
+    # Each run with its own origin: the part is shifted from the first run's clock to its own.
     for run, label, zero_s in zip(runs, labels, zeros_s, strict=True):
         if span_s is None:
             part_s = ALL
         else:
             part_s = (span_s[0] - zeros_s[0] + zero_s, span_s[1] - zeros_s[0] + zero_s)
         layer.add_run(run, label, zero_s, part_s)
+    # One run, or runs aligned by the clock, share a timeline of dates; else seconds from the zeros.
     by_clock = len(runs) == 1 or options.align == "utc"
     timeline = "utc" if by_clock else "run_time"
     if by_clock:
         zero_ns = round(1e9 * runs[0].origin_utc.timestamp())
     else:
         zero_ns = -round(1e9 * zeros_s[0])
+    # The viewer opens on the requested part, with the cursor at the moment that was asked for.
     shown_ns = None
     if span_s is not None:
         shown_ns = (zero_ns + round(1e9 * span_s[0]), zero_ns + round(1e9 * span_s[1]))
@@ -233,7 +240,7 @@ def make_review(
 
 def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
     """The runs that can be shown; adds a note to the others."""
-    there = [run for run in runs if run_times.end_s(run)]
+    there = [run for run in runs if run_span.end_s(run)]
     if not there:
         raise errors.InputError(
             f"{', '.join(str(run.folder) for run in runs)}: no readable telemetry"
@@ -248,19 +255,19 @@ def _requested_part(run: Run, options: ReviewOptions) -> tuple[float, float] | N
     """The requested part of the run, in seconds."""
     if options.start is not None or options.end is not None:
         start_s, end_s = run_times.part_s(run.origin_utc, options.start, options.end)
-        if start_s >= run_times.end_s(run):
-            raise run_times.make_outside_error(run, f"--from {options.start}")
+        if start_s >= run_span.end_s(run):
+            raise run_span.make_outside_error(run, f"--from {options.start}")
         if end_s <= 0:
-            raise run_times.make_outside_error(run, f"--to {options.end}")
+            raise run_span.make_outside_error(run, f"--to {options.end}")
         if options.start is None:
             start_s = 0.0
         if options.end is None:
-            end_s = run_times.end_s(run)
+            end_s = run_span.end_s(run)
         return start_s, end_s
     if options.at is not None:
         at_s = run_times.moment_s(options.at, run.origin_utc)
-        if not -_AROUND_S <= at_s <= run_times.end_s(run) + _AROUND_S:
-            raise run_times.make_outside_error(run, f"--at {options.at}")
+        if not -_AROUND_S <= at_s <= run_span.end_s(run) + _AROUND_S:
+            raise run_span.make_outside_error(run, f"--at {options.at}")
     elif options.around is not None:
         at_s = _find_event_time(run, options.around)
     else:

@@ -28,7 +28,7 @@ from membrane_ctrl.recorder.summary_page import SUMMARY_PATH, summary_page
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
-from membrane_ctrl.review.run_times import end_s
+from membrane_ctrl.review.run_span import end_s
 from membrane_ctrl.review.statistics.held_scalars import HeldSeries, review_scalars
 from membrane_ctrl.run_files import hold_parts, plot_marks, shapes, streams
 from membrane_ctrl.run_files.run import Block, Run
@@ -206,6 +206,7 @@ class Layer:
     ) -> None:
         """Send the reported events, the marks in the plots, and the detected events."""
         start_s, end_s = part_s
+        # Events that the run reported, but not each change of the reason for the state.
         logged = [
             each
             for each in run.log
@@ -216,11 +217,13 @@ class Layer:
             levels = [each.event.level.value for each in logged]
             texts = [each.event.sentence for each in logged]
             self._send_log(run, "/events", time_s, texts, levels)
+        # Vertical lines in the plots at commands, faults and the like.
         timed = [(each.mono_s, each.event) for each in run.log]
         for stream, time_s, values in plot_marks.mark_lines(timed):
             self._send_style(stream.path, _names_and_colours(stream), 2.0, vertical=True)
             self._send_columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
         self._send_pump_scale(run)
+        # Events that the review itself has found in the record.
         shown = [each for each in found if start_s <= each.time_s <= end_s]
         if shown:
             time_s = np.array([each.time_s for each in shown])
@@ -276,12 +279,14 @@ class Layer:
         self, cycles: shapes.Shapes, part_s: tuple[float, float], config: Config
     ) -> None:
         """Changes since the first cycle of the hold."""
+        # Only cycles that were not rejected, thinned evenly to what a viewer draws quickly.
         good = cycles.select_cycles(
             (cycles.verdict != "rejected") & np.isfinite(cycles.coeffs_um).all(axis=1)
         )
         if not len(good):
             return
         shown = good.select_cycles(_thin_evenly(len(good), SHAPES_MOST))
+        # Low orders since the first of them, µm, with their variances, µm².
         parameters = shown.parameters_um() - shown.parameters_um()[0]
         terms = [j - 1 for j in LOW_ORDER_COLUMNS]
         variances = _coefficient_variances(shown)[:, terms]
@@ -292,6 +297,7 @@ class Layer:
             parameters[:, terms],
             variances,
         )
+        # The sag with its uncertainty, and the laser's displacement beside it, which has none here.
         change = np.column_stack(
             (shown.sag_um - shown.sag_um[0], shown.displacement_um - shown.displacement_um[0])
         )
@@ -304,6 +310,7 @@ class Layer:
         residual_urad = shown.slope_residual_urad[:, np.newaxis]
         self._send_style(streams.RESIDUAL.path, _names_and_colours(streams.RESIDUAL))
         self._send_scalars(streams.RESIDUAL.path, shown.time_s, residual_urad)
+        # Maps are large, so only those of the part are sent.
         seen = (shown.time_s >= part_s[0]) & (shown.time_s <= part_s[1])
         seen |= ~seen.any()  # nothing measured there: show all rather than no map
         self._send_maps(shown.time_s[seen], parameters[seen])
