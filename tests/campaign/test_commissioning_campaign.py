@@ -96,7 +96,7 @@ def test_a_foreign_bench_at_its_depth(bench: Bench, tmp_path: Path) -> None:
 
 def test_a_film_clamped_with_tension_is_filled_from_flat(tmp_path: Path) -> None:
     """Two fifths of its pressure are tension, which no thickness explains: not an error."""
-    plant = ForeignPlant(ForeignPump(full_um_per_s=88.0), seed=2)
+    plant = ForeignPlant(ForeignPump("top unreachable", full_um_per_s=88.0), seed=2)
     plant.lower(500.0)
     emulated = QuickBench()
     emulated.use_mirror(foreign_bench(plant))
@@ -108,8 +108,21 @@ def test_a_film_clamped_with_tension_is_filled_from_flat(tmp_path: Path) -> None
     assert by_tension_pa == pytest.approx(0.4 * 600.0, rel=0.1)
 
 
+def test_a_dead_zone_that_nobody_stated_is_refused(tmp_path: Path) -> None:
+    """The pump gives nothing below a tenth of its drive, and was stated as proportional."""
+    plant = ForeignPlant(ForeignPump("straight", full_um_per_s=88.0), seed=2)
+    plant.lower(500.0)
+    emulated = QuickBench()
+    emulated.use_mirror(foreign_bench(plant))
+    run_stages(tmp_path, emulated, Person(), *DESK)
+    person = Person()
+    assert run_stages(tmp_path, emulated, person, "inflation", plan=SHORT) == Exit.INTERRUPTED
+    assert "no rise in" in person.text
+    assert emulated.bench.board.pump_fraction == 0.0
+
+
 def test_a_laser_at_the_wrong_depth_is_refused(tmp_path: Path) -> None:
-    plant = ForeignPlant(ForeignPump(full_um_per_s=88.0), seed=2)
+    plant = ForeignPlant(ForeignPump("top unreachable", full_um_per_s=88.0), seed=2)
     plant.lower(6000.0)
     emulated = QuickBench()
     emulated.use_mirror(foreign_bench(plant))

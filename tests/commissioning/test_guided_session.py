@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from membrane_ctrl.commissioning.check import DeviceProbe
+from membrane_ctrl.commissioning.guide.bench_access import HandAct, HandMotion
 from membrane_ctrl.commissioning.guide.dialogue import Dialogue
 from membrane_ctrl.commissioning.guide.inflation_stages import DepthPoint, judge_law
 from membrane_ctrl.commissioning.guide.mirror_design import PAPER_MIRROR
@@ -216,6 +218,72 @@ def test_a_circuit_that_never_opens_is_found(tmp_path: Path, bench: QuickBench) 
     person = Person()
     run_stages(tmp_path, bench, person, "interlocks")
     assert "emergency_stop open" in failed_in(tmp_path, person)
+
+
+PROTECTION = (
+    ("emergency_stop", {"stop_stopped": "n"}, "emergency stop"),
+    ("emergency_stop", {"stop_fitted": "n"}, "emergency stop"),
+    ("relief", {"relief_opened": "n"}, "relief valve opens"),
+    ("relief", {"mirror.relief_pa": "700"}, "relief valve's pressure"),
+    ("relief", {"mirror.relief_pa": "1500"}, "relief valve's pressure"),
+)
+
+
+@pytest.mark.parametrize(("stage", "answers", "check"), PROTECTION)
+def test_a_protection_that_does_not_protect_is_a_reason(
+    tmp_path: Path, bench: QuickBench, stage: str, answers: dict[str, str], check: str
+) -> None:
+    run_stages(tmp_path, bench, Person(**answers), *DESK)
+    person = Person(**answers, **{f"{stage}.after": "continue"})
+    assert run_stages(tmp_path, bench, person, stage) == Exit.REJECTED
+    assert check in failed_in(tmp_path, person)
+    assert "Not accepted" in (tmp_path / HTML).read_text(encoding="utf-8")
+
+
+TWO_CIRCUITS = {
+    "interlock2.driver": "board_input",
+    "interlock2.name": "door",
+    "interlock2.text": "shut the door",
+    "interlock2.input": "1",
+    "interlock3.driver": "none",
+}
+
+
+def test_every_circuit_is_tried(tmp_path: Path, bench: QuickBench) -> None:
+    run_stages(tmp_path, bench, Person(**TWO_CIRCUITS), *DESK)
+    person = Person()
+    assert run_stages(tmp_path, bench, person, "interlocks") == Exit.DONE, person.text
+    for name in ("emergency_stop", "door"):
+        for key in (f"open_{name}", f"lose_{name}", f"close_{name}"):
+            assert key in person.asked
+
+
+def test_exchanged_circuits_are_found(tmp_path: Path, bench: QuickBench) -> None:
+    run_stages(tmp_path, bench, Person(**TWO_CIRCUITS), *DESK)
+    other = {"emergency_stop": "door", "door": "emergency_stop", "": ""}
+    move_hand = bench.move_hand
+
+    def move_other(motion: HandMotion) -> None:
+        move_hand(replace(motion, name=other[motion.name]))
+
+    bench.move_hand = move_other  # type: ignore[method-assign]
+    person = Person()
+    run_stages(tmp_path, bench, person, "interlocks")
+    assert {"emergency_stop open", "door open"} <= set(failed_in(tmp_path, person))
+
+
+def test_a_lost_signal_that_reads_closed_is_found(tmp_path: Path, bench: QuickBench) -> None:
+    run_stages(tmp_path, bench, Person(), *DESK)
+    move_hand = bench.move_hand
+
+    def move_unless_lost(motion: HandMotion) -> None:
+        if motion.act is not HandAct.LOSE_SIGNAL:
+            move_hand(motion)
+
+    bench.move_hand = move_unless_lost  # type: ignore[method-assign]
+    person = Person()
+    run_stages(tmp_path, bench, person, "interlocks")
+    assert failed_in(tmp_path, person) == ["emergency_stop without its signal"]
 
 
 def test_a_pump_without_gas_ends_the_inflation(tmp_path: Path, bench: QuickBench) -> None:

@@ -97,7 +97,7 @@ def check_licences() -> str:
 def check_vulnerabilities() -> str:
     """No pinned package has a known vulnerability."""
     if importlib.util.find_spec("pip_audit") is None:
-        return "not run: pip-audit is not installed (pip install pip-audit)"
+        return "not run: install pip-audit, which asks a service on the internet"
     done = subprocess.run(
         [sys.executable, "-m", "pip_audit", "-r", "requirements.lock", "--no-deps"],
         cwd=ROOT, capture_output=True, text=True, check=False,
