@@ -279,10 +279,10 @@ class ProparParameters:
         kind = DeviceRefusedError if code in _REFUSALS else LinkError
         raise kind(f"{what}: status {code} ({STATUS_TEXT.get(code, 'unknown')})")
 
-    def _make_question(self, data: bytes, what: str) -> exchange.Question:
+    def _make_question(self, data: bytes, what: str) -> exchange.WireQuestion:
         self._sequence = (self._sequence + 1) % _SEQUENCES
         frame = binary_frame(ProparMessage(self._sequence, self._node, data))
-        return exchange.Question(
+        return exchange.WireQuestion(
             frame, _make_frame_filter(self._sequence, self._node), 2 * _ANSWER_BYTES, what
         )
 

@@ -42,7 +42,7 @@ _ABANDONED_MAX = 4  # questions whose late answers are recognised
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class WireQuestion:
     """A request, and how to recognise its answer."""
 
     data: bytes  # sent unchanged
@@ -62,7 +62,7 @@ class Question:
 class _Abandoned:
     """A question that was not answered in time, and the bytes since it was asked."""
 
-    question: Question
+    question: WireQuestion
     request_s: float
     received_bytes: bytes
 
@@ -90,7 +90,7 @@ class SerialExchange:
         self._noisy = False
         self._last_byte_s = 0.0
         self._buffer = b""
-        self._question: Question | None = None  # the last one
+        self._question: WireQuestion | None = None  # the last one
         self._answer: asyncio.Future[bytes] | None = None
         # the last questions without a valid answer in time, oldest first
         self._abandoned: deque[_Abandoned] = deque(maxlen=_ABANDONED_MAX)
@@ -125,13 +125,28 @@ class SerialExchange:
             await asyncio.wait([self._in_flight])
 
     async def ask(
-        self, question: Question, timeout_s: float, fence: Question | None, key: int = 0
+        self, question: WireQuestion, timeout_s: float, fence: WireQuestion | None, key: int = 0
     ) -> bytes:
         """Ask a question once and return its answer; nothing is ever resent automatically.
 
-        Devices (`key`) that wait are served in turn, each with one question. The device has
-        `timeout_s`, plus the time on the wire. `quiet_s` alone protects a device that has no fence
-        (None). Raises LinkError (no valid answer), LinkDownError (the line is closed or went away).
+        Parameters
+        ----------
+        question : WireQuestion
+            What to send, and how to recognise its answer.
+        timeout_s : float
+            Time of the device; that on the wire is added.
+        fence : WireQuestion or None
+            Question whose answer shows that no earlier answer is still to come; without one, only
+            the silence `quiet_s` protects the device.
+        key : int
+            The device. Devices that wait are served in turn, each with one question.
+
+        Raises
+        ------
+        LinkError
+            No valid answer.
+        LinkDownError
+            The line is closed or went away.
         """
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
@@ -145,7 +160,7 @@ class SerialExchange:
             task.exception()  # after a cancelled caller no other task retrieves it
 
     async def _transact(
-        self, question: Question, timeout_s: float, fence: Question | None, key: int
+        self, question: WireQuestion, timeout_s: float, fence: WireQuestion | None, key: int
     ) -> bytes:
         try:
             self._require_open(question.what)
@@ -190,7 +205,7 @@ class SerialExchange:
                 )
             await asyncio.sleep(wait_s)
 
-    async def _ask_once(self, question: Question, timeout_s: float) -> bytes:
+    async def _ask_once(self, question: WireQuestion, timeout_s: float) -> bytes:
         self._require_open(question.what)
         if self._echoes:
             self._echoes = False

@@ -4,7 +4,7 @@ import re
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from firmware_iface.links.exchange import Question, SerialExchange
+from firmware_iface.links.exchange import SerialExchange, WireQuestion
 from firmware_iface.links.serial_port import SerialPort
 from firmware_iface.roles import DeviceIdentity, LinkError
 
@@ -67,7 +67,7 @@ class LineLink:
         assert found is not None  # `extract_answer` matched it
         return found
 
-    def _make_question(self, command: str, answer: re.Pattern[str], longest: int) -> Question:
+    def _make_question(self, command: str, answer: re.Pattern[str], longest: int) -> WireQuestion:
         what = f"{self.name}: {command.splitlines()[-1]}"
 
         def extract_answer(received_bytes: bytes) -> bytes | None:
@@ -87,7 +87,7 @@ class LineLink:
         request = command + self._end
         # a device may confirm a command by repeating it: that is no echo of the adapter
         repeats = answer.fullmatch(request) is not None
-        return Question(
+        return WireQuestion(
             request.encode("ascii"), extract_answer, longest, what, answer_repeats=repeats
         )
 

@@ -225,7 +225,7 @@ class GuardedModbusRtu:
             raise modbus_link.exception_error(what, reply[1])
         return reply
 
-    def _fence_question(self) -> exchange.Question | None:
+    def _fence_question(self) -> exchange.WireQuestion | None:
         if not self._fence:
             return None
         pdu = struct.pack(">BHH", modbus_link.DIAGNOSTICS, 0, self._bus.find_token())
@@ -244,7 +244,7 @@ class GuardedModbusRtu:
         what: str,
         exactly: bytes = b"",
         repeats: bool = False,
-    ) -> exchange.Question:
+    ) -> exchange.WireQuestion:
         def extract_answer(received_bytes: bytes) -> bytes | None:
             reply = extract_reply(received_bytes, self._unit_id, pdu[0], answer_bytes, what)
             if (
@@ -258,7 +258,7 @@ class GuardedModbusRtu:
 
         reads = pdu[0] in _READS_REGISTERS + _READS_BITS
         frame = rtu_frame(self._unit_id, pdu)
-        return exchange.Question(frame, extract_answer, answer_bytes, what, repeats, reads)
+        return exchange.WireQuestion(frame, extract_answer, answer_bytes, what, repeats, reads)
 
 
 class ModbusLinks:

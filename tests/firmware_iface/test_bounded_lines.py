@@ -11,7 +11,7 @@ import pytest
 
 from firmware_iface.emulators.rtu_bus import RtuBusEmulator
 from firmware_iface.emulators.serial_device import LineDevice
-from firmware_iface.links.exchange import Question, SerialExchange
+from firmware_iface.links.exchange import SerialExchange, WireQuestion
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import LinkError
 
@@ -45,7 +45,7 @@ async def test_an_answer_without_end_ends_the_question(junk: bytes) -> None:
     port = FakePort()
     exchange = SerialExchange(port, gap_s=0.0, quiet_s=0.01)  # type: ignore[arg-type]
     exchange.connect()
-    question = Question(
+    question = WireQuestion(
         b"?", lambda heard: heard if re.fullmatch(b"ok\n", heard) else None, 3, "question"
     )
     received: list[int] = []
