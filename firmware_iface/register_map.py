@@ -248,6 +248,7 @@ def _parse_block(entry: Mapping[str, Any]) -> Block:
         raise RegisterMapError(
             f"block {name} has {block.count} words; one transaction carries {_READ_MAX_WORDS}"
         )
+    # Without gaps, and in the order of the map's versions: an earlier version is a beginning of it.
     for before, after in pairwise(registers):
         _check_sequence(before, after)
         if after.address > before.address + before.words:

@@ -46,6 +46,7 @@ def edit_text(text: str, changed: dict[str, dict[str, Any]], path: Path) -> str:
     import tomlkit
     from tomlkit.exceptions import TOMLKitError
 
+    # The edited text is accepted only if it reads as exactly this.
     wanted = tomllib.loads(text)
     changed = {name: keys for name, keys in changed.items() if keys}
     wanted |= {name: wanted.get(name, {}) | keys for name, keys in changed.items()}

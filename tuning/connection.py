@@ -33,11 +33,13 @@ def open_on_hold(
     with connect_to_hold(options, f"tune {options.name}") as link:
         if refused := refusal(link.config):
             raise InputError(refused)
+        # The gains to return to are those before the session.
         folder = find_session(options, link, fresh)
         rig = HoldRig(link, options.author, progress)
         rig.good = folder.head.before, folder.config.pump
         progress.log = LiveLog(folder.path, rig.loop.rate_hz, progress.print_line)
         rig.seen = progress.log.add_tick
+        # Whatever ends the block early, also Ctrl-C, restores them.
         with progress.catch_signals():
             try:
                 rig.end_experiment()  # of a session that was killed

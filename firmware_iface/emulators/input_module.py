@@ -46,6 +46,7 @@ class InputModule:
         places = range(address, address + count)
         if not all(place in table for place in places):
             return modbus_pdu.exception_pdu(pdu, modbus_pdu.ILLEGAL_ADDRESS)
+        # Bits in the order of their addresses, the first in the lowest bit.
         packed = 0
         for position, place in enumerate(places):
             if self.powered and table[place]():

@@ -317,6 +317,8 @@ class ProparDevice(serial_device.SerialDevice):
         """The answer to a request: each value under the indices that the request gave it."""
         answer, at, chained = bytearray([bronkhorst_propar.VALUES]), 1, False
         while at < len(data):
+            # A process's index precedes its first parameter; the highest bit of a parameter's index
+            # announces another one of the same process.
             if not chained:
                 answer.append(data[at])
                 at += 1
@@ -330,6 +332,7 @@ class ProparDevice(serial_device.SerialDevice):
                 return bytes([bronkhorst_propar.STATUS, _TYPE_ERROR, at])
             answer.append(index)
             raw = self.instrument.raw(parameter)
+            # Texts have a length: 0 asks for one that ends with a zero byte.
             if kind == 0x60:
                 length, at = data[at], at + 1
                 if length == 0:

@@ -39,12 +39,14 @@ def write_first_config(path: Path, twin: bool, ask: bool) -> int:
             f"{path}: exists already, and is not overwritten; name another file"
         )
     found = [] if twin else _find_connected()
+    # Without a terminal: the twin's board, and everything else by itself.
     if ask:
         tables = _ask_devices(path, found)
     else:
         board = _TWIN.format(port=Config().twin.port)
         tables = {"devices": {"board": board}, "shape": {"mode": "auto"}}
         tables |= {"estimator": {"process_value": "auto"}}
+    # A file that is not valid is not written, nor over another one.
     parsed = toml_file.parse_tables(tables, Config, str(path))
     if parsed.devices is not None:
         bench.require_separate_ports(parsed.devices)

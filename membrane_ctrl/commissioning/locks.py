@@ -70,6 +70,7 @@ def remove_lock(word: str) -> int:
     DeviceError
         If a program has the devices, or the file cannot be removed.
     """
+    # Which lock is meant, and whether this person may remove it.
     store = lock_store.LockStore.of_machine()
     found = {each.lock: each for each in store.find_locks()}
     remover = f"unix:{account_name()}"
@@ -79,6 +80,7 @@ def remove_lock(word: str) -> int:
     stored = found[unlocking.lock]
     if stored.file is None:
         raise DeviceError(f"{stored.lock.text}; mend the folder by hand")
+    # Only while no hold has the devices, and with a record of who did it.
     with contextlib.ExitStack() as stack:
         _require_no_hold(stored, stack)
         try:

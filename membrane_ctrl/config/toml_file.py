@@ -125,6 +125,7 @@ def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
 
     Raises InputError if the file is missing or holds anything but rows of numbers.
     """
+    # Nothing to do without a height map that names a file.
     screen = None
     if isinstance(geometry, dict):
         screen = geometry.get("screen")
@@ -134,6 +135,7 @@ def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
     field = f"{where}: geometry.screen.height_map.file"
     if "heights_mm" in table:
         raise InputError(f"{field}: give either the file or heights_mm")
+    # The file is named relative to the one that names it.
     path = where.parent / str(table.pop("file"))
     if not follow and path.parent != where.parent:
         raise InputError(f"{field}: {path}: not beside {where.name}")
@@ -167,6 +169,7 @@ def prune_unknown_keys(
             del table[key]
             ignored.append(prefix + key)
             continue
+        # Tables below this key are of the model that its annotation names.
         nested = [
             t
             for t in (known[key], *get_args(known[key]))

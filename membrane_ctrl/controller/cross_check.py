@@ -137,6 +137,7 @@ def _check_resume(config: Config, findings: cross_check_plant.ConfigFindings) ->
     resume = config.resume
     known = [rule.name for rule in safety.TABLE]
     may = sorted(rule.name for rule in safety.TABLE if rule.may_resume)
+    # Each name must be that of a fault that may end without a person.
     for index, name in enumerate(resume.faults):
         field = f"resume.faults.{index}"
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
@@ -147,6 +148,7 @@ def _check_resume(config: Config, findings: cross_check_plant.ConfigFindings) ->
             f"remove it; may resume: {', '.join(may)}",
         )
         findings.error(name in known and name not in may, field, why, remedy)
+    # How often, and how soon, the hold may resume.
     why = "a fault that recurs this often has a lasting cause"
     findings.error(
         resume.most_per_day > _RESUMES_MOST,

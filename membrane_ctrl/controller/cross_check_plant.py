@@ -267,12 +267,14 @@ def judge_optics(config: Config, findings: ConfigFindings) -> None:
 
 def _check_geometry(field: str, optics: OpticsConfig, used: bool, findings: ConfigFindings) -> None:
     geometry = optics.geometry
+    # Lengths measured too poorly to be of use.
     for name in ("a", "b"):
         length_mm, sigma_mm = getattr(geometry, f"{name}_mm"), getattr(geometry, f"{name}_sigma_mm")
         wide = length_mm is not None and sigma_mm is not None and sigma_mm > 0.1 * length_mm
         findings.warn(
             wide, f"{field}.{name}_sigma_mm", "a tenth of the length or more", "measure again"
         )
+    # A camera that could not see the screen in the mirror.
     if geometry.camera is not None and geometry.camera.position_mm[2] <= 0.0:
         why = "the camera is behind the mirror"
         findings.error(True, f"{field}.camera.position_mm", why, "z points out of the mirror")

@@ -65,6 +65,8 @@ def find_protections(process_value: ProcessValue, activity: Activity, duty: Duty
         Empty only for `MAJORITY`, which needs a third sensor and a mirror that is not far from its
         setpoint, and for `GAS`, which needs a mirror that is held.
     """
+    # A sensor that does not measure the process value cannot mislead the loop: its own rules are
+    # fewer, or none.
     uses_laser = process_value is not ProcessValue.OPTICS
     uses_optics = process_value is not ProcessValue.LASER
     by_figures: _Protections = (Guard.FIGURE_GATE,) if uses_optics else ()

@@ -37,6 +37,7 @@ class ScenarioRun:
     def __init__(self, scenario: Scenario, rings: Rings | None = None) -> None:
         self.config = config = scenario.config
         self.closing = RunEnd()
+        # The twin with the events of its plant and the switches of its bench.
         steps = sorted(scenario.at, key=lambda at: at.time_s)
         mirror = plant.Plant(
             config.twin,
@@ -52,6 +53,7 @@ class ScenarioRun:
         if scenario.shapes:
             shape = TruthShape(self.bench, config, config.twin.seed)
         self.virtual = VirtualRun(config, self.bench, zernike_projection(), shape, rings=rings)
+        # What happens when: the hold begins, the steps, the hold stops.
         self._ends_s = scenario.duration_s
         begin = (0.0, Command("hold", "scenario"))
         end = (scenario.duration_s, Command("stop", "duration"))
@@ -94,6 +96,7 @@ def _list_actions(
             command = Command(at.command, "scenario", value=at.value, text=at.text)  # type: ignore[arg-type]  # checked
             yield at.time_s, command
         elif at.wrong is not None:
+            # A fault of the bench may be repeated, and may end by itself.
             times = 1
             if at.every_s is not None:
                 times = max(1, math.ceil((end_s - at.time_s) / at.every_s))

@@ -50,6 +50,7 @@ class SystemdNotify:
         row = outputs.row
         if row.mono_s < self._next_s and row.state == self._state:
             return
+        # Ready with the first tick; each message also feeds the watchdog.
         ready = "READY=1\n" if math.isinf(self._next_s) else ""
         self._next_s = row.mono_s + _NOTIFY_S
         self._state = row.state

@@ -55,6 +55,7 @@ def _make_source(members: list[Member], links: ModbusLinks) -> PolledSource:
     source: roles.InterlockSource
     try:
         first_s = _GPIO_FIRST_S
+        # All members are circuits of one device: inputs of a Modbus unit, or lines of a GPIO chip.
         modbus = [found for _, found in members if isinstance(found, settings.ModbusInputConfig)]
         if modbus:
             timeout_s = max(found.timeout_s for found in modbus)
@@ -68,6 +69,7 @@ def _make_source(members: list[Member], links: ModbusLinks) -> PolledSource:
             )
     except ValueError as error:
         raise InputError(f"devices.interlocks.{bits[0]}: {error}") from None
+    # Read as often, and no older, than the strictest of them asks for.
     return PolledSource(
         source=source,
         bits=bits,

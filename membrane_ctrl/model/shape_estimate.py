@@ -206,6 +206,7 @@ def describe_black_clipping(fraction: float) -> str:
 def judge_quality(quality: Quality) -> tuple[Verdict, str]:
     """The worst verdict and its reason; NaN anywhere is a rejection."""
     q = quality
+    # What must hold, or there is no figure. A comparison with NaN does not hold.
     rejected = (
         (
             q.modulation_share >= MODULATION_REJECTED_SHARE,
@@ -226,6 +227,7 @@ def judge_quality(quality: Quality) -> tuple[Verdict, str]:
         (q.converged, "the fit did not converge"),
         (q.residual_urad <= RESIDUAL_REJECTED_URAD, f"slope residual {q.residual_urad:.0f} µrad"),
     )
+    # The same quantities with tighter limits, beyond which the figure is doubtful.
     degraded = (
         (q.modulation_share >= MODULATION_DEGRADED_SHARE, rejected[0][1]),
         (q.saturated_fraction <= SATURATED_DEGRADED_FRACTION, rejected[1][1]),

@@ -183,6 +183,8 @@ def reconstruct(
     shape: StartShape | PolynomialSurface = start
     changes_mm: list[float] = []
     for _ in range(iterations):
+        # Points on the last shape, their slopes by the paper's equations, and the shape with these
+        # slopes.
         points_mm = _place_points(geometry, seen, shape, fixed_mm)
         rays = _reflect(geometry, points_mm, shape)
         slopes = compute_slopes(geometry, points_mm, seen.screen_mm, rays, reading, y_geometry)

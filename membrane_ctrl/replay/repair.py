@@ -214,6 +214,7 @@ def _repair_summary(run_dir: Path, in_place: bool) -> FileFinding:
 def rebuild_summary(run_dir: Path) -> dict[str, Any]:
     """Rebuild `summary.json` from the files on disk, marked `"rebuilt": true`."""
     summary = Summary.for_config(run_config.read_config(run_dir, []))
+    # Rows may be on disk twice, if the recorder was replaced: each time counts once.
     path = run_dir / "events.jsonl"
     last_s = -np.inf
     for rows in _all_rows(run_dir):
@@ -221,6 +222,7 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
         if len(new):
             last_s = float(new[-1, telemetry.COLUMN["mono_s"]])
             summary.add_rows(new[np.isfinite(telemetry.get_column(new, "state"))])
+    # Shapes are in the controller's inputs, events in their log up to its last whole line.
     ticks = 0
     for frame in inputs_file.InputsReader(run_dir):
         ticks += len(frame.records)

@@ -384,6 +384,7 @@ class Run:
         list of dict
             `time_s`, `pattern` and `jpeg` of each, in order.
         """
+        # First only times and patterns, which are small; then the pictures that are chosen.
         places = list(self._open_table(table_specs.THUMBNAILS).iterate_tables(_PLACE_OF_THUMBNAIL))
         whole = [table for table in places if table.column_names == list(_PLACE_OF_THUMBNAIL)]
         if not whole:

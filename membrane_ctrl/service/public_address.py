@@ -101,11 +101,13 @@ def public_address(page: ServiceConfig) -> PublicAddress:
     """Return what follows from the page's configuration."""
     hosts = {*LOCAL_HOSTS, page.host.lower(), *(name.lower() for name in page.names)}
     proxies = tuple(ipaddress.ip_network(each) for each in page.trusted_proxies)
+    # Without a proxy in front, the page is reached where it listens.
     if not page.public_url:
         scheme = "https" if page.secure else "http"
         host = f"[{page.host}]" if ":" in page.host else page.host
         base_url = f"{scheme}://{host}:{page.port}/"
         return PublicAddress(frozenset(hosts), base_url, secure=page.secure, proxies=proxies)
+    # Behind a proxy the address, and perhaps a prefix of all paths, are the proxy's.
     url = urlsplit(page.public_url)
     prefix = url.path.rstrip("/")
     secure = page.secure or url.scheme == "https"

@@ -15,6 +15,7 @@ def watch_hold(options: TuneOptions) -> int:
     """Observe a hold and report whether a session is due (exit 3)."""
     from tuning.proposal.loop_health import judge_health
 
+    # What the last session designed, and what it expected of it.
     folder = connection.find_session(options, None)
     folder.require_done("design")
     made = gains_file.load_gains(folder.file_path("gains.toml"))

@@ -42,6 +42,7 @@ def save_gains(of: Workpiece, gains: Gains, author: str) -> str:
         loop = gains.applied_to(before.loop)
     except ValueError as error:
         raise errors.InputError(f"not saved: {str(error).splitlines()[0]}") from None
+    # Edited gains are judged as any candidate.
     found = candidate.evaluate_candidate(
         EDITED, gains, of.model, of.weather, loop, gain_search.Demands()
     )

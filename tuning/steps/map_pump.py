@@ -83,12 +83,14 @@ def map_pump(
     """
     before = rig.pump
     try:
+        # The curve from a survey of flows, then gains that suit it, both on trial.
         _calm_hold(rig, limit_um)
         found = _survey_pump(rig, limit_um)
         watched = before.model_dump(include={"probe_um", "change_max"})
         found = replace(found, pump=found.pump.model_copy(update=watched))
         loop = _make_safe_gains(_free_flow_limit(rig.good[0], before, found.pump), found)
         rig.set_gains(loop, "the measured curve of the pump", _MAP_S, pump=found.pump)
+        # Steps of the flow must move the mirror as the curve says.
         gain, sigma = _measure_gain(rig, found.delay_s + found.lag_s)
     except (experiments.ExperimentError, ValueError) as error:
         rig.restore_good_gains()

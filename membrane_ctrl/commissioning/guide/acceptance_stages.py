@@ -97,6 +97,7 @@ def hold_hour(context: StageContext) -> None:
         with context.access.start_hold(context.folder, context.config, "acceptance") as link:
             hold_depth(context, link, context.config.loop.setpoint_um)
             shown_s = 0.0
+            # Until the time is over; a fault ends it early.
             while not figures.duration_s >= context.plan.hold_s:
                 news = link.read_news()
                 faults += [

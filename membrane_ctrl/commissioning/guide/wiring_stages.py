@@ -160,6 +160,7 @@ def test_outputs(context: StageContext) -> None:
     """Run the vent, then the pump with the vent open: read-backs, and what is heard."""
     dialogue = context.dialogue
     limit_pa = _bench_pressure_pa(context)
+    # The vent first: with it open, the pump raises no pressure.
     if context.devices.vent_fitted:
         dialogue.wait("vent_try", "The vent opens for 3 s. Listen")
         seen = _act(context, lambda opened: run_outputs(opened, _VENTED, _RUN_S, limit_pa))

@@ -59,6 +59,7 @@ def pump_history(newest: Path) -> list[PumpSeen]:
 
     Runs that have learned nothing are omitted.
     """
+    # From the newest run back; the first that is found is what the others are compared with.
     devices = run_config.read_config(newest, []).devices
     latest: PumpConfig | None = None
     found: list[PumpSeen] = []

@@ -109,6 +109,7 @@ class Disturber:
         """Factor of the screen's light, and counts of the room's, (2, rows, columns)."""
         wanted = self._wanted
         nodes = self._nodes
+        # The screen: dust, bands of the backlight, ageing, patches, and what the last picture left.
         factor = self._dust_at(time_s) * self._backlight_factor(self.row_times_s(time_s))
         factor = factor * math.exp(-wanted.dimming_fraction_per_h * time_s / 3600.0)
         if wanted.brightness_fraction:
@@ -119,6 +120,7 @@ class Disturber:
             factor *= 1.0 + wanted.brightness_fraction * brighter
         if wanted.sticking_fraction and pattern.role == "crossed":
             factor *= 1.0 - wanted.sticking_fraction * self._retained_level(time_s, pattern)
+        # The room: brighter on one side, and swinging slowly.
         swing = _SWING * math.sin(2 * math.pi * time_s / _SWING_S)
         room_factor = 1.0 + _SLOPE * nodes.x_mm / nodes.radius_mm + swing
         room_adu = wanted.ambient_fraction * nodes.full_adu * room_factor

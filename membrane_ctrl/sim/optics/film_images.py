@@ -46,6 +46,7 @@ def light_of_pattern(shown: Pattern, config: PatternConfig, light: Light) -> Scr
             return screen_light(0.5 + 0.25 * (along_x + along_y), light)
 
         return crossed
+    # Patterns along one axis are a table: interpolated for sinusoids, in steps for the others.
     table = level_table(shown, config, light)
     place = np.arange(table.values.size) * table.cell_mm
 

@@ -83,11 +83,13 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     Crossed fringes have none (`shade_crossed`). Raises ValueError if the pattern's role or Gray bit
     is unknown.
     """
+    # Sinusoids: cells of one period, which repeat.
     phi = np.linspace(0.0, 2.0 * np.pi, _SINE_CELLS + 1) - np.pi
     if pattern.role == "sin":
         levels = 0.5 + 0.5 * np.cos(phi + pattern.shift_rad)
         period_mm = pattern.period_mm or config.period_mm
         return LevelTable(screen_light(levels, light), period_mm / _SINE_CELLS, smooth=True)
+    # The others change at half periods.
     half_periods = np.arange(2 * config.periods)
     if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
         codes = half_periods ^ (half_periods >> 1)
