@@ -337,8 +337,9 @@ class ShapeConfig(Section):
     """`cycle` takes the frames of a figure one pattern after the other; `track` shows crossed
     fringes that do not change, so that every frame gives a figure. `auto`: `track` if camera and
     processor give five figures a second, decided at the start of the hold; it is the default of a
-    hold without a file, and `config init` writes it. Set it to `track` for a figure at the camera's
-    rate (docs/how-to/tracking.md)."""
+    hold without a file, and `config init` writes it. A file without this key means `cycle`: other
+    patterns on the screen must not begin with another version of the program. Set it to `track` for
+    a figure at the camera's rate (docs/how-to/tracking.md)."""
     period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
     """Interval between cycles. Raise it for a camera or machine that needs longer."""
     frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1

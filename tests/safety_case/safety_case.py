@@ -231,7 +231,7 @@ rule is tested, not that it suffices.
 - *One gauge* serves the controller and the board (C1, C2): the relief valve is the independent protection.
 - *Slow drifts* within what a room's climate does are found late (C9; [protection](../measurements/protection.md) has the distances).
 - *Interlocks*: a welded contact or a short circuit of its wires is not found. *Locks* are known on one machine.
-- *The actuator test* in `check` lasts for at most 11 s, with all sensors good; the pump is on for 5 s at a time at most.
+- *The actuator test* in `check` lasts for at most 14 s, with all sensors good; the pump is on for 8 s at a time at most.
 - Everyone who may reach page, control port or a bridge with the role `operate` may command; [operations](../how-to/operations.md)
   has the roles. Locks and interlocks apply to all of them.
 
