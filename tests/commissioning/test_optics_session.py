@@ -106,6 +106,21 @@ def test_an_overexposed_camera_is_named(folder: Path, bench: QuickBench) -> None
     assert "saturated" in person.text
 
 
+def test_without_a_board_the_geometry_stays_by_hand(folder: Path, bench: QuickBench) -> None:
+    person = Person()
+    assert run_stages(folder, bench, person, "calibration") == Exit.DONE
+    assert "12 µm RMS" in person.text
+
+
+def test_photographs_that_are_not_there_are_named(folder: Path, bench: QuickBench) -> None:
+    person = Person(
+        **{"calibration.with": "board", "calibration.photographs": str(folder / "none")}
+    )
+    assert run_stages(folder, bench, person, "calibration") == Exit.INTERRUPTED
+    assert failed_in(folder, person) == ["lens from photographs of a board"]
+    assert str(folder / "none") in person.text
+
+
 @pytest.mark.campaign
 def test_figures_come_from_rendered_frames(folder: Path, bench: QuickBench) -> None:
     bench.lens.blur_px = 0.5

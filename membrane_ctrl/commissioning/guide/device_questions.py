@@ -123,7 +123,7 @@ def _ask_table(
 ) -> TomlTable:
     """Ask for a driver and for its required keys, until its table is valid; empty without one."""
     choices = [
-        Choice(name=driver, meaning=_first_line(section)) for driver, section in known.items()
+        Choice(name=driver, meaning=_first_sentence(section)) for driver, section in known.items()
     ]
     if optional:
         choices.insert(0, Choice(name=_NONE, meaning="not on this bench"))
@@ -188,5 +188,6 @@ def _parse_toml(text: str) -> Any:
         return text
 
 
-def _first_line(section: type[BaseModel]) -> str:
-    return (section.__doc__ or "").strip().partition("\n")[0]
+def _first_sentence(section: type[BaseModel]) -> str:
+    """What a driver is for, from its table's text."""
+    return " ".join((section.__doc__ or "").split()).partition(". ")[0].rstrip(".")

@@ -7,7 +7,6 @@ by `instrument_lab` where they are probed.
 
 import asyncio
 import contextlib
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -28,7 +27,7 @@ from membrane_ctrl.commissioning.guide.bench_access import (
 from membrane_ctrl.commissioning.guide.emulated_optics import EmulatedLens, EmulatedOptics
 from membrane_ctrl.commissioning.guide.real_bench import stop_outputs
 from membrane_ctrl.commissioning.guide.session_state import CONFIGURATION
-from membrane_ctrl.commissioning.guide.shown_program import run_shown
+from membrane_ctrl.commissioning.guide.shown_program import OWN_PROGRAM, run_shown
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.sessions.live_hold import HoldLink
@@ -194,7 +193,7 @@ class EmulatedBench:
         """Run `tune` on a twin of its own; its gains are not saved."""
         configuration = str(folder / CONFIGURATION)
         logs = str(folder / "logs")
-        arguments = [sys.executable, "-m", "membrane_ctrl", "tune", command, "--twin"]
+        arguments = [*OWN_PROGRAM, "tune", command, "--twin"]
         arguments += ["--config", configuration, "--logs", logs, "--yes"]
         return run_shown(arguments, show)
 

@@ -11,7 +11,13 @@ from membrane_ctrl.commissioning.guide.bench_access import HandAct, HandMotion
 from membrane_ctrl.commissioning.guide.dialogue import Choice
 from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth
 from membrane_ctrl.commissioning.guide.rim_edge import measure_rim_edge_px
-from membrane_ctrl.commissioning.guide.session_state import SessionState, TomlTable, read_tables
+from membrane_ctrl.commissioning.guide.session_state import (
+    CONFIGURATION,
+    SessionState,
+    TomlTable,
+    read_tables,
+)
+from membrane_ctrl.commissioning.guide.shown_program import OWN_PROGRAM, run_shown
 from membrane_ctrl.commissioning.guide.stage import (
     StageContext,
     StageFailedError,
@@ -21,6 +27,15 @@ from membrane_ctrl.config import sight
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sessions.live_hold import HoldError
 
+_BY_HAND, _PHOTOGRAPHS = "nothing", "board"
+_AT_HAND = (
+    Choice(name=_BY_HAND, meaning="the lens' data sheet and a tape measure"),
+    Choice(
+        name=_PHOTOGRAPHS, meaning="photographs of a board by this camera, focused as it is now"
+    ),
+)
+_BOARD = "charuco:15x9"
+_LENS = "camera.toml"
 _TURN_KEY = "focus_turn"
 _TURN, _FIXED = "turn", "fixed"
 _TURNS = (
@@ -184,7 +199,36 @@ def measure_figure(context: StageContext) -> None:
     )
     if context.access.simulated:
         context.note("origin of these figures", "frames rendered of the twin's film")
-    context.note("calibration", "by hand; `membrane-ctrl calibrate` refines it with capture sets")
+
+
+def calibrate_optics(context: StageContext) -> None:
+    """Calibrate what the things at hand allow, and state what that leaves."""
+    dialogue = context.dialogue
+    at_hand = dialogue.ask_choice(
+        "calibration.with", "what is at hand for a calibration?", _AT_HAND, _BY_HAND
+    )
+    if at_hand == _BY_HAND:
+        context.note("lens", "as stated")
+    else:
+        photographs = dialogue.ask_text(
+            "calibration.photographs", "folder of the photographs", is_needed=True
+        )
+        board = dialogue.ask_text("calibration.board", "the board", _BOARD)
+        lens = context.folder / _LENS
+        command = [*OWN_PROGRAM, "calibrate-camera", photographs, "--board", board]
+        command += ["--config", str(context.folder / CONFIGURATION), "--out", str(lens)]
+        code = run_shown(command, dialogue.show)
+        context.require(
+            "lens from photographs of a board",
+            code == 0,
+            str(lens) if code == 0 else f"exit code {code}",
+            "read the messages above; photograph the board tilted in all directions",
+        )
+    context.note(
+        "geometry",
+        "by hand: expect 12 µm RMS of height error; then `membrane-ctrl calibrate --live` on a "
+        "hold, which takes sets at several depths",
+    )
 
 
 def has_camera(state: SessionState, tables: TomlTable) -> bool:

@@ -24,7 +24,7 @@ from membrane_ctrl.commissioning.devices import (
 )
 from membrane_ctrl.commissioning.guide.bench_access import Action, HandMotion, OpenBench
 from membrane_ctrl.commissioning.guide.session_state import CONFIGURATION
-from membrane_ctrl.commissioning.guide.shown_program import run_shown
+from membrane_ctrl.commissioning.guide.shown_program import OWN_PROGRAM, run_shown
 from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port.ctl import Where
@@ -112,7 +112,7 @@ class RealBench:
         logs = folder / "logs"
         logs.mkdir(parents=True, exist_ok=True)
         command = [
-            *_own_command(),
+            *OWN_PROGRAM,
             "hold",
             "--config",
             str(folder / CONFIGURATION),
@@ -140,11 +140,11 @@ class RealBench:
     ) -> int:
         """Run `tune` on the hold that runs."""
         logs = str(folder / "logs")
-        arguments = [*_own_command(), "tune", command, "--logs", logs, "--yes", "--take-over"]
+        arguments = [*OWN_PROGRAM, "tune", command, "--logs", logs, "--yes", "--take-over"]
         code = run_shown(arguments, show)
         if code == 0:
             configuration = str(folder / CONFIGURATION)
-            saved = [*_own_command(), "tune", "save", "--logs", logs, "--config", configuration]
+            saved = [*OWN_PROGRAM, "tune", "save", "--logs", logs, "--config", configuration]
             code = run_shown([*saved, "--yes"], show)
         return code
 
@@ -153,10 +153,6 @@ async def stop_outputs(open_bench: roles.Bench) -> None:
     """Switch the pump off and shut the vent; a bench that does not answer has its watchdog."""
     with contextlib.suppress(roles.LinkError):
         await open_bench.write(roles.BenchCommand(0.0, 0.0))
-
-
-def _own_command() -> list[str]:
-    return [sys.executable, "-m", "membrane_ctrl"]
 
 
 def _wait_for_socket(process: "subprocess.Popen[bytes]", socket: Path, log: Path) -> None:

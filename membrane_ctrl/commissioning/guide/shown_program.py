@@ -2,9 +2,11 @@
 
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Sequence
 
 _ENDS_S = 120.0
+OWN_PROGRAM = (sys.executable, "-m", "membrane_ctrl")
 
 
 def run_shown(words: Sequence[str], show: Callable[[str], None]) -> int:

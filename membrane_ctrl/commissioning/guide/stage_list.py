@@ -163,6 +163,14 @@ STAGES: tuple[CommissioningStage, ...] = (
         is_needed=optics_stages.has_camera,
     ),
     CommissioningStage(
+        step=5,
+        name="calibration",
+        does="calibrates what the things at hand allow, and states what that leaves",
+        look_for="a lens file if there are photographs of a board",
+        run=optics_stages.calibrate_optics,
+        is_needed=optics_stages.has_camera,
+    ),
+    CommissioningStage(
         step=6,
         name="tune",
         does="identifies the plant, designs gains, tries them, and keeps them if they are better",
