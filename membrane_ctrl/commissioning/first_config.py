@@ -23,6 +23,7 @@ from membrane_ctrl.model import errors
 _HEAD = """\
 # Configuration of membrane-ctrl. Omitted keys use their defaults; `membrane-ctrl config explain KEY` shows what a key
 # means, docs/reference/configuration.md lists them all, and `membrane-ctrl check {name}` checks this file and its devices.
+# The loop holds the centre; `holds` of [loop] makes it hold the focus or a figure instead (docs/how-to/hold-a-figure.md).
 """  # noqa: E501
 _TWIN = "tcp://127.0.0.1:{port}"
 

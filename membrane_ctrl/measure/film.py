@@ -11,7 +11,7 @@ import numpy as np
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.result_files import write_json, write_picture
-from membrane_ctrl.metrology.film import film_figure, material_fit
+from membrane_ctrl.metrology.film import film_figure, material_fit, orthotropy, ring_waves
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty import linear_covariance
@@ -240,7 +240,16 @@ def _list_limits(
             "nu is not determined: its bar is what was known before; take sets at other pressures"
         )
 
+    # Elastic constants by direction
+    if fit.orthotropy is None:
+        notes.append("E1, E2 and G12 are not determined: waves of two or four have another cause")
+    elif fit.orthotropy.has_other_axes:
+        notes.append(
+            "the four waves are not along the axes of the two: no orthotropic film has such"
+        )
+
     # What they determine only together.
+    notes += [_describe_together(pair) for pair in fit.together]
     together = fit.covariance[0, 1] / (strain * poisson)
     if abs(together) > _TOGETHER:
         sags = [figure.sag_mm for figure in figures]
@@ -257,6 +266,69 @@ def _list_limits(
             "it is not elastic"
         )
     return notes
+
+
+def _describe_together(pair: ring_waves.CausesTogether) -> str:
+    """Which combination of two causes of waves the sets determine."""
+    first, second = pair.causes
+    unit, scale = _WAVE_UNITS.get(first, ("mm", 1.0))
+    other_unit, other_scale = _WAVE_UNITS.get(second, ("mm", 1.0))
+    factor = pair.factor * scale / other_scale
+    sign = "+"
+    if factor > 0:
+        sign = "-"
+    return (
+        f"{_CAUSES[first]} and {_CAUSES[second]}, {pair.order} waves, are known only together "
+        f"(correlation {pair.correlation:+.3f}): the first {sign} {abs(factor):.3g} {unit} per "
+        f"{other_unit} of the second is known to {scale * pair.sigma:.2g} {unit}"
+    )
+
+
+def _make_constants(film: orthotropy.OrthotropicFilm | None, gauged: bool) -> dict[str, Any] | None:
+    """Elastic constants by direction, for `film.json`; those of a stiffness need a gauge."""
+    if film is None:
+        return None
+    sigmas = film.sigmas
+    table: dict[str, Any] = {
+        name: {"value": float(value), "sigma": float(sigma)}
+        for name, value, sigma in zip(orthotropy.CONSTANTS, film.values, sigmas, strict=True)
+        if gauged or not name.endswith("_n_per_m")
+    }
+    direction = None
+    if film.has_direction:
+        direction = {
+            "value": float(np.degrees(film.direction_rad)),
+            "sigma": float(np.degrees(film.direction_sigma_rad)),
+        }
+    table["direction_deg"] = direction
+    return table
+
+
+def _list_constants(table: dict[str, Any] | None) -> list[str]:
+    """Elastic constants by direction as lines of text."""
+    if table is None:
+        return []
+    ratio, shear = table["ratio"], table["g12_over_e1"]
+    direction = "no stiff direction is seen"
+    if table["direction_deg"] is not None:
+        found = table["direction_deg"]
+        direction = f"stiff along {found['value']:.1f} +- {found['sigma']:.2g} degrees"
+    lines = [f"E1 / E2    {ratio['value']:.4f} +- {ratio['sigma']:.2g}; {direction}"]
+    if "e1_n_per_m" in table:
+        moduli = [
+            f"{label} {table[name]['value'] / 1e3:.2f} +- {table[name]['sigma'] / 1e3:.2g}"
+            for label, name in (
+                ("E1 t", "e1_n_per_m"),
+                ("E2 t", "e2_n_per_m"),
+                ("G12 t", "g12_n_per_m"),
+            )
+        ]
+        lines.append(f"moduli     {', '.join(moduli)} kN/m")
+    lines.append(
+        f"nu12       {table['nu12']['value']:.4f} +- {table['nu12']['sigma']:.2g}; G12 / E1 "
+        f"{shear['value']:.4f} +- {shear['sigma']:.2g}"
+    )
+    return lines
 
 
 def _make_fit_table(
@@ -299,6 +371,7 @@ def _make_fit_table(
         "prestrain": {"value": law.prestrain, "sigma": float(strain)},
         "poisson": {"value": law.poisson, "sigma": float(poisson)},
         "stiffness_n_per_m": stiffness,
+        "orthotropy": _make_constants(fit.orthotropy, gauged),
         "covariance": fit.covariance.tolist(),  # of pre-strain, nu, relative stiffness
         "ring": [
             {
@@ -350,6 +423,7 @@ def _format_fit(table: dict[str, Any], figures: list[film_figure.FilmFigure]) ->
         lines.append(
             f"E t        {stiffness['value'] / 1e3:.2f} +- {stiffness['sigma'] / 1e3:.2g} kN/m"
         )
+    lines += _list_constants(table["orthotropy"])
     lines += [_wave_line(wave) for wave in table["ring"]]
     edges = [one["edge_from_hencky_mm"] for one in table["sets"]]
     departure = table["departure"]

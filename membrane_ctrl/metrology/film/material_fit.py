@@ -30,9 +30,11 @@ from membrane_ctrl.metrology.film.misfit_average import (
     misfit_covariances,
     shared_covariance,
 )
+from membrane_ctrl.metrology.film.orthotropy import OrthotropicFilm, find_orthotropy
 from membrane_ctrl.metrology.film.radial_quadrature import slope_radii
 from membrane_ctrl.metrology.film.ring_waves import (
     CAUSES,
+    CausesTogether,
     RingWave,
     UnexplainedWaves,
     azimuthal_terms,
@@ -102,6 +104,10 @@ class FilmFit:
         Waves of the ring with a cause.
     unexplained : tuple of UnexplainedWaves
         Waves without one.
+    together : tuple of CausesTogether
+        Causes of waves that are known only together.
+    orthotropy : OrthotropicFilm or None
+        Elastic constants by direction; None if waves of two or four have another cause.
     misfit_um : float
         1 sigma of a term.
     """
@@ -111,6 +117,8 @@ class FilmFit:
     left_mm: FloatArray
     waves: tuple[RingWave, ...]
     unexplained: tuple[UnexplainedWaves, ...]
+    together: tuple[CausesTogether, ...]
+    orthotropy: OrthotropicFilm | None
     misfit_um: float
 
     @property
@@ -173,7 +181,16 @@ def fit_film(
         is_predicted[azimuthal_terms(order).ravel()] = True
     seen = np.array([figure.parameters_mm for figure in figures])
     left_mm = np.where(is_predicted, seen - predicted_mm, 0.0)
-    return FilmFit(law, covariance, left_mm, of_waves.waves, of_waves.unexplained, 1e3 * size_mm)
+    return FilmFit(
+        law=law,
+        covariance=covariance,
+        left_mm=left_mm,
+        waves=of_waves.waves,
+        unexplained=of_waves.unexplained,
+        together=of_waves.together,
+        orthotropy=find_orthotropy(law, covariance, of_waves.waves),
+        misfit_um=1e3 * size_mm,
+    )
 
 
 def round_terms_mm(bowls: Bowl, reach: float) -> FloatArray:

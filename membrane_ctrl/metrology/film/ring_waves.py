@@ -40,12 +40,13 @@ _CAUSE_SIGMAS: dict[HarmonicCause, float] = {
     "shear": 0.3,
 }
 _OF_FILM = ("modulus", "shear")
-_SURE = 4.0  # sigmas beyond which a cause is stated
+SURE_SIGMAS = 4.0  # beyond which a cause is stated
 _FOEPPL = 0.03  # relative change of an orthotropic film's wave by finite slopes
 # Share of the shear modulus that the square of the moduli's difference adds to four waves.
 _SECOND_ORDER = 2.0
 _UNEXPLAINED = 0.1  # share of an order's waves: if more is left, there is another cause
 _LEAST_SEEN_MM = 2e-3  # least RMS of an order's terms that is stated
+_TOGETHER = 0.95  # correlation of two causes that the sets determine only together
 _FIRST_FREE_ORDER = 4  # orders from here on show how large terms without a cause are
 
 
@@ -74,7 +75,7 @@ class RingWave:
     @property
     def seen(self) -> bool:
         """Whether it is there beyond doubt."""
-        return self.explained and bool(np.any(np.abs(self.amounts) > _SURE * self.sigmas))
+        return self.explained and bool(np.any(np.abs(self.amounts) > SURE_SIGMAS * self.sigmas))
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,30 @@ class UnexplainedWaves:
 
 
 @dataclass(frozen=True)
+class CausesTogether:
+    """Two causes of waves that the sets determine only together.
+
+    Attributes
+    ----------
+    order : int
+        m.
+    causes : (HarmonicCause, HarmonicCause)
+    correlation : float
+        Of their amounts.
+    factor : float
+        The sets determine the first amount less `factor` times the second,
+    sigma : float
+        to this standard uncertainty.
+    """
+
+    order: int
+    causes: tuple[HarmonicCause, HarmonicCause]
+    correlation: float
+    factor: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class WaveFit:
     """All causes, the orders without one, and what the causes add to the figures.
 
@@ -109,12 +134,15 @@ class WaveFit:
         All causes.
     unexplained : tuple of UnexplainedWaves
         Orders without a cause.
+    together : tuple of CausesTogether
+        Causes that are known only together.
     added_mm : (n, parameters) array
         What the causes add to the parameters of each figure.
     """
 
     waves: tuple[RingWave, ...]
     unexplained: tuple[UnexplainedWaves, ...]
+    together: tuple[CausesTogether, ...]
     added_mm: FloatArray
 
 
@@ -154,6 +182,7 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
     added = np.zeros((len(figures), ZERNIKE_TERMS))
     waves: list[RingWave] = []
     unexplained: list[UnexplainedWaves] = []
+    together: list[CausesTogether] = []
     for order, causes in CAUSES.items():
         # Cosine and sine terms of the order, (2, n, 3), and their fit by its causes.
         terms = azimuthal_terms(order)
@@ -174,11 +203,12 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
         if not explained and rms_mm > _LEAST_SEEN_MM:
             likely = _rank_causes(causes, response, data)
             unexplained.append(UnexplainedWaves(order, 1e3 * rms_mm, 1e3 * left_mm, likely))
+        together += _find_causes_together(order, causes, fits[0][1])
         for k, cause in enumerate(causes):
             amounts = np.array([found[k] for found, _ in fits])
-            sigmas = np.array([sigma[k] for _, sigma in fits])
+            sigmas = np.sqrt([covariance[k, k] for _, covariance in fits])
             waves.append(RingWave(cause, order, amounts, sigmas, explained))
-    return WaveFit(_widen_shear(waves), tuple(unexplained), added)
+    return WaveFit(_widen_shear(waves), tuple(unexplained), tuple(together), added)
 
 
 def _widen_shear(waves: list[RingWave]) -> tuple[RingWave, ...]:
@@ -199,10 +229,14 @@ def _fit_parity(
     data: FloatArray,
     seen_mm: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Amounts of the causes and their sigmas, from the cosine or the sine terms of an order."""
+    """Amounts of the causes and their covariance, from the cosine or the sine terms of an order."""
     prior_sigmas = np.array([_CAUSE_SIGMAS[cause] for cause in causes])
     noise = shared_covariance(figures, terms) + 1e-14 * np.eye(data.size)
-    spread = np.stack([np.kron(part, np.eye(terms.size)) for part in misfit_covariances(figures)])
+    # A wave's misfit grows in several ways at once: a cause leaves another power of the sag than a
+    # figure without one. A single power would have to explain the sets' differences to the noise,
+    # which only a misfit as large as the wave does; the causes would then be free.
+    mixed: FloatArray = np.mean(misfit_covariances(figures), axis=0)
+    spread: FloatArray = np.kron(mixed, np.eye(terms.size))[None].astype(np.float64)
     of_film = [k for k, cause in enumerate(causes) if cause in _OF_FILM]
     design = response.reshape(-1, len(causes))
     prior_mean = np.zeros(len(causes))
@@ -214,7 +248,25 @@ def _fit_parity(
         )
         waves_mm = response[..., of_film] @ found.mean[of_film]
         size_mm = float(np.hypot(seen_mm, _FOEPPL * np.sqrt(np.mean(waves_mm**2))))
-    return found.mean, np.sqrt(np.diag(found.covariance))
+    return found.mean, found.covariance
+
+
+def _find_causes_together(
+    order: int, causes: Sequence[HarmonicCause], covariance: FloatArray
+) -> list[CausesTogether]:
+    """Pairs of causes whose amounts are correlated so far that only a combination is known."""
+    sigmas = np.sqrt(np.diag(covariance))
+    found = []
+    for second in range(len(causes)):
+        for first in range(second):
+            correlation = float(covariance[first, second] / (sigmas[first] * sigmas[second]))
+            if abs(correlation) < _TOGETHER:
+                continue
+            factor = float(covariance[first, second] / covariance[second, second])
+            sigma = float(sigmas[first] * np.sqrt(1 - correlation**2))
+            pair = causes[first], causes[second]
+            found.append(CausesTogether(order, pair, correlation, factor, sigma))
+    return found
 
 
 def _rank_causes(

@@ -258,6 +258,29 @@ def test_an_orthotropic_film_is_named_with_its_direction_beside_an_uneven_ring()
     assert modulus.sigmas.max() < 1e-2
     assert seen["flat", 2].amounts == pytest.approx([0.2, 0.05], abs=0.01)
     assert fit.unexplained == ()
+    # The constants by direction, within their bars and the stated accuracy
+    film = fit.orthotropy
+    assert film is not None
+    shear = 0.94 / 2 / 1.33
+    true = np.array([STIFFNESS, 0.88 * STIFFNESS, shear * STIFFNESS, 0.33, 1 / 0.88, shear])
+    assert np.abs((film.values - true) / film.sigmas).max() < 3.0
+    assert film.values[4] == pytest.approx(1 / 0.88, rel=5e-3)
+    assert np.degrees(film.direction_rad) == pytest.approx(np.degrees(0.6), abs=2.0)
+    assert not film.has_other_axes
+    assert fit.law.prestrain == pytest.approx(1e-4, abs=max(1e-5, 3 * fit.sigmas[0]))
+
+
+def test_an_isotropic_film_has_no_stiff_direction() -> None:
+    """E1 / E2 is 1 within a bar of half a percent, and no cause is stated that is not there."""
+    material = Material(1.0, 0.35, None, prestrain=(5e-4, 5e-4, 0.0))
+    fit = _fit(_second_world_figures(Mirror(37.0, material=material)))
+    assert not any(wave.seen for wave in fit.waves)
+    film = fit.orthotropy
+    assert film is not None
+    assert not film.has_direction
+    assert film.sigmas[4] < 5e-3
+    assert abs(film.values[4] - 1.0) < 3 * film.sigmas[4]
+    assert fit.law.prestrain == pytest.approx(5e-4, abs=1e-5)
 
 
 def test_waves_without_a_known_cause_are_reported_as_unknown() -> None:
