@@ -121,12 +121,41 @@ class _Model:
         return np.exp(1j * turns), np.broadcast_to(inside, turns.shape)
 
     def effect_rad(self, errors: FloatArray, shares: FloatArray) -> FloatArray:
-        """Change (2, n) of the measured phase."""
+        """Change of the measured phase by the images: arg(1 + sum r_k e^(i (phi_k - phi))).
+
+        Parameters
+        ----------
+        errors : (FRONT_ERRORS,) array
+            Errors of form of the front film.
+        shares : (2,) array
+            r_1 and r_2.
+
+        Returns
+        -------
+        (2, n) array
+            Of the phases of x and of y.
+        """
         phasors, inside = self.phasors(errors)
         return np.asarray(np.angle(1 + np.tensordot(shares, inside * phasors, axes=1)))
 
     def derivatives(self, errors: FloatArray, shares: FloatArray) -> FloatArray:
-        """By the errors of form and the two shares, (FRONT_ERRORS + 2, 2, n)."""
+        """Derivatives of `effect_rad`.
+
+        With S = 1 + sum r_k e_k, d arg S is Im(dS / S): of a share Im(e_k / S), of a phase
+        Re(r_k e_k / S). The phases change with the errors of form by the images' places.
+
+        Parameters
+        ----------
+        errors : (FRONT_ERRORS,) array
+            Errors of form of the front film.
+        shares : (2,) array
+            r_1 and r_2.
+
+        Returns
+        -------
+        (FRONT_ERRORS + 2, 2, n) array
+            By the errors, then by the shares.
+        """
         phasors, inside = self.phasors(errors)
         lit = inside * phasors
         whole = 1 + np.tensordot(shares, lit, axes=1)
@@ -190,6 +219,7 @@ def fit_reflections(
     )
     if shows.size < _LEAST_POINTS:
         return nothing
+    # Some thousand of these pixels, and the phase that they have beside the expected one.
     some = shows[:: max(1, shows.size // _MOST_POINTS)]
     place_mm = position_mm[:, some]
     mm_per_rad = screen_scale.mm_per_rad(pattern)
@@ -199,6 +229,8 @@ def fit_reflections(
     smooth = _smooth_basis(images, place_mm)
     weights = np.all(np.abs(phase_rad - np.median(phase_rad, axis=1)[:, None]) < 1.0, axis=0)
     sigmas = np.array([bulge_sigma_mm, _TILT_MRAD, _TILT_MRAD, _SADDLE_MM, _SADDLE_MM])
+    # A search for the basin: the cost has many minima, as each turn of an image's phase looks
+    # alike.
     few = slice(None, None, max(1, some.size // _SEARCHED_POINTS))
     errors, shares = _search_errors(
         _Model(images, place_mm[:, few], expected_mm[:, some[few]], mm_per_rad),
@@ -211,6 +243,7 @@ def fit_reflections(
     residual = phase_rad
     fits = weights
     before_rad = _rms(_without_smooth(phase_rad, smooth, weights), weights)
+    # Gauss-Newton about images that are traced again; without outliers and pixels at edges.
     for _ in range(_TRACES):
         traced = map_reflections(geometry, surface, vertex_z_mm, pattern, errors)
         if traced is None:
@@ -350,6 +383,8 @@ def _search_errors(
     expected_shares: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """The bulge and the tilts that explain the phase best with the expected shares."""
+    # All combinations of bulge and tilts. Only the mean of an effect is removed, which is cheap;
+    # the smooth rest matters little for the choice.
     target = _without_smooth(phase_rad, smooth, weights)[:, weights]
     best = math.inf
     found = np.zeros(FRONT_ERRORS)
@@ -377,11 +412,13 @@ def _solve(
 ) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton steps for errors of form and shares, with the errors' sigmas as a prior."""
     for _ in range(_STEPS):
+        # The residual and its derivatives, both without the smooth change.
         effect = model.effect_rad(errors, shares)
         residual = _without_smooth(phase_rad - effect, smooth, weights)[:, weights]
         jacobian = model.derivatives(errors, shares)
         columns = _without_smooth(jacobian, smooth, weights)[..., weights]
         design = columns.reshape(FRONT_ERRORS + 2, -1)
+        # Normal equations with the prior of the errors; the shares have none.
         variance = float(np.mean(residual**2)) + 1e-12
         normal = design @ design.T / variance
         right = design @ residual.ravel() / variance
@@ -389,6 +426,7 @@ def _solve(
         normal += np.diag(prior)
         right -= prior * np.append(errors, shares)
         step = np.linalg.solve(normal, right)
+        # Steps no longer than a sigma, shares that light can have.
         errors = errors + np.clip(step[:FRONT_ERRORS], -sigmas, sigmas)
         shares = np.clip(shares + step[FRONT_ERRORS:], -0.05, 0.6)
     return errors, shares

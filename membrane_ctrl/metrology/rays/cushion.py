@@ -77,13 +77,27 @@ class Cushion:
         return 2 * of_face / (1 + of_face)
 
     def front_height(self, rim_z_mm: float, place: FloatArray) -> tuple[FloatArray, ...]:
-        """World z of the film's outer face over places (2, n), and its slopes along x and y."""
+        """The film's outer face: a Hencky bowl upside down, with its errors of form.
+
+        Parameters
+        ----------
+        rim_z_mm : float
+            World z of the mirror's rim.
+        place : (2, n) array
+            x and y in world, mm.
+
+        Returns
+        -------
+        z_mm, slope_x, slope_y : (n,) arrays
+            World z over the places, and its slopes.
+        """
         raised_mm, tilt_x, tilt_y, saddle_mm, diagonal_mm = self.errors
         bowl = Surface.hencky_bowl(self.bulge_mm + raised_mm, self.radius_mm)
         x, y = place / self.radius_mm
         height = bowl.height(place[0], place[1])
         slope_x, slope_y = bowl.slopes(place[0], place[1])
         top = rim_z_mm + self.rim_gap_mm + self.bulge_mm + raised_mm
+        # Errors of form: tilts, and two saddles that are turned by 45 degrees.
         tilted = 1e-3 * (tilt_x * place[0] + tilt_y * place[1])
         saddle = saddle_mm * (x * x - y * y) + 2 * diagonal_mm * x * y
         saddle_x = 2 * (saddle_mm * x + diagonal_mm * y) / self.radius_mm
@@ -123,12 +137,39 @@ class CushionBench:
         return self.vertex_z_mm + self.mirror.sag_mm
 
     def trace_alone(self, start: FloatArray, rays: FloatArray) -> FloatArray:
-        """Screen points (2, n) of rays (3, n) by the mirror without a film in front."""
+        """Trace rays by the mirror without a film in front.
+
+        Parameters
+        ----------
+        start : (3, n) array
+            Points of the rays in world, mm.
+        rays : (3, n) array
+            Unit vectors.
+
+        Returns
+        -------
+        (2, n) array
+            Screen points, mm.
+        """
         point = self._meet_mirror(start, rays)
         return self._meet_screen(point, self._reflect_at_mirror(point, rays))
 
     def trace_through(self, start: FloatArray, rays: FloatArray) -> FloatArray:
-        """Screen points (2, n) of rays (3, n) through the film to the mirror and back."""
+        """Trace rays through the film to the mirror and back.
+
+        Parameters
+        ----------
+        start : (3, n) array
+            Points of the rays in world, mm.
+        rays : (3, n) array
+            Unit vectors.
+
+        Returns
+        -------
+        (2, n) array
+            Screen points, mm.
+        """
+        # In through the film, by the mirror, out through the film.
         inside, ray = self._pass_film(*self._meet_front(start, rays), rays, goes_in=True)
         point = self._meet_mirror(inside, ray)
         up = self._reflect_at_mirror(point, ray)
@@ -136,13 +177,27 @@ class CushionBench:
         return self._meet_screen(outside, leaving)
 
     def trace_images(self, start: FloatArray, rays: FloatArray) -> FloatArray:
-        """Screen points (2, 2, n) of the two further images of the screen: by the film's outside,
-        and by mirror, film and mirror; without refraction, which moves them by micrometres.
+        """Trace rays to the two further images of the screen, without refraction, which moves
+        them by
+        micrometres.
 
-        NaN where the second meets the mirror beyond its rim.
+        Parameters
+        ----------
+        start : (3, n) array
+            Points of the rays in world, mm.
+        rays : (3, n) array
+            Unit vectors.
+
+        Returns
+        -------
+        (2, 2, n) array
+            Screen points, mm: of the image by the film's outside, and of that by mirror, film and
+            mirror; NaN where the latter meets the mirror beyond its rim.
         """
+        # By the film's outside.
         outside, normal = self._meet_front(start, rays)
         by_outside = self._meet_screen(outside, _reflect(rays, normal))
+        # By the mirror up to the film's inside, down again, and by the mirror a second time.
         point = self._meet_mirror(start, rays)
         up = self._reflect_at_mirror(point, rays)
         under, normal = self._meet_front(point, up)
@@ -155,6 +210,7 @@ class CushionBench:
 
     def _meet_mirror(self, start: FloatArray, rays: FloatArray) -> FloatArray:
         """Points (3, n) of the mirror on rays that come down."""
+        # Newton's method on z - vertex_z - h(x, y) = 0, from the plane of the rim.
         t = (self._rim_z_mm - start[2]) / rays[2]
         for _ in range(_NEWTON_STEPS):
             x, y, z = start + t * rays
@@ -169,6 +225,7 @@ class CushionBench:
 
     def _meet_front(self, start: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Points (3, n) of the front film on rays from either side, and its normals there."""
+        # Newton's method, from a plane half way up the bulge.
         middle_mm = self._rim_z_mm + self.cushion.rim_gap_mm + self.cushion.bulge_mm / 2
         t = (middle_mm - start[2]) / rays[2]
         for _ in range(_NEWTON_STEPS):
@@ -184,6 +241,7 @@ class CushionBench:
         self, point: FloatArray, normal: FloatArray, rays: FloatArray, goes_in: bool
     ) -> tuple[FloatArray, FloatArray]:
         """Points and directions behind the film of rays that meet it."""
+        # Snell at the first face.
         gas = 1 + self.cushion.gas_excess
         before, behind = gas, 1.0
         if goes_in:
@@ -226,7 +284,23 @@ def _refract(rays: FloatArray, unit: FloatArray, before: float, behind: float) -
 
 
 def image_shares(cushion: Cushion, mirror_reflectance: float) -> tuple[float, float]:
-    """Light of the two further images over that of the mirror seen through the film."""
+    """Light of the two further images over that of the mirror seen through the film.
+
+    The mirror is seen through the film twice, which leaves (1 - R)^2 rho of its light, with R the
+    film's reflectance and rho the mirror's. The film's outside gives R; the path by mirror, film
+    and mirror gives (1 - R)^2 rho R rho.
+
+    Parameters
+    ----------
+    cushion : Cushion
+        The film.
+    mirror_reflectance : float
+        rho.
+
+    Returns
+    -------
+    outside, mirror : float
+    """
     passed = (1 - cushion.reflectance) ** 2
     outside = cushion.reflectance / (passed * mirror_reflectance)
     return outside, mirror_reflectance * cushion.reflectance

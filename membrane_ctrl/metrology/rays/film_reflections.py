@@ -60,7 +60,20 @@ class ReflectionMap:
         return np.asarray(x * x + y * y <= 1)
 
     def find_images_mm(self, position_mm: FloatArray, errors: FloatArray) -> FloatArray:
-        """Places (2, 2, n) on the screen of both images, at traced places (2, n) of the mirror."""
+        """Places of both images on the screen.
+
+        Parameters
+        ----------
+        position_mm : (2, n) array
+            Traced places of the mirror.
+        errors : (FRONT_ERRORS,) array
+            Errors of form of the front film.
+
+        Returns
+        -------
+        (2, 2, n) array
+            s_x and s_y of the image by the film's outside, and of that by mirror, film and mirror.
+        """
         table = self.tables[0] + np.tensordot(errors - self.errors, self.tables[1:], axes=1)
         return self._evaluate(position_mm, table).reshape(2, 2, -1)
 

@@ -42,7 +42,20 @@ class GasLens:
     radius_mm: float
 
     def find_shift_mm(self, x_mm: FloatArray, y_mm: FloatArray, sag_mm: float) -> FloatArray:
-        """Shift (2, n) at places (n,) of a mirror of this depth."""
+        """Shift of the screen points at places of the mirror.
+
+        Parameters
+        ----------
+        x_mm, y_mm : (n,) arrays
+            The places, from the vertex.
+        sag_mm : float
+            Depth of the mirror.
+
+        Returns
+        -------
+        (2, n) array
+            Along s_x and s_y, mm.
+        """
         table = self.shift_mm + (sag_mm - self.sag_mm) * self.by_sag
         out = np.empty((2, x_mm.size))
         evaluate_tables(x_mm / self.radius_mm, y_mm / self.radius_mm, table, out)
@@ -51,8 +64,16 @@ class GasLens:
 
 @compile_kernel
 def evaluate_tables(x, y, table, out):  # type: ignore[no-untyped-def]
-    """Polynomials (k, degree + 1, degree + 1) at points (n,) into `out` (k, n), by Horner's
-    rule.
+    """Evaluate polynomials by Horner's rule.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays
+        Points, in radii.
+    table : (k, degree + 1, degree + 1) array
+        Coefficients of x^i y^j; those of i + j above the degree are not used.
+    out : (k, n) array
+        Takes the values.
     """
     degree = table.shape[1] - 1
     for axis in range(table.shape[0]):
@@ -93,6 +114,7 @@ def trace_gas_lens(
     x = rho * np.cos(theta)
     y = rho * np.sin(theta)
     tables = []
+    # For each depth, the rays of these places with the film and without.
     for sag_mm in (cushion.sag_mm, cushion.sag_mm + _DEEPER_MM):
         bowl = Surface.hencky_bowl(sag_mm, cushion.radius_mm)
         bench = CushionBench(cushion, bowl, 0.0, screen_origin_mm, screen_axes)
