@@ -29,6 +29,7 @@ def format_report(report: dict[str, Any]) -> list[str]:
 
     lines += _format_parameters(report["parameters"])
     lines += _format_sets(report["sets"])
+    # What the geometry is good for, and what would make it better.
     claim = report["uncertainty"]
     lines.append(
         f"figure with this geometry: sag +- {claim['sag_um']:.2f} µm, figure +- "
@@ -37,6 +38,7 @@ def format_report(report: dict[str, Any]) -> list[str]:
     )
     lines += _format_advice(report)
 
+    # Checks: the laser's scale, and what these sets leave open.
     laser = report["laser"]
     if laser["sigma"] < _SOME_LASER:
         lines.append(f"laser against optics: {laser['scale']:.5f} +- {laser['sigma']:.5f}")

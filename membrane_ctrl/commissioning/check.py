@@ -206,6 +206,7 @@ def _describe_hold(config: Config) -> dict[str, str]:
         )
         if on
     ]
+    # How figures would be measured, and why.
     shape_loop = "off"
     decided, figure_mode = choose_figure_mode(config)
     if shape.enabled and figure_mode is not None:
@@ -402,6 +403,7 @@ async def _probe_role(
 ) -> DeviceProbe:
     where = device.describe()
     name, notes = where.get("port", ""), where.get("watchdog", "")
+    # Open it, ask what it is, and time its reads; then it is free for a hold again.
     try:
         found = await role_bench.answer(role, device.open())
         timed = await _time_reads(lambda: role_bench.answer(role, read()))
@@ -414,6 +416,7 @@ async def _probe_role(
         part for part in (found.kind, found.serial, found.firmware, found.detail) if part
     )
     problem = ""
+    # What its last reading says: a laser has its own error codes and rate.
     samples_hz = math.nan
     value = timed.last
     if isinstance(value, roles.DisplacementSample):
@@ -424,6 +427,7 @@ async def _probe_role(
         value = value.displacement_um
     if not problem and not math.isfinite(value):
         problem = "answers without a reading"
+    # Ranges of the sensors, which the configuration must not contradict.
     facts = roles.BenchIdentity(found.kind, 0, found.firmware, math.nan)
     if role == "displacement":
         facts = replace(facts, displacement_range_um=found.shows)

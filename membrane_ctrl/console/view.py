@@ -201,6 +201,7 @@ class ConsolePage:
             time_left = f"{format_duration(view.left_s)} left"
         title = Text.assemble(" ", (view.state.name.lower(), _STATE_STYLES.get(view.state, "bold")))
         title.append(f" for {format_duration(view.state_age_s)} ")
+        # Items that the window has no room for are omitted; the caller says which.
         trend: Sequence[tuple[str, Text]] = ()
         if "trend" not in omitted:
             trend = _make_trend_items(view, self._config, trend_s, rows)
@@ -217,6 +218,7 @@ class ConsolePage:
         if self._foot:
             style = "bold yellow" if self._asks else "dim"
             parts.append(Text(self._foot, style=style, no_wrap=True, overflow="ellipsis"))
+        # The border tells the state from afar.
         held = view.state == telemetry.State.HOLD
         border = "green" if held else "blue"
         if view.fault or view.silent_s:

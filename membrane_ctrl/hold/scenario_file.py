@@ -56,6 +56,7 @@ class ScenarioStep(Section):
 
     @model_validator(mode="after")
     def _require_one_action(self) -> ScenarioStep:
+        # A step does one thing,
         if sum(thing is not None for thing in (self.wrong, self.event, self.command)) != 1:
             raise ValueError("give exactly one of wrong, event and command")
         if (
@@ -73,6 +74,7 @@ class ScenarioStep(Section):
             raise ValueError(
                 f"wrong = {self.wrong!r} with value = {self.value:g}: a fraction, 0 to 1"
             )
+        # and takes only the times that go with it.
         if self.for_s is not None and self.wrong is None:
             raise ValueError("for_s goes with wrong; an event has over_s")
         if self.over_s and self.event is None:

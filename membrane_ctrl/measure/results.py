@@ -165,6 +165,7 @@ def result_table(
     """
     full = measurement.full
     optics = measurement.head.optics
+    # A rejected set has no figure, but the same keys.
     if full is None:
         coeffs_um: list[Any] = [None] * zernike_terms.ZERNIKE_TERMS
         valid_fraction = 0.0

@@ -196,6 +196,7 @@ class StabilityRun:
     def make_table(self) -> dict[str, Any]:
         """The content of `stability.json`, less its head."""
         sd_um = self._sd_um()
+        # Noll coefficients from the parameters of the fit, among which is the excess of the bowl.
         to_coeffs = parameter_to_coeffs()
         covariance = to_coeffs @ self._parameters.covariance @ to_coeffs.T
         duration_s = None

@@ -31,6 +31,7 @@ def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) 
     held = summary["held"]
     states = summary["states"]
     of = "true centre" if held["of"] == "true" else "reading"
+    # Rows without anything to say are left out.
     last_fault = ""
     if summary["faults"]:
         last_fault = str(summary["faults"][-1].get("name", ""))

@@ -216,6 +216,7 @@ def _draw_overview(analysis: Analysis, width_in: float, height_in: float) -> Mar
             plot.plot(
                 time, level["mean_true_error_um"], color=GREEN, lw=0.9, label="true centre (twin)"
             )
+        # The scale is that of the band; a title says how far the error goes beyond it.
         most_um = _SHOWN_BANDS * band_um
         plot.set_ylim(-most_um, most_um)
         largest_um = float(np.nanmax(np.abs(ends), initial=0.0))
@@ -409,6 +410,7 @@ def draw_stability(shape: shape_review.ShapeReview) -> Markup:
     """Heights at A, B, C; camera against laser; the map of the standard deviation; drift of the
     terms.
     """
+    # Lines of no more points than a page shows, interrupted at gaps.
     span_s = float(np.ptp(shape.time_s))
     every = max(1, shape.time_s.size // _LINE_POINTS)
     lines = {
