@@ -295,13 +295,14 @@ def details_table(
 
 def _front_film_table(fit: ReflectionFit) -> dict[str, Any]:
     """The reflections of the screen by the front film, and its errors of form that they show."""
-    raised_mm, tilt_x_mrad, tilt_y_mrad, *saddles_mm = fit.errors.tolist()
+    raised_mm, tilt_x_mrad, tilt_y_mrad, saddle_mm, diagonal_mm, lifted_mm = fit.errors.tolist()
     return {
         "reflections": fit.state.value,
         "shares": fit.shares.tolist(),
         "bulge_less_stated_mm": raised_mm,
         "tilt_mrad": [tilt_x_mrad, tilt_y_mrad],
-        "saddles_mm": saddles_mm,
+        "saddles_mm": [saddle_mm, diagonal_mm],
+        "lifted_mm": lifted_mm,
         "ripple_rad": {
             "before": number_or_null(fit.before_rad),
             "after": number_or_null(fit.after_rad),

@@ -30,9 +30,10 @@ _STEPS = 12  # Gauss-Newton steps after each trace of the reflections
 _TRACES = 3
 _ITERATIONS = 4  # of phi from the measured phase: each gains a factor of five
 # Standard uncertainties of the errors of form: bulge in mm (or as stated), tilts in mrad, saddles
-# in mm on the rim.
+# in mm on the rim, height of the whole film in mm.
 _TILT_MRAD = 1.5
 _SADDLE_MM = 0.7
+_LIFT_MM = 1.5
 # First search: bulge in sigmas, tilts in mrad. From one place to the next an image's phase changes
 # by less than a radian.
 _RAISES = np.linspace(-2.0, 2.0, 5)
@@ -42,6 +43,7 @@ _SMALL_SHARE = 0.3  # of the expected share: less is no reflection of a film
 _LARGE_SHARE = 3.0
 _EXPLAINED = 0.8  # least share of the ripple's power that a fit must explain
 _OUTLIER_SIGMAS = 6.0
+_LEAST_SCATTER_RAD = 1e-3  # of the residual: less is noise-free
 _EDGE_PIXELS = 1.5  # beside the edge of an image: a pixel and the lens' blur
 _SOFT_MM = 1.0  # width of an image's edge in the fit
 
@@ -228,7 +230,8 @@ def fit_reflections(
     # The phase without a smooth change, robustly: lost pixels do not count.
     smooth = _smooth_basis(images, place_mm)
     weights = np.all(np.abs(phase_rad - np.median(phase_rad, axis=1)[:, None]) < 1.0, axis=0)
-    sigmas = np.array([bulge_sigma_mm, _TILT_MRAD, _TILT_MRAD, _SADDLE_MM, _SADDLE_MM])
+    sigmas = np.array([bulge_sigma_mm, _TILT_MRAD, _TILT_MRAD, _SADDLE_MM, _SADDLE_MM, _LIFT_MM])
+
     # A search for the basin: the cost has many minima, as each turn of an image's phase looks
     # alike.
     few = slice(None, None, max(1, some.size // _SEARCHED_POINTS))
@@ -255,7 +258,7 @@ def fit_reflections(
         errors, shares = _solve(model, phase_rad, smooth, weights, sigmas, errors, shares)
         residual = _without_smooth(phase_rad - model.effect_rad(errors, shares), smooth, weights)
         scatter = np.median(np.abs(residual[:, weights])) / 0.6745
-        fits = np.all(np.abs(residual) < _OUTLIER_SIGMAS * max(scatter, 1e-6), axis=0)
+        fits = np.all(np.abs(residual) < _OUTLIER_SIGMAS * max(scatter, _LEAST_SCATTER_RAD), axis=0)
         weights = fits & ~crossed
         if np.count_nonzero(weights) < _LEAST_POINTS:
             return nothing
@@ -391,7 +394,7 @@ def _search_errors(
     for raised in _RAISES * sigmas[0]:
         for tilt_x in _TILTS_MRAD:
             for tilt_y in _TILTS_MRAD:
-                errors = np.array([raised, tilt_x, tilt_y, 0.0, 0.0])
+                errors = np.array([raised, tilt_x, tilt_y, 0.0, 0.0, 0.0])
                 effect = model.effect_rad(errors, expected_shares)[:, weights]
                 left = target - effect + effect.mean(axis=1, keepdims=True)
                 cost = float(np.sum(left**2))

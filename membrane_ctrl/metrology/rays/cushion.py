@@ -18,9 +18,10 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
 
 _NEWTON_STEPS = 7  # from a plane half the bulge away to rounding
-# Errors of form of the front film, in the order of `Cushion.errors`: height of its vertex in mm,
-# slopes along x and y in mrad, and saddles x^2 - y^2 and 2 x y in mm on the rim.
-FRONT_ERRORS = 5
+# Errors of form of the front film, in the order of `Cushion.errors`: height of its vertex by a
+# deeper bowl in mm, slopes along x and y in mrad, saddles x^2 - y^2 and 2 x y in mm on the rim, and
+# height of the whole film in mm: another law of the film has another curvature at the same bulge.
+FRONT_ERRORS = 6
 
 
 @dataclass(frozen=True)
@@ -91,12 +92,12 @@ class Cushion:
         z_mm, slope_x, slope_y : (n,) arrays
             World z over the places, and its slopes.
         """
-        raised_mm, tilt_x, tilt_y, saddle_mm, diagonal_mm = self.errors
+        raised_mm, tilt_x, tilt_y, saddle_mm, diagonal_mm, lifted_mm = self.errors
         bowl = Surface.hencky_bowl(self.bulge_mm + raised_mm, self.radius_mm)
         x, y = place / self.radius_mm
         height = bowl.height(place[0], place[1])
         slope_x, slope_y = bowl.slopes(place[0], place[1])
-        top = rim_z_mm + self.rim_gap_mm + self.bulge_mm + raised_mm
+        top = rim_z_mm + self.rim_gap_mm + self.bulge_mm + raised_mm + lifted_mm
         # Errors of form: tilts, and two saddles that are turned by 45 degrees.
         tilted = 1e-3 * (tilt_x * place[0] + tilt_y * place[1])
         saddle = saddle_mm * (x * x - y * y) + 2 * diagonal_mm * x * y

@@ -22,8 +22,8 @@ _COARSE_PLACES = 3000  # on the mirror, to find the part that shows the pattern
 _PLACES = 300  # in that part
 _PLACING_STEPS = 6  # of rays to the mirror: each contracts by slope times inclination
 _PAD = 1.1  # radius of the traced part over that of the part that shows the pattern
-# Steps of the errors of form, for the derivatives: mm, mrad, mrad, mm, mm.
-_STEPS = (0.5, 0.5, 0.5, 0.2, 0.2)
+# Steps of the errors of form, for the derivatives: mm, mrad, mrad, mm, mm, mm.
+_STEPS = (0.5, 0.5, 0.5, 0.2, 0.2, 0.5)
 # How far beside the pattern, on the screen, a film with errors may still show it: 2 mrad of tilt,
 # 1 mm of bulge.
 MARGIN_MM = 15.0

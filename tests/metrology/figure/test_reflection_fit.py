@@ -74,8 +74,8 @@ def test_the_fit_measures_the_bulge() -> None:
     front = front_of(None)
     other = replace(front, shape=FilmShape(64.9))
     fit = fit_of(trace_phases(other, *MIDDLE))
-    assert fit.errors[0] == pytest.approx(1.5, abs=0.1)
-    assert fit.errors[1:] == pytest.approx(np.zeros(4), abs=0.1)
+    assert fit.errors[0] == pytest.approx(1.5, abs=0.15)
+    assert fit.errors[1:5] == pytest.approx(np.zeros(4), abs=0.1)
     expected = np.array(front.image_shares) / front.transmittance**2
     assert fit.shares == pytest.approx(expected, rel=0.03)
 
