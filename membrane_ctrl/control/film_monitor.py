@@ -242,6 +242,11 @@ class FilmMonitor:
         return next(filter(None, contradictions), "")
 
     @property
+    def share_of_minutes(self) -> float:
+        """How far sensor and gauge have moved apart within minutes, in units of the limit."""
+        return self.memory.minutes.share
+
+    @property
     def drifting(self) -> bool:
         """Sensor and gauge have moved apart over hours, as by climate or a slow drift."""
         return self.memory.drifting

@@ -7,6 +7,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import (
     film_health,
     film_monitor,
+    gas_balance,
     inner_loop,
     leak_growth,
     maintenance_notice,
@@ -72,6 +73,7 @@ class SensorConsistencyState(StateNode):
         default_factory=film_monitor.FilmMonitorState
     )
     redundancy: RedundancyState = field(default_factory=RedundancyState)
+    gas: gas_balance.GasBalanceState = field(default_factory=gas_balance.GasBalanceState)
     growth: leak_growth.LeakGrowth = field(default_factory=leak_growth.LeakGrowth)
     laser_missing_s: float = 0.0
     doubted: bool = False
@@ -123,6 +125,7 @@ class SensorConsistency:
         limits, mirror = config.limits, config.optics.mirror
         self._laser_film = film_monitor.FilmMonitor(limits, mirror, "laser", memory.laser_film)
         self._optics_film = film_monitor.FilmMonitor(limits, mirror, "optics", memory.optics_film)
+        self._gas = gas_balance.GasBalance(memory.gas)
         self._nominal_sag_um = 1e3 * config.optics.mirror.sag_mm
         self._by_optics = config.by_optics
         self._follows_optics = config.estimates_centre
@@ -190,6 +193,7 @@ class SensorConsistency:
         self.memory.laser_missing_s = min(
             max(self.memory.laser_missing_s + change_s, 0.0), _MISSING_MAX_S
         )
+        self._count_gas(state, dt_s, held)
         # Two sensors: laser (or optics) and gauge, in each state
         self._compare_with_gauge(state, dt_s, held)
         events = self._report_doubtful_sag(state) + self._notice_drift(state)
@@ -294,7 +298,17 @@ class SensorConsistency:
         gauge_pa = held.gauge_pressure_pa
         by_laser = self._laser_film.step(dt_s, held.laser_um, held.trim_um, gauge_pa)
         by_optics = self._optics_film.step(dt_s, held.sag_um - self._nominal_sag_um, 0.0, gauge_pa)
-        self.memory.laser_gauge_apart = by_optics if self._optics_alone else by_laser
+        if not self._optics_alone:
+            self.memory.laser_gauge_apart = by_laser
+        else:
+            by_gas = self._gas.explain_contradiction(self._optics_film.share_of_minutes)
+            self.memory.laser_gauge_apart = by_optics or by_gas
+
+    def _count_gas(self, state: State, dt_s: float, held: HoldStatus) -> None:
+        """Count the gas that enters while the optics hold the mirror in the lost laser's place."""
+        rests = state in state_sets.AT_SETPOINT and abs(held.ramp_left_um) <= self._far_um
+        alone = rests and self._optics_alone and not self._by_optics
+        self._gas.step(held.flow_um_per_s, held.leak_um_per_s, alone, dt_s)
 
     @property
     def _film_in_use(self) -> film_monitor.FilmMonitor:
