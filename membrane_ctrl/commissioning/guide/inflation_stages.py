@@ -4,7 +4,8 @@ The controller of a hold moves the gas, with every safety rule on. Between two d
 mirror and a person confirms the next one.
 """
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +40,21 @@ class DepthPoint:
     pressure_pa: float
 
 
+@contextlib.contextmanager
+def without_camera(context: StageContext) -> Iterator[None]:
+    """Let holds run without the camera: it is not commissioned yet, or used by the session itself.
+
+    The controller would also compare laser and camera over steps of many millimetres, for which
+    the camera's model of the bowl is not meant.
+    """
+    is_enabled = context.config.shape.enabled
+    context.set_keys("shape", enabled=False)
+    try:
+        yield
+    finally:
+        context.set_keys("shape", enabled=is_enabled)
+
+
 def inflate_in_steps(context: StageContext) -> None:
     """Fill the mirror in steps, and compare laser and gauge."""
     facts = context.facts
@@ -49,7 +65,10 @@ def inflate_in_steps(context: StageContext) -> None:
     context.set_keys("limits", displacement_min_um=-_HELD_LEAST_SHARE * sag_um)
     points: list[DepthPoint] = []
     try:
-        with context.access.start_hold(context.folder, context.config, "inflation") as link:
+        with (
+            without_camera(context),
+            context.access.start_hold(context.folder, context.config, "inflation") as link,
+        ):
             present_um = wait_for_row(link).displacement_um
             if not np.isfinite(present_um):
                 raise StageFailedError(
@@ -184,7 +203,10 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
 def measure_leak(context: StageContext) -> None:
     """Hold the mirror, switch the pump off for a minute, and see how fast it sinks."""
     try:
-        with context.access.start_hold(context.folder, context.config, "leak") as link:
+        with (
+            without_camera(context),
+            context.access.start_hold(context.folder, context.config, "leak") as link,
+        ):
             hold_depth(context, link, context.config.loop.setpoint_um)
             held = collect_rows(link, context.plan.settled_s)
             link.send_command(Command("lower", _WHO))
@@ -245,7 +267,8 @@ def run_tuning_in_hold(context: StageContext, run_name: str, command: str) -> in
 def map_pump(context: StageContext) -> None:
     """Measure the pump's curve with `tune pump`."""
     context.dialogue.show("  `membrane-ctrl tune pump` measures it; 15 to 35 min at a real bench")
-    code = run_tuning_in_hold(context, "pump", "pump")
+    with without_camera(context):
+        code = run_tuning_in_hold(context, "pump", "pump")
     context.require(
         "pump's curve", code == 0, f"exit code {code}", "read the messages above; then try again"
     )

@@ -9,7 +9,7 @@ import numpy as np
 from membrane_ctrl.commissioning.guide import thresholds
 from membrane_ctrl.commissioning.guide.bench_access import HandAct, HandMotion
 from membrane_ctrl.commissioning.guide.dialogue import Choice
-from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth
+from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth, without_camera
 from membrane_ctrl.commissioning.guide.rim_edge import measure_rim_edge_px
 from membrane_ctrl.commissioning.guide.session_state import (
     CONFIGURATION,
@@ -92,16 +92,15 @@ def ask_geometry(context: StageContext) -> None:
 @contextlib.contextmanager
 def hold_without_camera(context: StageContext, name: str) -> Iterator[None]:
     """Hold the mirror at its depth while this session, and not the hold, uses the camera."""
-    context.set_keys("shape", enabled=False)
     try:
-        with context.access.start_hold(context.folder, context.config, name) as link:
+        with (
+            without_camera(context),
+            context.access.start_hold(context.folder, context.config, name) as link,
+        ):
             hold_depth(context, link, context.config.loop.setpoint_um)
-            context.set_keys("shape", enabled=True)
             yield
     except HoldError as error:
         raise StageFailedError(f"the controller ended it: {error}") from None
-    finally:
-        context.set_keys("shape", enabled=True)
 
 
 def focus_camera(context: StageContext) -> None:
