@@ -19,6 +19,7 @@ _FITTED_BINS = 6000  # that determine it
 _ROUNDS = 4  # of its fit, each without the bins that are brighter
 _LEAST_SHARE = 0.02  # of the light
 _CLEAR_SIGMAS = 6.0
+_LARGEST_SQUARE = 5  # bins along a side
 _LEAST_BINS = 12
 _LEAST_PART, _LARGEST_PART = 5e-4, 0.3  # of the mirror's bins
 _STEEP = 0.2  # largest excess outside the edge of the patch over that inside it
@@ -105,7 +106,13 @@ def find_film_image(
         usual = np.abs(excess) < max(_LEAST_SHARE / 2, 3 * sigma)
         if np.mean(usual) < 1 - _LARGEST_PART:
             return NO_FILM_IMAGE
-    bright = excess > max(_LEAST_SHARE, _CLEAR_SIGMAS * sigma)
+
+    # Noisy bins are averaged over squares.
+    side = 1
+    while sigma / side > _LEAST_SHARE / _CLEAR_SIGMAS and side < _LARGEST_SQUARE:
+        side += 2
+    excess = _average_bins(shape, index, excess, side)
+    bright = excess > max(_LEAST_SHARE, _CLEAR_SIGMAS * sigma / side)
 
     # The largest connected patch of brighter bins.
     picture = np.zeros(shape, np.uint8)
@@ -129,6 +136,7 @@ def find_film_image(
     if not around.any() or np.median(excess[around]) > _STEEP * np.median(excess[within]):
         return NO_FILM_IMAGE
     swing_excess = _excess_over_smooth(swing, columns, usual)
+    swing_excess = _average_bins(shape, index, swing_excess, side)
     if float(np.mean(swing_excess[inside])) > _SWING_SHARE * share:
         return NO_FILM_IMAGE
     x_mm, y_mm = position_mm[:, inside]
@@ -162,6 +170,22 @@ def _excess_over_smooth(values: FloatArray, columns: FloatArray, usual: BoolArra
     known = columns[some]
     solved = np.linalg.solve(known.T @ known, known.T @ values[some])
     return np.asarray(values / (columns @ solved) - 1)
+
+
+def _average_bins(
+    shape: tuple[int, int], index: IntArray, values: FloatArray, side: int
+) -> FloatArray:
+    """Means of values (n,) over squares of bins, of those that have one."""
+    if side == 1:
+        return values
+    sums = np.zeros(shape)
+    known = np.zeros(shape)
+    sums.reshape(-1)[index] = values
+    known.reshape(-1)[index] = 1.0
+    square = (side, side)
+    mean = cv2.blur(sums, square, borderType=cv2.BORDER_CONSTANT)
+    share = cv2.blur(known, square, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(mean.reshape(-1)[index] / share.reshape(-1)[index])
 
 
 def _ring_around(patch: BoolArray) -> BoolArray:

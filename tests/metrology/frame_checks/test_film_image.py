@@ -11,7 +11,9 @@ SHAPE = (128, 153)
 MM = 7.0  # of a bin on the mirror
 
 
-def find(light_excess: float, swing_excess: float, blur: bool = False) -> FilmImage:
+def find(
+    light_excess: float, swing_excess: float, blur: bool = False, noise: float = 1.0
+) -> FilmImage:
     """Search bins of which a rectangle is brighter."""
     row, column = np.indices(SHAPE).reshape(2, -1)
     position_mm = MM * np.stack([column - 76.0, 63.5 - row])
@@ -23,8 +25,8 @@ def find(light_excess: float, swing_excess: float, blur: bool = False) -> FilmIm
         patch = np.exp(-((x - 0.05) ** 2 + y**2) / 0.05)
     rng = np.random.default_rng(1)
     smooth = 1000 * (1 - 0.2 * x + 0.1 * y - 0.15 * (x**2 + y**2))
-    light = smooth * (1 + light_excess * patch) + rng.normal(0, 1, x.size)
-    swing = smooth / 2 * (1 + swing_excess * patch) + rng.normal(0, 1, x.size)
+    light = smooth * (1 + light_excess * patch) + rng.normal(0, noise, x.size)
+    swing = smooth / 2 * (1 + swing_excess * patch) + rng.normal(0, noise, x.size)
     return find_film_image(SHAPE, index, position_mm, light, swing)
 
 
@@ -35,6 +37,11 @@ def test_a_patch_of_added_light_is_named_with_place_and_share() -> None:
     assert found.width_mm == pytest.approx(2 * 0.12 * 475, abs=15)
     assert "14% of the light" in found.describe()
     assert "mirror.front_film" in found.describe()
+
+
+def test_noise_of_the_bins_does_not_hide_a_patch() -> None:
+    assert find(0.14, 0.0, noise=35.0).share == pytest.approx(0.14, abs=0.03)
+    assert not find(0.0, 0.0, noise=35.0).is_found
 
 
 @pytest.mark.parametrize(

@@ -54,3 +54,17 @@ def test_a_stated_film_leaves_the_figure_of_a_single_one(tmp_path: Path) -> None
     change_um = 1e3 * (cushion.full.height_mm() - single.height_mm())
     assert abs(float(np.nanmedian(change_um))) < 0.05
     assert float(np.nanmax(np.abs(change_um))) < 0.3
+
+
+def test_a_path_traced_film_that_is_not_stated_is_named() -> None:
+    """Pictures of a renderer that nobody of this project wrote, of one pixel a bin."""
+    measurement = measure_set(Path("tests/data/path_traced/front-film"))
+    assert measurement.verdict == "degraded"
+    assert "a second reflection of the screen at" in measurement.reason
+
+
+@pytest.mark.campaign
+def test_a_path_traced_single_film_is_not_blamed() -> None:
+    checked = measure_set(Path("tests/data/path_traced/sound")).checked
+    assert checked is not None
+    assert not checked.image.is_found
