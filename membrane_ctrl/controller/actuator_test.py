@@ -50,8 +50,6 @@ _ASSUMED_MOST_SHARE = 8.0
 # with everything off shows nothing by rising.
 _SINKS_SIGMAS = 1.0
 _ROSE_SIGMAS = 2.5
-# A pump this much stronger than assumed is taken as a straight line through its measured flow.
-_STRONGER = 1.5
 # In that time its speed is measured over so many seconds.
 _LATE_WINDOW_MOST_S = 5.0
 # A straight line that leaves more than this was disturbed: by something in the beam, or a door.
@@ -238,7 +236,8 @@ class ActuatorTest:
         they allow, it may give several times the leak.
         """
         memory = self.memory
-        if not self._assumed or not memory.flow_um_per_s > _STRONGER * self._expected_um_per_s:
+        most_um_per_s = _PUMP_MOST_SHARE * self._expected_um_per_s
+        if not self._assumed or not memory.flow_um_per_s > most_um_per_s:
             return None
         return memory.pump.model_copy(
             update={

@@ -637,11 +637,16 @@ class Controller:
         pump = context.found_pump
         if pump is None or self._gains.on_trial:
             return
-        self._gains.replace_pump(pump)
-        self._set_gains(context.loop_config)
+        assumed_um_per_s = self._config.pump.flow_full_um_per_s
+        loop = context.loop_config
+        if loop.flow_max_um_per_s >= assumed_um_per_s:
+            # The limit was that of the assumed pump. From none to full within two seconds
+            most_um_per_s = min(pump.flow_full_um_per_s, 2.0 * loop.flow_rate_limit_um_per_s2)
+            loop = loop.model_copy(update={"flow_max_um_per_s": most_um_per_s})
+        self._gains.replace_pump(pump, loop)
+        self._set_gains(loop)
         # The loop began in this tick at the flow of the leak, by the assumed curve
         context.loop.start(context.observer.displacement_um, context.found_leak_um_per_s)
-        assumed_um_per_s = self._config.pump.flow_full_um_per_s
         events.append(PumpStronger(pump.flow_full_um_per_s, assumed_um_per_s))
 
     def _use_response(self, events: list[Event]) -> None:

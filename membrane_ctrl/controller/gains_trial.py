@@ -85,10 +85,12 @@ class GainsTrial:
         self.memory.good = self.memory.tried
         self._end_trial()
 
-    def replace_pump(self, pump: PumpConfig) -> None:
-        """Replace the pump's curve, which is not on trial, by another one that stays."""
+    def replace_pump(self, pump: PumpConfig, loop: LoopConfig) -> None:
+        """Replace the pump's curve, which is not on trial, and the loop's settings by others that
+        stay.
+        """
         self.memory.tried = replace(self.memory.tried, pump=pump)
-        self.keep()
+        self.limit(loop)
 
     def limit(self, loop: LoopConfig) -> None:
         """Replace the loop's settings, which are not on trial, by others that stay."""

@@ -251,6 +251,7 @@ def test_a_hold_of_an_unknown_pump_begins_with_the_defaults(pump: ForeignPump) -
     events = [event for tick in ticks if tick is not None for event in tick.events]
     found = [event for event in events if isinstance(event, PumpStronger)]
     assert len(found) == (pump.shape == "root")
+    assert run.loop_config.flow_max_um_per_s == pytest.approx(run.pump_config.flow_full_um_per_s)
     assert run.pump_config.flow_full_um_per_s == (
         found[0].flow_full_um_per_s if found else config.pump.flow_full_um_per_s
     )
