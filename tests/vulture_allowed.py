@@ -167,3 +167,4 @@ _.use_mirror  # another bench than the twin, for tests
     over_min,
 )  # of events, which are written as a whole
 _.ok  # of an answer of the control port, checked and passed on as a whole
+_.held_offset_sigma_um  # a column of telemetry, recorded and published as a whole

@@ -104,7 +104,6 @@ class HeldScalar:
             distrust=distrust if distrust != NO_REASON else _distrust_figures(figures),
         )
         context.held_offset_um = offset.step(given)
-        context.held_offset_sigma_um = offset.sigma_um
         # 3. What is news
         memory = offset.memory
         events: list[Event] = []

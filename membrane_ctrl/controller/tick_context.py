@@ -65,9 +65,7 @@ class TickContextState(StateNode):
     # of the last tick
     last_pump_fraction: float = 0.0
     trim_um: float = 0.0
-    # by how much the vertex is moved so that another scalar stays; NaN sigma before it is known
-    held_offset_um: float = 0.0
-    held_offset_sigma_um: float = math.nan
+    held_offset_um: float = 0.0  # by how much the vertex is moved so that another scalar stays
     laser_doubted: bool = False  # optics and gauge contradict it
     output: inner_loop.LoopOutput | None = None
     why: Reason = NO_REASON
