@@ -61,12 +61,13 @@ def run_hold(
     alter: Alter | None = None,
     commands: dict[int, Command] | None = None,
     continued_at_s: float = math.inf,
+    figures_s: float = 0.5,
 ) -> list[VirtualTick]:
     """A hold with two figures a second of a film that changes."""
     bench = VirtualBench(Plant(config.twin, config.pump))
     film = ChangingFilm(bench, config, 3, spherical_at, alter)
     run = VirtualRun(config, bench, zernike_projection(), film)
-    run._shape_period_s = 0.5
+    run._shape_period_s = figures_s
     asked = {1: Command("hold", "a test", "it runs")} | (commands or {})
     ticks: list[VirtualTick] = []
     while run.now_s < until_s:
@@ -124,6 +125,15 @@ def test_a_held_vertex_lets_the_focus_wander() -> None:
     wandered = focus_change_mm(kept_hold("vertex"))
     assert abs(wandered) == pytest.approx(0.093, abs=0.012)
     assert math.isnan(kept_hold("vertex")[-1].row.held_offset_um)
+
+
+def test_focus_stays_without_a_laser() -> None:
+    config = config_of("focus", "optics").model_copy(
+        update={"twin": TWIN.model_copy(update={"laser": False})}
+    )
+    ticks = run_hold(config, 100.0, figures_s=0.2)
+    assert ticks[-1].row.state == State.HOLD
+    assert abs(focus_change_mm(ticks)) < 0.012
 
 
 def test_best_fit_has_the_least_rms() -> None:
