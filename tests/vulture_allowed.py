@@ -82,6 +82,7 @@ _.__init_subclass__  # Python calls it
     _.slope_rms_urad,
 )  # written and read by their names
 _.spot_rms_mm, _.spot_50_mm, _.spot_80_mm, _.spot_95_mm
+_.star_path_rms_um, _.strehl
 _.places_mm, _.misfit, _.crossed_phasors  # a library: docs/how-to/library.md
 _.to_xarray, open_result, open_stability  # for scripts: docs/how-to/data.md
 (

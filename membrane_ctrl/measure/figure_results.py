@@ -23,6 +23,8 @@ from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 ENERGY_SHARES = np.linspace(0.01, 1.0, 100)
+# Numbers of the light at the focus, which a convex mirror does not have
+_AT_FOCUS = ("best_focus", "spot", "star", "strehl")
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class MeasuredFigure:
     spectrum: PowerSpectrum
     seen: SurfaceMap
     aperture_mm: float
+    wavelength_um: float
     nominal_radius_mm: float | None
 
     @property
@@ -72,13 +75,22 @@ def measured_figure(
     if np.count_nonzero(np.isfinite(seen.height_mm)) < LEAST_CELLS:
         return None
     # The figure, and its bars: each error is added to it and evaluated as the figure is.
-    evaluate = FigureOf(seen, aperture)
+    evaluate = FigureOf(seen, aperture, mirror.wavelength_um)
     found = evaluate(seen)
     trials = FigureTrials(evaluate, seen, found, mirror.radius_mm)
     of_noise = trials.figure_bars(bars.noise, bars.cell_slope)
     of_geometry = trials.figure_bars(bars.geometry)
     spectrum = power_spectrum(found, seen.axis_mm, aperture)
-    return MeasuredFigure(found, of_noise, of_geometry, spectrum, seen, aperture, nominal_radius_mm)
+    return MeasuredFigure(
+        found,
+        of_noise,
+        of_geometry,
+        spectrum,
+        seen,
+        aperture,
+        mirror.wavelength_um,
+        nominal_radius_mm,
+    )
 
 
 def figure_table(
@@ -101,7 +113,7 @@ def figure_table(
         if item is None
     }
     if found.figure.numbers.best_focus_mm <= 0:  # behind the mirror
-        for name in [name for name in numbers if name.startswith(("best_focus", "spot"))]:
+        for name in [name for name in numbers if name.startswith(_AT_FOCUS)]:
             numbers[name], missing[name] = None, "the mirror has no real focus"
     if found.power_um is None:
         missing["power_um"] = "no nominal radius: give --nominal-radius-mm"
@@ -110,6 +122,7 @@ def figure_table(
     return {
         "aperture_radius_mm": found.aperture_mm,
         "centre_mm": [0.0, 0.0],
+        "wavelength_um": found.wavelength_um,
         "cell_mm": measurement.full.grid.step_mm if measurement.full else None,
         "geometry_spread": bars.statement.source,
         "numbers": {name: item for name, item in numbers.items() if item is not None},
@@ -216,6 +229,11 @@ def figure_lines(found: MeasuredFigure) -> list[str]:
             f"spot      {quantity('best_focus_mm', 'mm')} from the vertex: 80 % of the rays within "
             f"{quantity('spot_80_mm', 'mm')}, 50 % {quantity('spot_50_mm', 'mm')}, 95 % "
             f"{quantity('spot_95_mm', 'mm')} (radius)"
+        )
+        strehl = quantity("strehl", "").rstrip()
+        lines.append(
+            f"star      Strehl ratio at {found.wavelength_um:g} µm {strehl}; the paths to the "
+            f"focus differ by {quantity('star_path_rms_um', 'µm')} RMS"
         )
     return lines
 

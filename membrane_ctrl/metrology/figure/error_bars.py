@@ -69,7 +69,7 @@ class FigureTrials:
         if np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS:
             thin = seen
         self._thin = thin
-        self._rough = FigureOf(thin, evaluate.aperture_mm)
+        self._rough = FigureOf(thin, evaluate.aperture_mm, evaluate.wavelength_um)
         self._nominal = self._rough(thin)
         self._nominal_spot_mm = np.sort(self._nominal.spot_mm)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.metrology.figure import best_sphere
+from membrane_ctrl.metrology.figure import best_sphere, star_image
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.numerics import grid_fit, zernike
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
@@ -23,6 +23,7 @@ _PVR_TERMS = 36  # by definition, whatever the fit's own number
 _RINGS = 96  # knots of the rotationally invariant part: 5 mm on a 1 m mirror
 _SEPARABLE = 1e-10  # eigenvalue over the largest, below which knots are without cells
 ENERGY_SHARES = (0.5, 0.8, 0.95)  # of the encircled energy
+WAVELENGTH_UM = 1000.0  # of the Strehl ratio, unless one is given
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,8 @@ class Quantities:
     spot_50_mm: float
     spot_80_mm: float
     spot_95_mm: float
+    star_path_rms_um: float
+    strehl: float
 
 
 @dataclass(frozen=True)
@@ -87,10 +90,15 @@ class FigureOf:
         cells.
     aperture_mm : float
         Radius of the aperture, by which the Fringe terms are counted.
+    wavelength_um : float
+        Of the Strehl ratio.
     """
 
-    def __init__(self, seen: SurfaceMap, aperture_mm: float) -> None:
+    def __init__(
+        self, seen: SurfaceMap, aperture_mm: float, wavelength_um: float = WAVELENGTH_UM
+    ) -> None:
         self.aperture_mm = aperture_mm
+        self.wavelength_um = wavelength_um
         self._mask = np.isfinite(seen.height_mm)
         axis = seen.axis_mm / aperture_mm
         self.fringe = grid_fit.GridFit(axis, self._mask, _FRINGE)
@@ -133,6 +141,8 @@ class FigureOf:
         focus_mm, spot_mm = _compute_spot(sphere, points, normals)
         spot_50_mm, spot_80_mm, spot_95_mm = np.quantile(spot_mm, ENERGY_SHARES)
 
+        strehl, path_rms_um = star_image.find_strehl(points, self.wavelength_um)
+
         radius_mm = np.nan
         if sphere.curvature_per_mm != 0:
             radius_mm = 1 / sphere.curvature_per_mm
@@ -153,6 +163,8 @@ class FigureOf:
             spot_50_mm=float(spot_50_mm),
             spot_80_mm=float(spot_80_mm),
             spot_95_mm=float(spot_95_mm),
+            star_path_rms_um=path_rms_um,
+            strehl=strehl,
         )
         return Figure(
             numbers=numbers,

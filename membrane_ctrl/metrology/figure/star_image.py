@@ -6,10 +6,11 @@ counted from a plane in front of the mirror, is
 
     L = |F - P| - z.
 
-F makes the mean square of L - mean(L) least, so the best focus and a tilt of the mirror are no
-error. The point spread function is the squared modulus of the Fourier transform of
-exp(2 pi i L / wavelength) over the aperture, as POPPY and prysm define it; divided by that of equal
-paths, its largest value is the Strehl ratio.
+F makes the mean square of L - mean(L) least. The wave comes along the axis of the paraboloid
+through the points: a telescope is pointed, and a tilt of the mirror is no error. The point spread
+function is the squared modulus of the Fourier transform of exp(2 pi i L / wavelength) over the
+aperture, as POPPY and prysm define it; divided by that of equal paths, its largest value is the
+Strehl ratio.
 """
 
 from dataclasses import dataclass
@@ -83,7 +84,7 @@ def image_star(axis_mm: FloatArray, height_mm: FloatArray, wavelength_um: float)
     mask = np.isfinite(height_mm)
     rows, columns = np.nonzero(mask)
     points = np.stack((axis_mm[columns], axis_mm[rows], height_mm[mask]))
-    focus_mm, path_mm = _find_focus(points)
+    focus_mm, path_mm = find_paths(points)
     path_um = 1e3 * (path_mm - path_mm.mean())
     paths = np.zeros(mask.shape)
     paths[mask] = path_um
@@ -108,25 +109,56 @@ def image_star(axis_mm: FloatArray, height_mm: FloatArray, wavelength_um: float)
     )
 
 
-def _find_focus(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The focus (3,) and the paths (n,) to it, in mm, by Gauss-Newton steps."""
+def find_paths(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The focus (3,) and the paths (n,) to it, in mm, by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    points_mm : (3, n) array
+        Points of the mirror.
+
+    Raises
+    ------
+    ValueError
+        A mirror without a focus in front of it.
+    """
     x, y, z = points_mm
-    # Start: the focus of the paraboloid through the points
-    square = x * x + y * y
-    columns = np.column_stack((np.ones_like(x), x, y, square))
-    curvature = np.linalg.lstsq(columns, z, rcond=None)[0][3]
+    # Start: the focus of the paraboloid through the points, whose axis is turned to z
+    scale_mm = float(np.sqrt(np.mean(x * x + y * y)))
+    u, v = x / scale_mm, y / scale_mm
+    columns = np.stack((np.ones_like(x), u, v, u * u + v * v))
+    found = np.linalg.solve(columns @ columns.T, columns @ z)
+    tilt_x, tilt_y, curvature = found[1:] / (scale_mm, scale_mm, scale_mm**2)
     if curvature <= 0:
         raise ValueError("the mirror has no focus in front of it")
+    z = z - tilt_x * x - tilt_y * y
+    points_mm = np.stack((x, y, z))
     focus = np.array([0.0, 0.0, 1 / (4 * curvature)])
     for _ in range(_NEWTON_STEPS):
         towards = focus[:, None] - points_mm
         distance = np.linalg.norm(towards, axis=0)
         path = distance - z
-        gradient = (towards / distance).T
-        rows = np.column_stack((gradient, np.ones_like(x)))
-        focus = focus - np.linalg.lstsq(rows, path - path.mean(), rcond=None)[0][:3]
+        # Both without their means, as the mean path is free
+        gradient = towards / distance
+        gradient -= gradient.mean(axis=1, keepdims=True)
+        focus = focus - np.linalg.solve(gradient @ gradient.T, gradient @ (path - path.mean()))
     path = np.linalg.norm(focus[:, None] - points_mm, axis=0) - z
     return focus, path
+
+
+def find_strehl(points_mm: FloatArray, wavelength_um: float) -> tuple[float, float]:
+    """Strehl ratio in the focus of least path differences, and their RMS in µm; NaN without one.
+
+    Where the paths differ by much less than the wavelength, this is the largest value of the point
+    spread function.
+    """
+    try:
+        _, path_mm = find_paths(points_mm)
+    except ValueError:
+        return np.nan, np.nan
+    path_um = 1e3 * (path_mm - path_mm.mean())
+    amplitude = np.mean(np.exp(2j * np.pi * path_um / wavelength_um))
+    return float(np.abs(amplitude) ** 2), float(np.sqrt(np.mean(path_um**2)))
 
 
 def _is_resolved(paths_um: FloatArray, mask: FloatArray, wavelength_um: float) -> bool:

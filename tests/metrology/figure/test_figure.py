@@ -170,6 +170,8 @@ def test_the_spot_of_a_paraboloid_is_a_point_in_its_focus() -> None:
     found = of(seen((X**2 + Y**2) / (4 * 1700.0))).numbers
     assert found.best_focus_mm == pytest.approx(1700, abs=1e-3)
     assert found.spot_95_mm < 1e-6
+    assert found.strehl == pytest.approx(1.0, abs=1e-9)
+    assert found.star_path_rms_um < 1e-6
 
 
 def test_the_spot_agrees_with_a_ray_trace_by_householder() -> None:
