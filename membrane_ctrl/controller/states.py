@@ -89,7 +89,10 @@ def inflate(context: TickContext) -> State:
     for a mirror that lags behind.
     """
     states = context.config.states
-    lag = abs(context.loop.lag_um) / states.inflate_pause_um
+    # A mirror ahead of the ramp must not stop it: with a slow leak it would never be caught up.
+    rises_to_target = context.setpoint_um >= context.loop.ramp_um
+    behind_um = context.loop.lag_um if rises_to_target else -context.loop.lag_um
+    lag = behind_um / states.inflate_pause_um
     output = drive_pump(context, context.loop.ramp_um if lag > 1.0 else context.setpoint_um)
     to_go_um = context.setpoint_um + context.setpoint_shift_um - output.filtered_um
     unseen = NO_REASON if math.isfinite(to_go_um) else context.observer.missing_reason

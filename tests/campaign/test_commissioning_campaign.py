@@ -3,7 +3,8 @@ hour of hold, and on benches whose physics share no code with the twin.
 
     python -m tests.campaign.test_commissioning_campaign FOLDER [STAGE ...]
 
-runs or resumes the session on the twin.
+runs or resumes the session on the twin with a hold of five minutes; named stages begin with the
+mirror at its depth.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.hold.virtual_hold import VirtualHold
 from membrane_ctrl.measure.simulate import shrink_camera
 from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.sim import plant, virtual_bench
 from tests.commissioning.guided import Person, QuickBench, run_stages, state_of
 from tests.worlds.eleven_benches import BENCHES, Bench
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench
@@ -47,9 +49,14 @@ def checks_of(folder: Path) -> dict[str, CheckRecord]:
     return {check.name: check for record in state_of(folder).records for check in record.checks}
 
 
-def run_on_twin(folder: Path, *names: str) -> tuple[Exit, Person]:
+def run_on_twin(
+    folder: Path, *names: str, plan: SessionPlan = HOUR, is_filled: bool = False
+) -> tuple[Exit, Person]:
     """Run or resume a session with a camera of a quarter of the resolution."""
     bench = EmulatedBench(VirtualHold)
+    if is_filled:
+        config = Config()
+        bench.use_mirror(virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump)))
     person = Person(**OPTICS)
     if not (folder / "lab.toml").exists():
         run_stages(folder, bench, person, *DESK)
@@ -57,7 +64,7 @@ def run_on_twin(folder: Path, *names: str) -> tuple[Exit, Person]:
         camera = shrink_camera(Config().optics.camera, 4)
         tables["optics"]["camera"] = camera.model_dump(exclude_none=True)
         write_tables(folder, tables)
-    return run_stages(folder, bench, person, *names, plan=HOUR), person
+    return run_stages(folder, bench, person, *names, plan=plan), person
 
 
 @pytest.mark.timeout(1800)
@@ -73,9 +80,8 @@ def test_a_session_with_pictures_tuning_and_an_hour(tmp_path: Path) -> None:
 @pytest.mark.parametrize("bench", BENCHES, ids=lambda bench: bench.name)
 def test_a_foreign_bench_at_its_depth(bench: Bench, tmp_path: Path) -> None:
     """Leak and hold are judged as they are, whichever pump and laser there are."""
-    plant = bench.plant(1)
     emulated = QuickBench()
-    emulated.use_mirror(foreign_bench(plant))
+    emulated.use_mirror(foreign_bench(bench.plant(1)))
     person = Person(**{"mirror.pump_ml_per_s": "6"})
     run_stages(tmp_path, emulated, person, *DESK)
     config = bench.config()
@@ -96,10 +102,10 @@ def test_a_foreign_bench_at_its_depth(bench: Bench, tmp_path: Path) -> None:
 
 def test_a_film_clamped_with_tension_is_filled_from_flat(tmp_path: Path) -> None:
     """Two fifths of its pressure are tension, which no thickness explains: not an error."""
-    plant = ForeignPlant(ForeignPump("top unreachable", full_um_per_s=88.0), seed=2)
-    plant.lower(500.0)
+    foreign = ForeignPlant(ForeignPump("top unreachable", full_um_per_s=88.0), seed=2)
+    foreign.lower(500.0)
     emulated = QuickBench()
-    emulated.use_mirror(foreign_bench(plant))
+    emulated.use_mirror(foreign_bench(foreign))
     run_stages(tmp_path, emulated, Person(), *DESK)
     person = Person()
     assert run_stages(tmp_path, emulated, person, "inflation", plan=SHORT) == Exit.DONE, person.text
@@ -110,10 +116,10 @@ def test_a_film_clamped_with_tension_is_filled_from_flat(tmp_path: Path) -> None
 
 def test_a_dead_zone_that_nobody_stated_is_refused(tmp_path: Path) -> None:
     """The pump gives nothing below a tenth of its drive, and was stated as proportional."""
-    plant = ForeignPlant(ForeignPump("straight", full_um_per_s=88.0), seed=2)
-    plant.lower(500.0)
+    foreign = ForeignPlant(ForeignPump("straight", full_um_per_s=88.0), seed=2)
+    foreign.lower(500.0)
     emulated = QuickBench()
-    emulated.use_mirror(foreign_bench(plant))
+    emulated.use_mirror(foreign_bench(foreign))
     run_stages(tmp_path, emulated, Person(), *DESK)
     person = Person()
     assert run_stages(tmp_path, emulated, person, "inflation", plan=SHORT) == Exit.INTERRUPTED
@@ -122,10 +128,10 @@ def test_a_dead_zone_that_nobody_stated_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_laser_at_the_wrong_depth_is_refused(tmp_path: Path) -> None:
-    plant = ForeignPlant(ForeignPump("top unreachable", full_um_per_s=88.0), seed=2)
-    plant.lower(6000.0)
+    foreign = ForeignPlant(ForeignPump("top unreachable", full_um_per_s=88.0), seed=2)
+    foreign.lower(6000.0)
     emulated = QuickBench()
-    emulated.use_mirror(foreign_bench(plant))
+    emulated.use_mirror(foreign_bench(foreign))
     run_stages(tmp_path, emulated, Person(), *DESK)
     emulated.bench.wrong.laser_offset_um = 8000.0  # mounted 8 mm too far away
     person = Person()
@@ -138,6 +144,7 @@ def test_a_laser_at_the_wrong_depth_is_refused(tmp_path: Path) -> None:
 if __name__ == "__main__":
     where = Path(sys.argv[1])
     where.mkdir(parents=True, exist_ok=True)
-    ended, seen = run_on_twin(where, *sys.argv[2:])
+    filled = len(sys.argv) > 2 and "inflation" not in sys.argv
+    ended, seen = run_on_twin(where, *sys.argv[2:], plan=SHORT, is_filled=filled)
     print(seen.text)
     sys.exit(ended)
