@@ -314,18 +314,11 @@ def _iterate(
     while True:
         # The equations about the present unknowns, and their solution.
         linear = _linearise_sets(problem, states, common, weights)
-        at_rim = np.zeros((common.size + 1, common.size + 1))
-        if problem.rim is not None:
-            at_rim = problem.rim.make_sums(problem.stated, common)
+        at_rim = _linearise_rim(problem, common)
         of_sets = np.sum([equations.eliminate_surface() for equations in linear], axis=0)
         sums = of_sets + make_prior(problem.sigmas, common) + at_rim
         step = solve_step(sums, problem.sigmas)
-        sigmas = np.sqrt(np.diag(step.covariance))
-        if not (np.isfinite(step.delta).all() and np.isfinite(sigmas).all()):
-            raise ValueError("the calibration diverges: the sets do not show the stated bench")
-        is_free = sigmas > 0
-        relative = np.abs(step.delta[is_free]) / sigmas[is_free]
-        change = float(np.max(relative, initial=0.0))
+        change = _largest_change(step)
         changes.append(change)
         if progress is not None:
             progress(len(changes), change)
@@ -374,6 +367,26 @@ def _iterate(
                 robust_weights.RobustWeights.from_residual(phases, residual_mm)
                 for phases, residual_mm in zip(problem.sets, left_mm, strict=True)
             )
+
+
+def _linearise_rim(problem: Problem, common: FloatArray) -> FloatArray:
+    """Equations (COMMON + 1, COMMON + 1) of the rim in the pictures; zeros where it is not seen."""
+    if problem.rim is None:
+        return np.zeros((common.size + 1, common.size + 1))
+    return problem.rim.make_sums(problem.stated, common)
+
+
+def _largest_change(step: SolverStep) -> float:
+    """Largest change of a free unknown by a step, in its standard deviations.
+
+    Raises ValueError if the steps diverge.
+    """
+    sigmas = np.sqrt(np.diag(step.covariance))
+    if not (np.isfinite(step.delta).all() and np.isfinite(sigmas).all()):
+        raise ValueError("the calibration diverges: the sets do not show the stated bench")
+    is_free = sigmas > 0
+    relative = np.abs(step.delta[is_free]) / sigmas[is_free]
+    return float(np.max(relative, initial=0.0))
 
 
 def _step_length(delta: FloatArray, sigmas: FloatArray) -> float:

@@ -16,27 +16,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from firmware_iface.optical_roles import Pattern
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle import cycle_geometry, cycle_motion
+from membrane_ctrl.metrology.cycle.cycle_sums import CycleSums
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.frame_checks import (
-    band_removal,
     film_image,
-    image_lag,
     picture_orientation,
 )
 from membrane_ctrl.metrology.frame_checks.clipping import ClippedShares
 from membrane_ctrl.metrology.phase import (
-    bin_sums,
     full_decoder,
     pattern_sequence,
     phase_change,
     phase_steps,
     screen_scale,
 )
-from membrane_ctrl.metrology.phase.clip_levels import ClipLevels, find_clip_levels
-from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.rays import geometry, ray_tracing, surface
 from membrane_ctrl.metrology.rays.film_reflections import find_reflecting_rays
 from membrane_ctrl.metrology.reconstruction import (
@@ -50,12 +45,10 @@ from membrane_ctrl.metrology.uncertainty import cycle_errors, geometry_spread
 from membrane_ctrl.metrology.uncertainty.geometry_statement import GeometryStatement
 from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding, find_motion_doubt
 from membrane_ctrl.model.arrays import (
-    AnyArray,
     ArrayLike,
     BoolArray,
     FloatArray,
     Image,
-    IntArray,
     Singles,
 )
 from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge_quality
@@ -133,20 +126,10 @@ class LiveReconstructor:
             [phase_steps.phase_sigma_rad(shifts, 1.0, 1.0) for shifts in self._shifts_rad]
         )
         self._slots = pattern_sequence.FullSlots(steps)
-        fringes = pattern_sequence.fringe_sequence(optics.pattern)
-        self._patterns = tuple(
-            replace(pattern, shift_rad=float(shift))
-            for pattern, shift in zip(fringes, self._shifts_rad.ravel(), strict=True)
-        )
-        # What the last full cycle found of the light: frequencies of backlight bands, the share of
-        # the previous picture, and why a cycle is degraded by either.
-        self._bands_rad = np.zeros(0)
-        self._lag = image_lag.ImageLag.unknown()
-        self._doubt = ""
+        # Why cycles are degraded by a front film that the last full cycle found; empty if by none.
         self._film_doubt = ""
         self._full_scale_adu = 2**optics.camera.bits - 1
-        size = (optics.camera.height_px, optics.camera.width_px)
-        self._binner = bin_sums.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
+        self._sums = CycleSums(optics, bin_px, self._shifts_rad)
         self._grid = bin_grid.BinGrid(self._geometry, optics.camera, bin_px)
         # Bins on the mirror, without those in which a front film may show the pattern again.
         near = self._grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
@@ -156,7 +139,7 @@ class LiveReconstructor:
         self._mm_per_rad = screen_scale.mm_per_rad(optics.pattern)
         self._pixel_sigma_adu = slope_noise.pixel_sigma_adu(optics.camera.noise_adu)
         self._tracked: tracked_points.TrackedPoints | None = None
-        bench = (optics, self._grid, self._binner.saturated.shape, bin_px)
+        bench = (optics, self._grid, self._sums.shape, bin_px)
         self._motion: cycle_motion.CycleMotion | None = None
         self._watch = cycle_errors.ErrorWatch(*bench, self._shifts_rad, laser_noise_um, spread)
         self._geometry_watch = (
@@ -190,16 +173,12 @@ class LiveReconstructor:
             self._reference_um = float(readings[np.isfinite(readings)][0])
 
         # Sums over the bins, without bands of the backlight.
-        self._binner.clear_saturation()
-        shown = [frames[k] for k in sinusoids]
-        self._binner.white_adu = find_clip_levels(shown, self._full_scale_adu).white_adu
-        self._binner.sum_frames(frames, range(len(frames)), watched=sinusoids)
-        self._take_bands(np.zeros(0))
+        self._sums.sum_full(frames)
 
         # Absolute phases of the bins near the mirror.
-        images = self._take_means(self._near)
+        images = self._sums.take_means(self._near)
         phase_rad = full_decoder.decode_full(images, optics.pattern, self._shifts_rad)
-        is_saturated = self._binner.saturated.ravel()[self._near] > 0
+        is_saturated = self._sums.find_saturated(self._near)
         phase_rad[:, is_saturated] = np.nan
 
         self._film_doubt = self._search_film_image(images, ~is_saturated).describe()
@@ -218,8 +197,9 @@ class LiveReconstructor:
             return make_rejected_cycle("full", times, readings, cause or str(error))
 
         # The figure, without light of previous pictures.
-        self._remove_lag_of_full(state)
-        self._watch.begin(state, self._lag)
+        places_px = np.stack([self._grid.column_px, self._grid.row_px])[:, state.index]
+        self._sums.remove_lag_of_full(state.index, places_px, state.accepted[:, 0])
+        self._watch.begin(state, self._sums.lag)
         self._statement = None
         estimate = self._follow_phases("full", state, times, readings)
         estimate = self._judge_geometry(estimate, state, readings)
@@ -260,11 +240,7 @@ class LiveReconstructor:
             return make_rejected_cycle(
                 "fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True
             )
-        self._binner.clear_saturation()
-        self._binner.sum_frames(frames, np.r_[self._slots.sinusoids].tolist())
-        if self._bands_rad.size:
-            self._take_bands(self._bands_rad)
-        self._remove_lag_of_fringes()
+        self._sums.sum_fringes(frames)
         estimate = self._follow_phases("fringes", self._tracked, times, readings)
         return self._degrade_contradicted(estimate)
 
@@ -330,9 +306,8 @@ class LiveReconstructor:
         """
         if self._geometry_watch is None or estimate.verdict == "rejected":
             return estimate
-        sinusoids = self._binner.sums[np.r_[self._slots.sinusoids]]
-        light = sinusoids.mean(axis=0) / self._bin_px**2
         tracer = self._make_tracer(readings)
+        light = self._sums.mean_light()
         self._statement = self._geometry_watch.judge(tracer, state, state.surface, light)
         return self._degrade_contradicted(estimate)
 
@@ -365,7 +340,7 @@ class LiveReconstructor:
         change_rad = state.fresh[:, 3]
         swing_adu = state.fresh[:, 4]
         modulation_adu = float(np.median(swing_adu[:, ::_EVERY]))
-        saturated = self._binner.saturated.ravel()[state.index] > 0
+        saturated = self._sums.find_saturated(state.index)
         has_fringes = swing_adu.min(axis=0) > full_decoder.FRINGE_SHARE * modulation_adu
         usable = ~saturated & has_fringes
         if reason := _find_loss_reason(change_rad, usable):
@@ -374,7 +349,7 @@ class LiveReconstructor:
         # The surface, without the effect of what the frames show of their own light and motion.
         fit = self._fit_points(state, usable, readings)
         cycle = cycle_errors.Cycle(
-            self._make_tracer(readings), state, fit, self._sinusoid_sums(), readings
+            self._make_tracer(readings), state, fit, self._sums.of_sinusoids(), readings
         )
         errors = self._watch.estimate_errors(cycle)
         corrected = fit.surface.parameters - errors.correction_mm
@@ -398,26 +373,6 @@ class LiveReconstructor:
             state.accept(fit.surface, usable)
             self._tracked = state
         return estimate
-
-    def _take_bands(self, known: FloatArray) -> None:
-        """Remove bands of the backlight from the sums.
-
-        `known` are the frequencies that the last full cycle found; empty in a full cycle.
-        """
-        # The sinusoids as means over bins, and the bands that they share.
-        slots = np.r_[self._slots.sinusoids]
-        binned = self._mean_of_bins(self._binner.sums[slots])
-        stack = self._stack_without_frames(self._patterns)
-        stack, binned, found = band_removal.remove_bands(stack, binned, known)
-        self._bands_rad = known if known.size else found
-        self._doubt = band_removal.describe_bands(stack.gain)
-        if known.size and not found.size:
-            self._doubt = (
-                "bands of the backlight could not be separated from other changes in this cycle"
-            )
-        elif found.size:
-            # Sums are integers: the corrected ones are rounded.
-            self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
 
     def _search_film_image(self, images: Singles, usable: BoolArray) -> film_image.FilmImage:
         """A second reflection of the screen in the bins near the mirror, by a front film that the
@@ -445,78 +400,9 @@ class LiveReconstructor:
         for slots, weights in zip(self._slots.sinusoids, self._weights, strict=True):
             _, cosine, sine = weights @ images[slots][:, seen]
             swing += np.hypot(cosine, sine) / 2
-        shape = self._binner.saturated.shape
         return film_image.find_film_image(
-            (shape[0], shape[1]), self._near[seen], position_mm[:, inside], light[seen], swing
+            self._sums.shape, self._near[seen], position_mm[:, inside], light[seen], swing
         )
-
-    def _remove_lag_of_full(self, state: tracked_points.TrackedPoints) -> None:
-        """Find the share of the previous picture in the frames of a full cycle, and remove it.
-
-        The first frame has no previous picture: its pattern is on the screen while the former cycle
-        is computed.
-        """
-        # The patterns of the cycle with the phase steps that were taken.
-        patterns = list(pattern_sequence.full_sequence(self._optics.pattern))
-        for slots, shifts in zip(self._slots.sinusoids, self._shifts_rad, strict=True):
-            for slot, shift in zip(range(slots.start, slots.stop), shifts, strict=True):
-                patterns[slot] = replace(patterns[slot], shift_rad=float(shift))
-        # A sample of the bins shows the shares.
-        stack = self._stack_without_frames(tuple(patterns))
-        some = image_lag.choose_lag_bins(state.index)
-        bins = state.index[some]
-        means = self._take_means(bins)
-        # Saturated bins are known of the sinusoids; other frames do not need them.
-        is_saturated = self._binner.saturated.ravel()[bins] > 0
-        levels = ClipLevels(self._binner.white_adu)
-        sample = Binned(self._bin_px, means, np.broadcast_to(is_saturated, means.shape), levels)
-        places_px = np.stack([self._grid.column_px[bins], self._grid.row_px[bins]])
-        phase_rad = state.accepted[:, 0, some]
-        self._lag = image_lag.find_image_lag(stack, sample, phase_rad, places_px)
-        # All bins are corrected.
-        if self._lag.corrected:
-            binned = self._mean_of_bins(self._binner.sums[: self._slots.count])
-            corrected = image_lag.remove_image_lag(stack, binned, self._lag)
-            slots = np.r_[self._slots.sinusoids]
-            self._binner.sums[slots] = np.rint(corrected.means[slots] * self._bin_px**2)
-        self._doubt = self._doubt or image_lag.describe_image_lag(self._lag)
-
-    def _remove_lag_of_fringes(self) -> None:
-        """Remove the share of the previous picture that the last full cycle found."""
-        if not self._lag.corrected:
-            return
-        slots = np.r_[self._slots.sinusoids]
-        stack = self._stack_without_frames(self._patterns)
-        binned = self._mean_of_bins(self._binner.sums[slots])
-        corrected = image_lag.remove_image_lag(stack, binned, self._lag)
-        self._binner.sums[slots] = np.rint(corrected.means * self._bin_px**2)
-
-    def _stack_without_frames(self, patterns: tuple[Pattern, ...]) -> FrameStack:
-        """The patterns of a cycle, of which only the bins are needed."""
-        none = np.empty((len(patterns), self._optics.camera.height_px, 0), np.uint8)
-        return FrameStack(none, patterns, np.full(len(patterns), math.nan), {})
-
-    def _mean_of_bins(self, sums: AnyArray) -> Binned:
-        """Sums of frames as means."""
-        # in single precision, which holds every sum exactly: a third of the time
-        means = sums.astype(np.float32)
-        means /= np.float32(self._bin_px**2)
-        saturated = np.broadcast_to(self._binner.saturated > 0, means.shape)
-        return Binned(self._bin_px, means, saturated, ClipLevels(self._binner.white_adu))
-
-    def _take_means(self, index: IntArray) -> Singles:
-        """Means (frames, n) of some bins in all frames of a full cycle."""
-        sums = self._binner.sums[: self._slots.count].reshape(self._slots.count, -1)
-        means = np.take(sums, index, axis=1).astype(np.float32)
-        means /= np.float32(self._bin_px**2)
-        return means
-
-    def _sinusoid_sums(self) -> list[AnyArray]:
-        """Bin sums (N, bins) of the sinusoids of x and of y."""
-        return [
-            self._binner.sums[slots].reshape(self._slots.steps, -1)
-            for slots in self._slots.sinusoids
-        ]
 
     def _track_phases(self, state: tracked_points.TrackedPoints, readings: FloatArray) -> None:
         """Fresh phases from the bin sums, corrected for the film's motion between the frames."""
@@ -534,7 +420,7 @@ class LiveReconstructor:
                 )
             )
         phase_change.update_phases(
-            self._sinusoid_sums(),
+            self._sums.of_sinusoids(),
             state.index,
             combined,
             state.sensitivity_rad_per_um,
@@ -605,7 +491,7 @@ class LiveReconstructor:
         geometry_sag_sigma_mm = math.sqrt(gradient @ self._watch.common_mm2 @ gradient)
 
         verdict, reason = judge_quality(quality)
-        doubt = self._doubt or self._film_doubt or motion_doubt
+        doubt = self._sums.doubt or self._film_doubt or motion_doubt
         if verdict == "ok" and doubt:
             verdict, reason = "degraded", doubt
         return ShapeEstimate(
@@ -639,7 +525,7 @@ class LiveReconstructor:
 
         After a motion the next cycle is the reference: what has moved stays there.
         """
-        if self._doubt or not np.isfinite(covariance_mm2).all():
+        if self._sums.doubt or not np.isfinite(covariance_mm2).all():
             if errors.is_reference:  # a disturbed cycle cannot be the reference
                 self._motion = None
             return None, ""

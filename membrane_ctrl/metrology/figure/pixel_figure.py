@@ -191,42 +191,20 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     -------
     PixelPoints
     """
-    stack = checked.stack
-    tracer = checked.tracer
-    surface = checked.state.surface
+    # Pixels of bins that have a phase, and their rays up to the surface of the bins.
+    row, column, in_bin = _list_pixels(checked)
+    index = row * checked.stack.size_px[1] + column
+    points = _follow_rays(checked, column, row)
+    del row, column
 
-    # The pixels of bins that have a phase, and the bin of each.
-    bin_px = checked.binned.bin_px
-    columns = checked.phase_rad.shape[2]
-    known = np.isfinite(checked.phase_rad).all(axis=0) & checked.near
-    row, column = np.nonzero(np.repeat(np.repeat(known, bin_px, axis=0), bin_px, axis=1))
-    index = row * stack.size_px[1] + column
-    in_bin = row // bin_px * columns + column // bin_px
-
-    # Their rays, followed to the surface of the bins.
-    rays = _trace_pixel_rays(tracer.geometry, column, row)
-    points = ray_tracing.Points.from_rays(rays, np.empty((2, index.size)))
-    del row, column, rays
-    points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
-    tracer.intersect(points, surface, newton=4)
-
-    # Their phases, in the period of their bin.
+    # Their phases, in the period of their bin: screen points.
     film = FilmMotion.from_set(checked)
-    moved = film.is_worth_correcting
-    motion_um = film.motion_um if moved else (None, None)
-    sensitivity_rad_per_um = np.zeros((2, index.size))
-    if moved:
-        sensitivity_mm_per_um = film_motion.sensitivity_mm_per_um(tracer, points, surface)
-        sensitivity_rad_per_um = sensitivity_mm_per_um / screen_scale.mm_per_rad(optics.pattern)
-    x_phases, y_phases = (
-        _axis_phases(checked, k, index, in_bin, sensitivity_rad_per_um[k], motion_um[k])
-        for k in range(2)
-    )
+    x_phases, y_phases = _phases_of_axes(optics, checked, film, points, index, in_bin)
     phase_rad = np.stack([x_phases.phase_rad, y_phases.phase_rad])
     points.screen_mm[:] = screen_scale.screen_mm(phase_rad, optics.pattern)
 
     # Without pixels beyond the analysed radius, with a clipped frame or with too weak fringes.
-    x_mm, y_mm = tracer.position_mm(points)
+    x_mm, y_mm = checked.tracer.position_mm(points)
     keep = x_mm**2 + y_mm**2 <= optics.mirror.analysis_radius_mm**2
     keep &= ~(x_phases.saturated | y_phases.saturated)
     swing_adu = np.minimum(x_phases.swing_adu, y_phases.swing_adu)
@@ -234,15 +212,16 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
 
     # Without the reflections of a front film, and pixels that show their edges.
     reflections = None
-    if tracer.geometry.cushion is not None:
+    if checked.tracer.geometry.cushion is not None:
         reflections, lost = _remove_reflections(optics, checked, points, keep)
         keep &= ~lost
     index = index[keep]
     swing_adu = swing_adu[keep]
-    noise_adu = pixel_noise.estimate_pixel_noise_adu(stack, checked.view.used, index)
+    noise_adu = pixel_noise.estimate_pixel_noise_adu(checked.stack, checked.view.used, index)
 
     # The copies of the points take the most memory of a measurement: free what is not needed.
-    del x_phases, y_phases, phase_rad, x_mm, y_mm, in_bin, sensitivity_rad_per_um
+    del x_phases, y_phases, phase_rad, x_mm, y_mm, in_bin
+    moved = film.is_worth_correcting
     return PixelPoints(index, points.subset(keep), swing_adu, noise_adu, moved, reflections)
 
 
@@ -289,6 +268,68 @@ def _remove_reflections(
     return fit, lost
 
 
+def _list_pixels(checked: Checked) -> tuple[IntArray, IntArray, IntArray]:
+    """Row, column and bin (n,) of each pixel of bins that have a phase."""
+    bin_px = checked.binned.bin_px
+    columns = checked.phase_rad.shape[2]
+    known = np.isfinite(checked.phase_rad).all(axis=0) & checked.near
+    row, column = np.nonzero(np.repeat(np.repeat(known, bin_px, axis=0), bin_px, axis=1))
+    in_bin = row // bin_px * columns + column // bin_px
+    return row, column, in_bin
+
+
+def _follow_rays(checked: Checked, column: IntArray, row: IntArray) -> ray_tracing.Points:
+    """The points where the rays of pixels meet the surface of the bins; no screen points yet."""
+    tracer = checked.tracer
+    rays = _trace_pixel_rays(tracer.geometry, column, row)
+    points = ray_tracing.Points.from_rays(rays, np.empty((2, column.size)))
+
+    # Newton's steps begin where each ray crosses the plane through the vertex.
+    points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
+    tracer.intersect(points, checked.state.surface, newton=4)
+    return points
+
+
+def _phases_of_axes(
+    optics: OpticsConfig,
+    checked: Checked,
+    film: FilmMotion,
+    points: ray_tracing.Points,
+    index: IntArray,
+    in_bin: IntArray,
+) -> tuple[PixelPhases, PixelPhases]:
+    """Phases of x and of y at some pixels, corrected for the film's motion if it is worth it.
+
+    Section 7 of docs/explanation/metrology.md.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The bench.
+    checked : Checked
+        The set.
+    film : FilmMotion
+        Motion of the film between its frames.
+    points : Points
+        The pixels on the surface.
+    index, in_bin : (n,) int arrays
+        Their numbers, and the bins that they are in.
+    """
+    motion_um: tuple[FloatArray | None, FloatArray | None] = (None, None)
+    sensitivity_rad_per_um = np.zeros((2, index.size))
+    if film.is_worth_correcting:
+        motion_um = film.motion_um
+        sensitivity_mm_per_um = film_motion.sensitivity_mm_per_um(
+            checked.tracer, points, checked.state.surface
+        )
+        sensitivity_rad_per_um = sensitivity_mm_per_um / screen_scale.mm_per_rad(optics.pattern)
+    x_phases, y_phases = (
+        _axis_phases(checked, k, index, in_bin, sensitivity_rad_per_um[k], motion_um[k])
+        for k in range(2)
+    )
+    return x_phases, y_phases
+
+
 def _trace_pixel_rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
     """Rays of pixels, in parts, because the intermediate results are larger."""
     out = np.empty((3, column.size))
@@ -325,7 +366,7 @@ def _axis_phases(
     used = checked.view.used[axis]
     combined = combine_axis_steps(checked, axis, motion_um)
 
-    # The frames; a slice does not copy them.
+    # The frames of the axis.
     every = stack.sinusoids(pattern_sequence.AXES[axis])
     chosen: slice | list[int] = used
     if used == every:

@@ -67,7 +67,8 @@ def estimate_unseen_motion(
     """Estimate the film's motion between the x and the y frames from the fringes.
 
     Least squares for the surface's parameters, all inputs of the geometry with their prior, and the
-    motion: what the others cannot explain is the motion.
+    motion: what the others cannot explain is the motion. Section 3 of
+    docs/explanation/uncertainty.md.
 
     Parameters
     ----------
@@ -82,28 +83,11 @@ def estimate_unseen_motion(
     -------
     UnseenMotion
     """
-    nominal = bench.geometry()
-    radius_mm = bench.surface.radius_mm
-    base_mm = trial_bench.predicted_mm(bench, nominal, bench.surface)
-
-    # Changes of the screen points (2 n, columns): by the surface's parameters,
-    of_surface = []
-    for step_mm in _STEP_MM * np.eye(PARAMETERS):
-        surface = Surface.from_parameters(bench.surface.parameters + step_mm, radius_mm)
-        predicted_mm = trial_bench.predicted_mm(bench, nominal, surface)
-        of_surface.append((predicted_mm - base_mm).ravel())
-    fitted = np.stack(of_surface, axis=1)
-
-    # by 1 sigma of each input of the geometry, and by the motion.
-    explained = [
-        trial_bench.predicted_mm(bench, bench.geometry((name,), [sigma]), bench.surface) - base_mm
-        for name, sigma in zip(spread.names, spread.sigmas, strict=True)
-    ]
-    explained.append(trial_bench.moves_mm(bench) * np.array([[-0.5], [0.5]]) * _PRIOR_UM)
-    inputs = np.stack([moved_mm.ravel() for moved_mm in explained], axis=1)
-
-    # The surface is free: only what it does not represent of the inputs counts.
-    inputs = inputs - fitted @ np.linalg.lstsq(fitted, inputs, rcond=None)[0]
+    # What moves the screen points: the motion last, each by 1 sigma of its prior. The surface is
+    # free: only what it does not represent of the inputs counts.
+    of_surface = _surface_columns(bench)
+    inputs = _input_columns(bench, spread)
+    inputs = inputs - of_surface @ np.linalg.lstsq(of_surface, inputs, rcond=None)[0]
 
     # Least squares in units of the priors; the scatter is what the inputs do not explain.
     left = bench.residual_mm.ravel()
@@ -129,6 +113,34 @@ def estimate_unseen_motion(
         noise_um=_PRIOR_UM * math.sqrt(noise),
         patches_um=_PRIOR_UM * of_patches,
     )
+
+
+def _surface_columns(bench: TrialBench) -> FloatArray:
+    """Changes (2 n, parameters) of the screen points by a step of each parameter of the surface."""
+    nominal = bench.geometry()
+    base_mm = trial_bench.predicted_mm(bench, nominal, bench.surface)
+    columns = []
+    for step_mm in _STEP_MM * np.eye(PARAMETERS):
+        parameters = bench.surface.parameters + step_mm
+        surface = Surface.from_parameters(parameters, bench.surface.radius_mm)
+        predicted_mm = trial_bench.predicted_mm(bench, nominal, surface)
+        columns.append((predicted_mm - base_mm).ravel())
+    return np.stack(columns, axis=1)
+
+
+def _input_columns(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
+    """Changes (2 n, inputs + 1) of the screen points by 1 sigma of each input of the geometry, and
+    by `_PRIOR_UM` of motion from x to y.
+    """
+    base_mm = trial_bench.predicted_mm(bench, bench.geometry(), bench.surface)
+    changes = [
+        trial_bench.predicted_mm(bench, bench.geometry((name,), [sigma]), bench.surface) - base_mm
+        for name, sigma in zip(spread.names, spread.sigmas, strict=True)
+    ]
+    # Half of it before the mean place of both axes, half after it.
+    from_x_to_y_um = _PRIOR_UM * np.array([[-0.5], [0.5]])
+    changes.append(trial_bench.moves_mm(bench) * from_x_to_y_um)
+    return np.stack([moved_mm.ravel() for moved_mm in changes], axis=1)
 
 
 def _assign_patches(bench: TrialBench) -> IntArray:

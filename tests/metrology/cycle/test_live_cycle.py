@@ -479,11 +479,11 @@ def test_bands_of_a_pulsed_backlight_are_removed_from_full_and_fringes_cycles(
 def test_bands_that_cannot_be_explained_degrade_the_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
     """They stayed in a cycle called ok."""
     live = _live()
-    live._bands_rad = np.array([0.3])
+    live._sums._bands_rad = np.array([0.3])
     monkeypatch.setattr(band_removal, "_UNEXPLAINED", -1.0)
     found = live.measure_fringes(*_render("fringes"))
     assert (found.verdict, found.reason[:34]) == ("degraded", "bands of the backlight could not b")
-    assert live._bands_rad.size == 1  # looked for again in the next
+    assert live._sums._bands_rad.size == 1  # looked for again in the next
 
 
 def test_a_noisy_laser_is_in_the_bar() -> None:
