@@ -11,10 +11,21 @@ _WEATHER_KEYS = ("barometer_gain_um_per_pa", "temperature_gain_um_per_k")
 
 
 def compare_sessions(a: SessionFolder, b: SessionFolder) -> str:
-    """Return Markdown: the plants, the gains, and the prediction for each set of gains on each
-    plant.
+    """Compare two sessions.
 
-    Raises InputError if one of the sessions has no design yet.
+    Parameters
+    ----------
+    a, b : SessionFolder
+
+    Returns
+    -------
+    str
+        Markdown: the plants, the gains, and the prediction for each set of gains on each plant.
+
+    Raises
+    ------
+    InputError
+        If one of the sessions has no design yet.
     """
     for each in (a, b):
         each.require_done("design")
@@ -33,6 +44,7 @@ def compare_sessions(a: SessionFolder, b: SessionFolder) -> str:
 def _tabulate_plants(
     a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile]
 ) -> list[str]:
+    """Table of the fitted plants, with noise and lower bound."""
     head = (
         "| plant | k | +- | dead time s | lag s | delay +- s | leak µm/s | laser µm | least std "
         "µm |"
@@ -62,29 +74,22 @@ def _tabulate_gains(files: list[gains_file.GainsFile]) -> list[str]:
 def _tabulate_crossed(
     a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile]
 ) -> list[str]:
+    """Table of the prediction for the gains of each session on the plant of each."""
     head = "| gains of | on plant and weather of | std µm | / least | Ms | load peak µm |"
     lines = [head, "|---|---" + "|---:" * 4 + "|"]
-    for place, each in (("A", a), ("B", b)):
-        found, weather = identify.load_identified(each), observe.load_disturbance(each)
-        own = files[0 if place == "A" else 1].loop
+    for place, each, own in (("A", a, files[0]), ("B", b, files[1])):
+        model = identify.load_identified(each).identified.model
+        weather = observe.load_disturbance(each)
         for name, gains in zip("AB", files, strict=True):
-            # the weather gains belong to the bench, not to the design
-            loop = schema.LoopConfig.model_validate(
-                gains.loop.model_dump() | {key: getattr(own, key) for key in _WEATHER_KEYS}
-            )
+            # The weather gains belong to the bench, not to the design.
+            of_bench = {key: getattr(own.loop, key) for key in _WEATHER_KEYS}
+            loop = schema.LoopConfig.model_validate(gains.loop.model_dump() | of_bench)
             row = candidate.evaluate_candidate(
-                name,
-                Gains.from_config(loop),
-                found.identified.model,
-                weather,
-                loop,
-                gain_search.Demands(),
+                name, Gains.from_config(loop), model, weather, loop, gain_search.Demands()
             )
-            std = (
-                f"{row.predicted.std_um:.3f} | {row.ratio:.2f}"
-                if row.predicted is not None
-                else "unstable | "
-            )
+            std = "unstable | "
+            if row.predicted is not None:
+                std = f"{row.predicted.std_um:.3f} | {row.ratio:.2f}"
             lines.append(
                 f"| {name} | {place} | {std} | {row.margins.ms:.2f} | {row.load_peak_um:.2f} |"
             )

@@ -60,6 +60,19 @@ def find_page(logs: Path) -> PageService:
 
 
 def link_to_tab(link: str, gains: str = "") -> str:
-    """Return the link to the tab *Tune*; `gains` names the session or run to explore."""
-    query = {"tab": "tune", "gains": gains} if gains else {"tab": "tune"}
-    return f"{link}{'&' if '?' in link else '?'}{urlencode(query)}"
+    """Return the link to the tab *Tune*.
+
+    Parameters
+    ----------
+    link : str
+        To the page, perhaps with a query.
+    gains : str
+        The session or run to explore, relative to the folder of runs; empty for none.
+    """
+    query = {"tab": "tune"}
+    if gains:
+        query["gains"] = gains
+    separator = "?"
+    if "?" in link:
+        separator = "&"
+    return f"{link}{separator}{urlencode(query)}"

@@ -51,7 +51,9 @@ class Candidate:
     @property
     def figures(self) -> loop_figures.LoopFigures:
         """What is compared with the other candidates."""
-        std_um = self.predicted.std_um if self.predicted is not None else math.inf
+        std_um = math.inf
+        if self.predicted is not None:
+            std_um = self.predicted.std_um
         return loop_figures.LoopFigures(
             std_um, self.load_peak_um, self.load_recovery_s, self.margins.ms
         )
@@ -65,21 +67,42 @@ def evaluate_candidate(
     loop: LoopConfig,
     demands: gain_search.Demands,
 ) -> Candidate:
-    """One row."""
-    found = compute_margins(gains, model, disturbance.rest.dt_s)
-    predicted = prediction.predict_loop(gains, model, disturbance, loop) if found.stable else None
-    if predicted is not None and predicted.flow_std_um_per_s > loop.flow_max_um_per_s:
-        # the pump only switches: no linear loop describes that
-        predicted = replace(predicted, std_um=math.nan)
-    ratio = (
-        predicted.std_um / lower_bound.compute_least_std_um(model, disturbance, loop)
-        if predicted is not None
-        else math.inf
-    )
-    answer = load_step.simulate_load_step(
-        gains, model, demands.load_step_um_per_s, disturbance.rest.dt_s
-    )
-    return Candidate(name, gains, found, predicted, ratio, answer.peak_um, answer.recovery_s)
+    """Evaluate gains: their margins, their predicted figures, and their answer to a step.
+
+    Parameters
+    ----------
+    name : str
+        Of the candidate.
+    gains : Gains
+    model : PlantModel
+        The identified plant.
+    disturbance : DisturbanceModel
+        Noise of the readings, and weather.
+    loop : LoopConfig
+        Its feed-forward and the limits of its flow.
+    demands : Demands
+        Its step of the leak.
+
+    Returns
+    -------
+    Candidate
+        Without error bars.
+    """
+    dt_s = disturbance.rest.dt_s
+    margins = compute_margins(gains, model, dt_s)
+
+    # The prediction of a stable loop, against the least that any controller reaches.
+    predicted = None
+    ratio = math.inf
+    if margins.stable:
+        predicted = prediction.predict_loop(gains, model, disturbance, loop)
+        if predicted.flow_std_um_per_s > loop.flow_max_um_per_s:
+            # The pump only switches: no linear loop describes that.
+            predicted = replace(predicted, std_um=math.nan)
+        ratio = predicted.std_um / lower_bound.compute_least_std_um(model, disturbance, loop)
+
+    answer = load_step.simulate_load_step(gains, model, demands.load_step_um_per_s, dt_s)
+    return Candidate(name, gains, margins, predicted, ratio, answer.peak_um, answer.recovery_s)
 
 
 def find_refusal(row: Candidate) -> str:

@@ -22,7 +22,7 @@ HEADS = (
 MARGIN_HEADS = ("Td s", "/ least", "flow std µm/s", "GM", "PM deg", "delay margin s", "disk margin")
 _WORDS = {"std_um": "std", "load_peak_um": "load peak", "load_recovery_s": "recovery", "ms": "Ms"}
 _DIGITS = {"std_um": 3, "load_peak_um": 2, "load_recovery_s": 1, "ms": 2}
-_ALIKE = 0.02  # a smaller change is none
+_NO_CHANGE = 0.02  # relative: a smaller change is not named
 
 
 def format_cells(rows: tuple[Candidate, ...]) -> list[tuple[str, ...]]:
@@ -48,13 +48,20 @@ def format_markdown(rows: tuple[Candidate, ...]) -> str:
 
 
 def format_terminal(rows: tuple[Candidate, ...], title: str, leak_um_per_s: float) -> Group:
-    """The candidates for a terminal of 80 columns; `leak_um_per_s` is what the mirror loses now."""
+    """Format the candidates for a terminal of 80 columns.
+
+    Parameters
+    ----------
+    rows : tuple of Candidate
+    title : str
+    leak_um_per_s : float
+        What the mirror loses now, for the caption.
+    """
     figures = Table(title=title, box=None, padding=(0, 1, 0, 0))
     words = Table("", "against the present gains", box=None, padding=(0, 1, 0, 0))
     for number, head in enumerate(HEADS[:-1]):
-        figures.add_column(
-            "\n".join(head.rsplit(" ", 1)), justify="right" if number else "left", no_wrap=True
-        )
+        two_lines = "\n".join(head.rsplit(" ", 1))  # the unit below the name
+        figures.add_column(two_lines, justify="right" if number else "left", no_wrap=True)
     for line in format_cells(rows):
         figures.add_row(*(cell.replace(" +- ", "+-") for cell in line[:-1]))
         words.add_row(line[0], line[-1])
@@ -63,15 +70,24 @@ def format_terminal(rows: tuple[Candidate, ...], title: str, leak_um_per_s: floa
         f"Load peak and recovery: after the leak grows from {leak_um_per_s:.2f} to "
         f"{leak_um_per_s + step:.2f} µm/s. "
         "+-: 1 sigma of the fit; for std with ten other minutes of weather like the "
-        "observed, which change every std "
-        "alike."
+        "observed, which change every std alike."
     )
     return Group(figures, "", words, "", caption)
 
 
 def describe_change(row: Candidate, present: Candidate | None) -> str:
-    """What gets better and what gets worse than with the present gains, as factors; or why it is
-    not offered.
+    """Say what gets better and what worse than with the present gains, as factors.
+
+    Parameters
+    ----------
+    row : Candidate
+    present : Candidate or None
+        The present gains; None if they are not in the table.
+
+    Returns
+    -------
+    str
+        Or why the candidate is not offered.
     """
     if row is present:
         return "in use"
@@ -82,15 +98,23 @@ def describe_change(row: Candidate, present: Candidate | None) -> str:
     better: list[str] = []
     worse: list[str] = []
     for name, word in _WORDS.items():
-        now, then = getattr(present.figures, name), getattr(row.figures, name)
-        if not math.isnan(now - then) and not math.isclose(now, then, rel_tol=_ALIKE):
-            factor = f" x {then / now:.2f}" if 0 < now < math.inf and then < math.inf else ""
-            (better if then < now else worse).append(word + factor)
-    return "; ".join(
-        f"{word}: {', '.join(quantities)}"
-        for word, quantities in (("better", better), ("worse", worse))
-        if quantities
-    )
+        now = getattr(present.figures, name)
+        then = getattr(row.figures, name)
+        if math.isnan(now - then) or math.isclose(now, then, rel_tol=_NO_CHANGE):
+            continue
+        changed = word
+        if 0 < now < math.inf and then < math.inf:
+            changed = f"{word} x {then / now:.2f}"
+        if then < now:
+            better.append(changed)
+        else:
+            worse.append(changed)
+    parts = []
+    if better:
+        parts.append(f"better: {', '.join(better)}")
+    if worse:
+        parts.append(f"worse: {', '.join(worse)}")
+    return "; ".join(parts)
 
 
 def _format_gains(row: Candidate) -> tuple[str, ...]:
@@ -108,17 +132,20 @@ def _format_figure(row: Candidate, name: str, digits: int) -> str:
     value = float(getattr(row.figures, name))
     if math.isnan(value):
         return "not known"
-    sigma = "" if row.sigma is None else f" +- {getattr(row.sigma, name):.{digits}f}"
-    return f"{value:.{digits}f}{sigma}"
+    if row.sigma is None:
+        return f"{value:.{digits}f}"
+    return f"{value:.{digits}f} +- {getattr(row.sigma, name):.{digits}f}"
 
 
 def _format_margins(row: Candidate) -> tuple[str, ...]:
-    m, p = row.margins, row.predicted
-    predicted = (f"{row.ratio:.2f}", f"{p.flow_std_um_per_s:.2f}") if p is not None else ("", "")
+    """The cells under `MARGIN_HEADS`; the predicted ones are empty for an unstable loop."""
+    predicted = ("", "")
+    if row.predicted is not None:
+        predicted = (f"{row.ratio:.2f}", f"{row.predicted.flow_std_um_per_s:.2f}")
     margins = (
-        f"{m.gain_margin:.1f}",
-        f"{m.phase_margin_deg:.0f}",
-        f"{m.delay_margin_s:.2f}",
-        f"{m.disk_margin:.2f}",
+        f"{row.margins.gain_margin:.1f}",
+        f"{row.margins.phase_margin_deg:.0f}",
+        f"{row.margins.delay_margin_s:.2f}",
+        f"{row.margins.disk_margin:.2f}",
     )
     return (f"{row.gains.td_s:.2f}", *predicted, *margins)

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from membrane_ctrl.config.schema import LoopConfig
 from tuning.identification import closed_loop, load_step, margins, plant_model, record
 from tuning.identification.disturbance import DisturbanceModel
-from tuning.proposal.prediction import predict_loop
+from tuning.proposal.prediction import Predicted, predict_loop
 from tuning.proposal.tuning_rules import compute_effective_delay_s, make_simc_gains
 
 # Filters tried by the search; none costs too much phase.
@@ -20,6 +20,8 @@ _GAIN_RANGE = (0.01, 1.0)
 _TI_RANGE = (2.0, 400.0)
 _STEEP = 1e3  # violating a demand costs more than any variance
 _SHARE_MOST = 100.0  # finite, so that the search knows its way back
+_PRICE_OF_BROKEN = 10.0  # of the logarithm of the standard deviation, for a figure twice its limit
+_START_CLOSED_LOOP_S = 1.2  # of the SIMC gains at which each search begins
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +48,26 @@ class Demands:
 def bound_load_peak_um(
     gains: closed_loop.Gains, model: plant_model.PlantModel, step_um_per_s: float
 ) -> float:
-    """Bound on the largest excursion after a step of the leak: the loop's delay counts as time
-    without response.
+    """Bound on the largest excursion after a step of the leak.
 
-    For searches: `loop_model.load_step` is exact, smaller, and takes longer.
+    The loop's delay counts as time without response. For searches:
+    `load_step.simulate_load_step` is exact, smaller, and takes longer.
 
     y'' + k K y' + k K / Ti y = D delta(t): a step D of the speed peaks at
     D / w0 exp(-zeta w0 t), with w0 = sqrt(k K / Ti) and zeta = sqrt(k K Ti) / 2, where the speed is
     back to 0.
+
+    Parameters
+    ----------
+    gains : Gains
+    model : PlantModel
+    step_um_per_s : float
+        D.
+
+    Returns
+    -------
+    float
+        In µm.
     """
     natural = math.sqrt(model.gain * gains.kp_per_s / gains.ti_s)
     zeta = math.sqrt(model.gain * gains.kp_per_s * gains.ti_s) / 2
@@ -69,7 +83,16 @@ def bound_load_peak_um(
 def search_max_ki(
     model: plant_model.PlantModel, dt_s: float, filter_s: float, ms: float
 ) -> closed_loop.Gains:
-    """PI with the largest K / Ti at a sensitivity below `ms`: best against a step of the leak."""
+    """Find the PI with the largest K / Ti: best against a step of the leak.
+
+    Parameters
+    ----------
+    model : PlantModel
+    dt_s, filter_s : float
+        Sample time, and the filter of the reading.
+    ms : float
+        Largest sensitivity.
+    """
     start = make_simc_gains(model, dt_s, filter_s)
     return _search_gains(
         model, dt_s, start, ms, lambda gains: -math.log(gains.kp_per_s / gains.ti_s)
@@ -79,44 +102,76 @@ def search_max_ki(
 def search_least_variance(
     model: plant_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, demands: Demands
 ) -> closed_loop.Gains:
-    """PI and filter with the least predicted variance of the true centre, within the demands.
+    """Find PI and filter with the least predicted variance of the true centre.
 
     No D: at best it improves the prediction by 1 %, for twice the pump's activity, and on pumps
     with a second of lag by 5 %: the pump cannot give less than nothing.
 
-    Only the feed-forward of `loop` matters, not its gains.
+    Parameters
+    ----------
+    model : PlantModel
+        The identified plant.
+    disturbance : DisturbanceModel
+        Noise of the readings, and weather.
+    loop : LoopConfig
+        Only its feed-forward and its limits matter, not its gains.
+    demands : Demands
+        What the gains must keep, as far as any gains do.
     """
     dt_s = disturbance.rest.dt_s
 
     def cost(gains: closed_loop.Gains) -> float:
-        found = predict_loop(gains, model, disturbance, loop)
-        jump = (
-            demands.rate_sigmas
-            * found.flow_step_std_um_per_s
-            / (loop.flow_rate_limit_um_per_s2 * dt_s)
-        )
-        peak = bound_load_peak_um(gains, model, demands.load_step_um_per_s) / demands.load_peak_um
-        slow = 3 * gains.ti_s / demands.recovery_s
-        reading = (
-            disturbance.laser_um
-            * math.sqrt(dt_s / (dt_s + 2 * gains.filter_s))
-            / demands.reading_um
-        )
-        shares = [jump, peak, slow, reading]
-        if math.isfinite(demands.peak_most_um):
-            answer = load_step.simulate_load_step(gains, model, demands.load_step_um_per_s, dt_s)
-            shares += [answer.peak_um / demands.peak_most_um]
-        if demands.as_good_as is not None:
-            answer = load_step.simulate_load_step(gains, model, demands.load_step_um_per_s, dt_s)
-            shares += [answer.peak_um / demands.as_good_as.peak_um]
-            shares += [answer.recovery_s / max(demands.as_good_as.recovery_s, dt_s)]
+        """Logarithm of the standard deviation, and a price for each broken demand."""
+        predicted = predict_loop(gains, model, disturbance, loop)
+        shares = _demanded_shares(gains, predicted, model, disturbance, loop, demands)
         broken = sum(max(0.0, min(share, _SHARE_MOST) - 1) for share in shares)
-        return math.log(found.std_um) + 10 * broken
+        return math.log(predicted.std_um) + _PRICE_OF_BROKEN * broken
 
-    starts = (
-        make_simc_gains(model, dt_s, filter_s, 1.2) for filter_s in _FILTERS_S if filter_s >= dt_s
-    )
-    return min((_search_gains(model, dt_s, start, demands.ms, cost) for start in starts), key=cost)
+    # One search for each filter: the variance has a minimum for each.
+    found = []
+    for filter_s in _FILTERS_S:
+        if filter_s >= dt_s:
+            start = make_simc_gains(model, dt_s, filter_s, _START_CLOSED_LOOP_S)
+            found.append(_search_gains(model, dt_s, start, demands.ms, cost))
+    return min(found, key=cost)
+
+
+def _demanded_shares(
+    gains: closed_loop.Gains,
+    predicted: Predicted,
+    model: plant_model.PlantModel,
+    disturbance: DisturbanceModel,
+    loop: LoopConfig,
+    demands: Demands,
+) -> list[float]:
+    """Each demanded figure over its limit: above 1 where the demand is broken."""
+    dt_s = disturbance.rest.dt_s
+    step_um_per_s = demands.load_step_um_per_s
+
+    # The flow's change from tick to tick, over the rate limit.
+    limit_um_per_s = loop.flow_rate_limit_um_per_s2 * dt_s
+    rate = demands.rate_sigmas * predicted.flow_step_std_um_per_s / limit_um_per_s
+
+    # The excursion and its recovery after a step of the leak.
+    peak = bound_load_peak_um(gains, model, step_um_per_s) / demands.load_peak_um
+    recovery = 3 * gains.ti_s / demands.recovery_s
+
+    # The laser's noise behind the filter.
+    passed = math.sqrt(dt_s / (dt_s + 2 * gains.filter_s))
+    reading = disturbance.laser_um * passed / demands.reading_um
+    shares = [rate, peak, recovery, reading]
+
+    # Further demands, by the exact answer to that step.
+    reference = demands.as_good_as
+    if reference is None and not math.isfinite(demands.peak_most_um):
+        return shares
+    answer = load_step.simulate_load_step(gains, model, step_um_per_s, dt_s)
+    if math.isfinite(demands.peak_most_um):
+        shares.append(answer.peak_um / demands.peak_most_um)
+    if reference is not None:
+        shares.append(answer.peak_um / reference.peak_um)
+        shares.append(answer.recovery_s / max(reference.recovery_s, dt_s))
+    return shares
 
 
 def _search_gains(
@@ -126,25 +181,31 @@ def _search_gains(
     ms: float,
     cost: Callable[[closed_loop.Gains], float],
 ) -> closed_loop.Gains:
-    """PI with the least cost at the filter of `start`, with the sensitivity below `ms`; in
-    logarithms.
+    """Find the PI with the least cost at the filter of `start`, with a sensitivity below `ms`.
+
+    Nelder and Mead's method in the logarithms of K and Ti: the cost has kinks where a demand is
+    broken.
     """
+    # Bounds in units of the plant: K times k d, and Ti over d.
     delay_s = compute_effective_delay_s(model, dt_s, start.filter_s)
     low = np.log([_GAIN_RANGE[0] / (model.gain * delay_s), _TI_RANGE[0] * delay_s])
     high = np.log([_GAIN_RANGE[1] / (model.gain * delay_s), _TI_RANGE[1] * delay_s])
 
     def gains_at(logs: record.Series) -> closed_loop.Gains:
+        """The gains with these logarithms, inside the bounds."""
         kp_per_s, ti_s = np.exp(np.clip(logs, low, high)).tolist()
         return closed_loop.Gains(kp_per_s, ti_s, 0.0, start.filter_s)
 
     def penalised(logs: record.Series) -> float:
+        """Cost, with a slope that leads back from beyond bounds and sensitivity."""
         gains = gains_at(logs)
         outside = float(np.sum(np.maximum(0.0, low - logs) + np.maximum(0.0, logs - high)))
         peak = margins.find_sensitivity_peak(gains, model, dt_s)
         if not math.isfinite(peak):
-            return _STEEP * (10.0 + float(logs[0]))
+            return _STEEP * (10.0 + float(logs[0]))  # unstable: less K is better
         return cost(gains) + _STEEP * max(0.0, peak - ms) + outside
 
+    # Begin with a stable loop.
     first = np.clip(np.log([start.kp_per_s, start.ti_s]), low, high)
     while (
         not math.isfinite(margins.find_sensitivity_peak(gains_at(first), model, dt_s))

@@ -39,25 +39,45 @@ class Health:
 
 
 def judge_health(record: Record, setpoint_um: Series, loop: LoopConfig, made: GainsFile) -> Health:
-    """Judge a quiet hold against the file its gains come from. Raises ValueError if it is shorter
-    than `LEAST_S`.
+    """Judge a quiet hold against the file its gains come from.
+
+    Parameters
+    ----------
+    record : Record
+        The hold.
+    setpoint_um : (n,) array
+        Setpoint at each sample.
+    loop : LoopConfig
+        The settings of the hold.
+    made : GainsFile
+        The plant for which the gains were designed.
+
+    Raises
+    ------
+    ValueError
+        If the record is shorter than `LEAST_S`.
     """
     if record.duration_s < LEAST_S:
         raise ValueError(
             f"{record.duration_s:.0f} s of hold are too short to judge a loop: need {LEAST_S:.0f} s"
         )
+
+    # The centre in this weather, against the least that any controller reaches and against the
+    # prediction for these gains.
     model = made.plant.model
     weather = disturbance.observe_disturbance(record, model, loop)
     off_um = record.filled_displacement_um() - setpoint_um
-    std_um = estimate_centre_std_um(
-        off_um, VerificationTrial(model, weather, loop, loop), weather, loop
-    )
+    trial = VerificationTrial(model, weather, loop, loop)
+    std_um = estimate_centre_std_um(off_um, trial, weather, loop)
     least_um = compute_least_std_um(model, weather, loop)
-    designed = (
-        predict_loop(closed_loop.Gains.from_config(loop), model, weather, loop).std_um / least_um
-    )
+    gains = closed_loop.Gains.from_config(loop)
+    designed = predict_loop(gains, model, weather, loop).std_um / least_um
+
+    # The plant as it is now.
     gain, gain_sigma = _compute_natural_gain(record, loop)
     leak_um_per_s = model.gain * float(record.flow_um_per_s.mean())
+
+    # What has changed beyond its error.
     found: list[str] = []
     if std_um / least_um > _RATIO_GROWTH * designed:
         ratio = std_um / (designed * least_um)

@@ -13,9 +13,7 @@ _START_S = 10.0
 
 
 class _ReplayBench:
-    """The readings of a record with the motion by its own pump
-    replaced by that for other commands.
-    """
+    """The readings of a record, with the motion by its pump replaced by that of other commands."""
 
     def __init__(
         self,
@@ -24,12 +22,11 @@ class _ReplayBench:
         model: plant_model.PlantModel,
         pump: PumpConfig,
     ) -> None:
+        # The motion by the pump that held the mirror is taken out of the readings.
         self.flow_um_per_s = float(record.cut(0.0, _START_S).flow_um_per_s.mean())
         flows = np.append(self.flow_um_per_s, record.flow_um_per_s)
-        own_um = (
-            model.gain
-            * plant_model.compute_driven_um(flows, model.dead_time_s, model.lag_s, record.dt_s)[1:]
-        )
+        driven = plant_model.compute_driven_um(flows, model.dead_time_s, model.lag_s, record.dt_s)
+        own_um = model.gain * driven[1:]
         columns = (off_um - own_um, record.ambient_pressure_pa, record.air_temperature_c)
         self._rest = zip(*(column.tolist() for column in columns), strict=True)
         self._driven = DrivenCentre(model, pump, self.flow_um_per_s, record.dt_s)
@@ -48,15 +45,30 @@ def replay_um(
     loop: LoopConfig,
     pump: PumpConfig,
 ) -> Series:
-    """What would have been read, less the setpoint, (n - 1,), had another loop held the mirror.
+    """What would have been read, less the setpoint, had another loop held the mirror.
 
     With the limits of pump and loop: weather that asks for less than no flow is as hard for it as
-    for the one that held. `off_um` (n,) are the record's readings less its setpoint.
+    for the one that held.
+
+    Parameters
+    ----------
+    record : Record
+        The hold.
+    off_um : (n,) array
+        Its readings less its setpoint.
+    model : PlantModel
+        The plant, which gives the motion by either pump command.
+    loop : LoopConfig
+        The other loop.
+    pump : PumpConfig
+        The pump's curve and limits.
+
+    Returns
+    -------
+    (n - 1,) array
+        In µm.
     """
     bench = _ReplayBench(record, off_um, model, pump)
     loop = loop.model_copy(update={"rate_hz": 1.0 / record.dt_s})  # that of its readings
-    return (
-        Rig(bench, loop, pump, bench.flow_um_per_s)
-        .hold(record.duration_s - record.dt_s)
-        .displacement_um
-    )
+    rig = Rig(bench, loop, pump, bench.flow_um_per_s)
+    return rig.hold(record.duration_s - record.dt_s).displacement_um

@@ -92,9 +92,12 @@ def find_settling_time_s(loop: LoopConfig) -> float:
     small beside both); its slowest root has the real part (K - sqrt(K^2 - 4 K / Ti)) / 2, or K / 2
     where it swings.
     """
-    k, ti_s = loop.kp_per_s, loop.ti_s
-    slowest_per_s = (k - math.sqrt(max(0.0, k * k - 4 * k / ti_s))) / 2
-    slowest_s = 1 / slowest_per_s if slowest_per_s > 0 else math.inf
+    k = loop.kp_per_s
+    discriminant = k * k - 4 * k / loop.ti_s
+    slowest_per_s = (k - math.sqrt(max(0.0, discriminant))) / 2
+    slowest_s = math.inf
+    if slowest_per_s > 0:
+        slowest_s = 1 / slowest_per_s
     return min(max(SETTLE_LEAST_S, _SETTLE_TIME_CONSTANTS * slowest_s), _SETTLE_MOST_S)
 
 
@@ -117,24 +120,47 @@ def estimate_centre_std_um(
     weather: disturbance.DisturbanceModel,
     loop: LoopConfig,
 ) -> float:
-    """Standard deviation of the centre without the laser's noise; 0 if the estimate is negative.
+    """Standard deviation of the centre without the laser's noise.
 
-    `off_um` (n,) are readings less setpoint under `loop`; they correct the prediction for this
-    weather.
+    The equation of the module: the prediction, corrected by the autocovariance that was seen.
+
+    Parameters
+    ----------
+    off_um : (n,) array
+        Readings less setpoint, under `loop`.
+    trial : VerificationTrial
+        Its plant.
+    weather : DisturbanceModel
+        The weather in which the loop is predicted.
+    loop : LoopConfig
+        The loop that held the mirror.
+
+    Returns
+    -------
+    float
+        In µm; 0 if the estimated variance is negative.
     """
+    # Autocovariance of the readings over short lags.
     dt_s = weather.rest.dt_s
     off = off_um - off_um.mean()
     lags = np.arange(1, round(_LAGS_S / dt_s) + 1)
-    seen = np.array([off[lag:] @ off[:-lag] / (off.size - lag) for lag in lags])
+    seen_um2 = np.array([off[lag:] @ off[:-lag] / (off.size - lag) for lag in lags])
+
+    # The same by the model: the spectrum |S|^2 (motion + noise) of the readings without its white
+    # part, which has no covariance over a lag, as an integral over the frequencies.
     gains = closed_loop.Gains.from_config(loop)
     w = closed_loop.make_frequencies(dt_s, _POINTS)
     model, moving = linearise_limits(gains, trial.model, weather, loop, w)
-    sensitivity = np.abs(1 / (1 + closed_loop.compute_loop_response(gains, model, w, dt_s))) ** 2
+    response = closed_loop.compute_loop_response(gains, model, w, dt_s)
+    sensitivity = np.abs(1 / (1 + response)) ** 2
     noise = weather.rest.white_psd
     coloured = sensitivity * (moving + noise) - noise
-    expected = np.trapezoid(coloured * np.cos(np.outer(lags * dt_s, w)), w, axis=1) / np.pi
-    predicted_um = predict_loop(gains, trial.model, weather, loop).std_um
-    return math.sqrt(max(0.0, predicted_um**2 + float(np.mean(seen - expected))))
+    over_lags = coloured * np.cos(np.outer(lags * dt_s, w))
+    predicted_um2 = np.trapezoid(over_lags, w, axis=1) / np.pi
+
+    # What exceeds it corrects the predicted variance.
+    std_um = predict_loop(gains, trial.model, weather, loop).std_um
+    return math.sqrt(max(0.0, std_um**2 + float(np.mean(seen_um2 - predicted_um2))))
 
 
 def estimate_growth_sigma(
@@ -143,8 +169,21 @@ def estimate_growth_sigma(
     """Standard error of the ratio of two standard deviations in the same weather.
 
     Both have the scatter of that weather, so that the difference of their relative variances in
-    blocks of the record is what scatters. `after_um` and `before_um` are (n,) readings less
-    setpoint, of the loop that held and of the replayed one. To this comes the replay's own error.
+    blocks of the record is what scatters. To this comes the error of the replay.
+
+    Parameters
+    ----------
+    after_um, before_um : (n,) arrays
+        Readings less setpoint, of the loop that held and of the replayed one.
+    after_std_um, before_std_um : float
+        Standard deviations of the centre under both.
+    dt_s : float
+        Sample time.
+
+    Returns
+    -------
+    float
+        Infinite for a record that is too short.
     """
     size = min(after_um.size, before_um.size)
     blocks = math.floor(size * dt_s / _ERROR_BLOCK_S)
@@ -152,12 +191,14 @@ def estimate_growth_sigma(
         return math.inf
 
     def block_variances(off_um: Series) -> Series:
+        """Variance of the motion in each block, µm^2."""
         off = off_um[:size] - off_um[:size].mean()
         return np.array([_mean_covariance(part, dt_s) for part in np.array_split(off, blocks)])
 
-    apart = block_variances(after_um) / after_std_um**2
-    apart -= block_variances(before_um) / before_std_um**2
-    scatter = 0.5 * float(np.std(apart, ddof=1)) / math.sqrt(blocks)
+    # A standard deviation has half of the relative error of its variance.
+    difference = block_variances(after_um) / after_std_um**2
+    difference -= block_variances(before_um) / before_std_um**2
+    scatter = 0.5 * float(np.std(difference, ddof=1)) / math.sqrt(blocks)
     return after_std_um / before_std_um * math.hypot(scatter, _REPLAY_SIGMA)
 
 
@@ -176,8 +217,24 @@ def estimate_sensitivity(
     level of the weather does not matter: only the shape is compared, each band with the median
     band. Doors and gusts are in a few segments, a pump's pulsation in a few bins of a band: medians
     over both leave them out.
+
+    Parameters
+    ----------
+    off_um : (n,) array
+        Readings less setpoint, under the new gains.
+    trial : VerificationTrial
+        The plant, and the new gains.
+    weather : DisturbanceModel
+        Of this record.
+
+    Returns
+    -------
+    float
+        Ms; that of the model if the spectrum has its shape.
     """
-    gains, dt_s = closed_loop.Gains.from_config(trial.after), weather.rest.dt_s
+    # Spectrum of the readings, up to twice the frequency at which the delay's phase is a quarter.
+    gains = closed_loop.Gains.from_config(trial.after)
+    dt_s = weather.rest.dt_s
     frequency_hz, power = welch(
         off_um,
         1 / dt_s,
@@ -188,14 +245,21 @@ def estimate_sensitivity(
     w: Series = 2 * np.pi * frequency_hz
     fastest = math.pi / (2 * (trial.model.delay_s + gains.filter_s + dt_s))
     used = (w > 2 * np.pi * 3 / _SEGMENT_S) & (w < 2 * fastest)
-    w, power = w[used], power[used]
+    w = w[used]
+    power = power[used]
+
+    # Its excess over the prediction |S|^2 (motion + noise), where the loop amplifies: slower motion
+    # that exceeds the prediction is weather, or a limit of the pump.
     model, moving = linearise_limits(gains, trial.model, weather, trial.after, w)
-    s = np.abs(1 / (1 + closed_loop.compute_loop_response(gains, model, w, dt_s))) ** 2
-    # slower motion that exceeds the prediction is weather, or a limit of the pump
-    peak = s >= min(1.0, s.max())
-    excess, bands = power[peak] / (s * (moving + weather.rest.white_psd))[peak], w[peak]
-    bands = np.floor(np.log(bands / w[0]) / math.log(_BAND)).astype(int)
-    levels = np.array([np.median(excess[bands == band]) for band in np.unique(bands)])
+    response = closed_loop.compute_loop_response(gains, model, w, dt_s)
+    squared_sensitivity = np.abs(1 / (1 + response)) ** 2
+    expected = squared_sensitivity * (moving + weather.rest.white_psd)
+    amplified = squared_sensitivity >= min(1.0, squared_sensitivity.max())
+    excess = power[amplified] / expected[amplified]
+
+    # The band with the largest median, against the median band.
+    band_of = np.floor(np.log(w[amplified] / w[0]) / math.log(_BAND)).astype(int)
+    levels = np.array([np.median(excess[band_of == band]) for band in np.unique(band_of)])
     model_ms = margins.compute_margins(gains, trial.model, dt_s).ms
     return float(model_ms * math.sqrt(max(1.0, levels.max() / np.median(levels))))
 
@@ -203,49 +267,80 @@ def estimate_sensitivity(
 def judge_stage(
     record: Record, setpoint_um: Series, trial: VerificationTrial, growth_max: float
 ) -> Stage:
-    """Judge the record so far, comparing the centre with each sample's setpoint."""
+    """Judge the record so far.
+
+    Parameters
+    ----------
+    record : Record
+        The hold with the new gains.
+    setpoint_um : (n,) array
+        Setpoint at each of its samples.
+    trial : VerificationTrial
+        Plant, weather of the session, and both gains.
+    growth_max : float
+        Limit of the standard deviation over that of the previous gains.
+
+    Returns
+    -------
+    Stage
+    """
+    # The centre under the new gains, in the weather of this record once that is known.
     off_um = record.filled_displacement_um() - setpoint_um
     weather = trial.weather
-    replayed = record.duration_s >= _REPLAY_LEAST_S
     if record.duration_s >= _OBSERVE_LEAST_S:
         weather = disturbance.observe_disturbance(record, trial.model, trial.after)
     std_um = estimate_centre_std_um(off_um, trial, weather, trial.after)
-    before_um, after_um = (
-        predict_loop(closed_loop.Gains.from_config(loop), trial.model, weather, loop).std_um
-        for loop in (trial.before, trial.after)
-    )
-    predicted_growth = after_um / before_um
+
+    # Under the previous gains: predicted, and replayed in this weather once there is enough of it.
+    predicted_before_um = _predict_std_um(trial.before, trial, weather)
+    predicted_after_um = _predict_std_um(trial.after, trial, weather)
+    before_um = predicted_before_um
     growth_sigma = math.inf
-    if replayed:
+    ms = math.nan
+    if record.duration_s >= _REPLAY_LEAST_S:
         would_um = replay_um(record, off_um, trial.model, trial.before, trial.pump)
         before_um = estimate_centre_std_um(would_um, trial, weather, trial.before)
         growth_sigma = estimate_growth_sigma(off_um, would_um, std_um, before_um, record.dt_s)
+        ms = estimate_sensitivity(off_um, trial, weather)
+
+    # The verdict. A person who chose these gains has accepted the growth that was predicted.
     if trial.accepted:
-        growth_max *= max(1.0, predicted_growth)
+        growth_max *= max(1.0, predicted_after_um / predicted_before_um)
     growth = std_um / before_um
-    ms = estimate_sensitivity(off_um, trial, weather) if replayed else math.nan
-    reason = ""
+    return Stage(
+        time_s=record.duration_s,
+        std_um=std_um,
+        before_um=before_um,
+        growth=growth,
+        growth_max=growth_max,
+        growth_sigma=growth_sigma,
+        ms=ms,
+        lost_fraction=record.lost_fraction,
+        reason=_explain_failure(std_um, growth, growth_max, ms),
+    )
+
+
+def _predict_std_um(
+    loop: LoopConfig, trial: VerificationTrial, weather: disturbance.DisturbanceModel
+) -> float:
+    """Predicted standard deviation of the centre under a loop."""
+    gains = closed_loop.Gains.from_config(loop)
+    return predict_loop(gains, trial.model, weather, loop).std_um
+
+
+def _explain_failure(std_um: float, growth: float, growth_max: float, ms: float) -> str:
+    """Why a stage fails; empty if it passes, also with an unknown sensitivity (NaN)."""
     if growth > growth_max:
-        reason = (
+        return (
             f"the standard deviation is {std_um:.3f} µm, {growth:.2f} times that of the previous "
             "gains"
         )
-    elif ms > MS_MAX:
-        reason = (
+    if ms > MS_MAX:
+        return (
             f"the readings show a sensitivity of {ms:.1f} (limit {MS_MAX:g}): less margin than "
             "designed"
         )
-    return Stage(
-        record.duration_s,
-        std_um,
-        before_um,
-        growth,
-        growth_max,
-        growth_sigma,
-        ms,
-        record.lost_fraction,
-        reason,
-    )
+    return ""
 
 
 def explain_no_benefit(stage: Stage, trial: VerificationTrial) -> str:
@@ -254,6 +349,12 @@ def explain_no_benefit(stage: Stage, trial: VerificationTrial) -> str:
     Gains whose price a person accepted are, and so are those that replace gains without enough
     margin. A record too short for a replay shows no benefit: after such a short verification it is
     enough that the gains are no worse.
+
+    Parameters
+    ----------
+    stage : Stage
+        The last one.
+    trial : VerificationTrial
     """
     if math.isinf(stage.growth_sigma):
         return ""

@@ -14,12 +14,28 @@ class DrivenBench(Protocol):
     """The bench a rig drives: the twin, a fitted model, or a live hold in its `tune` state."""
 
     def exchange(self, pump_fraction: float, vent_fraction: float) -> experiment.BenchSample:
-        """Write the commands, wait for the next tick and return its reading."""
+        """Write the commands, wait for the next tick and return its reading.
+
+        Parameters
+        ----------
+        pump_fraction, vent_fraction : float
+            Commands, 0..1.
+        """
         ...
 
 
 class Rig:
-    """One loop on one bench, tick by tick; it starts with the flow `leak_um_per_s`."""
+    """One loop on one bench, tick by tick.
+
+    Parameters
+    ----------
+    bench : DrivenBench
+    loop : LoopConfig
+    pump : PumpConfig
+        Its curve turns flows into commands.
+    leak_um_per_s : float
+        The flow with which the loop starts.
+    """
 
     def __init__(
         self, bench: DrivenBench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float
@@ -29,11 +45,9 @@ class Rig:
         self._pump = pump
         self._loop = inner_loop.InnerLoop(loop, pump)
         self.dt_s = 1 / loop.rate_hz
-        fraction = (
-            pump_curve.PumpCurve(pump).command(leak_um_per_s, self.dt_s)
-            if leak_um_per_s > 0
-            else 0.0
-        )
+        fraction = 0.0
+        if leak_um_per_s > 0:
+            fraction = pump_curve.PumpCurve(pump).command(leak_um_per_s, self.dt_s)
         self._last = bench.exchange(fraction, loop.bleed_fraction)
         self._loop.start(self._last.displacement_um, leak_um_per_s)
 
@@ -43,7 +57,14 @@ class Rig:
         self._loop.set_gains(loop)
 
     def hold(self, duration_s: float, target_um: float = 0.0) -> Record:
-        """Hold at a target."""
+        """Hold at a target, and return the record of the ticks.
+
+        Parameters
+        ----------
+        duration_s : float
+        target_um : float
+            Displacement to hold.
+        """
         flows: list[float] = []
         samples: list[experiment.BenchSample] = []
         for _ in range(round(duration_s / self.dt_s)):
@@ -78,7 +99,15 @@ class Rig:
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
 
     def around(self, held: Record, limit_um: float = 10.0) -> operating_point.OperatingPoint:
-        """Operating point of an experiment, from the hold before it."""
+        """Operating point of an experiment.
+
+        Parameters
+        ----------
+        held : Record
+            The hold before it.
+        limit_um : float
+            How far the mirror may move from its setpoint.
+        """
         return make_operating_point(held, self._config, self._pump, limit_um)
 
     def _make_loop_input(self, target_um: float) -> inner_loop.LoopInput:

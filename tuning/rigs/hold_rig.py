@@ -64,8 +64,9 @@ class HoldRig:
         self.shapes: list[shape_estimate.ShapeEstimate] = []  # all so far
 
     def hold(self, duration_s: float) -> Record:
-        """Record the next seconds of hold. Raises HoldError if the
-        mirror is not held throughout.
+        """Record the next seconds of hold.
+
+        Raises HoldError if the mirror is not held throughout.
         """
         return self.record(self.ticks(duration_s))
 
@@ -171,8 +172,20 @@ class HoldRig:
     ) -> None:
         """Set gains without a bump; on trial, the hold restores the old ones unless `keep` follows.
 
-        `shape_s`: time constant of the shape loop, `pump`: the pump's curve; NaN and None leave
-        them. With `setpoint_step_um` the trial moves the setpoint too, with the shape loop off.
+        Parameters
+        ----------
+        loop : LoopConfig
+            The gains.
+        why : str
+            Reason, for the record.
+        trial_s : float
+            Duration of the trial; NaN: no trial.
+        shape_s : float
+            Time constant of the shape loop; NaN leaves it.
+        pump : PumpConfig, optional
+            The pump's curve; it stays without one.
+        setpoint_step_um : float
+            Step of the setpoint during the trial, with the shape loop off; NaN: none.
         """
         end = Command(
             "gains", self._who, why, trial_s, loop=loop, shape_time_constant_s=shape_s, pump=pump
@@ -219,33 +232,9 @@ class HoldRig:
         """
         rows = list(rows)
         self._every = self._every or self._count_ticks_of_a_reading(rows)
-        while (
-            rows
-            and round(
-                rows[-1].tick + rows[-1].missed_ticks - rows[0].tick - rows[0].missed_ticks + 1
-            )
-            % self._every
-        ):
+        while rows and round(_count_ticks(rows[0], rows[-1])) % self._every:
             rows.append(self._next_held())
-        flows: list[float] = []
-        samples: list[experiment.BenchSample] = []
-        flow = next((row.flow_um_per_s for row in rows if math.isfinite(row.flow_um_per_s)), 0.0)
-        tick = rows[0].tick + rows[0].missed_ticks if rows else 0.0
-        for row in rows:
-            place = row.tick + row.missed_ticks
-            gap = max(0, round(place - tick))
-            flows += [flow] * gap
-            samples += [
-                experiment.BenchSample(math.nan, row.ambient_pressure_pa, row.air_temperature_c)
-            ] * gap
-            flow = row.flow_um_per_s if math.isfinite(row.flow_um_per_s) else flow
-            flows.append(flow)
-            samples.append(
-                experiment.BenchSample(
-                    row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c
-                )
-            )
-            tick = place + 1
+        flows, samples = _fill_skipped_ticks(rows)
         return Record.from_samples(self.dt_s, flows, samples).every(self._every)
 
     def _count_ticks_of_a_reading(self, rows: Sequence[telemetry.TelemetryRow]) -> int:
@@ -308,5 +297,47 @@ class HoldRig:
         raise HoldError("the hold did not report the end of the experiment")
 
     def _explain_state(self) -> str:
+        """Why the hold is in its state, as its last event states."""
         reasons = [event.why for event in self._events if isinstance(event, events.StateEntered)]
         return reasons[-1] if reasons else "no reason was given"
+
+
+def _tick_number(row: telemetry.TelemetryRow) -> float:
+    """Number of a tick, with the skipped ones counted."""
+    return row.tick + row.missed_ticks
+
+
+def _count_ticks(first: telemetry.TelemetryRow, last: telemetry.TelemetryRow) -> float:
+    """Ticks from one to another, both included, with the skipped ones."""
+    return last.tick + last.missed_ticks - first.tick - first.missed_ticks + 1
+
+
+def _fill_skipped_ticks(
+    rows: Sequence[telemetry.TelemetryRow],
+) -> tuple[list[float], list[experiment.BenchSample]]:
+    """Flow after each tick, and its sample; a skipped tick has no reading and keeps the flow."""
+    flows: list[float] = []
+    samples: list[experiment.BenchSample] = []
+    known = (row.flow_um_per_s for row in rows if math.isfinite(row.flow_um_per_s))
+    flow = next(known, 0.0)
+    expected = _tick_number(rows[0]) if rows else 0.0
+    for row in rows:
+        # Ticks between the last row and this one.
+        skipped = max(0, round(_tick_number(row) - expected))
+        no_reading = experiment.BenchSample(
+            math.nan, row.ambient_pressure_pa, row.air_temperature_c
+        )
+        flows += [flow] * skipped
+        samples += [no_reading] * skipped
+
+        # This one.
+        if math.isfinite(row.flow_um_per_s):
+            flow = row.flow_um_per_s
+        flows.append(flow)
+        samples.append(
+            experiment.BenchSample(
+                row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c
+            )
+        )
+        expected = _tick_number(row) + 1
+    return flows, samples

@@ -17,7 +17,17 @@ _USUAL = 0.99  # quantile of the differences; larger ones are jumps
 def make_operating_point(
     held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float
 ) -> operating_point.OperatingPoint:
-    """Operating point of an experiment, from the hold before it and the pump's range."""
+    """Operating point of an experiment.
+
+    Parameters
+    ----------
+    held : Record
+        The hold before it: mean flow and noise of a reading.
+    loop, pump : LoopConfig, PumpConfig
+        The range of the flow.
+    limit_um : float
+        How far the mirror may move from its setpoint.
+    """
     return operating_point.OperatingPoint(
         holding_flow_um_per_s=float(held.flow_um_per_s.mean()),
         least_flow_um_per_s=pump_curve.PumpCurve(pump).least_flow_um_per_s,
@@ -36,13 +46,16 @@ def estimate_laser_noise_um(record: Record) -> float:
     0. Their least step shows which: it is small beside the noise of a slow sensor, and
     as large as the noise of a coarse one. Raises ValueError for fewer than two readings.
     """
-    steps_um = np.abs(np.diff(record.displacement_um[np.isfinite(record.displacement_um)]))
+    readings_um = record.displacement_um[np.isfinite(record.displacement_um)]
+    steps_um = np.abs(np.diff(readings_um))
     if steps_um.size == 0:
         raise ValueError("no reading of the mirror in the record")
     changes_um = steps_um[steps_um > 0]
     if changes_um.size == 0:
         return 0.0
     of_changes_um = _scale_from_median(changes_um)
+
+    # A usual sensor, one that repeats its samples, or one with coarse steps?
     if changes_um.size >= _CHANGES_LEAST * steps_um.size:
         return _scale_from_median(steps_um)
     if changes_um.min() < _FINE_STEP * of_changes_um:
@@ -54,4 +67,5 @@ def estimate_laser_noise_um(record: Record) -> float:
 
 def _scale_from_median(steps_um: Series) -> float:
     """Standard deviation of readings whose differences have these sizes, if they are Gaussian."""
+    # A Gaussian's median size is 0.6745 of its standard deviation; a difference has two errors.
     return float(np.median(steps_um) / 0.6745 / math.sqrt(2))

@@ -28,6 +28,9 @@ from tuning.steps.observe import load_disturbance, load_quiet_record
 
 EDITED = "edited"  # name of gains in a file that was edited by hand
 _PICTURE = "candidates.png"
+# Largest values that its bars show
+_RECOVERY_CUT_S = 60.0
+_FLOW_CUT = 3.0  # µm/s
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +44,28 @@ class Design:
 
 
 def run_design(session: folder.SessionFolder, reason: str = "tuning session") -> GainsFile:
-    """Compute the candidates and propose gains. Raises RejectedError if the data do not support a
-    proposal.
+    """Compute the candidates and propose gains.
+
+    Parameters
+    ----------
+    session : SessionFolder
+        With an identified plant and observed weather.
+    reason : str
+        Of the session, for the gains file.
+
+    Returns
+    -------
+    GainsFile
+        The proposal, as it was written.
+
+    Raises
+    ------
+    RejectedError
+        If the data do not support a proposal.
     """
-    found, disturbance = load_identified(session), load_disturbance(session)
+    # The design.
+    found = load_identified(session)
+    disturbance = load_disturbance(session)
     session.begin_step("design")
     before = session.head.before
     try:
@@ -58,6 +79,8 @@ def run_design(session: folder.SessionFolder, reason: str = "tuning session") ->
         raise errors.RejectedError(
             "design: cannot predict a std from this noise and weather: observe again"
         )
+
+    # Its files: the proposed gains with their origin, the table of candidates, all of it.
     gains = GainsFile(
         author=session.head.author,
         date_utc=session.head.created_utc,
@@ -90,7 +113,8 @@ def load_candidates(
     """The candidates, and the one in `gains.toml`, which is a further one if that was edited by
     hand.
     """
-    rows, loop = load_design(session).candidates, load_gains(session.file_path("gains.toml")).loop
+    rows = load_design(session).candidates
+    loop = load_gains(session.file_path("gains.toml")).loop
     gains = closed_loop.Gains.from_config(loop)
     for row in rows:
         if row.gains == gains:
@@ -114,7 +138,21 @@ def list_applicable(session: folder.SessionFolder) -> tuple[str, ...]:
 
 
 def find_candidate(session: folder.SessionFolder, name: str) -> candidate.Candidate:
-    """The candidate of this name. Raises InputError if it is unknown or must not be applied."""
+    """Find a candidate that may be applied.
+
+    Parameters
+    ----------
+    session : SessionFolder
+        With a finished design.
+    name : str
+        `balanced` and `same-load` also where the least variance answers a step of the leak as well
+        as they must.
+
+    Raises
+    ------
+    InputError
+        If it is unknown or must not be applied.
+    """
     rows, _ = load_candidates(session)
     known = {row.name: row for row in rows if row.name != candidate.PRESENT}
     if name in (candidate.BALANCED, candidate.SAME_LOAD) and name not in known:
@@ -221,23 +259,26 @@ def _draw_candidates(path: Path, kept: Design, model: plant_model.PlantModel, dt
     """Draw all candidates: predicted standard deviation, Ms, load peak, recovery, pump activity,
     |S|.
     """
-    sound = [(row, row.predicted) for row in kept.candidates if row.predicted is not None]
-    rows, names = [row for row, _ in sound], [row.name for row, _ in sound]
-    stds, flows = ([getattr(p, name) for _, p in sound] for name in ("std_um", "flow_std_um_per_s"))
+    # The figures of the stable ones.
+    rows = [row for row in kept.candidates if row.predicted is not None]
+    predictions = [row.predicted for row in kept.candidates if row.predicted is not None]
+    names = [row.name for row in rows]
+    stds_um = [predicted.std_um for predicted in predictions]
+    flows_um_per_s = np.minimum([each.flow_std_um_per_s for each in predictions], _FLOW_CUT)
+    sensitivities = [row.margins.ms for row in rows]
+    peaks_um = [row.load_peak_um for row in rows]
+    recoveries_s = np.minimum([row.load_recovery_s for row in rows], _RECOVERY_CUT_S)
+
+    # Five figures as bars, with a limit where there is one.
     figure = Figure(figsize=(12, 8), layout="constrained")
-    (a, b, c), (d, e, f) = figure.subplots(2, 3)
+    panels = figure.subplots(2, 3).ravel()
     places = np.arange(len(names))
     for axes, values, title, limit in (
-        (a, stds, "predicted std (µm)", kept.least_std_um),
-        (b, [row.margins.ms for row in rows], "Ms", 1.4),
-        (c, [row.load_peak_um for row in rows], "load peak (µm)", math.nan),
-        (
-            d,
-            np.minimum([row.load_recovery_s for row in rows], 60.0),
-            "recovery (s, cut at 60)",
-            math.nan,
-        ),
-        (e, np.minimum(flows, 3.0), "flow std (µm/s, cut at 3)", math.nan),
+        (panels[0], stds_um, "predicted std (µm)", kept.least_std_um),
+        (panels[1], sensitivities, "Ms", 1.4),
+        (panels[2], peaks_um, "load peak (µm)", math.nan),
+        (panels[3], recoveries_s, f"recovery (s, cut at {_RECOVERY_CUT_S:.0f})", math.nan),
+        (panels[4], flows_um_per_s, f"flow std (µm/s, cut at {_FLOW_CUT:.0f})", math.nan),
     ):
         axes.barh(places, values, color=["tab:green"] + ["tab:blue"] * (len(names) - 1))
         axes.set_yticks(places, names, fontsize=7)
@@ -245,10 +286,14 @@ def _draw_candidates(path: Path, kept: Design, model: plant_model.PlantModel, dt
         axes.set_title(title, fontsize=9)
         if math.isfinite(limit):
             axes.axvline(limit, color="tab:red", linestyle="--")
+
+    # The sensitivity over the frequency.
+    last = panels[5]
     w = closed_loop.make_frequencies(dt_s)
     for row in rows:
-        size = np.abs(1 / (1 + closed_loop.compute_loop_response(row.gains, model, w, dt_s)))
-        f.semilogx(w, size, linewidth=2 if row is rows[0] else 0.8, label=row.name)
-    f.set(xlim=(0.05, w[-1]), xlabel="rad/s", title="|S|")
-    f.legend(loc="best", fontsize=6)
+        response = closed_loop.compute_loop_response(row.gains, model, w, dt_s)
+        width = 2 if row is rows[0] else 0.8
+        last.semilogx(w, np.abs(1 / (1 + response)), linewidth=width, label=row.name)
+    last.set(xlim=(0.05, w[-1]), xlabel="rad/s", title="|S|")
+    last.legend(loc="best", fontsize=6)
     save_figure(path, figure)

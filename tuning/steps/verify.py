@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from membrane_ctrl.report_pages.blocks import PageSection, PageTable, PageText, 
 from membrane_ctrl.sessions import folder, live_hold, session_json
 from tuning.gains_file import load_gains
 from tuning.identification import closed_loop, plant_model, record_file
-from tuning.identification.record import Record
+from tuning.identification.record import Record, Series
 from tuning.proposal import verification
 from tuning.proposal.candidate import SAME_LOAD
 from tuning.report.pictures import (
@@ -50,53 +50,128 @@ def run_verify(
     report_stage: Callable[[verification.Stage], None] = lambda stage: None,
     stages: tuple[tuple[float, float], ...] = verification.STAGES,
 ) -> Verified:
-    """Hold with the new gains and judge them in stages; keep them,
-    or restore the old ones at once.
+    """Hold with the new gains and judge them in stages; keep them, or restore the old ones at once.
+
+    Parameters
+    ----------
+    session : SessionFolder
+        With gains that were applied.
+    rig : HoldRig
+        The hold.
+    report_stage : callable
+        Gets each stage.
+    stages : tuple of (float, float)
+        Duration from the beginning in s, and largest growth of the standard deviation there.
+
+    Raises
+    ------
+    HoldError
+        If the hold ended, and with it the gains on trial.
     """
     session.require_done("apply")
-    after, before = load_checked_gains(session), session.head.before
-    named = load_gains(session.file_path("gains.toml")).candidate
-    # `same-load` has no price that a person could have accepted
-    accepted = named == load_candidates(session)[1].name != SAME_LOAD
+    trial = _load_trial(session, rig.pump)
     session.begin_step("verify")
-    model, weather = load_identified(session).identified.model, load_disturbance(session)
-    trial = verification.VerificationTrial(model, weather, before, after, accepted, rig.pump)
-    trial_s = verification.find_settling_time_s(after) + 2 * stages[-1][0] + _SPARE_S
-    rig.set_gains(after, f"session {session.path.name}: verification", trial_s)
-    looks: list[verification.Stage] = []
-    record: Record | None = None
-    setpoint_um, reason = np.empty(0), ""
-    held_s = 0.0
+
+    # The gains on trial for longer than the stages last, should this session end early.
+    settling_s = verification.find_settling_time_s(trial.after)
+    trial_s = settling_s + 2 * stages[-1][0] + _SPARE_S
+    rig.set_gains(trial.after, f"session {session.path.name}: verification", trial_s)
+    watched = _WatchedHold()
     try:
-        rig.hold(verification.find_settling_time_s(after))
-        for until_s, growth_max in (*stages, (2 * stages[-1][0], stages[-1][1])):
-            more, about_um = rig.hold_about(until_s - held_s)
-            held_s = until_s
-            record = more if record is None else record.followed_by(more)
-            setpoint_um = np.concatenate((setpoint_um, about_um))
-            looks.append(verification.judge_stage(record, setpoint_um, trial, growth_max))
-            report_stage(looks[-1])
-            reason = looks[-1].reason
-            if until_s == stages[-1][0] and _needs_longer(looks[-1], accepted):
-                continue  # as likely the weather as the gains: as long again decides
-            if until_s >= stages[-1][0] and not reason:
-                reason = verification.explain_no_benefit(looks[-1], trial)
-            if reason or until_s == stages[-1][0]:
-                break
+        rig.hold(settling_s)
+        reason = _judge_in_stages(rig, trial, stages, watched, report_stage)
     except live_hold.HoldError as error:
         reason = str(error)
+
+    # Kept or restored.
     if reason:
         try:
-            rig.set_gains(before, f"verification failed: {reason}"[:250])
+            rig.set_gains(trial.before, f"verification failed: {reason}"[:250])
         except live_hold.HoldError:  # the hold has ended; with it the gains on trial
             raise live_hold.HoldError(reason) from None
     else:
         rig.keep_gains()
-    done = Verified(not reason, reason, tuple(looks), before, after)
-    if record is not None:
-        record_file.save_record(session.file_path("verify.npz"), record)
+    done = Verified(not reason, reason, tuple(watched.stages), trial.before, trial.after)
+    if watched.record is not None:
+        record_file.save_record(session.file_path("verify.npz"), watched.record)
     session_json.write_session_file(session.file_path("verified.json"), done)
     return done
+
+
+def _load_trial(
+    session: folder.SessionFolder, pump: schema.PumpConfig
+) -> verification.VerificationTrial:
+    """The gains on trial and those before, on the session's plant and weather.
+
+    Raises InputError if the gains must not be applied.
+    """
+    after = load_checked_gains(session)
+    named = load_gains(session.file_path("gains.toml")).candidate
+    # `same-load` has no price that a person could have accepted
+    accepted = named == load_candidates(session)[1].name != SAME_LOAD
+    return verification.VerificationTrial(
+        model=load_identified(session).identified.model,
+        weather=load_disturbance(session),
+        before=session.head.before,
+        after=after,
+        accepted=accepted,
+        pump=pump,
+    )
+
+
+@dataclass(slots=True)
+class _WatchedHold:
+    """The hold with the gains on trial so far.
+
+    Attributes
+    ----------
+    record : Record or None
+    setpoint_um : (n,) array
+        Setpoint at each of its samples.
+    stages : list of Stage
+    """
+
+    record: Record | None = None
+    setpoint_um: Series = field(default_factory=lambda: np.empty(0))
+    stages: list[verification.Stage] = field(default_factory=list)
+
+    def add_record(self, more: Record, setpoint_um: Series) -> Record:
+        """Add what was held since; returns all of it."""
+        self.record = more if self.record is None else self.record.followed_by(more)
+        self.setpoint_um = np.concatenate((self.setpoint_um, setpoint_um))
+        return self.record
+
+
+def _judge_in_stages(
+    rig: HoldRig,
+    trial: verification.VerificationTrial,
+    stages: tuple[tuple[float, float], ...],
+    watched: _WatchedHold,
+    report_stage: Callable[[verification.Stage], None],
+) -> str:
+    """Hold and judge stage by stage, as long again if the last one is close.
+
+    `watched` gets the record and the stages, also if the hold ends meanwhile. Returns why the gains
+    must not stay; empty if they may.
+    """
+    last_s, last_growth = stages[-1]
+    held_s = 0.0
+    reason = ""
+    for until_s, growth_max in (*stages, (2 * last_s, last_growth)):
+        more, about_um = rig.hold_about(until_s - held_s)
+        held_s = until_s
+        record = watched.add_record(more, about_um)
+        stage = verification.judge_stage(record, watched.setpoint_um, trial, growth_max)
+        watched.stages.append(stage)
+        report_stage(stage)
+        reason = stage.reason
+        if until_s == last_s and _needs_longer(stage, trial.accepted):
+            continue  # as likely the weather as the gains: as long again decides
+        if until_s >= last_s and not reason:
+            reason = verification.explain_no_benefit(stage, trial)
+        if reason or until_s == last_s:
+            break
+    return reason
 
 
 def _needs_longer(stage: verification.Stage, accepted: bool) -> bool:
