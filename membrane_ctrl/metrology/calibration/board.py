@@ -4,7 +4,7 @@ photograph.
 
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +18,20 @@ MODULES = 8
 _MARKER_SHARE = 6 / MODULES  # side of a marker over that of its square
 _MARKERS = 1000  # markers in the dictionary
 DICTIONARY = cv2.aruco.DICT_4X4_1000
+
+
+class Markers(NamedTuple):
+    """Markers in a photograph, as OpenCV gives them; `ids` is None without any."""
+
+    corners: Any
+    ids: Any
+
+
+def detect_markers(image: Levels) -> Markers:
+    """Find the markers in a photograph."""
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARY))
+    corners, ids, _ = detector.detectMarkers(image)
+    return Markers(corners, ids)
 
 
 @dataclass(frozen=True)
@@ -69,9 +83,24 @@ class Board:
         size = (self.columns * square_px, self.rows * square_px)
         return np.asarray(self._charuco().generateImage(size, marginSize=0), np.uint8)
 
-    def corners(self, image: Levels) -> tuple[FloatArray, FloatArray]:
-        """Inner corners in a photograph: place (n, 3) on the board in squares, and (n, 2) column
-        and row in px.
+    def corners(
+        self, image: Levels, markers: Markers | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Inner corners in a photograph.
+
+        Parameters
+        ----------
+        image : (height, width) array
+        markers : Markers, optional
+            Those of the photograph, of which each size of a charuco board makes other corners;
+            detecting them takes most of the time.
+
+        Returns
+        -------
+        place : (n, 3) array
+            On the board, in squares.
+        seen_px : (n, 2) array
+            Column and row.
         """
         # The corners that are seen, and their numbers, counted row by row.
         numbers = np.zeros(0, int)
@@ -81,7 +110,13 @@ class Board:
             if found:
                 numbers = np.arange(inner[0] * inner[1])
         else:
-            seen, ids, _, _ = cv2.aruco.CharucoDetector(self._charuco()).detectBoard(image)
+            if markers is None:
+                markers = detect_markers(image)
+            ids = None
+            if markers.ids is not None:
+                seen, ids, _, _ = cv2.aruco.CharucoDetector(self._charuco()).detectBoard(
+                    image, markerCorners=markers.corners, markerIds=markers.ids
+                )
             if ids is not None:
                 numbers = np.asarray(ids).ravel()
         if not numbers.size:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from membrane_ctrl.metrology.calibration.board import DICTIONARY, Board, Levels
+from membrane_ctrl.metrology.calibration.board import Board, Levels, Markers, detect_markers
 from membrane_ctrl.metrology.calibration.board_lens import LEAST_CORNERS
 
 _TRIED = 3  # photographs
@@ -34,9 +34,15 @@ def find_other_board(stated: Board, photographs: Sequence[Levels]) -> Board | No
     """
     small = [_shrink(photograph) for photograph in photographs[:_TRIED]]
     needed = min(_CONFIRMED, len(small))
+    markers: list[Markers | None] = [None] * len(small)
+    if stated.kind == "charuco":
+        markers = [detect_markers(photograph) for photograph in small]
     best, best_score = None, (0, 0)
-    for board in _list_candidates(stated, small):
-        counts = [len(board.corners(photograph)[0]) for photograph in small]
+    for board in _list_candidates(stated, small, markers):
+        counts = [
+            len(board.corners(photograph, seen)[0])
+            for photograph, seen in zip(small, markers, strict=True)
+        ]
         shown = sum(count >= LEAST_CORNERS for count in counts)
         score = (sum(counts), -board.columns * board.rows)
         if shown >= needed and score > best_score:
@@ -44,7 +50,9 @@ def find_other_board(stated: Board, photographs: Sequence[Levels]) -> Board | No
     return best
 
 
-def _list_candidates(stated: Board, photographs: Sequence[Levels]) -> list[Board]:
+def _list_candidates(
+    stated: Board, photographs: Sequence[Levels], markers: Sequence[Markers | None]
+) -> list[Board]:
     """Sizes that are tried, without the stated one."""
     if stated.kind == "chessboard":  # a turned one is the same, and the detector is slow
         sizes = _grow_chessboards(photographs)
@@ -53,19 +61,17 @@ def _list_candidates(stated: Board, photographs: Sequence[Levels]) -> list[Board
         sizes = {(max(size), min(size)) for size in sizes}
         sizes.discard((max(stated.columns, stated.rows), min(stated.columns, stated.rows)))
     else:
-        sizes = _list_charuco_sizes(stated, photographs)
+        sizes = _list_charuco_sizes(stated, markers)
         sizes.discard((stated.columns, stated.rows))
     return [Board(stated.kind, *size) for size in sorted(sizes) if min(size) > max(_SMALLEST)]
 
 
-def _list_charuco_sizes(stated: Board, photographs: Sequence[Levels]) -> set[tuple[int, int]]:
+def _list_charuco_sizes(stated: Board, markers: Sequence[Markers | None]) -> set[tuple[int, int]]:
     """Sizes near the stated one with as many markers as the highest number that is seen."""
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARY))
-    markers = 0
-    for photograph in photographs:
-        _, numbers, _ = detector.detectMarkers(photograph)
-        if numbers is not None:
-            markers = max(markers, int(np.max(numbers)) + 1)
+    count = 0
+    for seen in markers:
+        if seen is not None and seen.ids is not None:
+            count = max(count, int(np.max(seen.ids)) + 1)
     around = range(-_AROUND, _AROUND + 1)
     near = {(stated.columns + i, stated.rows + j) for i in around for j in around}
     near |= {(rows, columns) for columns, rows in near}
@@ -73,7 +79,7 @@ def _list_charuco_sizes(stated: Board, photographs: Sequence[Levels]) -> set[tup
     return {
         (columns, rows)
         for columns, rows in near
-        if markers <= columns * rows // 2 <= markers + columns // 2 and markers > 0
+        if count <= columns * rows // 2 <= count + columns // 2 and count > 0
     }
 
 

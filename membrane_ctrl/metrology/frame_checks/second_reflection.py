@@ -47,6 +47,7 @@ _CHANCE_MEDIAN = 0.455
 _LEAST_SHARE = 5e-4  # of the light, to count as a second image
 _STRAY_SHARE = 0.5  # of a second image's share that its mirror image may have
 _TINY = 1e-30  # instead of a division by zero
+_DEPENDENT = 1e-15  # eigenvalue over the largest of rows that depend on others: as of `pinv`
 
 
 @dataclass(frozen=True)
@@ -105,23 +106,20 @@ class _GrayFrame:
         Number of its bit.
     sure : (n,) bool array
         Bins to compare on.
-    columns : (p, n) array
-        The frame's own pattern, of unit length.
-    solve : (p, n) array
-        From a picture to the coefficients of the columns.
+    own : (p, n) array
+        Orthonormal rows that span the frame's own pattern.
     left : (n,) array
-        What the columns leave of the picture.
+        What they leave of the picture.
     """
 
     bit: int
     sure: BoolArray
-    columns: FloatArray
-    solve: FloatArray
+    own: FloatArray
     left: FloatArray
 
     def free_of_own(self, image: FloatArray) -> FloatArray:
         """An image (n,) without what the frame's own pattern explains of it."""
-        return image - (self.solve @ image) @ self.columns
+        return image - (self.own @ image) @ self.own
 
 
 def find_second_reflection(
@@ -221,14 +219,24 @@ def _search_axis(
         # The frame's own pattern: level and contrast, which vary smoothly over the mirror.
         seen = binned.means[k].reshape(-1)[scene.index].astype(float)
         columns = np.concatenate([smooth, smooth * shown]) * (scene.light * sure)
-        columns /= np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), _TINY)
-        solve = np.linalg.pinv(columns @ columns.T) @ columns
-        left = seen * sure - (solve @ (seen * sure)) @ columns
-        frames.append(_GrayFrame(bit, sure, columns, solve, left))
+        own = _span_rows(columns)
+        left = seen * sure - (own @ (seen * sure)) @ own
+        frames.append(_GrayFrame(bit, sure, own, left))
     if not frames:
         return None
     bright = _white_light(stack, binned, scene, excluded)
     return _compare_places(phase_rad - centre_rad, frames, bright, centre_rad)
+
+
+def _span_rows(columns: FloatArray) -> FloatArray:
+    """Orthonormal rows (q, n) that span those of an array (p, n), by the eigenvectors of its Gram
+    matrix.
+    """
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), _TINY)
+    values, vectors = np.linalg.eigh(columns @ columns.T)
+    independent = values > _DEPENDENT * values[-1]
+    scaled = vectors[:, independent] / np.sqrt(values[independent])
+    return np.asarray(scaled.T @ columns)
 
 
 def _compare_places(
@@ -322,10 +330,11 @@ class _Images:
             Light of each bin in each Gray frame.
         """
         place_rad = scale * self._phase_rad + shifts_rad[:, None] + self._reach_rad
-        cell = np.rint(place_rad / _CELL_RAD).astype(np.int32)
-        last = self._table.shape[1] - 1
-        shown = self._table[:, np.clip(cell, 0, last)]
-        return np.asarray(shown * self._bright[:, None])
+        cell = np.rint(place_rad / _CELL_RAD).astype(np.intp)
+        light = np.empty((len(self._table), *cell.shape))
+        for of_frame, shown, bright in zip(light, self._table, self._bright, strict=True):
+            np.multiply(np.take(shown, cell, mode="clip"), bright, out=of_frame)
+        return light
 
 
 def _white_light(
@@ -385,16 +394,16 @@ def _score_places(
     rows = [np.zeros((5, 0))]
     for scale, shifts_rad in places:
         image = images.light_at(scale, shifts_rad)
-        whole_power = np.sum(image**2, axis=(0, 2))
-
-        # Power of the image outside the frames' own patterns, and its product with what is left.
-        power = whole_power.copy()
+        whole_power = np.zeros(shifts_rad.size)
+        power = np.zeros(shifts_rad.size)
         product = np.zeros(shifts_rad.size)
         for of_frame, frame in zip(image, frames, strict=True):
-            coefficients = of_frame @ frame.solve.T
-            products = of_frame @ frame.columns.T
-            power -= np.sum(coefficients * products, axis=1)
-            product += of_frame @ frame.left
+            # Power of the image outside the frame's own pattern, and its product with what is left.
+            of_frame_power = np.einsum("sn,sn->s", of_frame, of_frame)
+            found = of_frame @ np.vstack([frame.own, frame.left]).T
+            whole_power += of_frame_power
+            power += of_frame_power - np.sum(found[:, :-1] ** 2, axis=1)
+            product += found[:, -1]
         determined = power > _LEAST_DETERMINED * whole_power + 1e-9
         power = power[determined]
         product = product[determined]
