@@ -70,8 +70,9 @@ def find_orthotropy(
     waves : tuple of RingWave
         All causes of waves.
     """
-    moduli = next(wave for wave in waves if wave.cause == "modulus")
-    shear = next(wave for wave in waves if wave.cause == "shear")
+    # Each of the film's causes belongs to one order of waves
+    by_cause = {wave.cause: wave for wave in waves}
+    moduli, shear = by_cause["modulus"], by_cause["shear"]
     if not (moduli.explained and shear.explained):
         return None
     # 1. The stiff direction: half the phase of the two waves
