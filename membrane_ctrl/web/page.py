@@ -606,9 +606,13 @@ class WebPage:
 
     @property
     def _can_stop_guided(self) -> bool:
-        """Whether a guided session runs that this viewer may stop: the feed has not its holds."""
+        """Whether STOP is for a guided session: it runs, and no hold of this page does.
+
+        The feed has not the session's own holds. A hold of the page always comes first.
+        """
         is_running = self._guided is not None and self._guided.seen.is_running
-        return is_running and role_includes(self._user.role, STOP.role)
+        is_alone = bool(self._feed.seen.silent)
+        return is_running and is_alone and role_includes(self._user.role, STOP.role)
 
     async def _stop_guided(self) -> None:
         """Ask, and stop the guided session: it switches its pump off."""
