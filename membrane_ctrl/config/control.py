@@ -415,13 +415,14 @@ class EstimatorConfig(Section):
     """Random walk of the air's temperature; learned from a thermometer. Change it for a bench
     without one.
     """
-    centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.02
+    centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.01
     """Random walk of the centre that no weather explains; a hold learns it. Raise it for a shaken
     bench.
     """
-    leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.015
-    """Random walk of the leak between its sudden changes, which the filter detects. Raise it for a
-    leak that changes slowly: it then follows sooner and passes more noise."""
+    leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.0005
+    """Random walk of the leak between its sudden changes, which the filter detects; a hold learns
+    walks of up to 25 times that. Raise it for a leak that changes slowly from the start of a hold
+    on."""
     camera_mount_um_per_k: Annotated[float, Field(ge=-100, le=100)] = 0.0
     """Apparent change of sag for each kelvin by which the camera mount is warmer; it is subtracted.
     Set it to the measured one: a steel mount has about 0.34 at 2.7 m, invar near 0.03."""

@@ -3,13 +3,16 @@
 Pure. docs/explanation/estimator.md derives it.
 
     centre  c = z + g_p p + g_T T_gas           z: the gas in the mirror, as height of the centre
+            + g_p e_p (p - p_0) + g_T e_T (T_gas - T_0)
     dz/dt   = q - leak                          q: the pump's flow, after dead time and lag
     dT_gas/dt = (T_air - T_gas) / T_g
     laser   = c + mount      optics = c - zero       barometer = p      thermometer = T_air
 
-z, leak, p, T_air and mount are random walks; `zero` is by how much the optics' zero differs from
-the laser's at lock. A frame shows the centre of some time ago: the centre at each of the last ticks
-is a state of its own (a clone), so a late reading is exact, whenever it comes.
+z, leak, p, T_air and mount are random walks; e_p and e_T, the shares by which the configured gains
+are wrong, forget within hours; `zero` is by how much the optics' zero differs from the laser's at
+lock. p_0 and T_0 follow p and T_gas slowly, so that a changed e does not move the centre by the
+weather of hours ago. A frame shows the centre of some time ago: the centre at each of the last
+ticks is a state of its own (a clone), so a late reading is exact, whenever it comes.
 """
 
 import math
@@ -30,16 +33,24 @@ from membrane_ctrl.control.centre_estimate import (
 from membrane_ctrl.control.filters import lag_step_fraction
 from membrane_ctrl.control.gas_transit import Transit
 from membrane_ctrl.control.innovation_ramp import InnovationRamp
+from membrane_ctrl.control.leak_walk import LeakWalk
 from membrane_ctrl.control.noise_learning import LearnedFactor, ReadingNoise, configured_walk
 from membrane_ctrl.control.weather_limits import discard_impossible_weather
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
-_GAS, _LEAK, _AMBIENT, _AIR, _WARMTH, _MOUNT, _OPTICS_ZERO = range(7)
-_PLANT = 7  # states before the clones
+_GAS, _LEAK, _AMBIENT, _AIR, _WARMTH, _MOUNT, _OPTICS_ZERO, _PRESSURE_ERROR, _WARMTH_ERROR = range(
+    9
+)
+_PLANT = 9  # states before the clones
 CLONES = 64  # 1.3 s at 50 Hz
 _CLONE_S = 0.02  # least time between clones
-_GAIN_ERROR = 0.2  # share of the barometer's effect that its configured gain may miss
+# Share by which the effect of pressure and temperature may differ from the configured gains, 1
+# sigma, and the time in which it may change
+_GAIN_ERROR = 0.2
+_GAIN_MEMORY_S = 86_400.0
+# The pressure and temperature from which the gains' errors count follow within this time
+_WEATHER_MEMORY_S = 100.0
 # squared sigmas: weighed less beyond the first, dropped beyond the second
 _HUBER2 = 9.0
 _FAR2 = 25.0
@@ -62,7 +73,7 @@ _AMBIENT_STD_PA = 1.0
 _SHARE_S = 2.0  # memory of the sensors' weights
 # Of a leak's ramp in laser or optics, in standard deviations: seldom by chance where the noise is
 # large
-_RUN = 14.0, 8.0
+_RUN = 10.0, 8.0
 # a jump that the optics see and the laser's noise hides is the film's, most likely
 _OPTICS_JUMP_SHARE = 0.3
 # a reading's expectation is a sum of states: one of them, as a row
@@ -89,6 +100,12 @@ class CentreOrigin(StateNode):
     ambient_pressure_pa: float = math.nan
     air_temperature_c: float = math.nan
     sag_um: float = math.nan
+    # Slow means of the states, from which the errors of the gains count
+    mean_pressure_pa: float = 0.0
+    mean_warmth_k: float = 0.0
+    # The gains of the states, µm/Pa and µm/K
+    pressure_gain: float = math.nan
+    warmth_gain: float = math.nan
 
 
 @dataclass(slots=True)
@@ -122,6 +139,7 @@ class CentreState(StateNode):
     walks: Annotated[list[LearnedFactor], Field(min_length=4, max_length=4)] = field(
         default_factory=lambda: [configured_walk() for _ in range(4)]
     )
+    leak_walk: LeakWalk = field(default_factory=LeakWalk)
     # of laser and optics
     ramps: Annotated[list[InnovationRamp], Field(min_length=len(_RUN), max_length=len(_RUN))] = (
         field(default_factory=lambda: [InnovationRamp() for _ in _RUN])
@@ -142,7 +160,7 @@ class CentreFilter:
     ) -> None:
         self._config = config
         self._rate_hz = loop.rate_hz
-        self.set_gains(loop)
+        self._take_gains(loop)
         self._every = max(1, round(_CLONE_S * loop.rate_hz))
         self.memory = memory or CentreState()
         self._transit = self._make_transit()
@@ -169,13 +187,24 @@ class CentreFilter:
         loop : LoopConfig
             Gains in µm/Pa and µm/K, the lag of the gas behind the air, and which sensors are used.
         """
+        x, p, origin = self.memory.x, self.memory.p, self.memory.origin
+        centre_um = self._compute_centre_um()
+        self._take_gains(loop)
+        gains = self._pressure_gain, self._warmth_gain
+        if gains == (origin.pressure_gain, origin.warmth_gain) or math.isnan(origin.pressure_gain):
+            return
+        # Other gains: their errors are unknown again, and the centre stays
+        origin.pressure_gain, origin.warmth_gain = gains
+        for error in (_PRESSURE_ERROR, _WARMTH_ERROR):
+            x[error] = 0.0
+            p[error] = p[:, error] = 0.0
+            p[error, error] = _GAIN_ERROR**2
+        x[_GAS] += centre_um - self._compute_centre_um()
+
+    def _take_gains(self, loop: LoopConfig) -> None:
         self._pressure_gain = loop.barometer_gain_um_per_pa
         self._warmth_gain = loop.temperature_gain_um_per_k
         self._gas_follows_air_s = loop.gas_follows_air_s
-        weather: FloatArray = (
-            self._pressure_gain * _ONE[_AMBIENT] + self._warmth_gain * _ONE[_WARMTH]
-        )
-        self._centre: FloatArray = _ONE[_GAS] + weather
         self._uses = (loop.feedforward_barometer, loop.feedforward_temperature)
 
     def start(
@@ -212,7 +241,11 @@ class CentreFilter:
             _WARMTH_STD_K**2,
             0.0,
             _UNKNOWN_UM2,
+            _GAIN_ERROR**2,
+            _GAIN_ERROR**2,
         )
+        memory.origin.pressure_gain = self._pressure_gain
+        memory.origin.warmth_gain = self._warmth_gain
         for i, variance in enumerate(variances):
             memory.p[i, i] = variance
         # The pump has given this flow for long; a known zero of the optics locks them at once.
@@ -288,10 +321,11 @@ class CentreFilter:
         if math.isfinite(given.sag_um) and 0.0 <= given.sag_change_sigma_um < _IMPOSSIBLE:
             self._use_frame(given)
         if math.isfinite(given.laser_um):
-            row = self._centre + _ONE[_MOUNT]
-            self._use_reading(
-                Sensor.LASER, row, given.laser_um, config.laser_noise_um**2, given.now_s
-            )
+            row = self._find_centre_row(given.now_s) + _ONE[_MOUNT]
+            expected_um = self._compute_centre_um() + float(self.memory.x[_MOUNT])
+            # The expectation is not linear in the errors of the gains
+            change_um = given.laser_um - expected_um + float(row @ self.memory.x)
+            self._use_reading(Sensor.LASER, row, change_um, config.laser_noise_um**2, given.now_s)
         return self._make_estimate(given.now_s)
 
     def _predict_states(self, given: CentreReadings, dt_s: float) -> None:
@@ -301,13 +335,36 @@ class CentreFilter:
         follow = lag_step_fraction(dt_s, self._gas_follows_air_s)
         x[_GAS] += self._transit.advance(given.flow_um_per_s, dt_s) - x[_LEAK] * dt_s
         x[_WARMTH] += follow * (x[_AIR] - x[_WARMTH])
-        # F p F^T: the same two row operations on p and on its transpose (a view)
+        # The means move; the gas takes what the gains' errors then no longer contribute
+        origin, slowly = self.memory.origin, lag_step_fraction(dt_s, _WEATHER_MEMORY_S)
+        pressure_step_pa = slowly * (float(x[_AMBIENT]) - origin.mean_pressure_pa)
+        warmth_step_k = slowly * (float(x[_WARMTH]) - origin.mean_warmth_k)
+        origin.mean_pressure_pa += pressure_step_pa
+        origin.mean_warmth_k += warmth_step_k
+        by_pressure_um = self._pressure_gain * pressure_step_pa
+        by_warmth_um = self._warmth_gain * warmth_step_k
+        x[_GAS] += by_pressure_um * x[_PRESSURE_ERROR] + by_warmth_um * x[_WARMTH_ERROR]
+        # The errors of the gains forget
+        kept = 1.0 - lag_step_fraction(dt_s, _GAIN_MEMORY_S)
+        x[_PRESSURE_ERROR] *= kept
+        x[_WARMTH_ERROR] *= kept
+        # F p F^T: the same row operations on p and on its transpose (a view)
         for matrix in (p, p.T):
-            matrix[_GAS] -= dt_s * matrix[_LEAK]
+            matrix[_GAS] += (
+                by_pressure_um * matrix[_PRESSURE_ERROR]
+                + by_warmth_um * matrix[_WARMTH_ERROR]
+                - dt_s * matrix[_LEAK]
+            )
             matrix[_WARMTH] += follow * (matrix[_AIR] - matrix[_WARMTH])
+            matrix[_PRESSURE_ERROR] *= kept
+            matrix[_WARMTH_ERROR] *= kept
         # Q: the random walks
         p[_GAS, _GAS] += dt_s * self._centre_walk()
-        p[_LEAK, _LEAK] += dt_s * config.leak_walk_um_per_s_per_root_s**2
+        leak_walk = config.leak_walk_um_per_s_per_root_s**2
+        self.memory.leak_walk.predict(dt_s, self._centre_walk(), leak_walk)
+        p[_LEAK, _LEAK] += dt_s * self.memory.leak_walk.factor * leak_walk
+        for error in (_PRESSURE_ERROR, _WARMTH_ERROR):
+            p[error, error] += (1.0 - kept**2) * _GAIN_ERROR**2
         p[_AMBIENT, _AMBIENT] += dt_s * self._pressure_walk()
         p[_AIR, _AIR] += dt_s * self._air_walk()
         # Without optics no reading distinguishes mount from film, and a learned drift of the mount
@@ -323,11 +380,37 @@ class CentreFilter:
             return
         slot = memory.count // self._every % CLONES
         memory.times[slot] = now_s
-        # Its row and column of the covariance are those of c = (self._centre) x
+        # Its row and column of the covariance are those of the centre
         slot += _PLANT
-        memory.p[slot] = memory.p[:, slot] = self._centre @ memory.p
-        memory.p[slot, slot] = self._centre @ memory.p[slot]
-        memory.x[slot] = self._centre @ memory.x
+        row = self._find_centre_row(now_s)
+        memory.p[slot] = memory.p[:, slot] = row @ memory.p
+        memory.p[slot, slot] = row @ memory.p[slot]
+        memory.x[slot] = self._compute_centre_um()
+
+    def _compute_centre_um(self) -> float:
+        """Compute the centre from the states."""
+        x, origin = self.memory.x, self.memory.origin
+        by_error_um = self._pressure_gain * x[_PRESSURE_ERROR] * (
+            x[_AMBIENT] - origin.mean_pressure_pa
+        ) + self._warmth_gain * x[_WARMTH_ERROR] * (x[_WARMTH] - origin.mean_warmth_k)
+        weather_um = self._pressure_gain * x[_AMBIENT] + self._warmth_gain * x[_WARMTH]
+        return float(x[_GAS] + weather_um + by_error_um)
+
+    def _find_centre_row(self, now_s: float) -> FloatArray:
+        """Return the centre's derivative by the states, (73,).
+
+        Without its sensor the weather is estimated from the centre, and shows nothing of its gain.
+        """
+        x, origin = self.memory.x, self.memory.origin
+        row: FloatArray = np.zeros(_STATES)
+        row[_GAS] = 1.0
+        row[_AMBIENT] = self._pressure_gain * (1.0 + x[_PRESSURE_ERROR])
+        row[_WARMTH] = self._warmth_gain * (1.0 + x[_WARMTH_ERROR])
+        if self._is_fresh(Sensor.BAROMETER, now_s):
+            row[_PRESSURE_ERROR] = self._pressure_gain * (x[_AMBIENT] - origin.mean_pressure_pa)
+        if self._is_fresh(Sensor.THERMOMETER, now_s):
+            row[_WARMTH_ERROR] = self._warmth_gain * (x[_WARMTH] - origin.mean_warmth_k)
+        return row
 
     def _use_frame(self, given: CentreReadings) -> None:
         """Use a figure's sag: a reading of the centre at the time at which the frame was taken."""
@@ -394,7 +477,7 @@ class CentreFilter:
         Parameters
         ----------
         sensor : Sensor
-        row : (71,)
+        row : (73,)
             The reading's expectation is this row times the states.
         value, variance : float
             The reading, in its own unit, and the variance stated for it.
@@ -429,7 +512,7 @@ class CentreFilter:
         # After a jump or a run the states may have changed: widen them, then use the whole reading.
         # Otherwise a reading beyond three sigmas counts less (Huber)
         if ramp is not None and runs:
-            self._widen_leak(ramp, now_s, math.sqrt(spread))
+            self._open_leak(ramp, now_s, math.sqrt(spread))
         if watch.far or runs:
             watch.far = 0
             ph, spread = self._project_covariance(row, variance)
@@ -439,10 +522,15 @@ class CentreFilter:
         gain = ph / spread
         x += gain * innovation
         p -= gain[:, None] * ph
+        since_s = min(now_s - watch.seen_s, FRESH_S[sensor])
         watch.seen_s = now_s
         watch.taken_s = taken_s
         if sensor in (Sensor.LASER, Sensor.OPTICS):
-            watch.pull += abs(float(self._centre @ gain))
+            centre_gain = float(self._find_centre_row(now_s) @ gain)
+            watch.pull += abs(centre_gain)
+            if leads:
+                gains = centre_gain, float(gain[_LEAK])
+                memory.leak_walk.learn(innovation, variance, gains, since_s)
 
     def _learn_noise(self, sensor: Sensor, share: float, dt_s: float, leads: bool) -> None:
         """Let a good reading correct the noise levels of the walks that it shows.
@@ -474,13 +562,10 @@ class CentreFilter:
         return self.memory.walks[2].factor * self._config.air_walk_k_per_root_s**2
 
     def _centre_walk(self) -> float:
-        # The barometer's configured gain may be off by a share: that part of the pressure's walk is
-        # not predicted
-        missed = _GAIN_ERROR**2 * self._pressure_gain**2 * self._pressure_walk()
-        return self.memory.walks[0].factor * (self._config.centre_walk_um_per_root_s**2 + missed)
+        return self.memory.walks[0].factor * self._config.centre_walk_um_per_root_s**2
 
     def _project_covariance(self, row: FloatArray, variance: float) -> tuple[FloatArray, float]:
-        """Return P h (71,), the covariance of the states with a reading's expectation, and the
+        """Return P h (73,), the covariance of the states with a reading's expectation, and the
         innovation's variance h^T P h + r.
         """
         ph: FloatArray = self.memory.p @ row
@@ -518,10 +603,11 @@ class CentreFilter:
         elif sensor == Sensor.LASER and self._judged and self._is_fresh(Sensor.OPTICS, now_s):
             self._widen_states(innovation * _ONE[_MOUNT])
         elif sensor == Sensor.BAROMETER:
+            pressure_gain = self._pressure_gain * (1.0 + float(self.memory.x[_PRESSURE_ERROR]))
             self._widen_states(
-                innovation * (_ONE[_AMBIENT] + self._pressure_gain * self._centre_since(since_s))
+                innovation * (_ONE[_AMBIENT] + pressure_gain * self._centre_since(since_s))
             )
-            self._widen_states(self._pressure_gain * innovation * moved)
+            self._widen_states(pressure_gain * innovation * moved)
         elif (
             sensor == Sensor.OPTICS
             and self._laser_agrees(now_s)
@@ -546,14 +632,15 @@ class CentreFilter:
         return np.concatenate([np.zeros(_PLANT), self.memory.times >= since_s])
 
     def _widen_states(self, jump: FloatArray) -> None:
-        """Add the variance of a possible jump of the states, (71,)."""
+        """Add the variance of a possible jump of the states, (73,)."""
         self.memory.p += jump[:, None] * jump
 
-    def _widen_leak(self, ramp: InnovationRamp, now_s: float, sigma_um: float) -> None:
+    def _open_leak(self, ramp: InnovationRamp, now_s: float, sigma_um: float) -> None:
         """Add the variance of a leak that changed when the innovations began to run away."""
         jump = (now_s - ramp.since_s) * _ONE[_GAS] - _ONE[_LEAK]
         jump[_PLANT:] = np.maximum(self.memory.times - ramp.since_s, 0.0)
         self._widen_states(ramp.slope * sigma_um * jump)
+        self.memory.leak_walk.pause()
 
     def _is_fresh(self, sensor: Sensor, now_s: float) -> bool:
         limit_s = FRESH_S[sensor]
@@ -564,15 +651,16 @@ class CentreFilter:
         return now_s - self.memory.watches[sensor].seen_s <= limit_s
 
     def _make_estimate(self, now_s: float) -> CentreEstimate:
-        x = self.memory.x
+        x, row = self.memory.x, self._find_centre_row(now_s)
         drift = float(x[_LEAK])
         if self._gas_follows_air_s > 0:
-            drift -= float(self._warmth_gain * (x[_AIR] - x[_WARMTH]) / self._gas_follows_air_s)
-        um = float(self._centre @ x + x[_MOUNT])
+            gain = self._warmth_gain * (1.0 + x[_WARMTH_ERROR])
+            drift -= float(gain * (x[_AIR] - x[_WARMTH]) / self._gas_follows_air_s)
+        um = self._compute_centre_um() + float(x[_MOUNT])
         pulls = sum(watch.pull for watch in self.memory.watches)
         return CentreEstimate(
             um=um,
-            sigma_um=math.sqrt(max(0.0, self._project_covariance(self._centre, 0.0)[1])),
+            sigma_um=math.sqrt(max(0.0, self._project_covariance(row, 0.0)[1])),
             mount_um=float(x[_MOUNT]),
             ahead_um=um + self._transit.coming_um(drift),
             due_um_per_s=self._transit.due_um_per_s() - drift,
