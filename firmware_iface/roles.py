@@ -115,6 +115,17 @@ class BenchReading:
     # bit i: the board's interlock input i is closed; 0 without inputs: all open
     interlock_inputs: int = 0
     interlocks_open: int = 0
+    film_temperature_c: float = field(
+        default=math.nan,
+        metadata=_declare_sensor("film_thermometer", "film_temperature_c", "°C"),
+    )
+    ring_temperature_c: float = field(
+        default=math.nan,
+        metadata=_declare_sensor("ring_thermometer", "ring_temperature_c", "°C"),
+    )
+    humidity_percent: float = field(
+        default=math.nan, metadata=_declare_sensor("hygrometer", "humidity_percent", "%")
+    )
 
 
 # For a tick without an answer; its integers, which have no NaN, are unused.
@@ -303,6 +314,27 @@ class Thermometer(Device, Protocol):
     """Air temperature beside the mirror."""
 
     async def air_temperature_c(self) -> float:
+        """The newest value, NaN for none. Raises LinkError."""
+
+
+class FilmThermometer(Device, Protocol):
+    """Temperature of the film, by a radiation thermometer."""
+
+    async def film_temperature_c(self) -> float:
+        """The newest value, NaN for none. Raises LinkError."""
+
+
+class RingThermometer(Device, Protocol):
+    """Temperature of the ring that clamps the film."""
+
+    async def ring_temperature_c(self) -> float:
+        """The newest value, NaN for none. Raises LinkError."""
+
+
+class Hygrometer(Device, Protocol):
+    """Relative humidity of the air beside the mirror."""
+
+    async def humidity_percent(self) -> float:
         """The newest value, NaN for none. Raises LinkError."""
 
 

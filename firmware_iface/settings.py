@@ -317,6 +317,9 @@ SENSOR_DRIVERS: dict[str, Any] = {
     "gauge_pressure_pa": PressureDriver,
     "ambient_pressure_pa": BarometerDriver,
     "air_temperature_c": ValueDriver,
+    "film_temperature_c": ValueDriver,
+    "ring_temperature_c": ValueDriver,
+    "humidity_percent": ValueDriver,
 }
 ON_MODBUS = (BronkhorstModbusConfig, ModbusMapConfig)  # have a `link`, the others a `port`
 # Controllers of a flow: it is proportional to the command, from 0 on.

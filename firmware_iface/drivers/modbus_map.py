@@ -231,6 +231,18 @@ class ModbusValue:
         """As `Thermometer`."""
         return await self._read_value()
 
+    async def film_temperature_c(self) -> float:
+        """As `FilmThermometer`."""
+        return await self._read_value()
+
+    async def ring_temperature_c(self) -> float:
+        """As `RingThermometer`."""
+        return await self._read_value()
+
+    async def humidity_percent(self) -> float:
+        """As `Hygrometer`."""
+        return await self._read_value()
+
     async def set_pump(self, fraction: float) -> None:
         """As `Pump`."""
         await self._write_value(fraction)

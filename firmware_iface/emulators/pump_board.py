@@ -50,6 +50,10 @@ class BoardSample:
     sample_counter: int
     device_time_s: float
     interlock_inputs: int = 0xFFFF  # bit i: the circuit of interlock input i is closed
+    # Of instruments beside the board, which has no registers for them
+    film_temperature_c: float = math.nan
+    ring_temperature_c: float = math.nan
+    humidity_percent: float = math.nan
 
     @property
     def gauge_present(self) -> bool:

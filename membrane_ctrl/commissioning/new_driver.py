@@ -46,6 +46,24 @@ _WORDS: dict[str, dict[str, Any]] = {
         "unit": "degC",
         "divisor": 1.0,
     },
+    "film_temperature_c": {
+        "what": "film thermometer",
+        "Role": "FilmThermometer",
+        "unit": "degC",
+        "divisor": 1.0,
+    },
+    "ring_temperature_c": {
+        "what": "ring thermometer",
+        "Role": "RingThermometer",
+        "unit": "degC",
+        "divisor": 1.0,
+    },
+    "humidity_percent": {
+        "what": "hygrometer",
+        "Role": "Hygrometer",
+        "unit": "percent",
+        "divisor": 1.0,
+    },
     "pump_fraction": {"what": "pump", "Role": "Pump", "unit": "percent", "divisor": 100.0},
     "vent_fraction": {"what": "valve", "Role": "Vent", "unit": "percent", "divisor": 100.0},
 }

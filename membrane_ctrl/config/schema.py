@@ -21,6 +21,7 @@ from firmware_iface.settings import Section
 from membrane_ctrl.config import device_places
 from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.config.bridges import BridgesConfig
+from membrane_ctrl.config.climate import ClimateConfig
 from membrane_ctrl.config.control import (
     EstimatorConfig,
     LimitsConfig,
@@ -42,6 +43,7 @@ from membrane_ctrl.config.port import PortConfig
 
 __all__ = [
     "CameraConfig",
+    "ClimateConfig",
     "Config",
     "DevicesConfig",
     "DisturbancesConfig",
@@ -258,6 +260,11 @@ class TwinConfig(Section):
     """Noise of the barometer. Change it to your barometer's."""
     thermometer_noise_k: Annotated[float, Field(ge=0, le=10)] = 0.002
     """Noise of the air thermometer. Change it to your thermometer's."""
+    climate: Literal["steady", "day", "hvac", "lamp"] = "steady"
+    """Climate of the room, which strains film and ring: `day` has +-2 K and +-10 % of relative
+    humidity, `hvac` +-0.5 K and -+2 % each quarter of an hour, `lamp` a warm patch of the film for
+    ten minutes of each hour. Then film, ring and humidity have sensors in virtual time. Change it
+    to see how climate changes the figure."""
     film_prestrain: Annotated[float, Field(ge=-0.01, le=0.1)] = 0.0
     """Strain of the flat film before it was clamped, in its pictures. Change it to try `film` and
     `calibrate`.
@@ -322,6 +329,7 @@ class Config(Section):
     resume: ResumeConfig = ResumeConfig()
     shape: ShapeConfig = ShapeConfig()
     estimator: EstimatorConfig = EstimatorConfig()
+    climate: ClimateConfig = ClimateConfig()
     optics: OpticsConfig = OpticsConfig()
     devices: DevicesConfig | None = None
     twin: TwinConfig = TwinConfig()

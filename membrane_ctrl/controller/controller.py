@@ -39,6 +39,7 @@ from membrane_ctrl.controller import (
     state_handlers,
     state_sets,
 )
+from membrane_ctrl.controller.climate_part import ClimatePart
 from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.observation import Observation
 from membrane_ctrl.controller.observer import Observer
@@ -136,6 +137,7 @@ class Controller:
             present.loop, present.pump, estimator, memory.process_value
         )
         self._sample_rate = SampleRate(memory.sample_rate)
+        self._climate = ClimatePart(config, memory.climate)
         self._short_losses = ShortLossCounter(memory.short_losses)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
@@ -224,6 +226,7 @@ class Controller:
                 answered=inputs.reading is not None and advances,
                 fresh=observation.advance_age_s == 0.0,
             )
+        events += self._climate.step(inputs.reading, self.state, context.dt_s)
         verdict = self._safety.judge(self.state, observation)
         if self._config.states.observe:  # the program that drives the pump protects the mirror
             verdict = safety.Verdict(None)
@@ -263,6 +266,7 @@ class Controller:
                 observation,
                 shape,
                 self._held.row_values,
+                self._climate.telemetry(),
             ),
             events=tuple(events),
             finished=context.finished,

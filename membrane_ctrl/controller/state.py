@@ -12,6 +12,7 @@ from membrane_ctrl.control.held_offset import HeldOffsetMemory
 from membrane_ctrl.control.inner_loop import InnerLoopState
 from membrane_ctrl.control.shape_loop import ShapeLoopMemory
 from membrane_ctrl.controller.centre_estimation import CentreEstimationState
+from membrane_ctrl.controller.climate_part import ClimatePartState
 from membrane_ctrl.controller.gains_trial import GainsInUse, GainsState
 from membrane_ctrl.controller.interlocks import InterlocksState
 from membrane_ctrl.controller.observer import ObserverState
@@ -67,6 +68,7 @@ class ControllerState(StateNode):
     held: HeldOffsetMemory = field(default_factory=HeldOffsetMemory)
     estimation: CentreEstimationState = field(default_factory=CentreEstimationState)
     process_value: ProcessValueState = field(default_factory=ProcessValueState)
+    climate: ClimatePartState = field(default_factory=ClimatePartState)
 
 
 def make_first_state(config: Config) -> ControllerState:

@@ -24,6 +24,7 @@ def make_telemetry_row(
     observation: Observation,
     shape: shape_loop.ShapeOutput,
     held: Mapping[str, float],
+    climate: Mapping[str, float],
 ) -> telemetry.TelemetryRow:
     """Return the row of a tick.
 
@@ -42,6 +43,8 @@ def make_telemetry_row(
         Of the shape loop.
     held : mapping of str to float
         Columns of the held scalar.
+    climate : mapping of str to float
+        Columns of the predicted change of the figure.
     """
     reading = inputs.reading or NO_READING
     out = context.output or inner_loop.LoopOutput()
@@ -86,6 +89,7 @@ def make_telemetry_row(
         interlocks_open=_interlocks_open(context.interlocks),
         **seen,
         **held,
+        **climate,
         **{name: getattr(reading, name) for name in tick_codec.AS_READ},
     )
 

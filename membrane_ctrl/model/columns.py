@@ -43,6 +43,8 @@ UNIT_SUFFIXES: dict[str, str] = {
     "_ms": "ms",
     "_s": "s",
     "_innovation": "σ",
+    "_percent": "%",
+    "_ppm": "ppm",
 }
 
 # What a unit measures, where the unit alone gives it.
@@ -126,6 +128,9 @@ OPTICS_SHARE = Plot("Share of the optics in the estimate", Group.ESTIMATE)
 GAUGE = Plot("Gauge pressure", Group.ENVIRONMENT)
 AMBIENT = Plot("Ambient pressure", Group.ENVIRONMENT)
 TEMPERATURES = Plot("Temperatures", Group.ENVIRONMENT)
+HUMIDITY = Plot("Relative humidity", Group.ENVIRONMENT)
+STRAINS = Plot("Strains of film and ring", Group.ENVIRONMENT)
+CLIMATE_FIGURE = Plot("Figure change predicted from the climate", Group.ENVIRONMENT)
 TRIM = Plot("Trim of the shape loop", Group.SHAPE)
 LATENESS = Plot("Lateness of the tick", Group.TIMING)
 INTERVAL = Plot("Time between ticks", Group.TIMING)
@@ -458,6 +463,55 @@ class ColumnValues:
         TEMPERATURES,
         "/gas/temperature",
         published=True,
+    )
+    film_temperature_c: float = declare_column(
+        "film temperature",
+        "temperature of the film; missing without a film thermometer",
+        TEMPERATURES,
+        "/film/temperature",
+        published=True,
+    )
+    ring_temperature_c: float = declare_column(
+        "ring temperature",
+        "temperature of the ring; missing without a ring thermometer",
+        TEMPERATURES,
+        "/ring/temperature",
+        published=True,
+    )
+    humidity_percent: float = declare_column(
+        "relative humidity",
+        "humidity of the air around the mirror; missing without a hygrometer",
+        HUMIDITY,
+        "/ambient/humidity",
+        decimals=1,
+        published=True,
+    )
+    film_strain_ppm: float = declare_column(
+        "film strain",
+        "strain of the film by temperature and humidity since the hold began",
+        STRAINS,
+        "/film/strain",
+        decimals=1,
+    )
+    ring_strain_ppm: float = declare_column(
+        "ring strain",
+        "strain of the ring by temperature since the hold began",
+        STRAINS,
+        "/ring/strain",
+        decimals=1,
+    )
+    climate_figure_um: float = declare_column(
+        "climate figure",
+        "change of the figure, RMS, predicted from the two strains at a held centre",
+        CLIMATE_FIGURE,
+        "/film/figure_change",
+        published=True,
+    )
+    climate_sigma_um: float = declare_column(
+        "climate figure sigma",
+        "standard deviation of that prediction",
+        CLIMATE_FIGURE,
+        "/film/figure_change_sigma",
     )
     displacement_quality: float = declare_column(
         "displacement quality",

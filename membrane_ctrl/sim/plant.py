@@ -16,6 +16,7 @@ from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.sim import film
 from membrane_ctrl.sim.bench_events import BenchEvent
+from membrane_ctrl.sim.climate import ClimateBlock, Room
 from membrane_ctrl.sim.gas import GAS_FOLLOWS_AIR_S, REFERENCE_K, STANDARD_AMBIENT_PA, Gas, fill_gas
 from membrane_ctrl.sim.pump_model import PumpModel
 from membrane_ctrl.sim.sensors import Sensors
@@ -63,6 +64,7 @@ class Plant:
         # Weather and noise have random numbers of their own: one changes without the other.
         chance, noise = np.random.default_rng(twin.seed).spawn(2)
         self._sensors = Sensors(twin, noise)
+        self._room = Room(twin)
         self._disturbance = Disturbance(twin, events, STEP_S, chance)
         self._leak_ml_per_s_per_pa = gas_compliance_ml_per_pa() / twin.leak_time_constant_s
         self._vent_ml_per_s_per_pa = (
@@ -73,6 +75,7 @@ class Plant:
         self._steps = 0
         self._rest = 0.0
         self._pump_fraction = self._vent_fraction = self._inflow_ml_per_s = 0.0
+        self._climate: ClimateBlock | None = None
         self._load_block()
         self._index = 0
         # From flat films without gas, or at the setpoint with the pump at the flow that holds it.
@@ -125,6 +128,7 @@ class Plant:
         gauge_pa = gas.gauge_pressure_pa
         sag_mm = self._sag[i] * gas.root_pa
         um_per_ml = 1e3 * self._sag[i] * gas.root_pa_per_ml(ambient_pa, self._volume[i])
+        climate = {} if self._climate is None else self._climate.truth_at(i)
         return Truth(
             time_s=self.time_s,
             displacement_um=1e3 * (sag_mm - film.NOMINAL_SAG_MM),
@@ -139,6 +143,7 @@ class Plant:
             leak_um_per_s=um_per_ml * self._leak_ml_per_s_per_pa * self._leak[i] * gauge_pa,
             pump_um_per_s=um_per_ml * self._inflow_ml_per_s,
             vent_um_per_s=um_per_ml * self._vent_ml_per_s_per_pa * self._vent_fraction * gauge_pa,
+            **climate,
         )
 
     def _run_steps(self, start: int, stop: int) -> None:
@@ -183,3 +188,13 @@ class Plant:
         ) + film.BACK_FILM.volume_m3_per_root_pa(age_s)
         self._volume: list[float] = volume.tolist()
         self._index = -1
+        if self._room.is_steady:
+            return
+        weather = self._room.make_block(self._steps * STEP_S + STEP_S * np.arange(_BLOCK_STEPS))
+        self._climate = weather
+        self._air_k = (block.air_k + weather.air_k).tolist()
+        self._sag = (np.asarray(self._sag) * weather.mirror_factor).tolist()
+        self._back_sag = (np.asarray(self._back_sag) * weather.back_factor).tolist()
+        mirror = film.MIRROR_FILM.volume_m3_per_root_pa(age_s) * weather.mirror_factor
+        back = film.BACK_FILM.volume_m3_per_root_pa(age_s) * weather.back_factor
+        self._volume = (mirror + back).tolist()

@@ -9,6 +9,11 @@ from membrane_ctrl.config.schema import TwinConfig
 from membrane_ctrl.sim.truth import Truth
 
 GAUGE_NOISE_PA = 0.5  # a +-1 kPa differential sensor (assumed): 10 µm of centre, so a monitor only
+# An infrared thermometer, a resistor, and a capacitive hygrometer (assumed)
+FILM_NOISE_K = 0.05
+RING_NOISE_K = 0.01
+HUMIDITY_NOISE_PERCENT = 0.1
+_CLIMATE_NOISE = 77  # of the seed
 LASER_GOOD = 0
 LASER_NO_LIGHT = 1
 
@@ -20,6 +25,8 @@ class Sensors:
         self._config = config
         self._rng = rng
         self._counter = 0
+        # Of their own, so that the other sensors have the same noise in every climate
+        self._climate_rng = np.random.default_rng([config.seed, _CLIMATE_NOISE])
 
     def read(self, truth: Truth) -> BoardSample:
         """A new sample; the counter advances by one. Without light the displacement is NaN, its
@@ -36,6 +43,9 @@ class Sensors:
             displacement_um = _quantise_value(reading_um, config.laser_resolution_um)
             quality = LASER_GOOD
         self._counter += 1
+        film_k, ring_k, humidity = (math.nan, math.nan, math.nan)
+        if math.isfinite(truth.humidity_percent):
+            film_k, ring_k, humidity = self._climate_rng.standard_normal(3).tolist()
         return BoardSample(
             displacement_um=displacement_um,
             displacement_quality=quality,
@@ -45,6 +55,9 @@ class Sensors:
             gas_temperature_c=truth.gas_temperature_c + config.thermometer_noise_k * gas,
             sample_counter=self._counter,
             device_time_s=truth.time_s,
+            film_temperature_c=truth.film_temperature_c + FILM_NOISE_K * film_k,
+            ring_temperature_c=truth.ring_temperature_c + RING_NOISE_K * ring_k,
+            humidity_percent=truth.humidity_percent + HUMIDITY_NOISE_PERCENT * humidity,
         )
 
 

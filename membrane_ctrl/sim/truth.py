@@ -1,5 +1,6 @@
 """The true state of the simulated bench, as one message of a ring."""
 
+import math
 import struct
 from dataclasses import astuple, dataclass, fields
 
@@ -22,6 +23,10 @@ class Truth:
     leak_um_per_s: float  # speed at which the leak alone lowers the centre
     pump_um_per_s: float  # speed at which the pump's flow lifts it
     vent_um_per_s: float
+    film_temperature_c: float = math.nan
+    ring_temperature_c: float = math.nan
+    humidity_percent: float = math.nan
+    excess_strain_ppm: float = 0.0  # strain of the film above that of its ring
 
     def pack(self) -> bytes:
         """The fields as doubles in their order."""

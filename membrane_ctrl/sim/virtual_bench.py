@@ -106,7 +106,15 @@ class VirtualBench:
         """One sample. Raises LinkError."""
         reading = at_once(self._driver.read())
         interlocks_open = self.interlocks.open_mask(reading.interlock_inputs, self.plant.time_s)
-        reading = replace(reading, interlocks_open=interlocks_open)
+        # Instruments beside the board, which has no registers for the climate
+        sample = self._sample
+        reading = replace(
+            reading,
+            interlocks_open=interlocks_open,
+            film_temperature_c=sample.film_temperature_c,
+            ring_temperature_c=sample.ring_temperature_c,
+            humidity_percent=sample.humidity_percent,
+        )
         if math.isnan(self.wrong.readback_fraction):
             return reading
         return replace(reading, pump_fraction=self.wrong.readback_fraction)

@@ -1,0 +1,161 @@
+"""Strains of film and ring by temperature and humidity. Pure.
+
+    strain of the film   s_f = a_f T_film + b m       dm/dt = (H - m) / T_m
+    strain of the ring   s_r = a_r T_ring
+    excess               e = s_f - s_r, less that at the reference
+
+T_film, T_ring and the moisture m (as the relative humidity at which the film would be in balance)
+are the states. Each follows its sensor; without one the film follows the air, the ring the air with
+a lag, and the moisture stays. What is not measured makes the error larger with time.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from membrane_ctrl.config.climate import ClimateConfig
+from membrane_ctrl.control.filters import LowPass
+from membrane_ctrl.model.state_tree import StateNode
+
+# Noise of a thermometer or hygrometer is no change of the film
+_SMOOTH_S = 30.0
+# Without its sensor a state wanders by this, 1 sigma, in the square root of an hour, and by at most
+# a room's daily change (assumed)
+_WANDER_K = 0.5
+_WANDER_PERCENT = 3.0
+_WANDER_LIMIT_H = 12.0
+# A film without a thermometer is as warm as the air, but for the light that it absorbs (assumed)
+_FILM_AS_AIR_K = 0.3
+# The ring's expansion is that of a metal, known to (assumed)
+_RING_SIGMA = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class ClimateReadings:
+    """Usable readings of one tick; NaN for missing ones."""
+
+    film_c: float
+    ring_c: float
+    humidity_percent: float
+    air_c: float
+
+
+@dataclass(frozen=True, slots=True)
+class ClimateStrain(StateNode):
+    """Strains since the reference, in 1e-6.
+
+    Attributes
+    ----------
+    film_ppm, ring_ppm : float
+        NaN as long as no reading shows them.
+    excess_ppm, sigma_ppm : float
+        Strain of the film above that of the ring, and its standard deviation.
+    """
+
+    film_ppm: float = math.nan
+    ring_ppm: float = math.nan
+    excess_ppm: float = math.nan
+    sigma_ppm: float = math.nan
+
+
+@dataclass(slots=True)
+class FollowedState(StateNode):
+    """A temperature or the moisture: its value, at the reference, and how long it is unseen."""
+
+    value: LowPass = field(default_factory=LowPass)
+    reference: float = math.nan
+    unseen_s: float = 0.0
+
+    def follow(self, reading: float, dt_s: float, lag_s: float) -> None:
+        """Follow a reading; NaN leaves the value and counts the time."""
+        if math.isfinite(reading):
+            self.value.update(reading, dt_s, lag_s)
+            self.unseen_s = 0.0
+        else:
+            self.unseen_s += dt_s
+
+    @property
+    def change(self) -> float:
+        """Since the reference; 0 while the state is unknown."""
+        if math.isnan(self.value.value) or math.isnan(self.reference):
+            return 0.0
+        return self.value.value - self.reference
+
+
+@dataclass(slots=True)
+class ClimateState(StateNode):
+    """What the estimate of the strains remembers."""
+
+    film: FollowedState = field(default_factory=FollowedState)
+    ring: FollowedState = field(default_factory=FollowedState)
+    moisture: FollowedState = field(default_factory=FollowedState)
+    has_film_sensor: bool = False
+
+
+class Climate:
+    """Follows the strains, tick by tick."""
+
+    def __init__(self, config: ClimateConfig, memory: ClimateState | None = None) -> None:
+        self._config = config
+        self.memory = memory or ClimateState()
+
+    def set_reference(self) -> None:
+        """From now on the strains count from the present ones."""
+        memory = self.memory
+        for state in (memory.film, memory.ring, memory.moisture):
+            state.reference = state.value.value
+
+    def step(self, given: ClimateReadings, dt_s: float) -> ClimateStrain:
+        """Follow the readings of one tick.
+
+        Parameters
+        ----------
+        given : ClimateReadings
+        dt_s : float
+            Since the last tick, above 0.
+
+        Returns
+        -------
+        ClimateStrain
+        """
+        memory, config = self.memory, self._config
+        memory.has_film_sensor |= math.isfinite(given.film_c)
+        film_c = given.film_c
+        if not memory.has_film_sensor:
+            film_c = given.air_c
+        memory.film.follow(film_c, dt_s, _SMOOTH_S)
+        if math.isfinite(given.ring_c):
+            memory.ring.follow(given.ring_c, dt_s, _SMOOTH_S)
+        else:
+            memory.ring.follow(given.air_c, dt_s, config.ring_follows_air_s)
+        memory.moisture.follow(given.humidity_percent, dt_s, config.film_follows_humidity_s)
+        # A state that is seen for the first time is its own reference
+        for state in (memory.film, memory.ring, memory.moisture):
+            if math.isnan(state.reference):
+                state.reference = state.value.value
+        return self._make_strain()
+
+    def _make_strain(self) -> ClimateStrain:
+        memory, config = self.memory, self._config
+        if math.isnan(memory.film.value.value) and math.isnan(memory.moisture.value.value):
+            return ClimateStrain()
+        by_heat_ppm = config.film_ppm_per_k * memory.film.change
+        by_water_ppm = config.film_ppm_per_percent * memory.moisture.change
+        ring_ppm = config.ring_ppm_per_k * memory.ring.change
+        film_k = _wander(_WANDER_K, memory.film.unseen_s)
+        if not memory.has_film_sensor:
+            film_k = math.hypot(film_k, _FILM_AS_AIR_K)
+        parts = (
+            config.film_sigma * by_heat_ppm,
+            config.film_sigma * by_water_ppm,
+            _RING_SIGMA * ring_ppm,
+            config.film_ppm_per_k * film_k,
+            config.ring_ppm_per_k * _wander(_WANDER_K, memory.ring.unseen_s),
+            config.film_ppm_per_percent * _wander(_WANDER_PERCENT, memory.moisture.unseen_s),
+        )
+        film_ppm = by_heat_ppm + by_water_ppm
+        return ClimateStrain(film_ppm, ring_ppm, film_ppm - ring_ppm, math.hypot(*parts))
+
+
+def _wander(per_root_hour: float, unseen_s: float) -> float:
+    """Standard deviation of a state that no sensor has shown for a time."""
+    return per_root_hour * math.sqrt(min(unseen_s / 3600.0, _WANDER_LIMIT_H))

@@ -1,0 +1,134 @@
+"""Predicts from temperature and humidity how the figure changes, and reports when that matters."""
+
+import math
+from dataclasses import dataclass, field
+
+from firmware_iface.roles import BenchReading
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control import weather_limits
+from membrane_ctrl.control.climate import Climate, ClimateReadings, ClimateState, ClimateStrain
+from membrane_ctrl.control.climate_sensors import (
+    ClimateSensor,
+    ClimateSensors,
+    ClimateSensorsState,
+)
+from membrane_ctrl.metrology.film.climate_figure import compute_climate_sensitivity
+from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
+from membrane_ctrl.model.state_tree import StateNode
+from membrane_ctrl.model.telemetry import State
+
+FIGURE_NOTICE = "climate_figure"
+_SENSOR_NOTICES = {
+    ClimateSensor.FILM: "film_thermometer",
+    ClimateSensor.RING: "ring_thermometer",
+    ClimateSensor.HUMIDITY: "hygrometer",
+}
+# The notice ends only when the figure is clearly nearer again
+_OVER_SHARE = 0.8
+_SPHERICAL = 11  # Noll index
+
+
+@dataclass(slots=True)
+class ClimatePartState(StateNode):
+    """What the prediction remembers."""
+
+    sensors: ClimateSensorsState = field(default_factory=ClimateSensorsState)
+    climate: ClimateState = field(default_factory=ClimateState)
+    strain: ClimateStrain = field(default_factory=ClimateStrain)
+    referred: bool = False  # the strains count from the begin of the hold
+    reported: bool = False
+
+
+class ClimatePart:
+    """Follows the climate beside the states; commands nothing."""
+
+    def __init__(self, config: Config, memory: ClimatePartState | None = None) -> None:
+        self.memory = memory or ClimatePartState()
+        mirror = config.optics.mirror
+        self._sensitivity = compute_climate_sensitivity(mirror.radius_mm, mirror.sag_mm)
+        self._most_um = config.climate.figure_max_um
+        self._sensors = ClimateSensors(self.memory.sensors)
+        self._climate = Climate(config.climate, self.memory.climate)
+
+    @property
+    def figure_um(self) -> float:
+        """Predicted change of the figure since the begin of the hold, RMS; NaN if unknown."""
+        return abs(self.memory.strain.excess_ppm) * self._sensitivity.change_rms_um
+
+    def step(self, reading: BenchReading | None, state: State, dt_s: float) -> list[Event]:
+        """Follow one tick; returns the events.
+
+        Parameters
+        ----------
+        reading : BenchReading or None
+        state : State
+            The strains count from the moment at which `hold` begins.
+        dt_s : float
+            Since the last tick.
+        """
+        if reading is None:
+            return []
+        events: list[Event] = []
+        values = {
+            ClimateSensor.FILM: reading.film_temperature_c,
+            ClimateSensor.RING: reading.ring_temperature_c,
+            ClimateSensor.HUMIDITY: reading.humidity_percent,
+        }
+        usable: dict[ClimateSensor, float] = {}
+        for sensor, value in values.items():
+            usable[sensor], news = self._sensors.judge(sensor, value, dt_s)
+            if news is not None:
+                events.append(_report_sensor(sensor, news))
+        # A bench without any of these sensors predicts nothing
+        if all(not math.isfinite(watch.value) for watch in self.memory.sensors.watches):
+            return events
+        _, air_c = weather_limits.discard_impossible_weather(math.nan, reading.air_temperature_c)
+        readings = ClimateReadings(
+            usable[ClimateSensor.FILM],
+            usable[ClimateSensor.RING],
+            usable[ClimateSensor.HUMIDITY],
+            air_c,
+        )
+        self.memory.strain = self._climate.step(readings, dt_s)
+        held = state == State.HOLD
+        if held and not self.memory.referred:
+            self._climate.set_reference()
+        self.memory.referred = held or (self.memory.referred and state == State.TUNE)
+        return events + self._report_figure()
+
+    def telemetry(self) -> dict[str, float]:
+        """Columns of a telemetry row."""
+        strain = self.memory.strain
+        return {
+            "film_strain_ppm": strain.film_ppm,
+            "ring_strain_ppm": strain.ring_ppm,
+            "climate_figure_um": self.figure_um,
+            "climate_sigma_um": strain.sigma_ppm * self._sensitivity.change_rms_um,
+        }
+
+    def _report_figure(self) -> list[Event]:
+        memory = self.memory
+        share = _OVER_SHARE if memory.reported else 1.0
+        beyond = memory.referred and self.figure_um > share * self._most_um
+        if beyond == memory.reported:
+            return []
+        memory.reported = beyond
+        strain = memory.strain
+        if not beyond:
+            message = f"the figure is predicted to be {self.figure_um:.1f} µm RMS from its first"
+            return [MaintenanceOver(FIGURE_NOTICE, message)]
+        spherical_um = abs(strain.excess_ppm * self._sensitivity.terms_um[_SPHERICAL - 1])
+        message = (
+            f"the film is {strain.excess_ppm:+.0f} +- {strain.sigma_ppm:.0f} ppm longer than its "
+            "ring since the hold began: the figure is predicted to have changed by "
+            f"{self.figure_um:.1f} µm RMS, {spherical_um:.1f} µm of it spherical, however well "
+            "the centre is held. Keep temperature and humidity steady, or measure a new reference"
+        )
+        return [Maintenance(FIGURE_NOTICE, message)]
+
+
+def _report_sensor(sensor: ClimateSensor, fault: str) -> Event:
+    name = _SENSOR_NOTICES[sensor]
+    if fault:
+        return Maintenance(name, f"{fault}; the prediction of the figure does without it")
+    return MaintenanceOver(name, "the sensor is back")
