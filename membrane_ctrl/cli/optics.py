@@ -52,6 +52,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(measure)
     app.command()(track)
     app.command()(modes)
+    app.command()(climate)
     app.command()(export_figure)
     app.command()(film)
     app.command()(uncertainty)
@@ -123,6 +124,16 @@ def modes(
     from membrane_ctrl.review.statistics.modes_run import modes_command
 
     return modes_command(folders, out, json, pictures)
+
+
+def climate(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run of a night with figures.")],
+    json: JsonOption = False,
+) -> int:
+    """Learn how temperature and humidity strain film and ring, from the figures of a night."""
+    from membrane_ctrl.review.statistics.climate_run import climate_command
+
+    return climate_command(run, json)
 
 
 def export_figure(

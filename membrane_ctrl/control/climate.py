@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass, field
 
 from membrane_ctrl.config.climate import ClimateConfig
-from membrane_ctrl.control.filters import LowPass
+from membrane_ctrl.control.filters import LowPass, lag_step_fraction
 from membrane_ctrl.model.state_tree import StateNode
 
 # Noise of a thermometer or hygrometer is no change of the film
@@ -25,6 +25,8 @@ _WANDER_PERCENT = 3.0
 _WANDER_LIMIT_H = 12.0
 # A film without a thermometer is as warm as the air, but for the light that it absorbs (assumed)
 _FILM_AS_AIR_K = 0.3
+# A ring without a thermometer is as warm as the air behind its lag (assumed)
+_RING_AS_AIR_K = 0.5
 # The ring's expansion is that of a metal, known to (assumed)
 _RING_SIGMA = 0.03
 
@@ -64,14 +66,28 @@ class FollowedState(StateNode):
     value: LowPass = field(default_factory=LowPass)
     reference: float = math.nan
     unseen_s: float = 0.0
+    # Share of the error of the first value that remains, now and at the reference
+    start_share: float = 1.0
+    start_share_at_reference: float = 1.0
 
     def follow(self, reading: float, dt_s: float, lag_s: float) -> None:
         """Follow a reading; NaN leaves the value and counts the time."""
         if math.isfinite(reading):
             self.value.update(reading, dt_s, lag_s)
+            self.start_share *= 1.0 - lag_step_fraction(dt_s, lag_s)
             self.unseen_s = 0.0
         else:
             self.unseen_s += dt_s
+
+    def set_reference(self) -> None:
+        """Count changes from the present value."""
+        self.reference = self.value.value
+        self.start_share_at_reference = self.start_share
+
+    @property
+    def start_error(self) -> float:
+        """Share of the first value's error that has entered the change since the reference."""
+        return self.start_share_at_reference - self.start_share
 
     @property
     def change(self) -> float:
@@ -89,6 +105,7 @@ class ClimateState(StateNode):
     ring: FollowedState = field(default_factory=FollowedState)
     moisture: FollowedState = field(default_factory=FollowedState)
     has_film_sensor: bool = False
+    sees_ring: bool = False  # by its own sensor
 
 
 class Climate:
@@ -102,7 +119,7 @@ class Climate:
         """From now on the strains count from the present ones."""
         memory = self.memory
         for state in (memory.film, memory.ring, memory.moisture):
-            state.reference = state.value.value
+            state.set_reference()
 
     def step(self, given: ClimateReadings, dt_s: float) -> ClimateStrain:
         """Follow the readings of one tick.
@@ -123,7 +140,8 @@ class Climate:
         if not memory.has_film_sensor:
             film_c = given.air_c
         memory.film.follow(film_c, dt_s, _SMOOTH_S)
-        if math.isfinite(given.ring_c):
+        memory.sees_ring = math.isfinite(given.ring_c)
+        if memory.sees_ring:
             memory.ring.follow(given.ring_c, dt_s, _SMOOTH_S)
         else:
             memory.ring.follow(given.air_c, dt_s, config.ring_follows_air_s)
@@ -131,7 +149,7 @@ class Climate:
         # A state that is seen for the first time is its own reference
         for state in (memory.film, memory.ring, memory.moisture):
             if math.isnan(state.reference):
-                state.reference = state.value.value
+                state.set_reference()
         return self._make_strain()
 
     def _make_strain(self) -> ClimateStrain:
@@ -144,13 +162,17 @@ class Climate:
         film_k = _wander(_WANDER_K, memory.film.unseen_s)
         if not memory.has_film_sensor:
             film_k = math.hypot(film_k, _FILM_AS_AIR_K)
+        ring_k = _wander(_WANDER_K, memory.ring.unseen_s)
+        if not memory.sees_ring:
+            ring_k = math.hypot(ring_k, _RING_AS_AIR_K)
         parts = (
             config.film_sigma * by_heat_ppm,
             config.film_sigma * by_water_ppm,
             _RING_SIGMA * ring_ppm,
             config.film_ppm_per_k * film_k,
-            config.ring_ppm_per_k * _wander(_WANDER_K, memory.ring.unseen_s),
+            config.ring_ppm_per_k * ring_k,
             config.film_ppm_per_percent * _wander(_WANDER_PERCENT, memory.moisture.unseen_s),
+            config.film_ppm_per_percent * _WANDER_PERCENT * memory.moisture.start_error,
         )
         film_ppm = by_heat_ppm + by_water_ppm
         return ClimateStrain(film_ppm, ring_ppm, film_ppm - ring_ppm, math.hypot(*parts))

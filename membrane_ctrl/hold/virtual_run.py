@@ -21,8 +21,12 @@ from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.metrology.figure.held_quantities import find_held_weights
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import arrays, clock, errors, events, run_events, shape_estimate, telemetry
+from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.processes import ring
 from membrane_ctrl.sim import virtual_bench
+from membrane_ctrl.sim.climate import ROUND_TERMS, compute_figure_change_per_ppm
+from membrane_ctrl.sim.truth import Truth
 
 Rings = Mapping[str, ring.RingWriter]
 Alter = Callable[[float, roles.BenchReading], roles.BenchReading | None]
@@ -261,6 +265,14 @@ class TruthShape:
         self._covariance = sag_change_sigma_um**2 * np.outer(self._projection, self._projection)
         self._cycle = 0
 
+    def _find_climate_change(self, truth: Truth) -> FloatArray:
+        """Terms of the figure that the room's climate has changed, at the present sag."""
+        terms_um: FloatArray = np.zeros(ZERNIKE_TERMS)
+        if truth.excess_strain_ppm:
+            round_terms = [noll - 1 for noll in ROUND_TERMS]
+            terms_um[round_terms] = truth.excess_strain_ppm * compute_figure_change_per_ppm()
+        return terms_um
+
     def __call__(self, now_s: float) -> shape_estimate.ShapeEstimate | None:
         """One cycle; None while the camera is lost."""
         wrong = self._bench.wrong
@@ -275,7 +287,7 @@ class TruthShape:
         return shape_estimate.ShapeEstimate(
             time_s=now_s,
             kind="fringes",
-            coeffs_um=sag_um * self._projection,
+            coeffs_um=sag_um * self._projection + self._find_climate_change(truth),
             hencky_um=0.0,
             covariance_um2=self._covariance,
             sag_um=sag_um,

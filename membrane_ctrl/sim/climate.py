@@ -38,6 +38,7 @@ LAMP_K = 1.0
 LAMP_SHARE = 0.065
 POISSON_RATIO = 0.38
 _STEP = 2e-5  # of the pre-strain, for the derivative
+ROUND_TERMS = (1, 4, 11, 22)  # Noll indices of `compute_figure_change_per_ppm`
 _THICKNESS_RATIO = 5.0  # of mirror and back film
 
 
@@ -144,3 +145,27 @@ def compute_sag_change_per_ppm() -> float:
     by_strain = (load[1] - load[-1]) / (2 * _STEP)
     by_depth = (deeper - shallower) / 0.002
     return 1e-6 * by_strain / by_depth
+
+
+@cache
+def compute_figure_change_per_ppm() -> FloatArray:
+    """Change of the figure at equal sag for an excess strain of 1e-6: its `ROUND_TERMS` in µm.
+
+    Heights are upward and the vertex is held.
+    """
+    depth = NOMINAL_SAG_MM / RADIUS_MM
+    profiles = [solve_stretched_film(depth, s * _STEP, POISSON_RATIO)[1] for s in (-1, 1)]
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    v = (nodes + 1) / 2
+    # From 0 at the vertex to 1 at the rim, whatever the profile counts from
+    heights = [
+        (np.polynomial.polynomial.polyval(v, profile) - profile[0]) / (profile.sum() - profile[0])
+        for profile in profiles
+    ]
+    change_um = 1e3 * NOMINAL_SAG_MM * (heights[0] - heights[1]) / (2 * _STEP) * 1e-6
+    terms = [
+        math.sqrt(2 * k + 1)
+        * float(np.sum(weights / 2 * change_um * np.polynomial.legendre.Legendre.basis(k)(nodes)))
+        for k in range(4)
+    ]
+    return np.array(terms)
