@@ -72,7 +72,8 @@ def compute_climate_sensitivity(
     difference = legendre_series(longer.with_sag(sag_mm), _DEGREE) - legendre_series(
         shorter.with_sag(sag_mm), _DEGREE
     )
-    change = 1e3 * per_step * np.asarray(difference.coef)
+    coefficients: FloatArray = np.asarray(difference.coef, dtype=np.float64)
+    change: FloatArray = 1e3 * per_step * coefficients
     terms_um = np.zeros(ZERNIKE_TERMS)
     for degree, noll in enumerate(ROUND_NOLL):
         terms_um[noll - 1] = change[degree] / np.sqrt(2 * degree + 1)

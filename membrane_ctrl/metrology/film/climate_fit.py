@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from membrane_ctrl.control.filters import lag_step_fraction
 from membrane_ctrl.model.arrays import FloatArray
 
 BLOCK_S = 3600.0
@@ -207,7 +206,7 @@ def _follow(values: FloatArray, time_s: FloatArray, lag_s: float) -> FloatArray:
     """The values behind a lag, in balance at first."""
     followed = np.empty_like(values)
     followed[0] = values[0]
-    share = lag_step_fraction(float(np.median(np.diff(time_s))), lag_s)
+    share = -np.expm1(-float(np.median(np.diff(time_s))) / lag_s)
     for k in range(1, values.size):
         followed[k] = followed[k - 1] + share * (values[k] - followed[k - 1])
     return followed
