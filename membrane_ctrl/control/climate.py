@@ -16,6 +16,10 @@ from membrane_ctrl.config.climate import ClimateConfig
 from membrane_ctrl.control.filters import LowPass, lag_step_fraction
 from membrane_ctrl.model.state_tree import StateNode
 
+# Change of the height at equal sag for an excess strain e, by e a^2 / sag: RMS over the mirror, and
+# Noll 11 (`metrology.film.climate_figure`, Poisson's ratio 0.38)
+CHANGE_RMS = 0.030539
+CHANGE_SPHERICAL = 0.012199
 # Noise of a thermometer or hygrometer is no change of the film
 _SMOOTH_S = 30.0
 # Without its sensor a state wanders by this, 1 sigma, in the square root of an hour, and by at most

@@ -6,13 +6,19 @@ from dataclasses import dataclass, field
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control import weather_limits
-from membrane_ctrl.control.climate import Climate, ClimateReadings, ClimateState, ClimateStrain
+from membrane_ctrl.control.climate import (
+    CHANGE_RMS,
+    CHANGE_SPHERICAL,
+    Climate,
+    ClimateReadings,
+    ClimateState,
+    ClimateStrain,
+)
 from membrane_ctrl.control.climate_sensors import (
     ClimateSensor,
     ClimateSensors,
     ClimateSensorsState,
 )
-from membrane_ctrl.metrology.film.climate_figure import compute_climate_sensitivity
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
 from membrane_ctrl.model.state_tree import StateNode
 from membrane_ctrl.model.telemetry import State
@@ -25,7 +31,6 @@ _SENSOR_NOTICES = {
 }
 # The notice ends only when the figure is clearly nearer again
 _OVER_SHARE = 0.8
-_SPHERICAL = 11  # Noll index
 
 
 @dataclass(slots=True)
@@ -45,7 +50,10 @@ class ClimatePart:
     def __init__(self, config: Config, memory: ClimatePartState | None = None) -> None:
         self.memory = memory or ClimatePartState()
         mirror = config.optics.mirror
-        self._sensitivity = compute_climate_sensitivity(mirror.radius_mm, mirror.sag_mm)
+        # For a strain of 1e-6
+        unit_um = 1e-3 * mirror.radius_mm**2 / mirror.sag_mm
+        self._rms_um_per_ppm = CHANGE_RMS * unit_um
+        self._spherical_um_per_ppm = CHANGE_SPHERICAL * unit_um
         self._most_um = config.climate.figure_max_um
         self._sensors = ClimateSensors(self.memory.sensors)
         self._climate = Climate(config.climate, self.memory.climate)
@@ -53,7 +61,7 @@ class ClimatePart:
     @property
     def figure_um(self) -> float:
         """Predicted change of the figure since the begin of the hold, RMS; NaN if unknown."""
-        return abs(self.memory.strain.excess_ppm) * self._sensitivity.change_rms_um
+        return abs(self.memory.strain.excess_ppm) * self._rms_um_per_ppm
 
     def step(self, reading: BenchReading | None, state: State, dt_s: float) -> list[Event]:
         """Follow one tick; returns the events.
@@ -103,7 +111,7 @@ class ClimatePart:
             "film_strain_ppm": strain.film_ppm,
             "ring_strain_ppm": strain.ring_ppm,
             "climate_figure_um": self.figure_um,
-            "climate_sigma_um": strain.sigma_ppm * self._sensitivity.change_rms_um,
+            "climate_sigma_um": strain.sigma_ppm * self._rms_um_per_ppm,
         }
 
     def _report_figure(self) -> list[Event]:
@@ -117,7 +125,7 @@ class ClimatePart:
         if not beyond:
             message = f"the figure is predicted to be {self.figure_um:.1f} µm RMS from its first"
             return [MaintenanceOver(FIGURE_NOTICE, message)]
-        spherical_um = abs(strain.excess_ppm * self._sensitivity.terms_um[_SPHERICAL - 1])
+        spherical_um = abs(strain.excess_ppm) * self._spherical_um_per_ppm
         message = (
             f"the film is {strain.excess_ppm:+.0f} +- {strain.sigma_ppm:.0f} ppm longer than its "
             "ring since the hold began: the figure is predicted to have changed by "

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_bvp
 
+from membrane_ctrl.control.climate import CHANGE_RMS, CHANGE_SPHERICAL
 from membrane_ctrl.metrology.film.climate_figure import compute_climate_sensitivity
 from membrane_ctrl.metrology.film.climate_fit import Expansion, fit_climate
 from membrane_ctrl.sim.climate import ROUND_TERMS, compute_figure_change_per_ppm
@@ -99,6 +100,14 @@ def test_the_change_of_the_figure_is_predicted_within_a_micrometre(excess_ppm: f
     true_um = 1e3 * (_height_at_sag_mm(excess_ppm) - _height_at_sag_mm(0.0))
     assert _rms(true_um) > 5.0
     assert _rms(_predicted_um(excess_ppm) - true_um) < 1.0
+
+
+def test_the_tick_predicts_by_the_constants_of_the_law() -> None:
+    for radius_mm, sag_mm in ((500.0, 37.1), (300.0, 10.0)):
+        sensitivity = compute_climate_sensitivity(radius_mm, sag_mm)
+        unit_um = 1e-3 * radius_mm**2 / sag_mm
+        assert sensitivity.change_rms_um / unit_um == pytest.approx(CHANGE_RMS, rel=1e-3)
+        assert sensitivity.terms_um[10] / unit_um == pytest.approx(CHANGE_SPHERICAL, rel=1e-3)
 
 
 def test_the_twin_changes_its_figure_by_another_law_alike() -> None:
