@@ -105,8 +105,10 @@ class ClimatePart:
         return events + self._report_figure()
 
     def telemetry(self) -> dict[str, float]:
-        """Columns of a telemetry row."""
+        """Columns of a telemetry row; none while no sensor shows the climate."""
         strain = self.memory.strain
+        if not math.isfinite(strain.excess_ppm):
+            return {}
         return {
             "film_strain_ppm": strain.film_ppm,
             "ring_strain_ppm": strain.ring_ppm,
