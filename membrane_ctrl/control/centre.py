@@ -49,6 +49,7 @@ _CLONE_S = 0.02  # least time between clones
 # sigma, and the time in which it may change
 _GAIN_ERROR = 0.2
 _GAIN_MEMORY_S = 86_400.0
+_GAINS_FROM_S = 30.0  # after the start, they are learned
 # The pressure and temperature from which the gains' errors count follow within this time
 _WEATHER_MEMORY_S = 100.0
 # squared sigmas: weighed less beyond the first, dropped beyond the second
@@ -406,6 +407,9 @@ class CentreFilter:
         row[_GAS] = 1.0
         row[_AMBIENT] = self._pressure_gain * (1.0 + x[_PRESSURE_ERROR])
         row[_WARMTH] = self._warmth_gain * (1.0 + x[_WARMTH_ERROR])
+        # At first the unknown warmth of the gas would be taken for an error of its gain
+        if self.memory.count < _GAINS_FROM_S * self._rate_hz:
+            return row
         if self._is_fresh(Sensor.BAROMETER, now_s):
             row[_PRESSURE_ERROR] = self._pressure_gain * (x[_AMBIENT] - origin.mean_pressure_pa)
         if self._is_fresh(Sensor.THERMOMETER, now_s):

@@ -26,7 +26,8 @@ from membrane_ctrl.model.state_tree import StateNode
 _WALKS = (1.0, 5.0, 25.0)
 # Logarithms of their probabilities before any reading: most leaks are holes and do not walk
 _PRIOR = (0.0, -3.0, -6.0)
-# Nothing is learned for this time: at first the errors of the weather's gains look like a walk
+# Nothing is learned for this time, and the largest walk holds: the errors of the weather's gains
+# look like a walk at first, and those of the pump while the mirror settles must not stay in the leak
 _FIRST_PAUSE_S = 40.0
 # Memory of the likelihoods: a leak that changes in the cold of the night is another one by day
 _MEMORY_S = 1200.0
@@ -86,7 +87,7 @@ class LeakWalk(StateNode):
     hypotheses: Annotated[
         list[LeakHypothesis], Field(min_length=len(_WALKS), max_length=len(_WALKS))
     ] = field(default_factory=lambda: [LeakHypothesis() for _ in _WALKS])
-    factor: float = 1.0
+    factor: float = _WALKS[-1] ** 2
     paused_s: float = _FIRST_PAUSE_S  # nothing is learned for so long
 
     def predict(self, dt_s: float, centre_walk: float, leak_walk: float) -> None:
