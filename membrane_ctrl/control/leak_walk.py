@@ -26,8 +26,8 @@ from membrane_ctrl.model.state_tree import StateNode
 _WALKS = (1.0, 5.0, 25.0)
 # Logarithms of their probabilities before any reading: most leaks are holes and do not walk
 _PRIOR = (0.0, -3.0, -6.0)
-# Nothing is learned for this time, and the largest walk holds: the errors of the weather's gains
-# look like a walk at first, and those of the pump while the mirror settles must not stay in the leak
+# Nothing is learned for this time, and the largest walk holds: errors of the weather's gains look
+# like a walk at first, and those of the pump while the mirror settles must not stay in the leak
 _FIRST_PAUSE_S = 40.0
 # Memory of the likelihoods: a leak that changes in the cold of the night is another one by day
 _MEMORY_S = 1200.0
