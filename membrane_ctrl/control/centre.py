@@ -338,8 +338,15 @@ class CentreFilter:
         x[_WARMTH] += follow * (x[_AIR] - x[_WARMTH])
         # The means move; the gas takes what the gains' errors then no longer contribute
         origin, slowly = self.memory.origin, lag_step_fraction(dt_s, _WEATHER_MEMORY_S)
-        pressure_step_pa = slowly * (float(x[_AMBIENT]) - origin.mean_pressure_pa)
-        warmth_step_k = slowly * (float(x[_WARMTH]) - origin.mean_warmth_k)
+        pressure_step_pa = float(x[_AMBIENT]) - origin.mean_pressure_pa
+        warmth_step_k = float(x[_WARMTH]) - origin.mean_warmth_k
+        learns_pressure = self._learns_gain(Sensor.BAROMETER, given.now_s)
+        learns_warmth = self._learns_gain(Sensor.THERMOMETER, given.now_s)
+        # A gain that is not learned counts from the present weather
+        if learns_pressure:
+            pressure_step_pa *= slowly
+        if learns_warmth:
+            warmth_step_k *= slowly
         origin.mean_pressure_pa += pressure_step_pa
         origin.mean_warmth_k += warmth_step_k
         by_pressure_um = self._pressure_gain * pressure_step_pa
@@ -351,11 +358,11 @@ class CentreFilter:
         x[_WARMTH_ERROR] *= kept
         # F p F^T: the same row operations on p and on its transpose (a view)
         for matrix in (p, p.T):
-            matrix[_GAS] += (
-                by_pressure_um * matrix[_PRESSURE_ERROR]
-                + by_warmth_um * matrix[_WARMTH_ERROR]
-                - dt_s * matrix[_LEAK]
-            )
+            matrix[_GAS] -= dt_s * matrix[_LEAK]
+            if learns_pressure:
+                matrix[_GAS] += by_pressure_um * matrix[_PRESSURE_ERROR]
+            if learns_warmth:
+                matrix[_GAS] += by_warmth_um * matrix[_WARMTH_ERROR]
             matrix[_WARMTH] += follow * (matrix[_AIR] - matrix[_WARMTH])
             matrix[_PRESSURE_ERROR] *= kept
             matrix[_WARMTH_ERROR] *= kept
@@ -407,12 +414,9 @@ class CentreFilter:
         row[_GAS] = 1.0
         row[_AMBIENT] = self._pressure_gain * (1.0 + x[_PRESSURE_ERROR])
         row[_WARMTH] = self._warmth_gain * (1.0 + x[_WARMTH_ERROR])
-        # At first the unknown warmth of the gas would be taken for an error of its gain
-        if self.memory.count < _GAINS_FROM_S * self._rate_hz:
-            return row
-        if self._is_fresh(Sensor.BAROMETER, now_s):
+        if self._learns_gain(Sensor.BAROMETER, now_s):
             row[_PRESSURE_ERROR] = self._pressure_gain * (x[_AMBIENT] - origin.mean_pressure_pa)
-        if self._is_fresh(Sensor.THERMOMETER, now_s):
+        if self._learns_gain(Sensor.THERMOMETER, now_s):
             row[_WARMTH_ERROR] = self._warmth_gain * (x[_WARMTH] - origin.mean_warmth_k)
         return row
 
@@ -566,7 +570,19 @@ class CentreFilter:
         return self.memory.walks[2].factor * self._config.air_walk_k_per_root_s**2
 
     def _centre_walk(self) -> float:
-        return self.memory.walks[0].factor * self._config.centre_walk_um_per_root_s**2
+        walk = self._config.centre_walk_um_per_root_s**2
+        if not self._learns_gains:
+            # What the configured gain misses of the pressure's walk is not predicted
+            walk += _GAIN_ERROR**2 * self._pressure_gain**2 * self._pressure_walk()
+        return self.memory.walks[0].factor * walk
+
+    @property
+    def _learns_gains(self) -> bool:
+        """At first the unknown warmth of the gas would be taken for an error of its gain."""
+        return self.memory.count >= _GAINS_FROM_S * self._rate_hz
+
+    def _learns_gain(self, sensor: Sensor, now_s: float) -> bool:
+        return self._learns_gains and self._is_fresh(sensor, now_s)
 
     def _project_covariance(self, row: FloatArray, variance: float) -> tuple[FloatArray, float]:
         """Return P h (73,), the covariance of the states with a reading's expectation, and the
