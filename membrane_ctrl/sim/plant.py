@@ -190,7 +190,8 @@ class Plant:
         self._index = -1
         if self._room.is_steady:
             return
-        weather = self._room.make_block(self._steps * STEP_S + STEP_S * np.arange(_BLOCK_STEPS))
+        time_s = np.asarray(block.time_s, dtype=np.float64)
+        weather = self._room.make_block(time_s)
         self._climate = weather
         self._air_k = (block.air_k + weather.air_k).tolist()
         self._sag = (np.asarray(self._sag) * weather.mirror_factor).tolist()
