@@ -52,6 +52,7 @@ _NOTHING_FOUND = (
     "burst, noise change, drift, excursion or jump."
 )
 _REPORTED_MOST = 20
+_SCALAR_NAMES = {"vertex": "vertex", "focus": "focus", "best_fit": "best fit"}
 
 
 def render_report(
@@ -313,9 +314,6 @@ def _list_shape(shape: shape_review.ShapeReview) -> list[PageBlock]:
     if shape.pairs:
         blocks.append(PageDrawing(figures.draw_pairs(shape)))
     return blocks
-
-
-_SCALAR_NAMES = {"vertex": "vertex", "focus": "focus", "best_fit": "best fit"}
 
 
 def _list_scalars(series: held_scalars.HeldSeries) -> list[PageBlock]:
