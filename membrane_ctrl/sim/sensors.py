@@ -43,9 +43,12 @@ class Sensors:
             displacement_um = _quantise_value(reading_um, config.laser_resolution_um)
             quality = LASER_GOOD
         self._counter += 1
-        film_k, ring_k, humidity = (math.nan, math.nan, math.nan)
+        film_c = ring_c = humidity_percent = math.nan
         if math.isfinite(truth.humidity_percent):
-            film_k, ring_k, humidity = self._climate_rng.standard_normal(3).tolist()
+            film, ring, humidity = self._climate_rng.standard_normal(3).tolist()
+            film_c = truth.film_temperature_c + FILM_NOISE_K * film
+            ring_c = truth.ring_temperature_c + RING_NOISE_K * ring
+            humidity_percent = truth.humidity_percent + HUMIDITY_NOISE_PERCENT * humidity
         return BoardSample(
             displacement_um=displacement_um,
             displacement_quality=quality,
@@ -55,9 +58,9 @@ class Sensors:
             gas_temperature_c=truth.gas_temperature_c + config.thermometer_noise_k * gas,
             sample_counter=self._counter,
             device_time_s=truth.time_s,
-            film_temperature_c=truth.film_temperature_c + FILM_NOISE_K * film_k,
-            ring_temperature_c=truth.ring_temperature_c + RING_NOISE_K * ring_k,
-            humidity_percent=truth.humidity_percent + HUMIDITY_NOISE_PERCENT * humidity,
+            film_temperature_c=film_c,
+            ring_temperature_c=ring_c,
+            humidity_percent=humidity_percent,
         )
 
 
