@@ -212,7 +212,7 @@ def _make_instrument_terms(role: str) -> dict[str, Any]:
         "read": reads,
         "role_unit": roles.ROLES[role].unit,
         "suffix": {"degC": "c"}.get(unit, unit.lower()),
-        "quantity": "an error" if reads == "air_temperature_c" else "pressure",
+        "quantity": "pressure" if reads.endswith("_pa") else "an error",
         "field": unit,
         "SCALE": _SCALES[unit],
         "scale": 1 / divisor if unit == "percent" else divisor,
