@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from membrane_ctrl.config import sight
 from membrane_ctrl.geometry.spread_file import find_known_by, geometry_spread
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
 from membrane_ctrl.measure.result_files import number_or_null, write_arrays, write_json
@@ -140,8 +141,10 @@ def error_bars(
 def apply_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
     """The measurement with the verdict that its error bars allow.
 
-    A doubt degrades an `ok`, and so does a geometry that rim or slopes contradict. Slopes that
-    belong to no surface, and that no stated uncertainty explains, make the figure unusable.
+    A doubt degrades an `ok`, and so does a geometry that rim or slopes contradict. The figure is
+    unusable if slopes belong to no surface and no stated uncertainty explains them, or if a
+    contradicted geometry has a lens model that folds within the picture: such a model is wrong far
+    from its fold, too.
     """
     if bars is None or measurement.verdict == "rejected":
         return measurement
@@ -152,7 +155,10 @@ def apply_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measuremen
     known = []
     if measurement.reason:
         known = [measurement.reason]
-    verdict: shape_estimate.Verdict = "rejected" if statement.slopes.unusable else "degraded"
+    is_unusable = statement.slopes.unusable
+    if statement.doubts and sight.find_lens_doubt(measurement.head.optics) is not None:
+        is_unusable = True
+    verdict: shape_estimate.Verdict = "rejected" if is_unusable else "degraded"
     return replace(measurement, verdict=verdict, reason="; ".join([*known, *doubts]))
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.model.errors import CommandError
 from membrane_ctrl.model.program import program_commit
 from tests.studies.second_world_errors import drawn_points_mm, measured_errors
+from tests.studies.second_world_tables import FAR
 from tests.worlds.second_optics import (
     FRAME_S,
     Bench,
@@ -248,6 +249,7 @@ def bench_answer(seed: int, resolution: float = 0.25) -> dict[str, Any]:
                 verdict_row |= {
                     "error_um": one.error_um.tolist(),
                     "sigma_um": one.sigma_um.tolist(),
+                    "chance_far": one.chance_beyond(FAR),
                 }
                 found.append(one)
             answer["sets"].append(verdict_row)

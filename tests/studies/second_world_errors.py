@@ -21,6 +21,7 @@ FloatArray = NDArray[np.float64]
 
 TERMS = range(3, 11)  # Noll 4..11
 RADIUS_MM = 500.0
+CHANCE_DRAWS = 20_000  # the chance of a bench is then known to 0.1 %
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,21 @@ class MeasuredErrors:
     budget: Budget | None
     residual_urad: float = float("nan")
     geometry: str = ""
+
+    def chance_beyond(self, sigmas: float) -> float:
+        """Chance that one of the errors or more exceeds so many sigmas, if they are normal and have
+        exactly the budget's covariance; 0 without a figure.
+        """
+        if self.budget is None:
+            return 0.0
+        covariance = self.budget.covariance(True) + self.budget.covariance(False)
+        of_quantities = self.rows @ covariance @ self.rows.T
+        sigma = np.sqrt(np.maximum(np.diag(of_quantities), 1e-30))
+        correlation = of_quantities / np.outer(sigma, sigma)
+        values, vectors = np.linalg.eigh(correlation)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        normal = np.random.default_rng(0).standard_normal((CHANCE_DRAWS, len(root)))
+        return float(np.mean(np.abs(normal @ root.T).max(axis=1) > sigmas))
 
     @property
     def worst_sigmas(self) -> float:

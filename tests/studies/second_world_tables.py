@@ -119,6 +119,26 @@ def wrong_oks(given: list[dict[str, Any]]) -> list[tuple[float, dict[str, Any]]]
     return sorted(((off, one) for off, one in far if off > FAR), key=lambda pair: -pair[0])
 
 
+def expected_wrong_oks(given: list[dict[str, Any]]) -> float:
+    """Number of such benches if all errors were normal and had exactly the stated covariance."""
+    firsts = [one["sets"][0] for one in given]
+    return sum(float(one.get("chance_far", 0.0)) for one in firsts if one["verdict"] == "ok")
+
+
+def share_far(given: list[dict[str, Any]]) -> tuple[float, int]:
+    """Share of the numbers of `ok` first sets that are beyond three sigma, and their count."""
+    firsts = [one["sets"][0] for one in given]
+    ratios = [
+        np.abs(one["error_um"]) / np.maximum(one["sigma_um"], 1e-12)
+        for one in firsts
+        if one["verdict"] == "ok"
+    ]
+    if not ratios:
+        return 0.0, 0
+    every = np.concatenate(ratios)
+    return float(np.mean(every > FAR)), every.size
+
+
 def refusals(given: list[dict[str, Any]]) -> list[tuple[bool | None, str, dict[str, Any]]]:
     """First sets without a usable verdict: whether the first cause that they name is true.
 
@@ -215,7 +235,12 @@ def _verdict_text(given: list[dict[str, Any]]) -> str:
     refusal = "refusals whose first named cause is planted"
     refused_row = f"| {refusal} | {true} of {len(refused)}, {causes} | 95 % |"
     lines = [f"First sets: {counts}. {by_hand}", "", "| | reached | goal |", "|---|---|---|"]
-    lines += [wrong_row, refused_row, ""]
+    far, numbers = share_far(given)
+    far_row = f"| numbers of `ok` sets beyond 3 sigma, of {numbers} | {100 * far:.1f} % | 0.5 % |"
+    lines += [wrong_row, far_row, refused_row, ""]
+    expected = expected_wrong_oks(given)
+    if expected:
+        lines += [CHANCE_TEXT.format(expected=expected, share=100 * expected / len(given)), ""]
     return "\n".join(lines)
 
 
@@ -305,6 +330,10 @@ scatter (1 is sharp), of sets that are `ok` or `degraded`.
 STATEMENTS = """Each reason and each flagged frame of a first set names a cause or names none.
 A statement is true if a cause that explains it was planted.
 """
+
+CHANCE_TEXT = """A bench counts in the first row if one of its 19 numbers is beyond 3 sigma. If all
+errors were normal, with exactly the stated covariance, {expected:.1f} benches ({share:.1f} %)
+would."""
 
 WORST_TEXT = """`tests.studies.second_benches.bench_answer(seed)` repeats a bench. First sets: `ok`
 beyond 3 sigma, `degraded` beyond 3 sigma, refusals whose cause was not planted.

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.studies.second_benches import draw_bench
+from tests.studies.second_benches import FOLDING_LENS, draw_bench
 from tests.studies.second_world_errors import measured_errors
+from tests.worlds.second_optics import Bench, Mirror, Stated, World
 
 
 def test_a_sharp_set_that_contradicts_its_bench_is_not_called_blurred(tmp_path: Path) -> None:
@@ -20,3 +21,16 @@ def test_a_sharp_set_that_contradicts_its_bench_is_not_called_blurred(tmp_path: 
     assert found.verdict == "rejected"
     assert "the response of panel and camera is not linear" in found.reason
     assert "blurred" not in found.reason
+
+
+def test_a_lens_that_folds_and_contradicts_the_frames_makes_the_figure_unusable(
+    tmp_path: Path,
+) -> None:
+    """It folds beside the mirror, where no ray goes, but it is wrong within the mirror, too."""
+    stated = Stated(camera={"distortion": FOLDING_LENS})
+    world = World(Mirror(), Bench.paper(0.125), stated=stated)
+    truth = world.write_set(tmp_path / "set")
+    found = measured_errors(tmp_path / "set", world.mirror, truth, np.zeros((2, 1)))
+    assert found.worst_sigmas > 10
+    assert found.verdict == "rejected"
+    assert found.reason.startswith("camera.distortion: the lens model folds")

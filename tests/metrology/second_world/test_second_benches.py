@@ -8,8 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from membrane_ctrl.metrology.rays.surface import PARAMETERS
+from membrane_ctrl.metrology.uncertainty.budget import Budget, Source
 from tests.studies.second_benches import draw_bench
-from tests.studies.second_world_tables import blamed, held, is_true, page, refusals, wrong_oks
+from tests.studies.second_world_errors import MeasuredErrors
+from tests.studies.second_world_tables import (
+    blamed,
+    expected_wrong_oks,
+    held,
+    is_true,
+    page,
+    refusals,
+    share_far,
+    wrong_oks,
+)
 
 
 def answer(seed: int, verdict: str, off: float, planted: dict[str, float], reason: str = "") -> Any:
@@ -43,6 +55,27 @@ def test_the_share_of_intervals_counts_usable_sets_alone() -> None:
 
 def test_a_wrong_ok_is_found_by_its_seed() -> None:
     assert [one["seed"] for _, one in wrong_oks(GIVEN)] == [1]
+
+
+def test_wrong_oks_are_compared_with_those_of_exact_bars() -> None:
+    lucky = answer(6, "ok", 0.5, {})
+    lucky["sets"][0] |= {"chance_far": 0.25}
+    degraded = answer(7, "degraded", 0.5, {})
+    degraded["sets"][0] |= {"chance_far": 0.5}
+    given = [*GIVEN, lucky, degraded]
+    assert expected_wrong_oks(given) == 0.25
+    assert share_far(given) == (1 / 3, 3 * 19)
+    assert "0.2 benches (3.1 %)" in page({"quarter": given})
+
+
+def test_the_chance_of_independent_numbers_is_that_of_a_normal_law() -> None:
+    """36 independent terms of 1 sigma each: 1 - 0.9973^36."""
+    effects_mm = np.eye(PARAMETERS)
+    source = Source("all", "", 1.0, effects_mm)
+    one = MeasuredErrors(
+        "ok", "", (), None, None, None, np.eye(PARAMETERS), Budget((source,), 0.95)
+    )
+    assert one.chance_beyond(3.0) == pytest.approx(1 - 0.9973**PARAMETERS, abs=0.006)
 
 
 def test_a_refusal_is_true_only_if_its_cause_was_planted() -> None:
