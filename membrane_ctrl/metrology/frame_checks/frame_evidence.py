@@ -237,7 +237,10 @@ def estimate_light_and_film(
 
     # Each frame by its model, with a contrast that differs over the mirror, and with the light that
     # the other axis saw.
-    contrast = smooth[1:] - smooth[1:].mean(axis=1, keepdims=True)
+    contrast = smooth[1:]
+    if order == _SMOOTH_ORDER:
+        contrast = scene.smooth_columns()[1:]
+    contrast = contrast - contrast.mean(axis=1, keepdims=True)
     means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
     light = np.ones((2, len(stack.patterns)))
     film_um = np.empty(0)
