@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
+from membrane_ctrl.metrology.frame_checks.phase_drift import PhaseShifts
 from membrane_ctrl.metrology.rays import bench_motions
 from membrane_ctrl.metrology.rays.bench_motions import group_columns
 from membrane_ctrl.metrology.rays.geometry import Geometry
@@ -16,9 +22,11 @@ from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
 from membrane_ctrl.metrology.uncertainty.image_blur import blur_source, estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.motion_evidence import ring_tilt_urad
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_changes
+from membrane_ctrl.metrology.uncertainty.phase_drift_error import phase_drift_source
 from membrane_ctrl.metrology.uncertainty.residual_patches import Patches
+from membrane_ctrl.metrology.uncertainty.set_budget import _vertex_source
 from membrane_ctrl.metrology.uncertainty.slope_misfit import measure_curl_urad
-from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, predicted_mm
+from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, moves_mm, predicted_mm
 from tests.support.metrology_truth import RADIUS_MM
 
 Array = NDArray[np.float64]
@@ -149,3 +157,44 @@ def test_noise_of_cells_is_averaged_over_patches() -> None:
     noise = grid_of(1e-6 * rng.standard_normal(shape), 1e-6 * rng.standard_normal(shape), axis_mm)
     # A slope between two cells is their mean; that of a patch counts its cells once.
     assert measure_curl_urad(noise, np.zeros(shape)) == pytest.approx(1 / 6, rel=0.1)
+
+
+CAMERA_TURN = next(k for k, group in enumerate(bench_motions.GROUPS) if "turned" in group.name)
+
+
+def drift_of(bench: TrialBench, changes_mm: Array, film_rad: float = 0.0) -> list[PhaseShifts]:
+    """Shifts of four frames of x and four of y, 8 frames later, during steady changes (2, n)."""
+    mm_per_rad = OPTICS.pattern.period_mm / (2 * np.pi)
+    found = []
+    for axis, moves in enumerate(moves_mm(bench)):
+        design = np.stack([np.ones_like(moves), moves - moves.mean()], axis=1)
+        shift_mm = np.linalg.lstsq(design, changes_mm[axis], rcond=None)[0][0]
+        frames = 8.0 * axis + np.arange(4)
+        found.append(PhaseShifts(frames, frames * shift_mm / mm_per_rad, film_rad))
+    return found
+
+
+def test_the_row_of_a_drift_contains_the_camera_that_turns(bench: TrialBench) -> None:
+    """1.5 µrad a frame of yaw: x is taken 4 frames before the middle, y 4 frames after."""
+    changes_mm = motion_changes(bench)
+    turned_mm = 1.5 * changes_mm[group_columns()[CAMERA_TURN]][1]
+    x, y = drift_of(bench, turned_mm)
+    source = phase_drift_source(bench, changes_mm, (x, y))
+    off_mm = turned_mm * np.array([[-4.0], [4.0]])
+    expected_mm = bench.solve(bench.geometry(), off_mm, linear=True) - FILM.parameters
+    bodies = np.linalg.norm(source.effects_mm, axis=0) > 0
+    effects_mm = source.effects_mm * np.sqrt(np.count_nonzero(bodies))
+    away = np.linalg.norm(effects_mm - expected_mm[:, None], axis=0)
+    assert away.min() < 1e-3 * np.linalg.norm(expected_mm)
+
+
+def test_a_drift_that_the_film_explains_is_none(bench: TrialBench) -> None:
+    changes_mm = motion_changes(bench)
+    x, y = drift_of(bench, changes_mm[group_columns()[CAMERA_TURN]][0], film_rad=1.0)
+    assert not phase_drift_source(bench, changes_mm, (x, y)).known_mm.any()
+
+
+def test_the_vertex_without_a_laser_may_have_moved_by_half_the_motion(bench: TrialBench) -> None:
+    checked: Any = SimpleNamespace(stack=SimpleNamespace(readings_um=np.full(8, np.nan)))
+    source = _vertex_source(bench, SigmasConfig(), checked, 30.0)
+    assert source.sigma == pytest.approx(math.hypot(20.0, 15.0))
