@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,6 +20,8 @@ from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
+from membrane_ctrl.metrology.uncertainty.cycle_errors import LiveErrors
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.image_blur import blur_source, estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.motion_evidence import ring_tilt_urad
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_changes
@@ -27,6 +30,7 @@ from membrane_ctrl.metrology.uncertainty.residual_patches import Patches
 from membrane_ctrl.metrology.uncertainty.set_budget import _vertex_source
 from membrane_ctrl.metrology.uncertainty.slope_misfit import measure_curl_urad
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, moves_mm, predicted_mm
+from membrane_ctrl.metrology.uncertainty.unseen_motion import estimate_unseen_motion
 from tests.support.metrology_truth import RADIUS_MM
 
 Array = NDArray[np.float64]
@@ -198,3 +202,36 @@ def test_the_vertex_without_a_laser_may_have_moved_by_half_the_motion(bench: Tri
     checked: Any = SimpleNamespace(stack=SimpleNamespace(readings_um=np.full(8, np.nan)))
     source = _vertex_source(bench, SigmasConfig(), checked, 30.0)
     assert source.sigma == pytest.approx(math.hypot(20.0, 15.0))
+
+
+def test_the_correction_of_cycles_is_as_wrong_as_the_sensitivity_of_the_bench(
+    bench: TrialBench,
+) -> None:
+    """A focal length 1 % off: per µm that the film is deeper in x than in y."""
+    spread = GeometrySpread(("focal_relative",), np.array([[0.01**2]]))
+    shifts_rad = np.tile(np.pi / 2 * np.arange(4), (2, 1))
+    seen: Any = SimpleNamespace(harmonics=np.zeros((2, 2)))
+    none = np.zeros((PARAMETERS.size, 0))
+    light = np.ones_like(bench.screen_mm)
+    found = LiveErrors.from_benches(bench, bench, shifts_rad, light, seen, spread, 0.0, none)
+    off_mm = moves_mm(bench, bench.geometry(("focal_relative",), [0.01])) - moves_mm(bench)
+    half_mm = off_mm * np.array([[0.5], [-0.5]])
+    expected_mm = bench.solve(bench.geometry(), half_mm, linear=True) - FILM.parameters
+    size_mm = math.sqrt(float(np.trace(found.corrected_um2)))
+    assert size_mm == pytest.approx(float(np.linalg.norm(expected_mm)), rel=0.2)
+
+
+def test_a_motion_from_x_to_y_is_found_with_the_sigma_of_its_noise(bench: TrialBench) -> None:
+    """50 µm, in points with 10 µm of noise on the screen."""
+    noise_mm = 0.01 * np.random.default_rng(1).standard_normal(bench.screen_mm.shape)
+    moved_mm = 50.0 * moves_mm(bench) * np.array([[-0.5], [0.5]])
+    off_mm = moved_mm + noise_mm
+    nominal = bench.geometry()
+    fitted = Surface.from_parameters(bench.solve(nominal, off_mm), RADIUS_MM)
+    taken_mm = predicted_mm(bench, nominal, fitted) - bench.screen_mm
+    moved = replace(bench, residual_mm=off_mm - taken_mm)
+    spread = GeometrySpread(("focal_relative",), np.array([[1e-6**2]]))
+    found = estimate_unseen_motion(moved, spread, np.full(2, 0.01**2))
+    assert abs(found.moved_um - 50.0) < 4 * found.sigma_um
+    assert found.noise_um == pytest.approx(found.sigma_um, rel=0.5)
+    assert found.is_significant
