@@ -173,7 +173,7 @@ def drift_of(bench: TrialBench, changes_mm: Array, film_rad: float = 0.0) -> lis
     for axis, moves in enumerate(moves_mm(bench)):
         design = np.stack([np.ones_like(moves), moves - moves.mean()], axis=1)
         shift_mm = np.linalg.lstsq(design, changes_mm[axis], rcond=None)[0][0]
-        frames = 8.0 * axis + np.arange(4)
+        frames = 8.0 * axis + np.arange(4.0)
         found.append(PhaseShifts(frames, frames * shift_mm / mm_per_rad, film_rad))
     return found
 
