@@ -62,9 +62,10 @@ pump whose threshold follows the temperature, a slow pump, or a tight mirror), a
 (weather, gusts, doors as infrasound, an air conditioner, a laser mount that bends with the
 temperature) and a laser (1/f noise, coarse steps, its own pace, lost samples and gaps of 80 ms).
 None shares code with the twin. A hold starts as a lab's does, with the default gains, the default
-curve and the test of the actuators; it is held by the laser and by `auto` in the same weather,
-judged after three minutes. Then a session runs with `tune run --yes` in other weather; where it
-refuses, what it asks for is done. A last hold by the laser has the gains that were kept.
+curve and the test of the actuators, and has started when its state is `hold`; it is held by the
+laser and by `auto` in the same weather, judged after three minutes. Then a session runs with
+`tune run --yes` in other weather; where it refuses, what it asks for is done. A last hold by the
+laser has the gains that were kept.
 
 A session ends well if it keeps gains, finds the present ones as good beyond the error of the
 comparison, or does so after what a refusal asked for was done.
