@@ -100,18 +100,19 @@ def test_a_foreign_bench_at_its_depth(bench: Bench, tmp_path: Path) -> None:
     assert (std.verdict == CheckVerdict.PASSED) == within
 
 
-def test_a_film_clamped_with_tension_is_filled_from_flat(tmp_path: Path) -> None:
-    """Two fifths of its pressure are tension, which no thickness explains: not an error."""
+def test_a_film_of_another_law_is_refused_with_its_remedy(tmp_path: Path) -> None:
+    """Two fifths of its pressure are tension: at a tenth of the depth the gauge shows 20 Pa more
+    than the configured film needs."""
     foreign = ForeignPlant(ForeignPump("top unreachable", full_um_per_s=88.0), seed=2)
     foreign.lower(500.0)
     emulated = QuickBench()
     emulated.use_mirror(foreign_bench(foreign))
     run_stages(tmp_path, emulated, Person(), *DESK)
     person = Person()
-    assert run_stages(tmp_path, emulated, person, "inflation", plan=SHORT) == Exit.DONE, person.text
-    found = checks_of(tmp_path)
-    by_tension_pa = float(found["pressure by the tension of clamping"].measured.split()[0])
-    assert by_tension_pa == pytest.approx(0.4 * 600.0, rel=0.1)
+    assert run_stages(tmp_path, emulated, person, "inflation", plan=SHORT) == Exit.INTERRUPTED
+    assert "laser_gauge_apart" in person.text
+    assert "for another film set [optics.mirror" in person.text
+    assert emulated.bench.board.pump_fraction == 0.0
 
 
 def test_a_dead_zone_that_nobody_stated_is_refused(tmp_path: Path) -> None:

@@ -330,6 +330,17 @@ def test_laser_and_gauge_are_compared_by_the_films_law(
     assert failed_in(tmp_path, person) == failed
 
 
+def test_the_tension_of_clamping_is_no_error_of_laser_or_gauge(
+    tmp_path: Path, bench: QuickBench
+) -> None:
+    person = Person()
+    shares = (0.1, 0.35, 0.6, 0.8, 0.9, 1.0)
+    points = [DepthPoint(37.1 * s, 600.0 * (0.4 * s + 0.6 * s**3)) for s in shares]
+    judge_law(context_of(tmp_path, bench, person), points)
+    assert failed_in(tmp_path, person) == []
+    assert "pressure by the tension of clamping: 240.0 Pa" in person.text
+
+
 def test_a_damaged_state_is_named(tmp_path: Path) -> None:
     (tmp_path / "session.json").write_text("{", encoding="utf-8")
     with pytest.raises(InputError, match=r"session\.json: damaged"):
