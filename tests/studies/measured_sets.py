@@ -9,6 +9,7 @@ from membrane_ctrl.config.optics import (
 )
 from membrane_ctrl.geometry.spread_file import geometry_spread
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.rim_outline import find_outline
@@ -26,7 +27,11 @@ TERMS = range(3, 11)  # Noll 4..11
 
 def measured(stack: FrameStack, stated: OpticsConfig) -> tuple[FullResult, SetBudget, str]:
     """As `measure` does. Raises RejectedSetError."""
-    checked = check_set(stack, stated)
+    return measured_checked(check_set(stack, stated), stated)
+
+
+def measured_checked(checked: Checked, stated: OpticsConfig) -> tuple[FullResult, SetBudget, str]:
+    """As `measure` does with a set that has passed its checks."""
     full = reconstruct_full(stated, checked, measure_pixels(stated, checked))
     used = [k for axis in checked.view.used for k in axis]
     light = checked.binned.means[used].mean(axis=0).astype(float)

@@ -179,7 +179,7 @@ def test_noisy_pictures_move_no_film_and_hide_no_motion(
                 math.hypot(film.x_to_y_sigma_um, found_um[0].mean() - film.motion_um[0].mean())
             )
             left_um += [np.std(one) for one in off]
-        budget = measured_sets.measured(stack, optics)[1].budget
+        budget = measured_sets.measured_checked(checked, optics)[1].budget
         film_um.append(next(source.sigma for source in budget.sources if source.name == "film_um"))
     assert rms(off_um) <= most_um
     assert rms(np.divide(off_um, sigma_um)) <= 1.45
