@@ -23,6 +23,7 @@ from membrane_ctrl.commissioning.guide.session_state import (
 )
 from membrane_ctrl.commissioning.guide.stage import SessionPlan
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import load_toml
 from membrane_ctrl.hold.virtual_hold import VirtualHold
 from membrane_ctrl.measure.simulate import shrink_camera
 from membrane_ctrl.model.errors import Exit
@@ -54,9 +55,6 @@ def run_on_twin(
 ) -> tuple[Exit, Person]:
     """Run or resume a session with a camera of a quarter of the resolution."""
     bench = EmulatedBench(VirtualHold)
-    if is_filled:
-        config = Config()
-        bench.use_mirror(virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump)))
     person = Person(**OPTICS)
     if not (folder / "lab.toml").exists():
         run_stages(folder, bench, person, *DESK)
@@ -64,6 +62,9 @@ def run_on_twin(
         camera = shrink_camera(Config().optics.camera, 4)
         tables["optics"]["camera"] = camera.model_dump(exclude_none=True)
         write_tables(folder, tables)
+    if is_filled:
+        config = load_toml(folder / "lab.toml", Config)
+        bench.use_mirror(virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump)))
     return run_stages(folder, bench, person, *names, plan=plan), person
 
 
