@@ -38,9 +38,9 @@ class CommittedSet:
     stated: Stated = field(default_factory=lambda: Stated(sigma_share=FINE_SIGMAS))
     samples: int = 64
 
-    def write(self, folder: Path, seed: int) -> Truth:
+    def write(self, folder: Path, seed: int, variant: str = "scalar_rgb") -> Truth:
         """Render and write the set. Raises ImportError without Mitsuba."""
-        settings = RenderSettings(samples=self.samples)
+        settings = RenderSettings(samples=self.samples, variant=variant)
         return write_rendered_set(
             self.bench, folder, settings, seed, self.displacement_um, self.stated, self.added
         )
@@ -67,6 +67,6 @@ def committed_sets() -> dict[str, CommittedSet]:
         "sound-lifted": CommittedSet(sound, LIFTED_UM),
         "orthotropic": CommittedSet(woven, added=AddedLight(falloff=0.1)),
         "by-hand": CommittedSet(by_hand, stated=Stated(sigma_share=1.0)),
-        "front-film": CommittedSet(behind_film, samples=256),
-        "front-film-lifted": CommittedSet(behind_film, LIFTED_UM, samples=256),
+        "front-film": CommittedSet(behind_film, samples=144),
+        "front-film-lifted": CommittedSet(behind_film, LIFTED_UM, samples=144),
     }

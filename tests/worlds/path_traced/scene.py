@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from tests.worlds.path_traced.meshes import (
     Surface,
     bulging_surface,
-    film_surface,
     ring_surface,
 )
 from tests.worlds.path_traced.panel_texture import SIDE_MM
@@ -87,23 +86,13 @@ class RenderSettings:
     variant: str = "scalar_rgb"
 
 
-def render_textures(
-    bench: RenderedBench,
-    displacement_um: float,
-    textures: list[Singles],
-    settings: RenderSettings,
+def render_surface(
+    bench: RenderedBench, mirror: Surface, textures: list[Singles], settings: RenderSettings
 ) -> list[FloatArray]:
     """Light of each pixel (rows, columns, 3) under each texture of the panel (n, n, 3).
 
     The rows of a texture run along s_y, its columns along s_x. Raises ImportError without Mitsuba.
     """
-    return render_surface(bench, film_surface(bench.mirror, displacement_um), textures, settings)
-
-
-def render_surface(
-    bench: RenderedBench, mirror: Surface, textures: list[Singles], settings: RenderSettings
-) -> list[FloatArray]:
-    """`render_textures` with any mirror."""
     import mitsuba
 
     mitsuba.set_variant(settings.variant)

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tests.worlds.path_traced.panel_texture import SIDE_MM, panel_texture
+from tests.worlds.path_traced.offset_compensation import compensated_film
+from tests.worlds.path_traced.panel_texture import panel_texture
 from tests.worlds.path_traced.scene import (
     COLOURS,
     RenderedBench,
     RenderSettings,
-    render_textures,
+    render_surface,
 )
 from tests.worlds.second_optics import FRAME_S, Effects, Stated, Truth, World, patterns
 from tests.worlds.second_optics.effects import Sensor
@@ -24,6 +25,7 @@ from tests.worlds.second_optics.world import DARK, EDGE_TILT, NOMINAL_WHITE, VIG
 
 FloatArray = NDArray[np.float64]
 
+RENDERED_THICKNESS_UM = 0.01  # the rendered front film is a sheet without thickness
 GLARE_SHARE = 0.01  # of the light, spread over the picture by the lens
 GLARE_SPREAD = 0.12  # sigma, of the picture's width
 WHITE_PERCENTILE = 90  # of the pixels under a white screen: what the exposure is set to
@@ -57,14 +59,15 @@ def write_rendered_set(
 ) -> Truth:
     """Render a full set of 18 frames, write it, and return its truth.
 
-    The film rests during the set. Raises ImportError without Mitsuba.
+    The film rests during the set; a front film is stated. Raises ImportError without Mitsuba.
     """
     added = added or AddedLight()
     pictures = patterns.full_set()
     # three pictures a rendering, as its three colours
     groups = [pictures[k : k + COLOURS] for k in range(0, len(pictures), COLOURS)]
     textures = [panel_texture(group) for group in groups]
-    images = render_textures(bench, displacement_um, textures, settings)
+    mirror = compensated_film(bench, displacement_um, settings)
+    images = render_surface(bench, mirror, textures, settings)
     lights = [image[:, :, colour] for image in images for colour in range(COLOURS)]
 
     rng = np.random.default_rng((5003, seed))
@@ -88,37 +91,16 @@ def write_rendered_set(
             row["axis"] = picture.axis
         row |= {"index": picture.index, "time_s": FRAME_S * k, "displacement_um": displacement_um}
         rows.append(row)
+    table = world.stated_table()
+    if bench.front is not None:
+        table["mirror"]["front_film"] = {
+            "bulge_mm": bench.front.sag_mm,
+            "thickness_um": RENDERED_THICKNESS_UM,
+        }
     names = [f"{picture.name}.png" for picture in pictures]
-    write_files(folder, world.stated_table() | {"frames": rows}, names, frames)
+    write_files(folder, table | {"frames": rows}, names, frames)
     sinusoids = [k for k, picture in enumerate(pictures) if picture.role == "sin"]
     return world.truth(sinusoids, np.full(len(pictures), displacement_um))
-
-
-def rendered_screen_mm(
-    bench: RenderedBench, displacement_um: float, settings: RenderSettings
-) -> tuple[FloatArray, FloatArray]:
-    """Places on the screen (2, rows, columns) that the pixels see, and their light.
-
-    The panel shows s_x in one colour, s_y in the second, and light in the third, without pixels.
-    Where a path is lost the light is below 1.
-    """
-    texture = ramp_texture()
-    (image,) = render_textures(bench, displacement_um, [texture], settings)
-    return ramp_places_mm(image), image[:, :, 2]
-
-
-def ramp_texture() -> NDArray[np.float32]:
-    """A panel of 256 x 256 that shows s_x, s_y and light as its colours."""
-    ramp = ((np.arange(256) + 0.5) / 256).astype(np.float32)
-    along_x, along_y = np.meshgrid(ramp, ramp)
-    return np.stack([along_x, along_y, np.ones_like(along_x)], axis=-1)
-
-
-def ramp_places_mm(image: FloatArray) -> FloatArray:
-    """Places (2, rows, columns) on the screen from the light under `ramp_texture`."""
-    light = np.maximum(image[:, :, 2], 1e-9)
-    shares = np.stack([image[:, :, 0], image[:, :, 1]]) / light
-    return (shares - 0.5) * SIDE_MM
 
 
 def _viewing_loss(bench: RenderedBench, displacement_um: float, falloff: float) -> FloatArray:
