@@ -29,6 +29,7 @@ _.get_user, _._make_protocol  # asyncua calls these
 )  # named as text to the child process that imports them
 _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by their place
 _.effective_samples, _.pump_scale, _.pump_sigma  # written by `asdict`
+_.change_rms_um  # of a sensitivity: for callers of the library, and compared with another law
 list_checks  # of the conformance tests: called by the tests of drivers' packages
 Camera  # the role that the camera drivers fill
 (

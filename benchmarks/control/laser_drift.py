@@ -10,12 +10,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from membrane_ctrl.acquisition.virtual_camera import VirtualCamera
 from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
 from tests.support.figures import Figure, at_most
-from tests.worlds.virtual_camera import VirtualCamera
 from tests.worlds.virtual_record import run_virtual
 
 DRIFT_UM_PER_MIN = 2.0
