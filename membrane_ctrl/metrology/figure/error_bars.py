@@ -26,6 +26,11 @@ _TRIAL_CELLS = 96  # cells a side of a trial, at least
 _WHITE_TRIALS = 4
 _TILE = 256  # cells a side of the noise that is drawn
 _NEIGHBOURS = 0.03  # share of the rays, on either side, over which an encircled share is averaged
+# Places of the encircled radii among the numbers, in the order of `ENERGY_SHARES`
+_SPOT_PLACES = [
+    [number.name for number in fields(Quantities)].index(f"spot_{100 * share:.0f}_mm")
+    for share in ENERGY_SHARES
+]
 
 
 @dataclass(frozen=True)
@@ -134,7 +139,7 @@ class FigureTrials:
         """
         change = np.subtract(astuple(moved.numbers), astuple(self._nominal.numbers))
         farther_mm = np.sort(moved.spot_mm) - self._nominal_spot_mm
-        for place, share in zip(range(-len(ENERGY_SHARES), 0), ENERGY_SHARES, strict=True):
+        for place, share in zip(_SPOT_PLACES, ENERGY_SHARES, strict=True):
             first = int((share - _NEIGHBOURS) * farther_mm.size)
             last = int((share + _NEIGHBOURS) * farther_mm.size)
             change[place] = farther_mm[first : last + 1].mean()
