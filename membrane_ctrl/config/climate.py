@@ -23,7 +23,7 @@ class ClimateConfig(Section):
     in a night."""
     ring_ppm_per_k: PartsPerMillion = 23.0
     """Thermal expansion of the ring: aluminium 23, steel 12. Change it to your ring's."""
-    film_sigma: Annotated[float, Field(ge=0, le=1)] = 0.15
+    film_sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.15
     """Share by which the film's two expansions may be wrong, 1 sigma. Lower it to the error that
     `membrane-ctrl climate` states."""
     film_follows_humidity_s: Annotated[float, Field(ge=0, le=1e6)] = 2000.0

@@ -48,6 +48,8 @@ _UNITS = {
     "n": "N",
     "nm": "nm",
     "pa": "Pa",
+    "percent": "%",
+    "ppm": "ppm",
     "px": "px",
     "s": "s",
     "s2": "s2",

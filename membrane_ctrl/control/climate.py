@@ -170,8 +170,8 @@ class Climate:
         if not memory.sees_ring:
             ring_k = math.hypot(ring_k, _RING_AS_AIR_K)
         parts = (
-            config.film_sigma * by_heat_ppm,
-            config.film_sigma * by_water_ppm,
+            config.film_sigma_relative * by_heat_ppm,
+            config.film_sigma_relative * by_water_ppm,
             _RING_SIGMA * ring_ppm,
             config.film_ppm_per_k * film_k,
             config.ring_ppm_per_k * ring_k,

@@ -31,6 +31,7 @@ WITHOUT_UNIT = {
     "setpoint_weight",
 }
 WITHOUT_UNIT |= {"focal_relative", "pitch_relative", "laser_relative", "k1", "k2", "p1", "p2"}
+WITHOUT_UNIT |= {"film_sigma_relative", "thickness_sigma_relative", "gas_sigma_relative", "index"}
 
 
 @pytest.mark.parametrize(("title", "key"), ALL, ids=lambda value: getattr(value, "name", value))

@@ -56,7 +56,7 @@ def _config_of(fit: ClimateFit) -> ClimateConfig:
         ring_ppm_per_k=fit.ring_per_k.value,
         film_ppm_per_percent=fit.film_per_percent.value,
         film_follows_humidity_s=fit.follows_humidity_s,
-        film_sigma=0.03,
+        film_sigma_relative=0.03,
     )
 
 

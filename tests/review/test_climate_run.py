@@ -39,5 +39,5 @@ def test_a_fit_is_printed_as_a_table_of_the_configuration() -> None:
     text = "\n".join(format_fit(fit))
     assert "film_ppm_per_k = 18.20  # +- 0.90" in text
     assert "# ring_ppm_per_k: its cause has changed too little" in text
-    assert "film_sigma = 0.05" in text
+    assert "film_sigma_relative = 0.05" in text
     assert "film_follows_humidity_s = 1500" in text

@@ -102,7 +102,7 @@ def format_fit(fit: ClimateFit) -> list[str]:
     film = [each for each in (fit.film_per_k, fit.film_per_percent) if each is not None]
     if film:
         share = max(each.sigma / abs(each.value) for each in film)
-        lines.append(f"film_sigma = {min(1.0, max(share, 0.01)):.2f}")
+        lines.append(f"film_sigma_relative = {min(1.0, max(share, 0.01)):.2f}")
     if np.isfinite(fit.follows_humidity_s):
         lines.append(f"film_follows_humidity_s = {fit.follows_humidity_s:.0f}")
     lines.append(
