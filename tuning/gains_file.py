@@ -14,6 +14,7 @@ from pydantic import Field
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.control import KEYS_BESIDE_GAINS
 from membrane_ctrl.config.origin import OriginSection
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model import errors, files, program
@@ -65,7 +66,7 @@ class GainsFile(OriginSection):
 
 
 def save_gains(path: Path, gains: GainsFile) -> None:
-    """Write a gains file atomically, without the setpoint, which belongs to the hold.
+    """Write a gains file atomically, without what belongs to the hold: setpoint and held scalar.
 
     Parameters
     ----------
@@ -73,7 +74,8 @@ def save_gains(path: Path, gains: GainsFile) -> None:
     gains : GainsFile
     """
     origin = program.file_origin(SCHEMA)
-    table = gains.model_dump(mode="json", by_alias=True, exclude={"loop": {"setpoint_um"}})
+    excluded = {"loop": set(KEYS_BESIDE_GAINS)}
+    table = gains.model_dump(mode="json", by_alias=True, exclude=excluded)
     files.write_text_atomic(files.resolve_user_path(path), tomli_w.dumps({**table, **origin}))
 
 

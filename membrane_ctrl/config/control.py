@@ -10,6 +10,9 @@ from pydantic import Field, model_validator
 from firmware_iface.settings import Fraction, Micrometres, Section
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
+# Keys of `[loop]` that are no gains: the setpoint has its own command, and what a run holds stays
+KEYS_BESIDE_GAINS = ("setpoint_um", "holds", "reference_figure_um")
+
 
 class LoopConfig(Section):
     """The inner loop. The manipulated value is the pump's flow as a

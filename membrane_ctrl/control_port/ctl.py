@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from membrane_ctrl.config.control import KEYS_BESIDE_GAINS
 from membrane_ctrl.config.fleet import FleetConfig
 from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.toml_file import load_toml, read_toml
@@ -270,6 +271,9 @@ def loop_keys(argument: str) -> dict[str, Any]:
             ) from None
     if isinstance(tables, dict) and isinstance(tables.get("loop"), dict):
         tables = tables["loop"]
+    for key in KEYS_BESIDE_GAINS[1:]:
+        if isinstance(tables, dict) and key in tables:
+            raise errors.InputError(f"{argument}: {key}: stays for a run; remove it")
     if not isinstance(tables, dict) or not all(
         isinstance(value, (bool, int, float)) for value in tables.values()
     ):

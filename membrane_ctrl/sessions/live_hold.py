@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from membrane_ctrl.config import schema, toml_file
+from membrane_ctrl.config.control import KEYS_BESIDE_GAINS
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where, socket_path
 from membrane_ctrl.control_port.message_syntax import Message
@@ -138,7 +139,7 @@ class LiveHold:
             if math.isfinite(getattr(command, key)):
                 request[key] = getattr(command, key)
         if command.loop is not None:
-            request["loop"] = command.loop.model_dump(exclude={"setpoint_um"})
+            request["loop"] = command.loop.model_dump(exclude=set(KEYS_BESIDE_GAINS))
         if command.pump is not None:
             request["pump"] = command.pump.model_dump()
         if command.experiment is not None:

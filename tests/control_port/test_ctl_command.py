@@ -137,6 +137,16 @@ def test_gains_from_files(tmp_path: Path, asked: Asked) -> None:
     assert (second["loop"], "value" in second) == ({"kp_per_s": 0.25}, False)
 
 
+def test_what_a_run_holds_is_no_gain(
+    tmp_path: Path, asked: Asked, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toml = tmp_path / "loop.toml"
+    toml.write_text('[loop]\nkp_per_s = 0.5\nholds = "focus"\n')
+    assert run(["ctl", "gains", str(toml)]) == 2
+    assert "holds: stays for a run" in capsys.readouterr().err
+    assert asked == []
+
+
 def test_the_socket_is_found(tmp_path: Path) -> None:
     run_dir = tmp_path / "logs" / "a-run"
     run_dir.mkdir(parents=True)
