@@ -22,6 +22,8 @@ from membrane_ctrl.processes.frames import FrameWriter
 # A door or a moving mirror may spoil a full cycle: take two more at once. Three failures in a row
 # mean that no mirror is visible (flat, dark, covered), which a pause does not worsen.
 REJECTED_IN_A_ROW = 3
+# What is degraded in three full cycles in a row is so on the bench.
+DEGRADED_IN_A_ROW = 3
 
 
 class Reconstructor(Protocol):
@@ -76,7 +78,8 @@ class CycleFailed:
 
 
 class ShapeCycle:
-    """Takes cycles: a full one first and after losing the fringe orders, else fringes only.
+    """Takes cycles: a full one first and after losing the fringe orders, else fringes only. A
+    degraded full cycle is repeated until `DEGRADED_IN_A_ROW` of them agree.
 
     `frames` must hold a full cycle. `stopping` is checked before each exposure: True ends the cycle
     without a result.
@@ -105,6 +108,7 @@ class ShapeCycle:
         self._cycle = 0
         self._failed_in_a_row = 0
         self._full_rejected_in_a_row = 0
+        self._full_degraded_in_a_row = 0
 
     def want_full(self) -> None:
         """Make the next cycle a full one."""
@@ -133,7 +137,11 @@ class ShapeCycle:
         """Decide the kind of the next cycle."""
         rejected = estimate.verdict == "rejected"
         if estimate.kind == "full":
-            self._full_next = rejected
+            # One spoiled full cycle, as by a person who passes, would degrade all that follow it
+            degraded = estimate.verdict == "degraded"
+            self._full_degraded_in_a_row = self._full_degraded_in_a_row + 1 if degraded else 0
+            repeated = degraded and self._full_degraded_in_a_row < DEGRADED_IN_A_ROW
+            self._full_next = rejected or repeated
             self._full_rejected_in_a_row = self._full_rejected_in_a_row + 1 if rejected else 0
         elif estimate.tracking_lost:
             self._full_next = True

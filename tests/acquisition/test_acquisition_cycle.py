@@ -21,7 +21,13 @@ from acquisition_fakes import (
 from acquisition_fakes import VirtualClock as Clock
 
 from firmware_iface.optical_roles import Pattern
-from membrane_ctrl.acquisition.cycle import REJECTED_IN_A_ROW, CycleDone, CycleFailed, ShapeCycle
+from membrane_ctrl.acquisition.cycle import (
+    DEGRADED_IN_A_ROW,
+    REJECTED_IN_A_ROW,
+    CycleDone,
+    CycleFailed,
+    ShapeCycle,
+)
 from membrane_ctrl.model.durations import pause_s
 from membrane_ctrl.processes.frames import FrameReader, FrameRing, FrameWriter
 
@@ -134,6 +140,19 @@ def test_full_cycles_go_on_until_one_is_accepted_and_back_off(bench: Bench) -> N
     results = [bench.done() for _ in range(rejected + 2)]
     assert [r.estimate.kind for r in results] == ["full"] * (rejected + 1) + ["fringes"]
     assert [r.pause_s for r in results] == [0, 0, 1, 2, 4, 0, 0]
+
+
+def test_a_full_cycle_that_was_spoiled_is_repeated(bench: Bench) -> None:
+    """Else the fringes that follow it would stay degraded, although nothing is wrong any more."""
+    bench.reconstructor.verdicts = [("degraded", "slopes of no surface"), ("ok", "")]
+    kinds = [bench.done().estimate.kind for _ in range(4)]
+    assert kinds == ["full", "full", "fringes", "fringes"]
+
+
+def test_a_bench_on_which_full_cycles_stay_degraded_takes_fringes(bench: Bench) -> None:
+    bench.reconstructor.verdicts = [("degraded", "slopes of no surface")] * 6
+    kinds = [bench.done().estimate.kind for _ in range(6)]
+    assert kinds == ["full"] * DEGRADED_IN_A_ROW + ["fringes"] * 3
 
 
 def test_full_cycle_on_request(bench: Bench) -> None:
