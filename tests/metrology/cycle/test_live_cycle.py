@@ -279,9 +279,9 @@ def test_predicted_sigma_is_the_scatter_of_cycles() -> None:
     live = _live(bin_px=2)
     estimates = [live.measure_fringes(*_render("fringes")) for _ in range(60)]
     sags = np.array([e.sag_um for e in estimates])
-    assert sags.std() == pytest.approx(
-        estimates[0].sag_change_sigma_um, rel=0.3
-    )  # 60 cycles give a sigma to 9 %
+    # the bar of a cycle whose noise looks like a motion is wider: the usual one is the median
+    bar_um = float(np.median([e.sag_change_sigma_um for e in estimates]))
+    assert sags.std() == pytest.approx(bar_um, rel=0.3)  # 60 cycles give a sigma to 9 %
     coeffs = np.array([e.coeffs_um for e in estimates])
     ratio = coeffs.std(axis=0) / np.sqrt(np.diag(estimates[0].covariance_um2))
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.15)
@@ -513,11 +513,18 @@ def test_the_harmonics_of_the_display_move_with_the_film() -> None:
     bar_um = np.sqrt(np.diag(still.covariance_um2 + moved.covariance_um2))[3:]
     assert abs(moved.sag_um - still.sag_um) < 0.05
     assert np.abs((moved.coeffs_um - still.coeffs_um)[3:] / bar_um).max() < 4
+    # medians, as the bar of a cycle whose noise looks like a motion is wider
     pure = _live(bin_px=2)
-    assert (
-        moved.sag_change_sigma_um
-        < 1.5 * pure.measure_fringes(*_render("fringes", where)).sag_change_sigma_um
-    )
+    bars_um = [
+        np.median(
+            [
+                each.measure_fringes(*_render("fringes", where, light=shown)).sag_change_sigma_um
+                for _ in range(5)
+            ]
+        )
+        for each, shown in ((live, light), (pure, Light()))
+    ]
+    assert bars_um[0] < 1.5 * bars_um[1]
 
 
 def test_the_effect_of_a_wrong_geometry_on_a_measured_motion_is_in_the_error_bar() -> None:
