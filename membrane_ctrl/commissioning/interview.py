@@ -113,7 +113,7 @@ def hold_interview(path: Path, display: SessionDisplay, ask: Callable[[Dialogue]
             raise InterviewStoppedError(
                 f"stopped; nothing is lost: the same command continues ({path})"
             ) from None
-        path.unlink(missing_ok=True)
+        files.remove_file(path)
         return found
 
 

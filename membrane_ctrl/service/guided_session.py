@@ -158,7 +158,7 @@ class GuidedSession:
                 words.append("--twin")
             with errors.convert_write_errors(folder, errors.DeviceError):
                 files.make_folder(folder)
-                log = (folder / LOG_NAME).open("w", encoding="utf-8")
+                log = files.fresh_text(folder / LOG_NAME)
             with log:
                 self._process = subprocess.Popen(
                     words,

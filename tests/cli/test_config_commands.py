@@ -19,6 +19,8 @@ from membrane_ctrl.sim.lab import Lab
 
 FOUND = [devices.FoundDevice("port", "/dev/ttyUSB0: FTDI", 'port = "usb:0403:6001"')]
 
+NO_CLIMATE = ["", "", ""]  # film and ring thermometer, hygrometer
+
 
 @pytest.fixture(autouse=True)
 def connected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +109,7 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
     gauge = ["bronkhorst_modbus", "rtu:///dev/ttyUSB1", "5"]
     screen = ["pygame", "1920", "1080", "0.4961"]
     vent = ["modbus_map", "none", "tcp://10.0.0.1:502", "0", "0, 20000", "[0.0, 1.0]"]
-    answers = ["2", *laser, *pump, *gauge, *vent, "", "", "uvc", *screen, ""]
+    answers = ["2", *laser, *pump, *gauge, *vent, "", "", *NO_CLIMATE, "uvc", *screen, ""]
     assert answered(monkeypatch, path, *answers) == 0, capsys.readouterr().err
     config = load_toml(path, Config)
     assert config.devices is not None
@@ -137,7 +139,7 @@ def test_a_slip_is_taken_back_and_an_end_loses_nothing(
     assert answered(monkeypatch, path, *first) == 130  # the end of the input, as by Ctrl-C
     assert not path.exists()
     assert "nothing is lost" in capsys.readouterr().err
-    rest = ["2", "/dev/pump", "mks_937b", "2", "/dev/gauge", "", "", "", "", ""]
+    rest = ["2", "/dev/pump", "mks_937b", "2", "/dev/gauge", "", "", "", *NO_CLIMATE, "", ""]
     assert answered(monkeypatch, path, *rest) == 0
     shown = capsys.readouterr().err
     assert "continuing after 5 answers" in shown
@@ -155,7 +157,7 @@ def test_a_preset_replaces_the_keys_that_it_has(
     path = tmp_path / "lab.toml"
     laser, gauge = ["optoncdt1420", "1"], ["mks_937b", "2", "/dev/gauge"]
     pump = ["modbus_map", "waveshare_ao8", "rtu:///dev/ttyUSB1", "", "0", "0, 1"]
-    answers = ["2", *laser, *pump, *gauge, "", "", "", "", ""]
+    answers = ["2", *laser, *pump, *gauge, "", "", "", *NO_CLIMATE, "", ""]
     assert answered(monkeypatch, path, *answers) == 0, capsys.readouterr().err
     shown = capsys.readouterr().err
     assert "raw (" not in shown
@@ -193,7 +195,7 @@ def test_an_input_of_the_board_is_no_interlock_of_single_instruments(
     laser, pump = ["optoncdt1420", "2", "/dev/x"], ["ventus", "2", "/dev/y"]
     gauge = ["mks_937b", "2", "/dev/z"]
     line = ["board_input", "gpio_line", "stop", "the emergency stop is pressed", "17"]
-    answers = ["2", *laser, *pump, *gauge, "", "", "", "", *line, ""]
+    answers = ["2", *laser, *pump, *gauge, "", "", "", *NO_CLIMATE, "", *line, ""]
     assert answered(monkeypatch, path, *answers) == 0
     assert "board_input " not in capsys.readouterr().err
     config = load_toml(path, Config)
@@ -219,6 +221,7 @@ def test_answers_that_contradict_each_other_write_nothing(
         "",
         "",
         "",
+        *NO_CLIMATE,
         "",
         "",
     ]
@@ -234,7 +237,10 @@ def test_a_pump_and_a_gauge_on_one_register_write_nothing(
     laser = ["optoncdt1420", "2", "/dev/x"]
     pump = ["modbus_map", "none", "tcp://10.0.0.1", "7", "[0, 20000]", "[0.0, 1.0]"]
     gauge = ["modbus_map", "none", "tcp://10.0.0.1:502", "7", "[0, 20000]", "[0.0, 1000.0]"]
-    assert answered(monkeypatch, path, "2", *laser, *pump, *gauge, "", "", "", "", "") == 2
+    assert (
+        answered(monkeypatch, path, "2", *laser, *pump, *gauge, "", "", "", *NO_CLIMATE, "", "")
+        == 2
+    )
     output = capsys.readouterr().err
     assert (
         "devices.pump.address and devices.gauge_pressure.address name the same holding register 7"
@@ -264,6 +270,7 @@ def test_two_names_of_one_serial_port_write_nothing(
         "",
         "",
         "",
+        *NO_CLIMATE,
         "",
         "",
     ]

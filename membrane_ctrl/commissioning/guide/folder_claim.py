@@ -5,18 +5,16 @@ import fcntl
 from collections.abc import Iterator
 from pathlib import Path
 
-from membrane_ctrl.model import errors
-
-_NAME = "session.lock"
+from membrane_ctrl.model import errors, files
 
 
 @contextlib.contextmanager
 def claim_folder(folder: Path) -> Iterator[None]:
     """Keep the session of a folder to this program. Raises DeviceError if another one has it."""
-    path = folder / _NAME
-    with errors.convert_write_errors(path, errors.DeviceError):
-        lock = path.open("a")
-    with lock:
+    with contextlib.ExitStack() as stack:
+        with errors.convert_write_errors(folder, errors.DeviceError):
+            # the folder itself is locked: a file in it could be another's
+            lock = stack.enter_context(files.folder_handle(folder.resolve()))
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
