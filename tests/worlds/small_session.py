@@ -39,7 +39,10 @@ def main(folder: Path) -> int:
         display.show_line("  holding <b>3.71</b> mm")
         more = Question(key="more", kind=QuestionKind.CONFIRMATION, text="Fill to 13 mm?")
         told.write(f"more {display.ask_question(more)}\n")
-        time.sleep(600.0)  # a long stage
+        # A long stage, in short waits: a signal just before one sleep of 600 s would end it only
+        # after these.
+        for _ in range(6000):
+            time.sleep(0.1)
     except (KeyboardInterrupt, EOFError):
         told.write("stopped safely\n")
         return 130
