@@ -67,6 +67,21 @@ def test_a_stop_reaches_a_stage_that_runs(guided: GuidedSession, tmp_path: Path)
     assert told_in(tmp_path / "lab-1")[-1] == "stopped safely"
 
 
+def test_a_service_from_the_background_of_a_shell_can_stop_a_session(tmp_path: Path) -> None:
+    """Such a shell lets its programs ignore SIGINT, and all that they start."""
+    ignoring = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+    starting = "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    session = GuidedSession(
+        tmp_path, command=[sys.executable, "-c", ignoring + starting, *PROGRAM[1:]]
+    )
+    session.start("lab-1", simulated=True, who="ann")
+    wait_for(session, is_asked("fill"))
+    session.stop("bob")
+    wait_for(session, lambda seen: not seen.is_running)
+    assert told_in(tmp_path / "lab-1") == ["stopped safely"]
+    session.close()
+
+
 def test_the_end_of_the_service_stops_the_session(guided: GuidedSession, tmp_path: Path) -> None:
     guided.start("lab-1", simulated=True, who="ann")
     wait_for(guided, is_asked("fill"))

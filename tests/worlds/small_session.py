@@ -18,7 +18,7 @@ from membrane_ctrl.commissioning.guide.dialogue import (
     StageProgress,
     StageResult,
 )
-from membrane_ctrl.commissioning.guide.session_messages import MessageDisplay
+from membrane_ctrl.commissioning.guide.session_messages import MessageDisplay, hear_interrupts
 from membrane_ctrl.commissioning.guide.session_state import CheckRecord, CheckVerdict
 
 HEAD = StageHead(step=4, title="First inflation", name="inflation", does="fills", look_for="film")
@@ -26,6 +26,7 @@ HEAD = StageHead(step=4, title="First inflation", name="inflation", does="fills"
 
 def main(folder: Path) -> int:
     """Ask, write the answers to `told.txt`, and end as the last answer wants."""
+    hear_interrupts()
     display = MessageDisplay(sys.stdin, sys.stdout, lambda: os.kill(os.getpid(), signal.SIGINT))
     told = (folder / "told.txt").open("a", buffering=1)
     try:

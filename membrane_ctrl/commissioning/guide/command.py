@@ -11,7 +11,7 @@ from membrane_ctrl.commissioning.guide.emulated_bench import EmulatedBench, Make
 from membrane_ctrl.commissioning.guide.folder_claim import claim_folder
 from membrane_ctrl.commissioning.guide.real_bench import RealBench
 from membrane_ctrl.commissioning.guide.session import CommissioningSession
-from membrane_ctrl.commissioning.guide.session_messages import MessageDisplay
+from membrane_ctrl.commissioning.guide.session_messages import MessageDisplay, hear_interrupts
 from membrane_ctrl.commissioning.guide.text_display import (
     TextDisplay,
     print_line,
@@ -41,6 +41,7 @@ def commission_bench(
 
 def _make_message_display() -> MessageDisplay:
     """Messages on the standard output; whatever else prints there goes to the standard error."""
+    hear_interrupts()
     target = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
 

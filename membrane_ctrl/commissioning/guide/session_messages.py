@@ -7,6 +7,7 @@ browser sends it.
 """
 
 import queue
+import signal
 import threading
 from collections.abc import Callable
 from typing import Annotated, Literal, TextIO
@@ -72,6 +73,15 @@ class AnswerMessage(BaseModel):
 
     number: int
     answer: str
+
+
+def hear_interrupts() -> None:
+    """Let SIGINT end this program as Ctrl-C does.
+
+    A shell lets what it starts in the background ignore SIGINT, and so does every program that is
+    started from there: the service, and the session, whose stop would not be heard.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class MessageDisplay(SessionDisplay):
