@@ -87,13 +87,13 @@ def holds_with(state: dict[str, Any], kp_per_s: float) -> bool:
     )
 
 
-def begin_experiment(logs: Path, row: dict[str, float]) -> None:
+def begin_experiment(logs: Path) -> None:
     """A program of this machine does it: the interface for programs does not."""
     with connected(Where(logs=logs)) as client:
         relay = {
             "kind": "relay",
             "duration_s": 300.0,
-            "holding_flow_um_per_s": row["flow_um_per_s"],
+            "holding_flow_um_per_s": 1.2,  # about the twin's leak; the flow of one tick may be 0
             "laser_um": 1.0,
         }
         answer = client.ask(do="tune", experiment=relay)
@@ -142,7 +142,7 @@ async def test_a_key_is_edited_and_the_hold_restarts_with_it(
                 refused = await operator.post("api/restart", json={"configuration": name})
                 assert refused.status_code == 409
                 assert reason in describe_refusal(refused)
-            await asyncio.to_thread(begin_experiment, logs, first["status"]["row"])
+            await asyncio.to_thread(begin_experiment, logs)
             await until(reader, lambda state: state["state"] == "tune")
             refused = await operator.post("api/restart", json=wanted)
             assert refused.status_code == 409
