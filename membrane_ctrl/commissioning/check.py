@@ -108,7 +108,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
         warnings = [finding.line(source) for finding in findings if finding.severity == "warning"]
         warnings += [f"{source}: {each.missing_line}" for each in missing]
         _print_probes(source, probes, circuits, would, warnings)
-    # The exit code tells the worst finding: configuration, then devices, then interlocks.
+    # The exit code states the worst finding: configuration, then devices, then interlocks.
     refused = [finding.line(source) for finding in findings if finding.severity == "error"]
     if refused:
         raise errors.FindingsError(refused)

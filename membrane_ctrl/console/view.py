@@ -218,7 +218,7 @@ class ConsolePage:
         if self._foot:
             style = "bold yellow" if self._asks else "dim"
             parts.append(Text(self._foot, style=style, no_wrap=True, overflow="ellipsis"))
-        # The border tells the state from afar.
+        # The border shows the state from afar.
         held = view.state == telemetry.State.HOLD
         border = "green" if held else "blue"
         if view.fault or view.silent_s:

@@ -90,7 +90,7 @@ def explain_refusal(command: Command, state: State, config: Config) -> str:
     str
         Empty if it can.
     """
-    # What no person sends: the start of a run tells the tick of earlier runs.
+    # What no person sends: the start of a run informs the tick of earlier runs.
     if command.kind == "resumed" or command.kind == "latched":
         return (
             ""

@@ -420,7 +420,7 @@ class ProcessValueChoice:
             memory.trusted_until_s = until_s
             self._correlation.reset()
             return []
-        # The PI stays, and a person is told why.
+        # The PI stays, and the event states why.
         memory.fall_back_until_s = until_s
         memory.noticed = True
         message = (

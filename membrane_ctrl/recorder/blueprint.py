@@ -187,7 +187,7 @@ def _make_shape_tab(config: Config) -> rrb.Vertical:
         _make_map("uncertainty", "Noise of a cycle, 1σ, µm"),
         rrb.TextDocumentView(name="Colours", origin="/shape/legend"),
     )
-    # Below them sag and low orders in time, then what tells the quality of a cycle.
+    # Below them sag and low orders in time, then the quality of a cycle.
     band_um = config.limits.band_um
     rows = [
         maps,

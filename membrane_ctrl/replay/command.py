@@ -313,7 +313,7 @@ def _format_report(report: dict[str, Any]) -> list[str]:
         for name, (then, now) in (report["fields"] or {}).items():
             lines.append(f"           {name}: recorded {then!r}, today {now!r}")
     lines += [f"decision   {sentence}" for sentence in report["decisions"]]
-    # A snapshot tells the whole state of the controller, more than a tick's row.
+    # A snapshot has the whole state of the controller, more than a tick's row.
     if (state := report["state_differences"]) is not None:
         lines.append(
             f"state      differs from the snapshot at {state['time_s']:.2f} s in "

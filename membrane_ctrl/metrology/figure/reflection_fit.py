@@ -232,8 +232,8 @@ def fit_reflections(
     weights = np.all(np.abs(phase_rad - np.median(phase_rad, axis=1)[:, None]) < 1.0, axis=0)
     sigmas = np.array([bulge_sigma_mm, _TILT_MRAD, _TILT_MRAD, _SADDLE_MM, _SADDLE_MM, _LIFT_MM])
 
-    # A search for the basin: the cost has many minima, as each turn of an image's phase looks
-    # alike.
+    # A search for the basin: the cost has many minima, as each turn of an image's phase looks the
+    # same.
     few = slice(None, None, max(1, some.size // _SEARCHED_POINTS))
     errors, shares = _search_errors(
         _Model(images, place_mm[:, few], expected_mm[:, some[few]], mm_per_rad),

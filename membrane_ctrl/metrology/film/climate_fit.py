@@ -11,7 +11,7 @@ Errors are those of a jackknife over blocks of an hour, as the residual is not w
 free in it, too, to first order.
 
 Noise of a thermometer would make its expansion too small. Figures and sensors are therefore
-smoothed alike before the fit, which changes no relation between them, and what noise is left counts
+smoothed equally before the fit, which changes no relation between them. What noise is left counts
 as an error.
 """
 

@@ -2,8 +2,8 @@
 
 A convex film in front shows the whole screen in a small part of the mirror. There white is brighter
 by a fifth, with sharp edges, but the fringes hardly swing more: the added light comes from other
-places of the screen, whose fringes run across each other. A bright spot of the panel raises both
-alike; a lamp in the room is in the black frame too.
+places of the screen, whose fringes run across each other. A bright spot of the panel raises
+both; a lamp in the room is in the black frame, too.
 """
 
 import math

@@ -503,7 +503,7 @@ def test_a_noisy_laser_is_in_the_bar() -> None:
 
 
 def test_the_harmonics_of_the_display_move_with_the_film() -> None:
-    """A told motion is corrected as if the fringes were pure: gamma 2 leaves 0.1 µm of sag, five
+    """A stated motion is corrected as if the fringes were pure: gamma 2 leaves 0.1 µm of sag, five
     times the noise.
     """
     light = Light(gamma=2.0)

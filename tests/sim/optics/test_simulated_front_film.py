@@ -57,8 +57,8 @@ def test_the_gas_bends_the_rays_by_micrometres_on_the_screen() -> None:
 
 def test_nitrogen_in_air_is_denser_optically_by_seven_millionths() -> None:
     assert gas_excess_of(FrontFilmConfig(), 600.0) == pytest.approx(7.1e-6, abs=0.3e-6)
-    alike = gas_excess_of(FrontFilmConfig(gas="air"), 0.0)
-    assert alike == 0.0
+    same_gas = gas_excess_of(FrontFilmConfig(gas="air"), 0.0)
+    assert same_gas == 0.0
     assert gas_excess_of(FrontFilmConfig(gas="helium"), 600.0) < -2e-4
 
 
