@@ -13,6 +13,7 @@ frames. A Gray frame has two levels, I = g (lo + (hi - lo) bit); white and black
 thousands of bins noise is negligible; the remaining residual does not belong to the pattern.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,10 +34,13 @@ _SEVERAL_RAD = 6.0
 _SMOOTH_ORDER = 4  # powers of the smooth deviations over the mirror with several fringes
 _FLAT_ORDER = 1  # with fewer: a constant alone
 _COLUMNS_ORDER = 4  # of the polynomials of `SampledBins.smooth_columns`
+# Patches across the picture: what a model leaves of a frame is independent from one to the next.
+_PATCHES = 12
 # Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred µm, stay
 # inside.
 _EDGE_RAD = 0.5
 _HARMONICS = (2, 3, 4)  # of a sinusoid: the display's response
+_COSINE, _SINE, _MOTION, _SECOND_HARMONIC = range(1, 5)  # columns of a sinusoid's model
 # Least correlation with a pattern, to look like it: a sinusoid and its square wave have 0.9.
 _LEAST_LIKENESS = 0.7
 _CLEARLY_MORE = 1e-3  # another pattern must be more like a frame than its own by this much
@@ -166,7 +170,8 @@ def measure_frames(
         seen = binned.means[k].reshape(-1)[scene.index].astype(float)
         saturated = float(np.mean(binned.saturated[k].reshape(-1)[scene.index]))
         shows = _find_best_pattern(seen, waves, scene.light, k)
-        evidence[k] = _make_evidence(seen, models[k], scene.light, saturated, shows)
+        solution = _solve_frame(seen, models[k], scene.light)
+        evidence[k] = _make_evidence(solution, models[k], scene.light, saturated, shows)
     return evidence
 
 
@@ -241,6 +246,7 @@ def estimate_light_and_film(
     if order == _SMOOTH_ORDER:
         contrast = scene.smooth_columns()[1:]
     contrast = contrast - contrast.mean(axis=1, keepdims=True)
+    patch = _assign_patches(scene.places_px)
     means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
     light = np.ones((2, len(stack.patterns)))
     film_um = np.empty(0)
@@ -248,17 +254,26 @@ def estimate_light_and_film(
     shifts = []
     for axis, (own, others) in enumerate((used, used[::-1])):
         light_of_others = stack.weights(others)[0] @ means[others]
-        found = []
-        for k in own:
-            model = _make_model(stack, scene, k, float(readings_um[k]))
-            columns = np.vstack([model.columns, model.columns[1] * contrast])
-            model = replace(model, columns=columns)
-            found.append(_make_evidence(means[k], model, light_of_others, 0.0, k))
         sensitivity = scene.sensitivity_rad_per_um[axis]
+        found = []
+        patches_rad = []
+        for k in own:
+            # The second harmonic differs over the mirror, too: by blur, or by the angle of view.
+            model = _make_model(stack, scene, k, float(readings_um[k]))
+            parts = [model.columns, model.columns[1] * contrast]
+            parts.append(model.columns[_SECOND_HARMONIC] * contrast)
+            model = replace(model, columns=np.vstack(parts))
+            solution = _solve_frame(means[k], model, light_of_others)
+            found.append(_make_evidence(solution, model, light_of_others, 0.0, k))
+            per_unit = np.array([1.0, -sensitivity.mean()])
+            influence = per_unit @ solution.inverse[[_SINE, _MOTION]] @ solution.columns
+            parts_rad = influence * solution.rest / max(solution.swing, _TINY)
+            patches_rad.append(np.bincount(patch, parts_rad, _PATCHES**2))
         places_um = readings_um[own] + [each.moved_um for each in found]
         shift_rad = [each.step_rad - sensitivity.mean() * each.moved_um for each in found]
         film_rad = float(np.sqrt(np.mean(sensitivity**2)) * np.std(places_um))
-        shifts.append(PhaseShifts(np.array(own, float), np.array(shift_rad), film_rad))
+        frames = np.array(own, float)
+        shifts.append(PhaseShifts(frames, np.array(shift_rad), film_rad, np.array(patches_rad)))
 
         # Light about the mean of the axis, and the film's place: the laser's reading corrected.
         level_and_swing = np.array([[each.level, each.swing] for each in found]).T
@@ -298,6 +313,15 @@ class _FrameModel:
         return self.sure, (pattern - pattern.mean()) / norm
 
 
+def _assign_patches(places_px: FloatArray) -> IntArray:
+    """Number (n,) of the patch of the picture that each place (2, n) is in."""
+    first_px = places_px.min(axis=1, keepdims=True)
+    reach_px = np.maximum(np.ptp(places_px, axis=1, keepdims=True), _TINY)
+    in_patches = (places_px - first_px) / reach_px * _PATCHES
+    column, row = np.clip(in_patches.astype(int), 0, _PATCHES - 1)
+    return np.asarray(row * _PATCHES + column)
+
+
 def _make_model(
     stack: FrameStack, scene: SampledBins, frame: int, reading_um: float
 ) -> _FrameModel:
@@ -332,10 +356,40 @@ def _make_model(
     return _FrameModel("sin", columns, every_bin)
 
 
-def _solve_coefficients(
-    seen: FloatArray, model: _FrameModel, light: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Coefficients, their noise if the rest is noise, and the RMS of the rest over the light."""
+@dataclass(frozen=True)
+class _FrameSolution:
+    """The least squares of a frame by its model, on its n sure bins.
+
+    Attributes
+    ----------
+    coefficients : (p,) array
+        Of the model's columns.
+    columns : (p, n) array
+        Those columns, times the light.
+    inverse : (p, p) array
+        Inverse of the normal matrix.
+    rest : (n,) array
+        What the model leaves.
+    """
+
+    coefficients: FloatArray
+    columns: FloatArray
+    inverse: FloatArray
+    rest: FloatArray
+
+    @property
+    def rest_rms(self) -> float:
+        """RMS of what the model leaves, which is the noise of each bin."""
+        return float(np.sqrt(np.mean(self.rest**2)))
+
+    @property
+    def swing(self) -> float:
+        """Swing b of a sinusoid, by b cos delta and b sin delta."""
+        return float(np.hypot(self.coefficients[_COSINE], self.coefficients[_SINE]))
+
+
+def _solve_frame(seen: FloatArray, model: _FrameModel, light: FloatArray) -> _FrameSolution:
+    """Fit a frame, whose bins have the light `seen` (n,), by its model."""
     # Normal equations, scaled to a unit diagonal: the columns are of very different size.
     sure = model.sure
     columns = (model.columns * light)[:, sure]
@@ -344,28 +398,26 @@ def _solve_coefficients(
     scales = np.outer(scale, scale)
     inverse = np.linalg.pinv(normal / scales) / scales
     solved = inverse @ (columns @ seen[sure])
-
-    # The rest, which is the noise of each bin.
-    rest = float(np.sqrt(np.mean((seen[sure] - solved @ columns) ** 2)))
-    sigma = rest * np.sqrt(np.maximum(np.diag(inverse), 0.0))
-    return solved, sigma, rest / float(np.mean(light[sure]))
+    return _FrameSolution(solved, columns, inverse, seen[sure] - solved @ columns)
 
 
 def _make_evidence(
-    seen: FloatArray, model: _FrameModel, light: FloatArray, saturated: float, shows: int
+    solution: _FrameSolution, model: _FrameModel, light: FloatArray, saturated: float, shows: int
 ) -> FrameEvidence:
-    """The evidence of one frame, whose bins have the light `seen` (n,)."""
-    solved, sigma, rest = _solve_coefficients(seen, model, light)
+    """The evidence of one frame by the fit of its model."""
+    solved = solution.coefficients
+    rest = solution.rest_rms / float(np.mean(light[model.sure]))
 
     # A sinusoid: b cos delta and b sin delta give swing and step.
     if model.role == "sin":
-        swing = float(np.hypot(solved[1], solved[2]))  # b cos delta and b sin delta
+        swing = max(solution.swing, _TINY)
+        variance = max(float(solution.inverse[_MOTION, _MOTION]), 0.0)
         return FrameEvidence(
             level=float(solved[0]),
-            swing=swing,
-            step_rad=float(np.arctan2(solved[2], solved[1])),
-            moved_um=float(solved[3]) / max(swing, _TINY),
-            moved_sigma_um=float(sigma[3]) / max(swing, _TINY),
+            swing=solution.swing,
+            step_rad=float(np.arctan2(solved[_SINE], solved[_COSINE])),
+            moved_um=float(solved[_MOTION]) / swing,
+            moved_sigma_um=solution.rest_rms * math.sqrt(variance) / swing,
             rest=rest,
             saturated=saturated,
             shows=shows,

@@ -27,11 +27,14 @@ class PhaseShifts:
         Shift of the whole picture, without that by the film's motion.
     film_rad : float
         Change of the phases by the film's motion, RMS over the frames and the mirror.
+    patches_rad : (N, patches) array
+        What the residuals of each patch of the picture add to the shifts.
     """
 
     frames: FloatArray
     shift_rad: FloatArray
     film_rad: float
+    patches_rad: FloatArray
 
     @property
     def drift_rad(self) -> float:
@@ -42,6 +45,15 @@ class PhaseShifts:
     def drift_by_film_rad(self) -> float:
         """1 sigma of the drift per frame that a film in motion seems to cause."""
         return _FILM_SHARE * self.film_rad * float(np.linalg.norm(self._rate()))
+
+    @property
+    def drift_sigma_rad(self) -> float:
+        """1 sigma of the drift per frame by what the frames' models leave.
+
+        Noise, and waves of a response, a blur or a previous picture that no model represents: what
+        patches of the picture contribute scatters, in all frames together.
+        """
+        return float(np.linalg.norm(self._rate() @ self.patches_rad))
 
     def _rate(self) -> FloatArray:
         """Weights (N,) of the shifts in the drift.

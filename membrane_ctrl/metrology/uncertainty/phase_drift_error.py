@@ -58,9 +58,12 @@ def phase_drift_source(
         effects.append(solved - bench.surface.parameters)
     effects_mm = np.stack(effects, axis=1) / math.sqrt(max(len(effects) - 1, 1))
 
-    # The share of the drift that a film in motion would cause as well.
+    # The share of the drift that a film in motion, and what the frames' models leave, would cause
+    # as well.
     by_film_mm = scale * np.array([of_axis.drift_by_film_rad for of_axis in shifts])
-    share = min(float(np.sum(by_film_mm**2) / max(np.sum(drift_mm**2), _TINY)), 1.0)
+    by_rest_mm = scale * np.array([of_axis.drift_sigma_rad for of_axis in shifts])
+    by_others_mm2 = float(np.sum(by_film_mm**2) + np.sum(by_rest_mm**2))
+    share = min(by_others_mm2 / max(float(np.sum(drift_mm**2)), _TINY), 1.0)
     noise_mm2 = share * float(np.sum(effects_mm**2))
     return Source(
         "phase_drift",

@@ -16,7 +16,7 @@ _PATCHES = 40  # across the mirror: slopes that the fit leaves are independent f
 
 
 def pixel_sources(
-    full: FullResult, slope_variance: FloatArray, noise_adu: float
+    full: FullResult, slope_variance: FloatArray, noise_adu: float, share_of_waves: float
 ) -> Iterator[Source]:
     """Rows of the budget for the noise of the pixels, and for what the slopes show beyond it.
 
@@ -28,6 +28,9 @@ def pixel_sources(
         Variance of an x and of a y slope from the noise.
     noise_adu : float
         Noise of a pixel.
+    share_of_waves : float
+        Part of the residuals' square that waves of the response explain, which have a row of their
+        own.
     """
     # White noise: the covariance inverse M inverse, with M the matrix of the slopes' variances.
     fit = full.fit
@@ -39,8 +42,8 @@ def pixel_sources(
     # Residual slopes, as one error for each patch of the mirror.
     left = Patches.from_grid(full.fit_grid).effects(full.surface.radius_mm, inverse)
     left_urad = 1e6 * math.hypot(fit.residual_x, fit.residual_y)
-    noise_mm2 = float(np.sum(noise**2))
-    description = "slopes that the fit leaves: gamma, light, dust, ripple"
+    noise_mm2 = float(np.sum(noise**2) + share_of_waves * np.sum(left**2))
+    description = "slopes that the fit leaves: light, dust, ripple"
     yield Source("slope_urad", description, left_urad, left, common=False, noise_mm2=noise_mm2)
 
 

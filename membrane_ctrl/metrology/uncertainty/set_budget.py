@@ -30,6 +30,7 @@ from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_changes
 from membrane_ctrl.metrology.uncertainty.phase_drift_error import phase_drift_source
 from membrane_ctrl.metrology.uncertainty.response_harmonics import find_response_harmonics
+from membrane_ctrl.metrology.uncertainty.response_wave_error import estimate_response_waves
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
 from membrane_ctrl.metrology.uncertainty.second_reflection_error import second_reflection_source
 from membrane_ctrl.metrology.uncertainty.set_moment import moment_source
@@ -142,6 +143,7 @@ def assemble_budget(
     # One row for each input.
     slope_variance = full.slope_variance(optics, shifts, noise_adu)
     light = math.hypot(frame_effects.LIGHT, checked.light_left)
+    waves = estimate_response_waves(bench, max(used))
     changes_mm = motion_changes(bench)
     sources = [
         *bench_sources.geometry_sources(bench, spread, widening),
@@ -156,7 +158,8 @@ def assemble_budget(
         second_reflection_source(bench, checked.second),
         *front_film_sources(bench),
         *image_lag_sources(bench, checked.stack, checked.view.used, checked.lag),
-        *residual_patches.pixel_sources(full, slope_variance, noise_adu),
+        waves.source,
+        *residual_patches.pixel_sources(full, slope_variance, noise_adu, waves.share),
     ]
     whole = budget.Budget(tuple(sources), disc, PairMotion.from_changes(bench, changes_mm))
     return SetBudget(whole, tuple(doubts), rim, slopes)

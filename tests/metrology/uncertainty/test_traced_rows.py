@@ -27,6 +27,7 @@ from membrane_ctrl.metrology.uncertainty.motion_evidence import ring_tilt_urad
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_changes
 from membrane_ctrl.metrology.uncertainty.phase_drift_error import phase_drift_source
 from membrane_ctrl.metrology.uncertainty.residual_patches import Patches
+from membrane_ctrl.metrology.uncertainty.response_wave_error import estimate_response_waves
 from membrane_ctrl.metrology.uncertainty.set_budget import _vertex_source
 from membrane_ctrl.metrology.uncertainty.slope_misfit import measure_curl_urad
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, moves_mm, predicted_mm
@@ -163,6 +164,33 @@ def test_noise_of_cells_is_averaged_over_patches() -> None:
     assert measure_curl_urad(noise, np.zeros(shape)) == pytest.approx(1 / 6, rel=0.1)
 
 
+def waving(bench: TrialBench, amplitude_mm: float, noise_mm: float) -> tuple[TrialBench, Array]:
+    """The bench with waves of four times the fringes' phase in x, and its waves (2, n)."""
+    phase_rad = bench.screen_mm[0] * 2 * np.pi / OPTICS.pattern.period_mm
+    waves_mm = np.stack([amplitude_mm * np.cos(4 * phase_rad + 0.3), np.zeros(phase_rad.size)])
+    solved = bench.solve(bench.geometry(), waves_mm, linear=True)
+    there = Surface.from_parameters(solved, RADIUS_MM)
+    taken_mm = predicted_mm(bench, bench.geometry(), there) - bench.screen_mm
+    noise = noise_mm * np.random.default_rng(1).standard_normal(waves_mm.shape)
+    return replace(bench, residual_mm=waves_mm - taken_mm + noise), waves_mm
+
+
+def test_waves_of_a_response_have_the_effect_that_the_fit_takes_of_them(bench: TrialBench) -> None:
+    waved, waves_mm = waving(bench, 0.02, 0.002)
+    found = estimate_response_waves(waved, steps=4)
+    expected_mm = bench.solve(bench.geometry(), waves_mm, linear=True) - FILM.parameters
+    effects_mm = found.source.effects_mm
+    assert np.linalg.norm(effects_mm[:, 0] - expected_mm) < 0.05 * np.linalg.norm(expected_mm)
+    assert np.linalg.norm(effects_mm[:, 1]) < 0.05 * np.linalg.norm(expected_mm)
+    assert found.share == pytest.approx(1 - 0.002**2 * 2 / (0.02**2 / 2), abs=0.02)
+
+
+def test_noise_has_no_waves_beyond_chance(bench: TrialBench) -> None:
+    waved, _ = waving(bench, 0.0, 0.002)
+    found = estimate_response_waves(waved, steps=4)
+    assert found.share < 0.01
+
+
 CAMERA_TURN = next(k for k, group in enumerate(bench_motions.GROUPS) if "turned" in group.name)
 
 
@@ -174,7 +202,8 @@ def drift_of(bench: TrialBench, changes_mm: Array, film_rad: float = 0.0) -> lis
         design = np.stack([np.ones_like(moves), moves - moves.mean()], axis=1)
         shift_mm = np.linalg.lstsq(design, changes_mm[axis], rcond=None)[0][0]
         frames = 8.0 * axis + np.arange(4.0)
-        found.append(PhaseShifts(frames, frames * shift_mm / mm_per_rad, film_rad))
+        shift_rad = frames * shift_mm / mm_per_rad
+        found.append(PhaseShifts(frames, shift_rad, film_rad, np.zeros((4, 1))))
     return found
 
 
@@ -196,6 +225,19 @@ def test_a_drift_that_the_film_explains_is_none(bench: TrialBench) -> None:
     changes_mm = motion_changes(bench)
     x, y = drift_of(bench, changes_mm[group_columns()[CAMERA_TURN]][0], film_rad=1.0)
     assert not phase_drift_source(bench, changes_mm, (x, y)).known_mm.any()
+
+
+def test_a_drift_that_scatters_over_the_picture_is_stated_beyond_its_scatter(
+    bench: TrialBench,
+) -> None:
+    """Half of the drift's square is scatter: half of the square of its effects is left."""
+    changes_mm = motion_changes(bench)
+    x, y = drift_of(bench, changes_mm[group_columns()[CAMERA_TURN]][0])
+    sure = phase_drift_source(bench, changes_mm, (x, y)).known_mm
+    drift_rad2 = x.drift_rad**2 + y.drift_rad**2
+    of_patch_rad = x.frames[:, None] * math.sqrt(drift_rad2 / 2)
+    scattered = phase_drift_source(bench, changes_mm, (replace(x, patches_rad=of_patch_rad), y))
+    assert np.sum(scattered.known_mm**2) == pytest.approx(np.sum(sure**2) / 2, rel=1e-6)
 
 
 def test_the_vertex_without_a_laser_may_have_moved_by_half_the_motion(bench: TrialBench) -> None:

@@ -44,6 +44,9 @@ class Panel:
         Light of black over that of white.
     previous_share : float
         Share of the previous picture that a frame still shows.
+    between_greys : float
+        That share where one sinusoid follows another, over that of the other frames: a liquid
+        crystal turns from grey to grey at another rate than from black to white.
     falloff : float
         Share of the light that is lost at the mirror's edge (`EDGE_TILT` of viewing angle) when the
         panel is brightest straight ahead.
@@ -57,6 +60,7 @@ class Panel:
     gamma_by_angle: float = 0.0
     leak: float = 0.02
     previous_share: float = 0.0
+    between_greys: float = 1.0
     falloff: float = 0.0
     falloff_slope: float = 0.0
     contrast_falloff: float = 0.0

@@ -283,7 +283,10 @@ class World:
         light = self._panel_light(picture, maps.screen, maps.tilt)
         if panel.previous_share and self._previous != picture:
             before = self._panel_light(self._previous, maps.screen, maps.tilt)
-            light += np.float32(panel.previous_share) * (before - light)
+            share = panel.previous_share
+            if self._previous.role == picture.role == "sin":
+                share *= panel.between_greys
+            light += np.float32(share) * (before - light)
         if panel.ghost is not None:
             light += np.float32(panel.ghost.share) * self._panel_light(
                 picture, _ghost_screen(panel.ghost, maps.screen), maps.tilt
