@@ -4,7 +4,7 @@ clock.
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from statistics import fmean, pstdev
 
 from membrane_ctrl.config.schema import Config
@@ -24,6 +24,7 @@ from membrane_ctrl.model import (
     shape_estimate,
     telemetry,
 )
+from membrane_ctrl.model.held_words import describe_held
 from membrane_ctrl.model.lock import describe_lock
 from membrane_ctrl.run_files.held_error import HeldError, HeldErrorMeter
 
@@ -106,6 +107,7 @@ class ConsoleView:
     remedy: str  # for it
     faults: int  # faults so far in the run
     last_fault: str  # the newest of them, with its time
+    held_scalar: str  # what is held besides the centre; empty for the centre
     too_tight: bool  # the leak is too small for the band
     gains: str  # in use, with the countdown of a trial
     flow_most_um_per_s: float  # with the present curve
@@ -223,6 +225,7 @@ class ConsoleModel:
             remedy=status.fault.remedy if status.fault else "",
             faults=status.faults,
             last_fault=self._describe_last_fault(),
+            held_scalar=self._describe_held_scalar(),
             too_tight=self._too_tight(now_s),
             gains=run_status.gains_words(vars(present.loop), status.trial_left_s),
             flow_most_um_per_s=present.loop.flow_most_um_per_s(present.pump),
@@ -237,6 +240,12 @@ class ConsoleModel:
             return ""
         time = format_duration(status.last_fault_s)
         return f"{describe_fault_state(status.last_fault)} at {time}"
+
+    def _describe_held_scalar(self) -> str:
+        status = self._status
+        if status.held is None or status.row is None:
+            return ""
+        return describe_held(asdict(status.held), asdict(status.row))
 
     def _too_tight(self, now_s: float) -> bool:
         row = self._status.row

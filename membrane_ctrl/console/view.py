@@ -318,6 +318,7 @@ def _make_figures_table(
         ("gas", _format_gas(view, row)),
         ("", Text()),
         *_make_shape_items(view.shape, row),
+        *([("holds", Text(view.held_scalar))] if view.held_scalar else []),
         ("", Text()),
         ("lateness", _format_lateness(view, row)),
         ("faults", _format_faults(view)),

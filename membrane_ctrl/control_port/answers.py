@@ -68,6 +68,14 @@ class GainsPart(_Part):
     td_s: _Number
 
 
+class HeldPart(_Part):
+    """What is held besides the centre."""
+
+    holds: _Name
+    state: _Name
+    reason: _Text = ""
+
+
 class SessionPart(_Part):
     """The session that has command of the hold."""
 
@@ -103,6 +111,7 @@ class StatusPart(_Part):
     safe_level: _Name | None = None
     shape: _Name | None = None
     shape_reason: _Text = ""
+    held: HeldPart | None = None
     state_age_s: _Number | None = None
     trial_left_s: _Number | None = None
     commander: _Text | None = None

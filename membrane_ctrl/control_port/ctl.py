@@ -20,6 +20,7 @@ from membrane_ctrl.control_port.service_client import ServiceAddress, ServiceCli
 from membrane_ctrl.control_port.status_lines import alarm_lines
 from membrane_ctrl.model import errors, files, plain_json, run_status, terminal
 from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
+from membrane_ctrl.model.held_words import describe_held
 
 _LABEL_WIDTH = 18
 _WATCHED = ("mono_s", "error_um", "pump_fraction")
@@ -199,6 +200,8 @@ def status_lines(status: dict[str, Any]) -> list[str]:
             )
         shape = f"{status.get('shape') or '?'} {status.get('shape_reason', '')}"
         lines.append(f"  {'shape loop':{_LABEL_WIDTH}}{shape}".rstrip())
+        if held := describe_held(status.get("held"), row):
+            lines.append(f"  {'held':{_LABEL_WIDTH}}{held}")
         lines.append(f"  {'geometry':{_LABEL_WIDTH}}{_describe_geometry(status.get('geometry'))}")
     lines.append(f"  {'commander':{_LABEL_WIDTH}}{_name_commander(status)}")
     return lines

@@ -20,6 +20,9 @@ def status_table(status: RunStatus) -> dict[str, Any]:
     fault = None
     if status.fault:
         fault = {key: getattr(status.fault, key) for key in ("code", "name", "cause", "remedy")}
+    held = None
+    if status.held:
+        held = {key: getattr(status.held, key) for key in ("holds", "state", "reason")}
     trial_left_s = None
     if math.isfinite(status.trial_left_s):
         trial_left_s = round(status.trial_left_s, 1)
@@ -37,6 +40,7 @@ def status_table(status: RunStatus) -> dict[str, Any]:
         "safe_level": telemetry.SafeLevel(int(row.safe_level)).name.lower(),
         "shape": telemetry.ShapeState(int(row.shape_state)).name.lower(),
         "shape_reason": status.shape_reason,
+        "held": held,
         "trial_left_s": trial_left_s,
         "geometry": asdict(status.geometry) if status.geometry else None,
         "row": columns,

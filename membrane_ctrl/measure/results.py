@@ -25,9 +25,12 @@ from membrane_ctrl.metrology.reconstruction import slope_noise
 from membrane_ctrl.metrology.uncertainty import height_map, set_budget
 from membrane_ctrl.metrology.uncertainty.budget import Budget
 from membrane_ctrl.metrology.uncertainty.geometry_statement import GeometryStatement
+from membrane_ctrl.metrology.uncertainty.reflection_error import ZeroError
 from membrane_ctrl.model import errors, program, shape_estimate, zernike_terms
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import make_folder
+
+_NO_ZERO_ERROR = ZeroError(0.0)  # of a map without error bars
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class ErrorBars:
         1 sigma of the mean slope of a cell of the height map, from pixel noise.
     zonal_um : float
         Standard uncertainty of the map's height over the fit.
+    zero : ZeroError
+        Of the map's zero.
     """
 
     budget: Budget
@@ -56,6 +61,7 @@ class ErrorBars:
     grid: height_map.HeightMap
     cell_slope: float = 0.0
     zonal_um: float = 0.0
+    zero: ZeroError = _NO_ZERO_ERROR
 
     @property
     def noise(self) -> FloatArray:
@@ -77,11 +83,12 @@ class ErrorBars:
 
     def maps_um(self) -> tuple[FloatArray, FloatArray]:
         """1 sigma (n, n) of the height on `grid.axis_mm`, from noise and from the geometry; NaN
-        outside the analysis radius.
+        outside the analysis radius. An error of the zero moves the height everywhere.
         """
         of_noise_um = self.grid.picture(1e3 * self.grid.sigma(self.noise))
         of_geometry_um = self.grid.picture(1e3 * self.grid.sigma(self.geometry))
-        return np.hypot(of_noise_um, self.zonal_um), of_geometry_um
+        of_zonal_um = math.hypot(self.zonal_um, self.zero.sigma_um)
+        return np.hypot(of_noise_um, of_zonal_um), of_geometry_um
 
 
 def error_bars(
@@ -135,7 +142,8 @@ def error_bars(
     statement = GeometryStatement.from_evidence(
         find_known_by(optics, geometry), source, seen.rim, seen.slopes
     )
-    return ErrorBars(seen.budget, statement, seen.doubts, grid, cell_slope, zonal_um)
+    zero = ZeroError(zonal_um, seen.zero_reflections_um)
+    return ErrorBars(seen.budget, statement, seen.doubts, grid, cell_slope, zonal_um, zero)
 
 
 def apply_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
@@ -289,6 +297,10 @@ def details_table(
             "geometry": number_or_null(of_geometry_um),
             "geometry_spread": bars.statement.source,
         }
+        table["zero_sigma_um"] = {
+            "noise": number_or_null(bars.zero.noise_um),
+            "reflections": number_or_null(bars.zero.reflections_um),
+        }
     if outline is not None:
         table["rim"] = {
             "centre_px": list(outline.centre_px),
@@ -305,6 +317,7 @@ def _front_film_table(fit: ReflectionFit) -> dict[str, Any]:
     return {
         "reflections": fit.state.value,
         "shares": fit.shares.tolist(),
+        "share_sigmas": None if fit.left is None else fit.left.share_sigmas.tolist(),
         "bulge_less_stated_mm": raised_mm,
         "tilt_mrad": [tilt_x_mrad, tilt_y_mrad],
         "saddles_mm": [saddle_mm, diagonal_mm],

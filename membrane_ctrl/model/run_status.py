@@ -33,6 +33,7 @@ class RunStatus:
     faults: int = 0  # so far in the run
     notices: Notices = field(default_factory=dict)
     shape_reason: str = ""  # of the shape loop
+    held: events.HeldScalarState | None = None  # None while the centre is held
     acquisition: acquisition_events.AcquisitionState | None = None  # the acquisition's last report
     geometry: acquisition_events.GeometryInUse | None = None  # used by the cycles
     # gains set during the run; None: those of the configuration
@@ -104,6 +105,8 @@ class RunStatus:
                 return replace(self, fault=None)
             case events.ShapeLoopState():
                 return replace(self, shape_reason=event.reason)
+            case events.HeldScalarState():
+                return replace(self, held=event)
             case events.CommandTaken(refused=None):
                 return self._after_command(event, mono_s)
             case events.LockSet():

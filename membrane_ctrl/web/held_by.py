@@ -8,12 +8,13 @@ from typing import Any
 
 from membrane_ctrl.console.why import list_used_sensors
 from membrane_ctrl.model.columns import COLUMNS
+from membrane_ctrl.model.held_words import describe_held
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
 
 def describe_holder(status: Mapping[str, Any]) -> str:
     """Which sensors the loop follows, each with its weight, and the estimate's standard deviation;
-    empty if nothing is held.
+    empty if nothing is held. Behind it, what is held besides the centre.
 
     Parameters
     ----------
@@ -23,6 +24,12 @@ def describe_holder(status: Mapping[str, Any]) -> str:
     values = status.get("row")
     if status.get("state") not in ("hold", "settle", "tune") or not isinstance(values, dict):
         return ""
+    sensors = _describe_sensors(status, values)
+    scalar = describe_held(status.get("held"), values)
+    return "; ".join(part for part in (sensors, scalar) if part)
+
+
+def _describe_sensors(status: Mapping[str, Any], values: Mapping[str, Any]) -> str:
     row = TelemetryRow(**{name: _to_number(values.get(name)) for name in FIELDS})
     if math.isfinite(row.estimate_sigma_um):
         sigma = COLUMNS["estimate_sigma_um"].format_value(row.estimate_sigma_um)

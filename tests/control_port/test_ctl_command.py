@@ -16,7 +16,7 @@ from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.controller.commands import SAME_AS, TABLE
 from membrane_ctrl.model.acquisition_events import GeometryInUse
 from membrane_ctrl.model.event_lines import from_dict
-from membrane_ctrl.model.events import MaintenanceOver
+from membrane_ctrl.model.events import HeldScalarState, MaintenanceOver
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 from tests.worlds.port_run import ROW
@@ -175,6 +175,24 @@ def test_status_for_a_person() -> None:
     assert any(line.split() == ["error", "0.25", "µm"] for line in lines)
     assert any(line.split() == ["leak", "–", "µm/s"] for line in lines)
     assert any("unix:ann" in line for line in lines)
+
+
+def test_what_is_held_besides_the_centre_is_shown() -> None:
+    status = RunStatus().after_row(ROW)
+    assert not any(line.startswith("  held") for line in status_lines(status_table(status)))
+    status = status.after_row(replace(ROW, held_offset_um=12.34, held_offset_sigma_um=0.0251))
+    status = status.after_event(HeldScalarState("best_fit", "tracking", 12.34, "", "", 0.025))
+    lines = status_lines(status_table(status))
+    assert (
+        "  held              best fit is held; the centre stands +12.34 ± 0.025 µm from the "
+        "setpoint for it"
+    ) in lines
+    lost = HeldScalarState("focus", "vertex", 12.34, "no usable figure for 30 s")
+    lines = status_lines(status_table(status.after_event(lost)))
+    assert any(
+        "focus is not followed: the centre rests at the last offset (no usable figure" in line
+        for line in lines
+    )
 
 
 def test_what_stands_until_it_is_over_is_shown() -> None:

@@ -39,6 +39,12 @@ def status(state: str = "hold", shape: str = "off", **row: Any) -> dict[str, Any
         (status(), "held by nothing: no reading"),
         (status("fault", **ESTIMATE), ""),
         ({"state": "hold"}, ""),
+        (
+            status(displacement_um=0.1, displacement_quality=0.0, held_offset_um=12.3)
+            | {"held": {"holds": "focus", "state": "tracking", "reason": ""}},
+            "held by the laser; focus is held; the centre stands +12.30 µm from the setpoint for "
+            "it",
+        ),
     ],
 )
 def test_the_holder_is_named_with_weights(given: dict[str, Any], expected: str) -> None:

@@ -45,6 +45,7 @@ _EXPLAINED = 0.8  # least share of the ripple's power that a fit must explain
 _OUTLIER_SIGMAS = 6.0
 _LEAST_SCATTER_RAD = 1e-3  # of the residual: less is noise-free
 _EDGE_PIXELS = 1.5  # beside the edge of an image: a pixel and the lens' blur
+_PATCH_MM = 12.0  # side of patches between which residuals are independent: some ripples
 _SOFT_MM = 1.0  # width of an image's edge in the fit
 
 
@@ -54,6 +55,36 @@ class ReflectionState(Enum):
     FITTED = "fitted and removed"
     ABSENT = "not seen"
     UNEXPLAINED = "not explained"
+
+
+@dataclass(frozen=True)
+class LeftReflections:
+    """What is not known of fitted reflections, at n of the pixels that may show them.
+
+    Attributes
+    ----------
+    position_mm : (2, n) array
+        The pixels on the mirror.
+    derivatives_mm : (FRONT_ERRORS + 2, 2, n) array
+        Changes of the screen points by the errors of form and the shares.
+    covariance : (FRONT_ERRORS + 2, FRONT_ERRORS + 2) array
+        Of the errors of form and the shares.
+    ripple_mm : (2, n) array
+        Screen points that neither reflections nor a smooth change explain; 0 for outliers.
+    pixels_a_point : float
+        Pixels of the set for each of these.
+    """
+
+    position_mm: FloatArray
+    derivatives_mm: FloatArray
+    covariance: FloatArray
+    ripple_mm: FloatArray
+    pixels_a_point: float
+
+    @property
+    def share_sigmas(self) -> FloatArray:
+        """Standard uncertainties (2,) of the shares."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[FRONT_ERRORS:]))
 
 
 @dataclass(frozen=True)
@@ -74,6 +105,8 @@ class ReflectionFit:
         The images.
     smooth_rad : (2, k) array
         Smooth change of the phases of x and y over the fitted part, beside the expected ones.
+    left : LeftReflections, optional
+        What is not known of them; None unless they are fitted.
     """
 
     state: ReflectionState
@@ -83,6 +116,7 @@ class ReflectionFit:
     after_rad: float
     map: ReflectionMap
     smooth_rad: FloatArray
+    left: LeftReflections | None = None
 
     @property
     def doubt(self) -> str:
@@ -278,7 +312,18 @@ def fit_reflections(
     model = _Model(images, place_mm, expected_mm[:, some], mm_per_rad)
     clean_rad = phase_rad - model.effect_rad(errors, shares)
     smooth_rad = clean_rad[:, weights] @ np.linalg.pinv(smooth[:, weights])
-    return ReflectionFit(state, shares, errors, before_rad, after_rad, images, smooth_rad)
+    left = None
+    if state is ReflectionState.FITTED:
+        ripple_rad = np.where(weights, residual, 0.0)
+        columns = _without_smooth(model.derivatives(errors, shares), smooth, weights)
+        left = LeftReflections(
+            place_mm,
+            mm_per_rad * model.derivatives(errors, shares),
+            _estimate_covariance(columns * weights, ripple_rad, sigmas, place_mm),
+            mm_per_rad * ripple_rad,
+            shows.size / some.size,
+        )
+    return ReflectionFit(state, shares, errors, before_rad, after_rad, images, smooth_rad, left)
 
 
 def remove_reflections(
@@ -375,6 +420,40 @@ def _without_smooth(values: FloatArray, smooth: FloatArray, weights: BoolArray) 
 
 def _rms(residual: FloatArray, weights: BoolArray) -> float:
     return float(np.sqrt(np.mean(np.square(residual[:, weights]))))
+
+
+def _estimate_covariance(
+    columns: FloatArray, ripple_rad: FloatArray, sigmas: FloatArray, place_mm: FloatArray
+) -> FloatArray:
+    """Covariance (FRONT_ERRORS + 2, same) of the errors of form and the shares.
+
+    The residual is independent from patch to patch only: N^-1 (sum over patches of g g') N^-1 with
+    the normal matrix N and the gradient g = D r of a patch, and of the prior.
+
+    Parameters
+    ----------
+    columns : (FRONT_ERRORS + 2, 2, n) array
+        Derivatives of the phases, without the smooth change; 0 for points without weight.
+    ripple_rad : (2, n) array
+        Residual, 0 for points without weight.
+    sigmas : (FRONT_ERRORS,) array
+        Of the prior.
+    place_mm : (2, n) array
+        The points on the mirror.
+    """
+    # Sums of the gradient over patches.
+    column, row = np.floor((place_mm - place_mm.min(axis=1, keepdims=True)) / _PATCH_MM).astype(int)
+    patch = row * (column.max() + 1) + column
+    gradients = np.sum(columns * ripple_rad, axis=1)
+    sums = np.stack([np.bincount(patch, gradient) for gradient in gradients])
+    # The normal matrix with the prior, in units of the residual's variance.
+    design = columns.reshape(len(columns), -1)
+    known = np.count_nonzero(np.any(design != 0, axis=0))
+    variance = float(np.sum(ripple_rad**2)) / max(known, 1) + _LEAST_SCATTER_RAD**2
+    prior = np.append(sigmas**-2, np.zeros(2))
+    inverse = np.linalg.inv(design @ design.T / variance + np.diag(prior))
+    middle = sums @ sums.T / variance**2 + np.diag(prior)
+    return np.asarray(inverse @ middle @ inverse)
 
 
 def _search_errors(

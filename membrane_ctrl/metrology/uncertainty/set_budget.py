@@ -29,6 +29,7 @@ from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_source
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_changes
 from membrane_ctrl.metrology.uncertainty.phase_drift_error import phase_drift_source
+from membrane_ctrl.metrology.uncertainty.reflection_error import find_reflection_error
 from membrane_ctrl.metrology.uncertainty.response_harmonics import find_response_harmonics
 from membrane_ctrl.metrology.uncertainty.response_wave_error import estimate_response_waves
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
@@ -58,12 +59,15 @@ class SetBudget:
         The rim against the geometry's prediction; None if the picture does not show it.
     slopes : SlopeMisfit
         Slopes that belong to no surface.
+    zero_reflections_um : float
+        1 sigma of the map's zero by a front film's reflections.
     """
 
     budget: budget.Budget
     doubts: tuple[str, ...]
     rim: RimMisfit | None
     slopes: SlopeMisfit
+    zero_reflections_um: float = 0.0
 
 
 def assemble_budget(
@@ -140,6 +144,20 @@ def assemble_budget(
     if is_blurred and not slopes.contradicts:
         doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
 
+    # What is left of a front film's reflections. Where they could not be fitted, the middle is left
+    # out, and the zero is where the map begins: as far off as the residual is from the fit.
+    reflection_rows = []
+    zero_um = 0.0
+    if full.reflections is not None:
+        left = find_reflection_error(
+            full.reflections, checked.tracer, full.surface, full.fit.normal.inverse
+        )
+        if left is None:
+            zero_um = 1e3 * float(np.nanstd(full.residual_mm))
+        else:
+            reflection_rows.append(left.source)
+            zero_um = left.zero_um
+
     # One row for each input.
     slope_variance = full.slope_variance(optics, shifts, noise_adu)
     light = math.hypot(frame_effects.LIGHT, checked.light_left)
@@ -157,12 +175,13 @@ def assemble_budget(
         *frame_effects.frame_sources(bench, optics, shifts, film_um, light),
         second_reflection_source(bench, checked.second),
         *front_film_sources(bench),
+        *reflection_rows,
         *image_lag_sources(bench, checked.stack, checked.view.used, checked.lag),
         waves.source,
         *residual_patches.pixel_sources(full, slope_variance, noise_adu, waves.share),
     ]
     whole = budget.Budget(tuple(sources), disc, PairMotion.from_changes(bench, changes_mm))
-    return SetBudget(whole, tuple(doubts), rim, slopes)
+    return SetBudget(whole, tuple(doubts), rim, slopes, zero_um)
 
 
 def _make_bench(optics: OpticsConfig, checked: Checked) -> TrialBench:
