@@ -353,6 +353,7 @@ def _light_table(checked: Checked) -> dict[str, Any]:
             "shift_mm": [number_or_null(second.mm_per_rad * s) for s in second.shift_rad],
         },
         "film_image": {
+            "tested": checked.image.evidence.value,
             "share": checked.image.share,
             "place_mm": [number_or_null(checked.image.x_mm), number_or_null(checked.image.y_mm)],
         },

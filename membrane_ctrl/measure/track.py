@@ -161,7 +161,14 @@ def track_set(
     try:
         scene = make_scene(optics, reference.checked, figure, crossed.period_mm, crossed.contrast)
         full_scale_adu = 2**camera.bits - 1
-        tracker = Tracker(scene, size, full_scale_adu, camera.noise_adu, reference.displacement_um)
+        tracker = Tracker(
+            scene,
+            size,
+            full_scale_adu,
+            camera.noise_adu,
+            reference.displacement_um,
+            reference.checked.image.describe(),
+        )
     except ValueError as error:
         raise errors.InputError(f"{path}: pattern.crossed.period_mm: {error}") from None
 

@@ -448,7 +448,7 @@ def _estimate_covariance(
     sums = np.stack([np.bincount(patch, gradient) for gradient in gradients])
     # The normal matrix with the prior, in units of the residual's variance.
     design = columns.reshape(len(columns), -1)
-    known = np.count_nonzero(np.any(design != 0, axis=0))
+    known = int(np.count_nonzero(np.any(design != 0, axis=0)))
     variance = float(np.sum(ripple_rad**2)) / max(known, 1) + _LEAST_SCATTER_RAD**2
     prior = np.append(sigmas**-2, np.zeros(2))
     inverse = np.linalg.inv(design @ design.T / variance + np.diag(prior))

@@ -33,10 +33,13 @@ class Anchor:
         Absolute phases of the bins; NaN where unknown.
     light : (rows, columns) array
         Light of the bins.
+    image : FilmImage
+        A second reflection of the screen that the full set shows.
     """
 
     phase_rad: FloatArray
     light: FloatArray
+    image: film_image.FilmImage = film_image.NO_FILM_IMAGE
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,7 @@ class Checked:
 
     def make_anchor(self) -> Anchor:
         """For the sets that refer to this one."""
-        return Anchor(self.phase_rad, self.view.light)
+        return Anchor(self.phase_rad, self.view.light, self.image)
 
 
 class RejectedSetError(bin_view.NoFigureError):

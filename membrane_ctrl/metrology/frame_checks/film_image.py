@@ -3,11 +3,13 @@
 A convex film in front shows the whole screen in a small part of the mirror. There white is brighter
 by a fifth, with sharp edges, but the fringes hardly swing more: the added light comes from other
 places of the screen, whose fringes run across each other. A bright spot of the panel raises
-both; a lamp in the room is in the black frame, too.
+both; a lamp in the room is in the black frame, too. Without white and black frames the mean light
+of the fringes shows the same patch, but a lamp as well.
 """
 
 import math
 from dataclasses import dataclass
+from enum import Enum
 
 import cv2
 import numpy as np
@@ -27,6 +29,14 @@ _SWING_SHARE = 0.6  # largest excess of the swing over that of the light
 _MAD_SIGMAS = 1.4826
 
 
+class ImageEvidence(Enum):
+    """Which light was searched for a second reflection."""
+
+    WHITE_AND_BLACK = "white and black"
+    MEAN_LIGHT = "mean light of the fringes"
+    NOT_TESTED = "not tested"
+
+
 @dataclass(frozen=True)
 class FilmImage:
     """A part of the mirror that shows the screen a second time.
@@ -35,6 +45,9 @@ class FilmImage:
     ----------
     share : float
         Of the main light; 0 if there is none.
+    evidence : ImageEvidence
+        The light that was searched; not tested: the frames do not allow it, or the bench has a
+        front film.
     x_mm, y_mm : float
         Middle of the part on the mirror.
     width_mm, height_mm : float
@@ -42,6 +55,7 @@ class FilmImage:
     """
 
     share: float
+    evidence: ImageEvidence = ImageEvidence.NOT_TESTED
     x_mm: float = math.nan
     y_mm: float = math.nan
     width_mm: float = math.nan
@@ -56,10 +70,19 @@ class FilmImage:
         """Why a set is degraded; empty without a second reflection."""
         if not self.is_found:
             return ""
+        place = (
+            f"at x {self.x_mm:+.0f} mm, y {self.y_mm:+.0f} mm "
+            f"({self.width_mm:.0f} by {self.height_mm:.0f} mm), {self.share:.0%} of the light"
+        )
+        if self.evidence is ImageEvidence.MEAN_LIGHT:
+            return (
+                f"a second reflection of the screen, or of a lamp, {place}: is there a film in "
+                "front of the mirror? State it as mirror.front_film; a set with white and black "
+                "frames shows which it is"
+            )
         return (
-            f"a second reflection of the screen at x {self.x_mm:+.0f} mm, y {self.y_mm:+.0f} mm "
-            f"({self.width_mm:.0f} by {self.height_mm:.0f} mm), {self.share:.0%} of the light: "
-            "is there a film in front of the mirror? State it as mirror.front_film"
+            f"a second reflection of the screen {place}: is there a film in front of the mirror? "
+            "State it as mirror.front_film"
         )
 
 
@@ -72,6 +95,7 @@ def find_film_image(
     position_mm: FloatArray,
     light: FloatArray,
     swing: FloatArray,
+    evidence: ImageEvidence = ImageEvidence.WHITE_AND_BLACK,
 ) -> FilmImage:
     """Search the bins of the mirror for a part that shows the screen a second time.
 
@@ -84,14 +108,17 @@ def find_film_image(
     position_mm : (2, n) array
         Where they are on it.
     light : (n,) array
-        Light of a white screen less that of a black one.
+        Light of a white screen less that of a black one, or the mean light of the fringes.
     swing : (n,) array
         Amplitude of the fringes.
+    evidence : ImageEvidence
+        Which of both the light is.
 
     Returns
     -------
     FilmImage
     """
+    nothing = FilmImage(0.0, evidence)
     if index.size < _LEAST_BINS / _LARGEST_PART or not np.median(light) > 0:
         return NO_FILM_IMAGE
 
@@ -105,7 +132,7 @@ def find_film_image(
         sigma = _MAD_SIGMAS * float(np.median(np.abs(excess[usual])))
         usual = np.abs(excess) < max(_LEAST_SHARE / 2, 3 * sigma)
         if np.mean(usual) < 1 - _LARGEST_PART:
-            return NO_FILM_IMAGE
+            return nothing
 
     # Noisy bins are averaged over squares.
     side = 1
@@ -119,13 +146,13 @@ def find_film_image(
     picture.reshape(-1)[index[bright]] = 1
     count, parts, stats, _ = cv2.connectedComponentsWithStats(picture, connectivity=4)
     if count < 2:
-        return NO_FILM_IMAGE
+        return nothing
     largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
     patch = parts == largest
     inside = patch.reshape(-1)[index]
     size = int(np.count_nonzero(inside))
     if size < max(_LEAST_BINS, _LEAST_PART * index.size) or size > _LARGEST_PART * index.size:
-        return NO_FILM_IMAGE
+        return nothing
 
     # Its edges are sharp, and its fringes do not swing more.
     share = float(np.median(excess[inside]))
@@ -134,14 +161,15 @@ def find_film_image(
     if not within.any():
         within = inside
     if not around.any() or np.median(excess[around]) > _STEEP * np.median(excess[within]):
-        return NO_FILM_IMAGE
+        return nothing
     swing_excess = _excess_over_smooth(swing, columns, usual)
     swing_excess = _average_bins(shape, index, swing_excess, side)
     if float(np.mean(swing_excess[inside])) > _SWING_SHARE * share:
-        return NO_FILM_IMAGE
+        return nothing
     x_mm, y_mm = position_mm[:, inside]
     return FilmImage(
         share,
+        evidence,
         float(np.mean(x_mm)),
         float(np.mean(y_mm)),
         float(np.ptp(x_mm)),

@@ -304,7 +304,7 @@ def _check_rounds(
                 light_left=float(np.sqrt(np.mean(np.square(light_error[:, used])))),
                 lag=lag,
             )
-            return _measure_light_path(checked, attempt.scene, excluded, optics)
+            return _measure_light_path(checked, attempt.scene, excluded, optics, anchor)
 
         # Two frames that show each other's pictures are exchanged, and both stay in use.
         pair = _find_swapped_pair(fresh, known)
@@ -361,6 +361,7 @@ def _measure_light_path(
     scene: frame_evidence.SampledBins,
     excluded: set[int],
     optics: OpticsConfig,
+    anchor: Anchor | None,
 ) -> Checked:
     """The set with what its frames show of second images, and of the response to light."""
     second = second_reflection.find_second_reflection(
@@ -375,21 +376,31 @@ def _measure_light_path(
         excluded,
         checked.view.used,
     )
-    image = _find_film_image(checked, excluded, optics)
+    image = _find_film_image(checked, excluded, optics, anchor)
     return replace(checked, second=second, response=response, image=image)
 
 
 def _find_film_image(
-    checked: Checked, excluded: set[int], optics: OpticsConfig
+    checked: Checked, excluded: set[int], optics: OpticsConfig, anchor: Anchor | None
 ) -> film_image.FilmImage:
-    """A second reflection of the screen in a part of the mirror, if the bench has no front film and
-    the set has a white and a black frame.
+    """A second reflection of the screen in a part of the mirror, if the bench has no front film.
+
+    By white and black of the set, or of the set that it refers to, or else by the mean light of
+    its fringes.
     """
-    pair = checked.stack.white_and_black(excluded)
     geometry = checked.tracer.geometry
-    if pair is None or geometry.cushion is not None:
+    if geometry.cushion is not None:
         return film_image.NO_FILM_IMAGE
-    white, black = pair
+    pair = checked.stack.white_and_black(excluded)
+    if pair is not None:
+        white, black = pair
+        light = checked.binned.means[white].astype(float) - checked.binned.means[black]
+        evidence = film_image.ImageEvidence.WHITE_AND_BLACK
+    elif anchor is not None and anchor.image.evidence is film_image.ImageEvidence.WHITE_AND_BLACK:
+        return anchor.image
+    else:
+        light = checked.view.light
+        evidence = film_image.ImageEvidence.MEAN_LIGHT
 
     # Bins on the mirror, about where their rays cross the middle of the bowl's depth.
     index = np.flatnonzero(checked.view.mask & checked.near)
@@ -399,7 +410,6 @@ def _find_film_image(
     position_mm = geometry.pinhole_mm[:2, None] + t * rays[:2]
     on_film = np.hypot(*position_mm) < optics.mirror.analysis_radius_mm
     index = index[on_film]
-    light = checked.binned.means[white].astype(float) - checked.binned.means[black]
     swing = checked.view.swing_adu.mean(axis=0)
     return film_image.find_film_image(
         (light.shape[0], light.shape[1]),
@@ -407,6 +417,7 @@ def _find_film_image(
         position_mm[:, on_film],
         light.reshape(-1)[index],
         swing.reshape(-1)[index],
+        evidence,
     )
 
 

@@ -195,7 +195,14 @@ class LiveTracker:
         self._urad_per_rad = 1e6 * float(np.sqrt(np.sum(gain) / 2)) / scene.rad_per_mm
         camera = optics.camera
         size_px = camera.height_px, camera.width_px
-        return Tracker(scene, size_px, 2**camera.bits - 1, camera.noise_adu, stack.mean_reading_um)
+        return Tracker(
+            scene,
+            size_px,
+            2**camera.bits - 1,
+            camera.noise_adu,
+            stack.mean_reading_um,
+            checked.image.describe(),
+        )
 
     def _advance_pattern(self, now_s: float) -> None:
         """Go to the next step of the pattern if it is time; the first five follow each other."""

@@ -74,6 +74,9 @@ class Tracker:
         Noise of a pixel.
     displacement_um : float
         Laser reading of the reference; NaN without.
+    reference_doubt : str
+        Why all frames are degraded by what the reference shows of the bench, for people; empty if
+        they are not.
 
     Raises
     ------
@@ -88,7 +91,9 @@ class Tracker:
         full_scale_adu: int,
         noise_adu: float,
         displacement_um: float = math.nan,
+        reference_doubt: str = "",
     ) -> None:
+        self._reference_doubt = reference_doubt
         self._binner = Binner(*size_px, scene.bin_px, full_scale_adu, 1)
         self._is_noise_free = noise_adu < _NOISE_FREE_ADU
         # Noise of a bin, with that of rounding to whole counts.
@@ -398,6 +403,8 @@ class Tracker:
         finding = doubt or next(iter(faults), None) or Finding("ok", "")
         if finding.verdict == "ok":
             self._add_to_step(shifts_rad, self._clear, fit, time_s)
+            if self._reference_doubt:
+                finding = Finding("degraded", self._reference_doubt)
         return self._make_frame(
             fit, covariance_mm2, motion, time_s, finding, rest_share, saturated_share
         )
