@@ -36,6 +36,7 @@ BENCHMARKS = {
     "tracking_live": "benchmarks.metrology",
     "virtual_time": "benchmarks.control",
     "held": "benchmarks.control",
+    "climate_day": "benchmarks.control",
     "centre": "benchmarks.control",
     "laser_drift": "benchmarks.control",
     "report_month": "benchmarks.records",

@@ -21,7 +21,7 @@ from membrane_ctrl.report_pages.render import render_page
 # On the page, these tables come before the other pictures; the Zernike terms come after them.
 _TABLES_FIRST = 2
 # The picture that shows what a reader came for: the first of these that was drawn.
-_PICTURES_FIRST = ("figure", "residual", "frames")
+_PICTURES_FIRST = ("figure", "star", "residual", "frames")
 _MARKS = {"ok": TextMark.GOOD, "degraded": TextMark.LOOK, "rejected": TextMark.BAD}
 
 

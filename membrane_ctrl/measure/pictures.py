@@ -15,6 +15,7 @@ from membrane_ctrl.measure.result_files import write_picture
 from membrane_ctrl.measure.results import ErrorBars
 from membrane_ctrl.metrology.figure import radial_profile
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
+from membrane_ctrl.metrology.figure.star_image import image_star
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.rays import rim_outline
 from membrane_ctrl.model.arrays import FloatArray
@@ -27,6 +28,10 @@ _MAP_CELLS = 450  # side of other maps
 _STEEP = 3.0
 _TYPICAL_PERCENTILES = (0.5, 99.5)
 _LEAST_SCALE = 1e-12
+_STAR_CELLS = 192  # side of the grid that the image of a star is made of
+_FAINTEST = 1e-4  # light of the star's image that is drawn, over its brightest
+_LARGE_UM = 1000.0  # beyond which its picture counts in millimetres
+_STAR_VIEW = 3.0  # half the side of its picture, over the radius with 80 % of the light
 _SHOWN_ROWS = 16  # of the budget: further ones add nothing
 _LONGEST_TITLE = 110
 
@@ -76,6 +81,9 @@ def draw_measurement(
             drawn["uncertainty"] = _draw_uncertainty(bars)
         if figure is not None:
             drawn["figure"] = _draw_figure(figure)
+            star = _draw_star(figure)
+            if star is not None:
+                drawn["star"] = star
     return [write_picture(out / f"{name}.png", picture) for name, picture in drawn.items()]
 
 
@@ -142,6 +150,70 @@ def _draw_figure(found: MeasuredFigure) -> Figure:
             )
         energy.set(title=f"encircled energy, {numbers.best_focus_mm:.1f} mm from the vertex")
     energy.set(xlabel="radius (mm)", ylabel="% of the rays", ylim=(0, 101))
+    return figure
+
+
+def _draw_star(found: MeasuredFigure) -> Figure | None:
+    """Draw the image of a distant point at the stated wavelength, and its energy by radius.
+
+    None without a real focus. Where the cells do not resolve the differences of the paths, the
+    point spread function is not that of the mirror: the picture says so, and shows where the rays
+    meet the focal plane.
+    """
+    if not found.figure.numbers.best_focus_mm > 0:
+        return None
+    # Some cells: the image of the whole grid has no more detail near its middle.
+    seen = found.seen.take_every(max(1, found.seen.axis_mm.size // _STAR_CELLS))
+    try:
+        image = image_star(seen.axis_mm, seen.height_mm, found.wavelength_um)
+    except ValueError:
+        return None
+    figure, (picture, energy) = new_sheet(12, 5.2, 1, 2)
+    wave = f"at {found.wavelength_um:g} µm"
+    energy.set(title=f"focus {image.focus_mm:.1f} mm above the vertex", ylim=(0, 101))
+    if not image.resolved:
+        reason = (
+            f"not resolved {wave}:\nthe paths to the focus differ by\n"
+            f"{image.path_rms_um:.3g} µm RMS, and from cell to cell\nby more than half a wavelength"
+        )
+        place = picture.transAxes
+        picture.text(0.5, 0.5, reason, transform=place, ha="center", va="center")
+        picture.set(title=f"image of a star {wave}", xticks=[], yticks=[])
+        energy.plot(np.quantile(found.figure.spot_mm, ENERGY_SHARES), 100 * ENERGY_SHARES)
+        energy.set(xlabel="radius (mm)", ylabel="% of the rays")
+        return figure
+
+    # The light around the middle, in a unit that suits it.
+    half_um = image.pixel_um * len(image.spread) / 2
+    view_um = min(half_um, _STAR_VIEW * image.radius_80_um)
+    unit, per_um = "µm", 1.0
+    if view_um > _LARGE_UM:
+        unit, per_um = "mm", 1e-3
+    half = per_um * half_um
+    view = per_um * view_um
+    shown = picture.imshow(
+        np.log10(np.maximum(image.spread / image.spread.max(), _FAINTEST)),
+        extent=(-half, half, -half, half),
+        origin="lower",
+        cmap=SEQUENTIAL_MAP,
+        interpolation="nearest",
+    )
+    figure.colorbar(shown, ax=picture, shrink=0.85)
+    picture.set(
+        title=f"image of a star {wave}, log10; Strehl {found.figure.numbers.strehl:.3g}",
+        xlabel=f"x ({unit})",
+        xlim=(-view, view),
+        ylim=(-view, view),
+    )
+
+    # Its energy by radius.
+    radius_um, share = image.energy_curve()
+    energy.plot(per_um * radius_um, 100 * share)
+    for percent, at_um in ((50, image.radius_50_um), (80, image.radius_80_um)):
+        at = per_um * at_um
+        energy.plot(at, percent, "o", color="tab:red")
+        energy.annotate(f"  {percent} % within {at:.4g} {unit}", (at, percent))
+    energy.set(xlabel=f"radius ({unit})", ylabel="% of the light", xlim=(0, view))
     return figure
 
 

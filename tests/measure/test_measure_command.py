@@ -120,6 +120,7 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
         "convergence",
         "uncertainty",
         "figure",
+        "star",
     }
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img ") == page.count('src="data:image/png;base64,') == len(names)
@@ -133,7 +134,7 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
     number, value = 'data-label="number"', 'data-label="value"'  # for a phone, one cell a line
     assert f"<td {number}>power_um</td><td {value}>{power_um:.6g}</td>" in page
     shown = re.findall(r"<img alt=\"(\w+)\"|<pre>|class=\"(verdict \w+)\"", page)
-    assert [name or mark for name, mark in shown][:3] == ["verdict good", "figure", "residual"]
+    assert [name or mark for name, mark in shown][:4] == ["verdict good", "figure", "star", "residual"]
     assert page.index('alt="figure"') < page.index("power_um") < page.index("<pre>")
     assert figure["not_given"] == {}
     document = (tmp_path / "report.pdf").read_bytes()

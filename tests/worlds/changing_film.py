@@ -71,15 +71,24 @@ class ChangingFilm:
 
 
 def true_focus_mm(sag_um: float, spherical_um: float) -> float:
-    """Half the radius of the best sphere of a bowl with such a change.
-
-    By Newton's rule on the mean square of the distance from the sphere's centre, over the radius
-    with weights of area: no code and no linearisation of the product.
-    """
-    r = APERTURE_MM * (np.arange(_POINTS) + 0.5) / _POINTS
-    rho2 = (r / RADIUS_MM) ** 2
+    """Half the radius of the best sphere of a bowl with such a change."""
+    rho2 = radii_mm() ** 2 / RADIUS_MM**2
     spherical = math.sqrt(5) * (6 * rho2**2 - 6 * rho2)
-    z = 1e-3 * (sag_um * hencky_profile(rho2) + spherical_um * spherical)
+    return best_sphere_focus_mm(1e-3 * (sag_um * hencky_profile(rho2) + spherical_um * spherical))
+
+
+def radii_mm() -> FloatArray:
+    """Radii (n,) of rings over the used aperture, for `best_sphere_focus_mm`."""
+    return np.asarray(APERTURE_MM * (np.arange(_POINTS) + 0.5) / _POINTS)
+
+
+def best_sphere_focus_mm(z: FloatArray) -> float:
+    """Half the radius of the best sphere of heights (n,) in mm at `radii_mm`.
+
+    By a search on the mean square of the distance from the sphere's centre, over the radius with
+    weights of area: no code and no linearisation of the product.
+    """
+    r = radii_mm()
 
     def residuals(centre_mm: float) -> tuple[FloatArray, float]:
         distance = np.hypot(r, z - centre_mm)

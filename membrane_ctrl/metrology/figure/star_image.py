@@ -22,6 +22,7 @@ from membrane_ctrl.model.arrays import FloatArray
 _PADDING = 4  # of the aperture: samples of the image at a quarter of wavelength over aperture
 _NEWTON_STEPS = 6
 _ENERGY_SHARES = (0.5, 0.8)
+_CURVE_POINTS = 2000  # of a curve of the energy: enough for a picture
 # Neighbouring cells whose paths differ by more than half a wavelength do not show what lies between
 # them.
 _LARGEST_STEP = 0.5
@@ -59,6 +60,12 @@ class StarImage:
     radius_80_um: float
     spread: FloatArray
     pixel_um: float
+
+    def energy_curve(self) -> tuple[FloatArray, FloatArray]:
+        """Radii (n,) around the middle in µm, and the share (n,) of the energy within."""
+        radius, energy = _sum_energy(self.spread)
+        every = max(1, radius.size // _CURVE_POINTS)
+        return self.pixel_um * radius[::every], energy[::every]
 
 
 def image_star(axis_mm: FloatArray, height_mm: FloatArray, wavelength_um: float) -> StarImage:
@@ -175,6 +182,15 @@ def _is_resolved(paths_um: FloatArray, mask: FloatArray, wavelength_um: float) -
 
 def _find_energy_radii(spread: FloatArray, pixel_um: float) -> tuple[float, float]:
     """Radii around the middle of the energy that hold 50 and 80 % of it, µm."""
+    radius, energy = _sum_energy(spread)
+    half, most = (pixel_um * float(np.interp(share, energy, radius)) for share in _ENERGY_SHARES)
+    return half, most
+
+
+def _sum_energy(spread: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Radii (n,) of all samples around the middle of the energy, in order, and the share (n,) of
+    the energy up to each.
+    """
     axis = np.arange(len(spread))
     total = spread.sum()
     row = float(spread.sum(axis=1) @ axis / total)
@@ -182,7 +198,4 @@ def _find_energy_radii(spread: FloatArray, pixel_um: float) -> tuple[float, floa
     radius = np.hypot(axis[:, None] - row, axis[None, :] - column).ravel()
     order = np.argsort(radius)
     energy = np.cumsum(spread.ravel()[order]) / total
-    half, most = (
-        pixel_um * float(np.interp(share, energy, radius[order])) for share in _ENERGY_SHARES
-    )
-    return half, most
+    return radius[order], energy
