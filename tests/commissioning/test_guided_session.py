@@ -98,6 +98,14 @@ def test_a_clear_film_in_front_is_written_and_taken_back(tmp_path: Path, bench: 
     assert load_toml(tmp_path / CONFIGURATION, Config).optics.mirror.front_film is None
 
 
+def test_a_stated_front_film_stays_if_nobody_answers(tmp_path: Path, bench: QuickBench) -> None:
+    (tmp_path / CONFIGURATION).write_text("[optics.mirror.front_film]\nbulge_mm = 61.0\n")
+    run_stages(tmp_path, bench, Person(), "mirror")
+    front = load_toml(tmp_path / CONFIGURATION, Config).optics.mirror.front_film
+    assert front is not None
+    assert front.bulge_mm == 61.0
+
+
 def test_a_pump_that_can_only_switch_is_refused(tmp_path: Path, bench: QuickBench) -> None:
     person = Person(**{"mirror.pump_kind": "diaphragm"})
     assert run_stages(tmp_path, bench, person, "mirror") == Exit.INTERRUPTED

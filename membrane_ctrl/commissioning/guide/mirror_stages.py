@@ -88,7 +88,12 @@ def _ask_relief(context: StageContext) -> float:
 
 
 def _ask_front_bulge_mm(context: StageContext, facts: MirrorFacts) -> float:
-    """Ask whether the camera looks through the other film, and for the height of that film."""
+    """Ask whether the camera looks through the other film, and for the height of that film.
+
+    A front film that the configuration states is the default: an answer that nobody gave must not
+    remove it.
+    """
+    stated = context.config.optics.mirror.front_film
     seen = context.dialogue.ask_choice(
         "mirror.seen",
         "how does the camera see the mirror?",
@@ -99,14 +104,15 @@ def _ask_front_bulge_mm(context: StageContext, facts: MirrorFacts) -> float:
                 meaning="through the other film, which is clear, and the gas: the paper's cushion",
             ),
         ),
-        _DIRECTLY,
+        _DIRECTLY if stated is None else _THROUGH,
     )
     if seen == _DIRECTLY:
         return 0.0
+    bulge_mm = find_other_bulge_mm(facts) if stated is None else stated.bulge_mm
     return context.dialogue.ask_number(
         "mirror.front_bulge_mm",
         "height of the clear film's middle above its rim, measured, or as derived",
-        round(find_other_bulge_mm(facts), 1),
+        round(bulge_mm, 1),
         0.1,
         5000.0,
         "mm",
