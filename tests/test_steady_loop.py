@@ -58,3 +58,11 @@ def test_a_wait_in_which_the_machine_stood_still_is_no_time(
     assert loop.time() - begin_s < STANDSTILL_S / 2
     monkeypatch.undo()
     loop.close()
+
+
+async def test_only_the_thread_of_the_loop_may_add_a_callback() -> None:
+    loop = asyncio.get_running_loop()
+    with pytest.raises(RuntimeError, match="Non-thread-safe"):
+        await asyncio.to_thread(loop.call_soon, print)
+    with pytest.raises(RuntimeError, match="Non-thread-safe"):
+        await asyncio.to_thread(loop.call_later, 0.0, print)

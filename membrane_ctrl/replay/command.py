@@ -10,7 +10,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -87,14 +87,11 @@ class RecordedRun:
         return RecordedRows(open_run(self.folder).tick_blocks(["tick", *names], from_s))
 
     def find_differences(
-        self, rows: Sequence[telemetry.TelemetryRow]
-    ) -> list[dict[str, tuple[float, float]] | None]:
-        """Fields in which each row differs from the recorded one; None where the recording has
-        none.
+        self, row: telemetry.TelemetryRow
+    ) -> dict[str, tuple[float, float]] | None:
+        """Return the fields in which a row differs from the recorded one; None without such a
+        row.
         """
-        return [self._compare_row(row) for row in rows]
-
-    def _compare_row(self, row: telemetry.TelemetryRow) -> dict[str, tuple[float, float]] | None:
         after_s = math.nextafter(row.mono_s, math.inf)
         recorded = next(
             open_run(self.folder).tick_blocks(telemetry.FIELDS, row.mono_s, after_s), None
@@ -225,11 +222,12 @@ def _make_report(
     decisions = replays.find_unmatched(
         recorded[: max(in_time, len(today))], today, DECISION_SLACK_S
     )
-    first = found.different_rows[0] if found.different else None
+    first = found.first_different
     first_different = None
+    fields = None
     if first is not None:
         first_different = {"tick": int(first.tick), "time_s": first.mono_s}
-    differences = run.find_differences(found.different_rows)
+        fields = run.find_differences(first)
     state_differences = None
     if found.state_differences is not None:
         state_differences = asdict(found.state_differences)
@@ -245,7 +243,7 @@ def _make_report(
         "near": found.near,
         "different": found.different,
         "first_different": first_different,
-        "fields": differences[0] if differences else None,
+        "fields": fields,
         "decisions": decisions,
         "state_differences": state_differences,
         "gaps": [

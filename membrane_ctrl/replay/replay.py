@@ -31,8 +31,6 @@ from membrane_ctrl.run_files.inputs_file import InputsFrame
 
 # A shape is used in the tick it arrives in; no more than these need be kept.
 _SHAPES_KEPT = 16
-# Events in other words make some ticks an hour different; with more than these the code differs.
-_ROWS_KEPT = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +84,7 @@ class Replay:
     compared: int = 0  # of these, bit by bit
     near: int = 0  # of these, with other last bits
     different: int = 0  # of these
-    # today's, of the first of them
-    different_rows: list[telemetry.TelemetryRow] = field(default_factory=list)
+    first_different: telemetry.TelemetryRow | None = None  # today's row of the first of these
     gaps: list[Gap] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     last_s: float = -math.inf
@@ -223,8 +220,8 @@ def _compare_tick(
         found.near += 1
         return
     found.different += 1
-    if len(found.different_rows) < _ROWS_KEPT:
-        found.different_rows.append(outputs.row)
+    if found.first_different is None:
+        found.first_different = outputs.row
 
 
 def decisions_of(logged: Iterable[tuple[float, Event]]) -> list[Decision]:

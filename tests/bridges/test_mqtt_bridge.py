@@ -119,7 +119,6 @@ async def listening(port: int) -> AsyncIterator[Listener]:
 async def bridge(folder: Path) -> AsyncIterator[tuple[PortRun, Listener, int]]:
     """A run, a broker, a bridge between them, and a listener."""
     port = free_port()
-    asyncio.get_running_loop().set_debug(False)  # which makes each message several times as slow
     async with (
         port_run(folder) as run,
         broker(port),

@@ -67,7 +67,6 @@ async def bridge(
     """A run with an OPC UA bridge; yields the run and the server's address."""
     port = free_port()
     seen = dataclasses.replace(seen_hold(), name="the-run", seen_s=time.monotonic() + 1e6)
-    asyncio.get_running_loop().set_debug(False)  # which makes a call ten times as slow
     async with port_run(folder) as run:
         bridge = bridge_with(role, seen, folder / "control.sock")
         config = OpcuaConfig(port=port, **settings)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import ast
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -77,9 +77,9 @@ def import_nodes(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
     return (node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom))
 
 
-def imported(tree: ast.AST) -> Iterator[str]:
+def imported(nodes: Iterable[ast.Import | ast.ImportFrom]) -> Iterator[str]:
     """Yield each imported name in full: `package.module` or `package.module.name`."""
-    for node in import_nodes(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif node.module:
@@ -97,6 +97,12 @@ def module_of(name: str, known: frozenset[str]) -> str | None:
 
 
 @cache
+def tree_of(path: Path) -> ast.Module:
+    """Return the syntax tree of a file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def modules(root: Path = ROOT) -> dict[str, Module]:
     """Read every module of the product; keys are dotted names."""
     paths = {
@@ -107,13 +113,13 @@ def modules(root: Path = ROOT) -> dict[str, Module]:
     known = frozenset(paths)
     found = {}
     for name, path in paths.items():
-        text = path.read_text(encoding="utf-8")
-        tree = ast.parse(text)
-        targets = frozenset(target for full in imported(tree) if (target := module_of(full, known)))
-        import_lines = sum(
-            node.end_lineno - node.lineno + 1 for node in import_nodes(tree) if node.end_lineno
+        nodes = list(import_nodes(tree_of(path)))
+        targets = frozenset(
+            target for full in imported(nodes) if (target := module_of(full, known))
         )
-        found[name] = Module(name, path, text.count("\n"), import_lines, targets)
+        import_lines = sum(node.end_lineno - node.lineno + 1 for node in nodes if node.end_lineno)
+        lines = path.read_text(encoding="utf-8").count("\n")
+        found[name] = Module(name, path, lines, import_lines, targets)
     return found
 
 

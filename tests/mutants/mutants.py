@@ -31,6 +31,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from queue import Queue
 from threading import Lock
@@ -381,11 +382,17 @@ def removes(mutant: Mutant) -> str:
     """
     if mutant.guard or mutant.rule:
         return mutant.guard or mutant.rule
-    text = SAFETY.read_text(encoding="utf-8")
-    for rule, row in _rows_of_rules(text):
-        if mutant.find in (ast.get_source_segment(text, row) or ""):
+    for rule, row in _texts_of_rules().items():
+        if mutant.find in row:
             return rule
     return ""
+
+
+@cache
+def _texts_of_rules() -> dict[str, str]:
+    """Text of each rule's row in the safety table."""
+    text = SAFETY.read_text(encoding="utf-8")
+    return {rule: ast.get_source_segment(text, row) or "" for rule, row in _rows_of_rules(text)}
 
 
 def sample(mutants: Sequence[Mutant], number: int) -> list[Mutant]:
