@@ -25,7 +25,7 @@ from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_log import LiveLog
 from membrane_ctrl.sessions.progress import Progress
-from membrane_ctrl.web import cli, runs_panel, server
+from membrane_ctrl.web import cli, report_answers, runs_panel, server
 from tests.support import review_runs
 from tests.support.browser import Tab, browser_tab
 from tests.support.machine_needs import needs
@@ -356,14 +356,14 @@ def test_a_report_is_that_of_a_run_in_the_folder(tmp_path: Path, name: str) -> N
     for folder in (tmp_path, tmp_path / "logs"):
         (folder / "report").mkdir(exist_ok=True)
         (folder / REPORT_NAME).write_text("secret")
-    assert b"secret" not in bytes(server.report_page(tmp_path / "logs", name).body)
+    assert b"secret" not in bytes(report_answers.report_page(tmp_path / "logs", name).body)
 
 
 def test_the_report_of_a_run_is_written_and_shown(tmp_path: Path) -> None:
     run = review_runs.written(tmp_path, 0.05)
-    assert server.report_page(tmp_path, run.name).status_code == 404
+    assert report_answers.report_page(tmp_path, run.name).status_code == 404
     assert runs_panel.report_problem(run, WebUser("anna", "operate")) == ""
-    shown = server.report_page(tmp_path, run.name)
+    shown = report_answers.report_page(tmp_path, run.name)
     assert shown.status_code == 200
     assert run.name.encode() in bytes(shown.body)
 
@@ -371,11 +371,11 @@ def test_the_report_of_a_run_is_written_and_shown(tmp_path: Path) -> None:
 def test_a_report_of_a_stranger_runs_in_a_sandbox(tmp_path: Path) -> None:
     (tmp_path / "run" / "report").mkdir(parents=True)
     (tmp_path / "run" / REPORT_NAME).write_text("<script>fetch('/')</script>")
-    answer = server.report_page(tmp_path, "run")
+    answer = report_answers.report_page(tmp_path, "run")
     policy = answer.headers["content-security-policy"]
     assert policy.startswith("sandbox")
     assert "allow-same-origin" not in policy
-    assert server.report_page(tmp_path, "none").status_code == 404
+    assert report_answers.report_page(tmp_path, "none").status_code == 404
 
 
 def test_a_reader_starts_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

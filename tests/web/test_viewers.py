@@ -15,7 +15,7 @@ from membrane_ctrl.service.web_user import WebUser
 from membrane_ctrl.service.work_pool import WorkPool
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_log import ANSWER, LiveLog, PageAnswer
-from membrane_ctrl.web import server, tuning_panel
+from membrane_ctrl.web import hang_up, tuning_panel
 from membrane_ctrl.web.made_once import MadeOnce
 
 
@@ -88,7 +88,7 @@ def test_only_new_lines_are_shown(
 async def test_a_viewer_who_does_not_read_is_hung_up_on(
     leaves: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(server, "_STUCK_S", 0.01)
+    monkeypatch.setattr(hang_up, "_STUCK_S", 0.01)
 
     async def app(scope: Any, receive: Any, send: Any) -> None:
         if leaves:
@@ -104,7 +104,7 @@ async def test_a_viewer_who_does_not_read_is_hung_up_on(
         await asyncio.Event().wait()  # the transport's buffer is full
 
     scope = {"type": "websocket", "membrane_user": WebUser("anna", "read")}
-    await server.HangUp(app)(scope, receive, send)  # type: ignore[arg-type]
+    await hang_up.HangUp(app)(scope, receive, send)  # type: ignore[arg-type]
     assert capsys.readouterr().err == (
         "" if leaves else "membrane-ctrl serve: viewer anna does not read: hung up\n"
     )

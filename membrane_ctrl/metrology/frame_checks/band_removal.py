@@ -267,7 +267,7 @@ def remove_bands(
         return stack, binned, _NONE
 
     # Bands common to all steps of an axis bend none of its phases, but in the light of the other
-    # axis the film would seem to move (`frame_evidence.estimate_light_and_film`).
+    # axis the film would seem to move (`light_and_film.estimate_light_and_film`).
     y.amplitudes += fitted_waves(row_waves(found, rows), x.light_difference(y))
 
     # Bins and rows of pixels are divided by the gain.

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.schema import PatternConfig
-from membrane_ctrl.metrology.frame_checks.frame_evidence import SampledBins
+from membrane_ctrl.metrology.frame_checks.sampled_bins import SampledBins
 from membrane_ctrl.metrology.phase import screen_scale
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.phase.gray_code import gray_bit

@@ -7,7 +7,7 @@ import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
-from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM, FilmMotion
+from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.phase import screen_scale
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.uncertainty import (
     residual_patches,
     trial_bench,
 )
-from membrane_ctrl.metrology.uncertainty.corrected_motion_error import SensitivityError
+from membrane_ctrl.metrology.uncertainty.film_motion_rows import find_film_motion_rows
 from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_sources
 from membrane_ctrl.metrology.uncertainty.front_film_error import front_film_sources
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
@@ -37,12 +37,8 @@ from membrane_ctrl.metrology.uncertainty.second_reflection_error import second_r
 from membrane_ctrl.metrology.uncertainty.set_moment import moment_source
 from membrane_ctrl.metrology.uncertainty.slope_misfit import SlopeMisfit, measure_slope_misfit
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
-from membrane_ctrl.metrology.uncertainty.unseen_motion import UnseenMotion, estimate_unseen_motion
 
 _BLUR_UM = 0.5  # RMS of the height beyond which a picture is out of focus
-# What the correction for the film's motion from frame to frame leaves, besides a share of the
-# motion by the geometry: the fringes' error in the film's place.
-_FRINGES_UM = 0.1
 
 
 @dataclass(frozen=True)
@@ -109,20 +105,11 @@ def assemble_budget(
     sigmas = optics.geometry.sigmas or SigmasConfig()
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
 
-    # Motion of the film from x to y: by the laser, or by the fringes.
-    motion = FilmMotion.from_set(checked)
-    unseen = None
-    if not math.isfinite(motion.x_to_y_sigma_um):
-        of_pixel_mm2 = full.screen_variance_mm2(optics, shifts, noise_adu)
-        unseen = estimate_unseen_motion(bench, spread, of_pixel_mm2 / checked.binned.bin_px**2)
-    film_rows, doubts = _film_rows(bench, motion, unseen)
-    film_um = math.hypot(motion.moved_um, motion.noise_um)
-    if motion.is_worth_correcting:
-        error = SensitivityError.from_spread(bench, spread, sigmas.laser_relative)
-        film_um = math.hypot(_FRINGES_UM, error.relative * motion.moved_um, motion.noise_um)
-        x_um, y_um = (float(of_axis_um.mean()) for of_axis_um in motion.motion_um)
-        film_rows.append(error.source(bench, x_um, y_um))
-    moment = moment_source(checked, motion, unseen, optics.mirror.radius_mm)
+    # Motion of the film from x to y, and from frame to frame.
+    noise_mm2 = full.screen_variance_mm2(optics, shifts, noise_adu) / checked.binned.bin_px**2
+    film = find_film_motion_rows(bench, checked, spread, sigmas.laser_relative, noise_mm2)
+    doubts = list(film.doubts)
+    moment = moment_source(checked, film.motion, film.unseen, optics.mirror.radius_mm)
     moment_rows = [] if moment is None else [moment]
 
     # The geometry against the rim in the picture, and against slopes that no surface has.
@@ -166,13 +153,13 @@ def assemble_budget(
     sources = [
         *bench_sources.geometry_sources(bench, spread, widening),
         *bench_sources.bench_sources(bench, sigmas),
-        *film_rows,
+        *film.rows,
         *moment_rows,
         phase_drift_source(bench, changes_mm, checked.shifts),
-        _vertex_source(bench, sigmas, checked, film_rows[0].sigma),
+        _vertex_source(bench, sigmas, checked, film.rows[0].sigma),
         *film_shape_sources(full, slope_variance),
         blur,
-        *frame_effects.frame_sources(bench, optics, shifts, film_um, light),
+        *frame_effects.frame_sources(bench, optics, shifts, film.frame_to_frame_um, light),
         second_reflection_source(bench, checked.second),
         *front_film_sources(bench),
         *reflection_rows,
@@ -224,50 +211,3 @@ def _vertex_source(
     scale_um = 1e3 * sigmas.laser_relative * abs(bench.vertex_z_mm)
     description = "place of the vertex, by the laser's noise and scale"
     return bench_sources.vertex_source(bench, math.hypot(noise_um, scale_um), description)
-
-
-def _film_rows(
-    bench: TrialBench, motion: FilmMotion, unseen: UnseenMotion | None
-) -> tuple[list[budget.Source], list[str]]:
-    """Rows for the film's motion from x to y, and the doubts that it raises.
-
-    Parameters
-    ----------
-    bench : TrialBench
-        Some points of the set.
-    motion : FilmMotion
-        Motion by laser and fringes.
-    unseen : UnseenMotion or None
-        Motion by the fringes alone, of a set without a laser.
-    """
-    if unseen is None:
-        left_um = 0.0
-        if not motion.is_worth_correcting:
-            x_um, y_um = motion.motion_um
-            left_um = float(x_um.mean() - y_um.mean())
-        sigma_um = math.hypot(motion.x_to_y_sigma_um, left_um)
-        description = "motion of the film from x to y, by the laser"
-        return [bench_sources.film_source(bench, (sigma_um,), description, paired=False)], []
-
-    # Without a laser: the motion, with the parts of its error that sets share (the geometry, and
-    # slopes that patches of the mirror leave); the noise of the fringes, which they do not.
-    description = "motion of the film from x to y, without a laser"
-    sigmas_um = (unseen.moved_um, unseen.shared_um)
-    source = bench_sources.film_source(bench, sigmas_um, description, paired=True)
-    description = "slopes of patches of the mirror that look like motion of the film from x to y"
-    by_patch = bench_sources.film_source(bench, unseen.patches_um, description, paired=True)
-    noise_mm2 = float(np.sum(by_patch.effects_mm**2)) * unseen.noise_share
-    description = "noise of the fringes that show the film's motion from x to y"
-    noise = bench_sources.film_source(bench, (unseen.noise_um,), description, paired=False)
-    rows = [
-        source,
-        replace(by_patch, name="film_patches_um", noise_mm2=noise_mm2),
-        replace(noise, name="film_seen_um"),
-    ]
-    if not unseen.is_significant:
-        return rows, []
-    doubt = (
-        f"the film moved by {unseen.moved_um:+.0f} +- {unseen.sigma_um:.0f} µm from the x to the y "
-        "frames, seen in the fringes: record the laser's readings"
-    )
-    return rows, [doubt]
