@@ -13,6 +13,9 @@ from pydantic import Field
 
 from membrane_ctrl.model.state_tree import StateNode
 
+_MISSING_S = 300.0  # a slow instrument may miss minutes
+_FROZEN_S = 3600.0  # in a steady room the last digit may stay for long, but not all digits
+
 
 class ClimateSensor(IntEnum):
     """What shows the climate."""
@@ -32,10 +35,6 @@ _POSSIBLE = {
     ClimateSensor.RING: (-20.0, 60.0),
     ClimateSensor.HUMIDITY: (0.0, 100.0),
 }
-# A slow instrument may miss minutes
-_MISSING_S = 300.0
-# The last digit of a sensor in a steady room may stand for long, but not all digits for so long
-_FROZEN_S = 3600.0
 
 
 @dataclass(slots=True)

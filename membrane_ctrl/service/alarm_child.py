@@ -12,7 +12,7 @@ from membrane_ctrl.processes.child import Child
 from membrane_ctrl.processes.event_pipe import make_pipe
 from membrane_ctrl.processes.managed_child import ManagedChild
 from membrane_ctrl.service.alarm_process import SERVICE_WORKS, AlarmProcessSpec
-from membrane_ctrl.service.followed_run import find_published_run, read_alarms_config
+from membrane_ctrl.service.runs_to_follow import find_published_run, read_alarms_config
 
 _STOPS_S = 3.0
 _TARGET = "membrane_ctrl.service.alarm_process:alarm_process_main"

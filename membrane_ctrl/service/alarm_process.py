@@ -19,12 +19,9 @@ from membrane_ctrl.alarms.memory_limit import limited_memory
 from membrane_ctrl.config.service import HeartbeatConfig
 from membrane_ctrl.model import child_events, errors
 from membrane_ctrl.processes import child, event_pipe
-from membrane_ctrl.service.followed_run import (
-    FollowedRun,
-    find_published_run,
-    read_alarms_config,
-)
+from membrane_ctrl.service.followed_run import FollowedRun
 from membrane_ctrl.service.heartbeat import make_heartbeat
+from membrane_ctrl.service.runs_to_follow import find_published_run, read_alarms_config
 
 SERVICE_WORKS = "service works"  # message of the service
 _LOOK_S = 0.5

@@ -15,19 +15,16 @@ from pathlib import Path
 
 from membrane_ctrl.alarms.addresses import apprise_senders
 from membrane_ctrl.alarms.run_alarms import RunAlarms
-from membrane_ctrl.alarms.sent_log import LOG_NAME, SentLog
+from membrane_ctrl.alarms.sent_log import SentLog
 from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.model import event_lines, telemetry
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.run_events import ENDS_WITHOUT_CONTROL, Ended
 from membrane_ctrl.processes import published_rings, ring
 from membrane_ctrl.run_files.event_log import read_events
-from membrane_ctrl.run_files.run_config import read_config
 from membrane_ctrl.service.run_events_reader import RunEventsReader
 
 _LOOKS_WITHOUT_CONTROL = 2  # see `is_control_alive`
-_NEWS_AGE_MAX_S = 86_400.0  # an older end is no news
-_RINGS = "rings.json"
 
 
 class FollowedRun:
@@ -119,36 +116,6 @@ class _RunSeconds:
         if not self._is_exact:
             self._origin_s = time.monotonic() - mono_s
             self._is_exact = True
-
-
-def find_published_run(logs: Path) -> Path | None:
-    """Return the newest run of a folder that has published its rings; None without one."""
-    with suppress(OSError):
-        for folder in sorted(logs.iterdir(), reverse=True):
-            if folder.name[:1].isdigit() and (folder / _RINGS).exists():
-                return folder
-    return None
-
-
-def read_alarms_config(folder: Path) -> AlarmsConfig | None:
-    """Return the alarms of a run; None if none are to be sent: it names no addresses, or its end is
-    no news.
-    """
-    alarms = read_config(folder, []).alarms
-    if alarms.urls_file is None:
-        return None
-    with suppress(OSError):
-        if published_rings.is_control_alive(folder):
-            return alarms
-    return alarms if _is_news(folder) else None
-
-
-def _is_news(folder: Path) -> bool:
-    """Whether a run without a control process has recorded something in the last day."""
-    with suppress(OSError):
-        age_s = time.time() - (folder / "events.jsonl").stat().st_mtime
-        return age_s < _NEWS_AGE_MAX_S and (folder / LOG_NAME).exists()
-    return False
 
 
 def _without_control(line: EventLine) -> EventLine:

@@ -11,6 +11,7 @@ import typer
 
 from membrane_ctrl.model import durations, errors, files
 from membrane_ctrl.model.optional import PAGE_LIBRARIES, require_installed
+from membrane_ctrl.web import token_commands
 
 app = typer.Typer(
     invoke_without_command=True,
@@ -30,12 +31,7 @@ _FILES = frozenset(
         "ca_file",
     }
 )
-token_app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    help="Tokens for programs, which send them as `Authorization: Bearer TOKEN`.",
-)
-app.add_typer(token_app, name="token")
+app.add_typer(token_commands.app, name="token")
 
 
 @app.callback()
@@ -183,32 +179,3 @@ def add_user(
         files.write_text_atomic(file, "".join(f"{each.line()}\n" for each in found.values()))
         file.chmod(0o600)
     print(f"{file}: {len(found)} users", file=sys.stderr)
-
-
-@token_app.command("add")
-def add(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the program.")],
-    role: Annotated[str, typer.Argument(metavar="ROLE", help="read, operate or tune.")],
-) -> None:
-    """Make a token and print it; it cannot be shown again."""
-    from membrane_ctrl.service.tokens import add_token, tokens_file
-
-    print(add_token(tokens_file(), name, role))
-
-
-@token_app.command("list")
-def list_tokens() -> None:
-    """List the tokens of this user's services: name and role."""
-    from membrane_ctrl.service.tokens import read_tokens, tokens_file
-
-    for each in read_tokens(tokens_file()):
-        print(f"{each.name}  {each.role}")
-
-
-@token_app.command("revoke")
-def revoke(name: Annotated[str, typer.Argument(metavar="NAME")]) -> None:
-    """Remove a token: the next request with it is refused."""
-    from membrane_ctrl.service.tokens import revoke_token, tokens_file
-
-    revoke_token(tokens_file(), name)
-    print(f"{name}: revoked", file=sys.stderr)

@@ -19,7 +19,7 @@ from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.published_rings import publish_rings
 from membrane_ctrl.processes.ring import RingAddress, RingWriter, open_ring
 from membrane_ctrl.service.alarm_process import FolderAlarms, is_working
-from membrane_ctrl.service.followed_run import read_alarms_config
+from membrane_ctrl.service.runs_to_follow import read_alarms_config
 
 DAY_S = 86_400.0
 ROW = TelemetryRow(*(0.0 for _ in FIELDS))
