@@ -20,8 +20,19 @@ _LARGEST_BAND = 0.10
 
 
 def explain_checkerboard(seen: ArrayLike, white: ArrayLike, black: ArrayLike) -> str:
-    """The problem and its remedy, from frames (H, W) of checkerboard, white and black; empty if
-    none.
+    """Explain what is wrong with the screen's pixels, by frames of a one-pixel checkerboard.
+
+    Parameters
+    ----------
+    seen : (H, W) array
+        Frame of the checkerboard.
+    white, black : (H, W) array
+        Frames of a white and of a black screen, with the same exposure.
+
+    Returns
+    -------
+    str
+        The problem and its remedy; empty if the screen shows every pixel as sent.
     """
     # Blocks that see the screen.
     dark = block_means(black)

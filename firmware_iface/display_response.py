@@ -46,10 +46,23 @@ def make_linear_response() -> DisplayResponse:
 
 
 def make_measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayResponse:
-    """The response from a ramp: `levels` (K,) rising from 0 to 255, and `seen_adu` (K,),
-    unsaturated.
+    """Make the display's response from a ramp of grey levels.
 
-    Raises ValueError if the camera saw no ramp, with the remedy.
+    Parameters
+    ----------
+    levels : (K,) array
+        Levels, rising from 0 to 255.
+    seen_adu : (K,) array
+        What the camera saw of each, unsaturated.
+
+    Returns
+    -------
+    DisplayResponse
+
+    Raises
+    ------
+    ValueError
+        The camera saw no ramp, a falling or a saturated one; with the remedy.
     """
     shown = np.asarray(levels, np.float64)
     seen = np.asarray(seen_adu, np.float64)

@@ -33,10 +33,22 @@ class Settling:
 
 
 def share_left(frame: ArrayLike, before: ArrayLike, after: ArrayLike) -> float:
-    """Remaining share of a step in a frame: the worst block's difference from the end, over the
+    """Return the remaining share of a step: the worst block's difference from the end, over the
     largest step.
 
-    Each picture is (H, W); `before` is from before the step, `after` from long after it.
+    Parameters
+    ----------
+    frame : (H, W) array
+        The frame to judge.
+    before : (H, W) array
+        A frame from before the step.
+    after : (H, W) array
+        A frame from long after the step.
+
+    Returns
+    -------
+    float
+        0 once the display has settled, 1 before the step.
     """
     end = block_means(after)
     step = np.abs(block_means(before) - end)

@@ -174,9 +174,23 @@ def estimate_flow(
     response: PumpResponse,
     still_um_per_s: float,
 ) -> float:
-    """Flow of the pump when it is on, in µm/s: k of (1) by least squares, for a known response.
+    """Estimate the pump's flow when it is on: k of (1) by least squares, for a known response.
 
-    Parameters are those of `identify_pump_response`.
+    Parameters
+    ----------
+    readings : (n, 2) array
+        As in `identify_pump_response`.
+    switches : sequence of Switch
+        When the pump was switched on and off.
+    response : PumpResponse
+        Dead time and lag.
+    still_um_per_s : float
+        Motion of the mirror with the pump off.
+
+    Returns
+    -------
+    float
+        µm/s.
     """
     time_s = readings[:, 0]
     path = _simulate_paths(

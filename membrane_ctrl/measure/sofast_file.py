@@ -143,7 +143,15 @@ def lit_pixels(measurement: SofastMeasurement) -> BoolArray:
 
 
 def axis_series(measurement: SofastMeasurement, mask: BoolArray) -> tuple[AxisSeries, AxisSeries]:
-    """The axes of a measurement at the pixels in `mask`, in the order of capture."""
+    """Return the series of both axes at some pixels, in the order of capture: y, then x.
+
+    Parameters
+    ----------
+    measurement : SofastMeasurement
+        The file's frames.
+    mask : (rows, columns) bool array
+        The pixels.
+    """
     return (
         AxisSeries("y", measurement.frames_y[..., mask], measurement.periods_y, SHIFTS_RAD),
         AxisSeries("x", measurement.frames_x[..., mask], measurement.periods_x, SHIFTS_RAD),

@@ -92,8 +92,16 @@ def draw_stability(
 
 
 def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
-    """Draw the terms' changes (sets, terms) from their means: the eight that move most, by Noll
-    index.
+    """Draw how the Zernike terms change from their means: the eight that move most, by Noll index.
+
+    Parameters
+    ----------
+    path : Path
+        The picture to write.
+    time_s : (sets,) array
+        Times of the sets.
+    coeffs_um : (sets, terms) array
+        Zernike terms, RMS.
     """
     change = coeffs_um - coeffs_um.mean(axis=0)
     figure = Figure(figsize=(10, 5), layout="constrained")
@@ -108,7 +116,17 @@ def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
 def draw_pairs(
     path: Path, axis_mm: FloatArray, maps: Mapping[float, tuple[FloatArray, FloatArray]]
 ) -> None:
-    """Draw, for each lag in s, a pair's change of height beside its RMSE, in µm."""
+    """Draw pairs of sets: the change of height beside its RMSE.
+
+    Parameters
+    ----------
+    path : Path
+        The picture to write.
+    axis_mm : (m,) array
+        Places of the maps' rows and columns.
+    maps : mapping of two (m, m) arrays
+        Change of height and its RMSE in µm, by the lag of the pair in s.
+    """
     figure = Figure(figsize=(11, 4.6 * len(maps)), layout="constrained")
     axes = figure.subplots(len(maps), 2, squeeze=False)
     for row, (lag_s, (change_um, rmse_um)) in zip(axes, maps.items(), strict=True):

@@ -114,8 +114,16 @@ def take_upper_half(covariance_um2: FloatArray) -> NDArray[np.float32]:
 def packed_parts(
     head: Mapping[str, Any], coeffs_um: FloatArray, upper_um2: NDArray[np.float32]
 ) -> bytes:
-    """Bytes of an estimate's numbers and words, coefficients (terms,) and upper half
-    (COVARIANCE_UPPER_SIZE,).
+    """Pack an estimate from its parts.
+
+    Parameters
+    ----------
+    head : mapping of Any
+        Numbers and words by name; they must be JSON.
+    coeffs_um : (terms,) array
+        Zernike terms.
+    upper_um2 : (COVARIANCE_UPPER_SIZE,) float32 array
+        Upper half of their covariance, row by row.
     """
     line = json.dumps({**head, "terms": ZERNIKE_TERMS}, default=float)
     arrays = (

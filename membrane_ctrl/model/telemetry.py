@@ -134,8 +134,19 @@ def true_error_um(ticks: Mapping[str, Column]) -> Column:
 
 
 def find_changes(codes: FloatArray, before: float) -> list[tuple[int, int]]:
-    """Changes of a code: (row, new code) for each, comparing the first row with `before` (NaN:
-    none).
+    """Find where a code changes.
+
+    Parameters
+    ----------
+    codes : (n,) array
+        The code of each row; NaN where it is unknown.
+    before : float
+        The code before the first row; NaN for none.
+
+    Returns
+    -------
+    list of (int, int)
+        Row and new code of each change.
     """
     previous = np.concatenate(([before], codes[:-1]))
     return [

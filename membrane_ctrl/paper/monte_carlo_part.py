@@ -215,7 +215,19 @@ def _run_everywhere(inputs: TrialInputs, options: PaperOptions) -> FloatArray:
 def compare_with_paper(
     reading: AngleReading, rmse_um: FloatArray, expected_um: FloatArray, trials: int
 ) -> PaperStatement:
-    """One reading against the paper's mean and maximum."""
+    """Compare one reading of the paper's text with the paper's mean and maximum.
+
+    Parameters
+    ----------
+    reading : AngleReading
+        How the angle's error is read.
+    rmse_um : (points,) array
+        RMSE of the height over the trials.
+    expected_um : (points,) array
+        The same without scatter, which is judged.
+    trials : int
+        Their number.
+    """
     mean_um, max_um = float(np.mean(rmse_um)), float(np.max(rmse_um))
     expected_mean_um = float(np.mean(expected_um))
     low, high = PAPER_MEAN_UM * (1 - _WITHIN), PAPER_MEAN_UM * (1 + _WITHIN)

@@ -14,7 +14,20 @@ _MAP_COLOURS = "viridis"
 
 
 def draw_frames(frames: Sequence[AnyArray], names: Sequence[str]) -> bytes:
-    """Frames in two rows."""
+    """Draw frames in two rows.
+
+    Parameters
+    ----------
+    frames : sequence of (H, W) arrays
+        The frames.
+    names : sequence of str
+        One title each.
+
+    Returns
+    -------
+    bytes
+        A PNG.
+    """
     columns = (len(frames) + 1) // 2
     figure, axes = new_sheet(2.2 * columns, 4.4, 2, columns)
     for cell, frame, name in zip(np.ravel(axes), frames, names, strict=True):
@@ -25,7 +38,20 @@ def draw_frames(frames: Sequence[AnyArray], names: Sequence[str]) -> bytes:
 
 
 def draw_images(images: Sequence[AnyArray], titles: Sequence[str]) -> bytes:
-    """Images of the camera beside each other, each with its colour bar."""
+    """Draw images of the camera beside each other, each with its colour bar.
+
+    Parameters
+    ----------
+    images : sequence of (H, W) arrays
+        The images.
+    titles : sequence of str
+        One each.
+
+    Returns
+    -------
+    bytes
+        A PNG.
+    """
     figure, axes = new_sheet(3.4 * len(images), 3.0, 1, len(images))
     for cell, image, title in zip(np.ravel(axes), images, titles, strict=True):
         shown = cell.imshow(_thin_image(image), cmap=_MAP_COLOURS, interpolation="nearest")
@@ -41,7 +67,24 @@ def draw_maps(
     unit: str,
     marks_mm: Mapping[str, tuple[float, float]] | None = None,
 ) -> bytes:
-    """Maps over the mirror by their title, with colour bars in `unit`."""
+    """Draw maps over the mirror beside each other, with colour bars.
+
+    Parameters
+    ----------
+    maps : mapping of (m, m) arrays
+        By their title.
+    axis_mm : (m,) array
+        Places of their rows and columns.
+    unit : str
+        Label of the colour bars.
+    marks_mm : mapping of (float, float)
+        Points to mark in each map, by name.
+
+    Returns
+    -------
+    bytes
+        A PNG.
+    """
     figure, axes = new_sheet(4.2 * len(maps), 3.6, 1, len(maps))
     half_mm = float(axis_mm[-1])
     for cell, (title, values) in zip(np.ravel(axes), maps.items(), strict=True):
@@ -58,7 +101,20 @@ def draw_maps(
 
 
 def draw_gray_table(bits: BoolArray, k1: IntArray, k2: IntArray) -> bytes:
-    """The Gray code as black and white cells, with the orders below."""
+    """Draw a Gray code as black and white cells, with the orders below.
+
+    Parameters
+    ----------
+    bits : (bits, half periods) bool array
+        The code.
+    k1, k2 : (half periods,) int array
+        Orders of the fringes and of the shifted ones.
+
+    Returns
+    -------
+    bytes
+        A PNG.
+    """
     figure, axes = new_sheet(7.0, 2.4)
     cell: Any = np.ravel(axes)[0]
     cell.imshow(bits, cmap="gray", aspect="auto", vmin=0, vmax=1)
@@ -78,7 +134,26 @@ def draw_curves(
     level: float | None = None,
     bands: Mapping[str, FloatArray] | None = None,
 ) -> bytes:
-    """Curves (x, y) by their name; `level` is a dashed line, `bands` half widths by curve."""
+    """Draw curves with a legend.
+
+    Parameters
+    ----------
+    curves : mapping of two (n,) arrays
+        x and y of each, by name.
+    x_label, y_label : str
+        With their units.
+    logarithmic : bool
+        Whether y is.
+    level : float or None
+        A dashed line at this y.
+    bands : mapping of (n,) arrays
+        Half width of a band around a curve, by the curve's name.
+
+    Returns
+    -------
+    bytes
+        A PNG.
+    """
     figure, axes = new_sheet(6.5, 4.0)
     cell: Any = np.ravel(axes)[0]
     for name, (x, y) in curves.items():

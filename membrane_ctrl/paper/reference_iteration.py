@@ -47,11 +47,33 @@ class PolynomialSurface:
     radius_mm: float
 
     def height_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Height (n,) at points."""
+        """Return the height at points.
+
+        Parameters
+        ----------
+        x_mm, y_mm : (n,) array
+            The points.
+
+        Returns
+        -------
+        (n,) array
+            In mm.
+        """
         return np.asarray(make_height_matrix(x_mm, y_mm, self.radius_mm) @ self.coeffs_mm)
 
     def slopes(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """dh/dx and dh/dy (n,) at points."""
+        """Return the slopes at points.
+
+        Parameters
+        ----------
+        x_mm, y_mm : (n,) array
+            The points.
+
+        Returns
+        -------
+        along_x, along_y : (n,) array
+            dh/dx and dh/dy.
+        """
         along_x, along_y = make_slope_matrices(x_mm, y_mm, self.radius_mm)
         return np.asarray(along_x @ self.coeffs_mm), np.asarray(along_y @ self.coeffs_mm)
 
@@ -96,7 +118,20 @@ class ReferenceSolution:
 
 
 def make_height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
-    """Matrix (n, terms) from coefficients to heights."""
+    """Return the matrix from coefficients of the polynomials to heights.
+
+    Parameters
+    ----------
+    x_mm, y_mm : (n,) array
+        Points.
+    radius_mm : float
+        By which they are divided.
+
+    Returns
+    -------
+    (n, terms) array
+        In the order of `POWERS`.
+    """
     x, y = x_mm / radius_mm, y_mm / radius_mm
     return np.stack([x**i * y**j for i, j in POWERS], axis=1)
 
@@ -104,7 +139,20 @@ def make_height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> 
 def make_slope_matrices(
     x_mm: FloatArray, y_mm: FloatArray, radius_mm: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Matrices (n, terms) from coefficients to slopes in x and in y."""
+    """Return the matrices from coefficients of the polynomials to slopes.
+
+    Parameters
+    ----------
+    x_mm, y_mm : (n,) array
+        Points.
+    radius_mm : float
+        By which they are divided.
+
+    Returns
+    -------
+    along_x, along_y : (n, terms) array
+        Per mm, in the order of `POWERS`.
+    """
     x, y = x_mm / radius_mm, y_mm / radius_mm
     along_x = np.stack([i * x ** max(i - 1, 0) * y**j for i, j in POWERS], axis=1)
     along_y = np.stack([j * x**i * y ** max(j - 1, 0) for i, j in POWERS], axis=1)

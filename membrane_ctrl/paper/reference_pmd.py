@@ -66,8 +66,14 @@ class PaperGeometry:
         return self.a_mm * np.array([math.cos(self.alpha_rad), 0.0, math.sin(self.alpha_rad)])
 
     def project_onto_yz(self, screen_x_mm: FloatArray, reading: YReading) -> "PaperGeometry":
-        """The same bench as the y equations see it, for points that see the screen at
-        `screen_x_mm` (n,).
+        """Return the bench as the equations of y see it.
+
+        Parameters
+        ----------
+        screen_x_mm : (n,) array
+            Where the points see the screen, along x.
+        reading : YReading
+            How the paper's text is read.
         """
         if reading is YReading.CHIEF_RAY:
             return PaperGeometry(self.a_mm, self.b_mm, math.pi / 2)

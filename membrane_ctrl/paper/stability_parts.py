@@ -262,7 +262,25 @@ def _add_air(sd_um: FloatArray, air_sd_um: FloatArray, amplitude_um: float) -> F
 
 
 def find_air_um(sd_um: FloatArray, air_sd_um: FloatArray) -> float:
-    """Amplitude of the air with which the mean SD is the paper's."""
+    """Find the amplitude of the warm air with which the mean SD is the paper's.
+
+    Parameters
+    ----------
+    sd_um : (points,) array
+        SD of the height without air.
+    air_sd_um : (points,) array
+        What air of the short series adds.
+
+    Returns
+    -------
+    float
+        µm.
+
+    Raises
+    ------
+    ValueError
+        No amplitude up to the largest one tried gives it.
+    """
 
     def missing_um(amplitude_um: float) -> float:
         return float(np.mean(_add_air(sd_um, air_sd_um, amplitude_um))) - PAPER_MEAN_SD_UM
@@ -277,7 +295,22 @@ def _state_period(period_s: float) -> str:
 def compare_pairs(
     series: SetSeries, height_um: FloatArray, lag_s: float
 ) -> tuple[PaperStatement, dict[str, float]] | None:
-    """Change from each set to the one nearest after an interval; None without any."""
+    """Compare each set with the one nearest after an interval.
+
+    Parameters
+    ----------
+    series : SetSeries
+        Times of the sets.
+    height_um : (sets, points) array
+        Their heights.
+    lag_s : float
+        The interval.
+
+    Returns
+    -------
+    tuple[PaperStatement, dict[str, float]] or None
+        The statement and its figures; None if no two sets are that far apart.
+    """
     # the set that is nearest to an interval later, if it is near enough
     apart_s = series.time_s - series.time_s[:, None]
     later = np.argmin(np.abs(apart_s - lag_s), axis=1)
@@ -310,8 +343,19 @@ def _read_parameters(estimate: ShapeEstimate) -> FloatArray:
 
 
 def estimate_film_share_um(series: SetSeries, height_um: FloatArray) -> FloatArray | None:
-    """Heights (sets, points) that follow the displacement of the centre, by regression; None
-    without a laser, or if its readings are all the same.
+    """Estimate the part of the heights that follows the displacement of the centre, by regression.
+
+    Parameters
+    ----------
+    series : SetSeries
+        Readings of the laser.
+    height_um : (sets, points) array
+        Heights.
+
+    Returns
+    -------
+    (sets, points) array or None
+        None without a laser, or if its readings are all the same.
     """
     if not np.isfinite(series.displacement_um).all() or np.ptp(series.displacement_um) == 0:
         return None

@@ -56,8 +56,14 @@ def colour_span(values: AnyArray, least_um: float | None) -> tuple[float, float]
 
 
 def map_picture(values: AnyArray, span: tuple[float, float]) -> rr.DepthImage:
-    """A map, in diverging colours for a range around 0. NaN is drawn as the lowest value: a mask
-    must cover it.
+    """Make the picture of a map, in diverging colours for a range around 0.
+
+    Parameters
+    ----------
+    values : (m, m) array
+        The map; NaN is drawn as the lowest value, so a mask must cover it.
+    span : tuple[float, float]
+        Lowest and highest value of the colours.
     """
     return rr.DepthImage(
         values, colormap="CyanToYellow" if span[0] < 0 else "Viridis", depth_range=span

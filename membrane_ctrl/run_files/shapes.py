@@ -237,10 +237,20 @@ def deviation_map_um(parameters_um: Column) -> Map:
 
 
 def without_terms(height: AnyArray, terms: int) -> AnyArray:
-    """A square map of the unit disc less the best fit of the first terms, at most 4, to its finite
-    pixels.
+    """Return a map less the best fit of the first Zernike terms to its finite pixels.
 
     3 terms are piston and tilt, 4 defocus as well.
+
+    Parameters
+    ----------
+    height : (m, m) array
+        Map of the unit disc; NaN outside it.
+    terms : int
+        How many, at most 4: 3 are piston and tilt, 4 defocus as well.
+
+    Returns
+    -------
+    (m, m) array
     """
     finite = np.isfinite(height)
     x, y = (axis[finite] for axis in _disc_grid(len(height)))
@@ -254,8 +264,18 @@ def without_terms(height: AnyArray, terms: int) -> AnyArray:
 
 
 def without_noll_terms(height: AnyArray, indices: Sequence[int]) -> AnyArray:
-    """A map of the unit disc less the best fit of some Zernike terms, given by their Noll indices,
-    to its finite pixels.
+    """Return a map less the best fit of some Zernike terms to its finite pixels.
+
+    Parameters
+    ----------
+    height : (m, m) array
+        Map of the unit disc, on the grid of `Shapes`; NaN outside it.
+    indices : sequence of int
+        Noll indices of the terms.
+
+    Returns
+    -------
+    (m, m) array
     """
     there = np.isfinite(height)
     inside = _inside_disc()

@@ -233,7 +233,18 @@ def measure_scalars(
 
 
 def zernike_heights(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Terms (n, terms) at points (n,) of the unit disc."""
+    """Evaluate all Zernike terms at points of the unit disc.
+
+    Parameters
+    ----------
+    x, y : (n,) array
+        The points.
+
+    Returns
+    -------
+    (n, terms) array
+        Noll order, RMS 1 each.
+    """
     powers = range(zernike.monomial_table().shape[1])
     x_powers = np.stack([x**power for power in powers])
     y_powers = np.stack([y**power for power in powers])

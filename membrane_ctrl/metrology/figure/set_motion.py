@@ -20,9 +20,20 @@ X_TO_Y = 5.0
 
 
 def motion_share(within_um: float, noise_um: float) -> float:
-    """Share of the laser's reading of the motion from x to y that is motion, the rest being noise.
+    """Return the share of the laser's reading of the motion from x to y that is motion; the rest is
+    noise.
 
-    `within_um` is the RMS motion within an axis, `noise_um` the noise of that reading.
+    Parameters
+    ----------
+    within_um : float
+        RMS motion within an axis.
+    noise_um : float
+        Noise of the reading.
+
+    Returns
+    -------
+    float
+        From 0 to 1: a Wiener filter whose expected motion is `X_TO_Y` times that within an axis.
     """
     expected_um2 = (X_TO_Y * within_um) ** 2
     return expected_um2 / (expected_um2 + noise_um**2)

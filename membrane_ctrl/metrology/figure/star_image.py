@@ -154,10 +154,24 @@ def find_paths(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def find_strehl(points_mm: FloatArray, wavelength_um: float) -> tuple[float, float]:
-    """Strehl ratio in the focus of least path differences, and their RMS in µm; NaN without one.
+    """Return the Strehl ratio in the focus of least path differences, and their RMS.
 
     Where the paths differ by much less than the wavelength, this is the largest value of the point
     spread function.
+
+    Parameters
+    ----------
+    points_mm : (3, n) array
+        Points of the mirror, each standing for an equal area.
+    wavelength_um : float
+        Of the light.
+
+    Returns
+    -------
+    strehl : float
+        From 0 to 1; NaN for a mirror without a focus.
+    rms_um : float
+        RMS of the path differences; NaN without a focus.
     """
     try:
         _, path_mm = find_paths(points_mm)

@@ -198,7 +198,15 @@ def exchange_order(count: int, a: int, b: int) -> list[int]:
 def flags_of_sinusoids(
     stack: frame_stack.FrameStack, flags: Iterable[frame_faults.Flag]
 ) -> list[frame_faults.Flag]:
-    """Return the flags of sinusoids, in their order."""
+    """Return the flags of sinusoids, in their order.
+
+    Parameters
+    ----------
+    stack : FrameStack
+        The set.
+    flags : iterable of Flag
+        Flags of its frames.
+    """
     return [flag for flag in flags if stack.patterns[flag.frame].role == "sin"]
 
 

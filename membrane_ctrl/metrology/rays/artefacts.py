@@ -52,8 +52,17 @@ class Artefact:
         )
 
     def terms_mm(self, tilt_x: float = 0.0, tilt_y: float = 0.0) -> FloatArray:
-        """Parameters (parameters,) of the surface with these slopes at its vertex, and its terms
-        beyond the fit's.
+        """Return the artefact as parameters of the surface fit.
+
+        Parameters
+        ----------
+        tilt_x, tilt_y : float
+            Slopes at its vertex.
+
+        Returns
+        -------
+        (k,) array
+            Parameters of the surface in mm, followed by its terms beyond the fit's.
         """
         x, y, onto = height_projection()
         return np.asarray(onto @ self._heights_mm(self.curvature_per_mm, x, y, tilt_x, tilt_y))

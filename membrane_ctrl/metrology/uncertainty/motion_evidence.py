@@ -88,7 +88,18 @@ def ring_saddle() -> FloatArray:
 
 
 def ring_tilt_urad(earlier: Surface, later: Surface) -> float:
-    """Angle by which the ring has tilted from one surface to another, in µrad."""
+    """Return the angle by which the ring has tilted between two surfaces.
+
+    Parameters
+    ----------
+    earlier, later : Surface
+        The surfaces, of one radius.
+
+    Returns
+    -------
+    float
+        µrad.
+    """
     tilt_mm = ring_tilt() @ (later.parameters - earlier.parameters)
     return 1e6 * math.hypot(*tilt_mm) / later.radius_mm
 

@@ -40,7 +40,24 @@ class PairMotion:
 
     @classmethod
     def from_changes(cls, bench: TrialBench, changes: FloatArray) -> "PairMotion":
-        """Of a set with its `motion_changes`. Raises ArithmeticError if a fit diverges."""
+        """Make the effects of the motions of one set's bench.
+
+        Parameters
+        ----------
+        bench : TrialBench
+            n points of the set.
+        changes : (components, 2, n) array
+            As `motion_changes` returns them.
+
+        Returns
+        -------
+        PairMotion
+
+        Raises
+        ------
+        ArithmeticError
+            A fit diverges.
+        """
         nominal = bench.geometry()
         found = [bench.solve(nominal, _AMOUNT * change, linear=True) for change in changes]
         figure_mm = (np.stack(found, axis=1) - bench.surface.parameters[:, None]) / _AMOUNT

@@ -154,7 +154,27 @@ class TrialBench:
     def solve(
         self, there: BenchGeometry, disturbance_mm: FloatArray | float = 0.0, linear: bool = False
     ) -> FloatArray:
-        """Parameters (parameters,), mm, of the surface that `fit` finds."""
+        """Return the parameters of the surface that `fit` finds.
+
+        Parameters
+        ----------
+        there : BenchGeometry
+            The bench.
+        disturbance_mm : (2, n) array or float
+            Error of the screen points.
+        linear : bool
+            One step of the fit suffices.
+
+        Returns
+        -------
+        (parameters,) array
+            In mm.
+
+        Raises
+        ------
+        ArithmeticError
+            The fit does not converge.
+        """
         return self.fit(there, disturbance_mm, linear).surface.parameters
 
     def fit(
@@ -252,7 +272,15 @@ def spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
 
 
 def moved_film(bench: TrialBench, displacement_um: float) -> TrialBench:
-    """Return the bench with a bowl that is deeper by a displacement; the ring stays."""
+    """Return the bench with a bowl that is deeper; the ring stays.
+
+    Parameters
+    ----------
+    bench : TrialBench
+        The bench.
+    displacement_um : float
+        By how much the vertex is lower.
+    """
     deeper_mm = displacement_um * 1e-3
     surface = bench.surface
     bowl = Surface.hencky_bowl(deeper_mm, surface.radius_mm)

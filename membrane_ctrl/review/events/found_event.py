@@ -56,14 +56,39 @@ def event_around(
 
 
 def widen_flags(flags: BoolArray, rows: int) -> BoolArray:
-    """True flags, widened by `rows` on each side."""
+    """Widen the stretches of true flags.
+
+    Parameters
+    ----------
+    flags : (n,) bool array
+        The flags.
+    rows : int
+        By how many on each side.
+
+    Returns
+    -------
+    (n,) bool array
+    """
     return np.asarray(
         ndimage.maximum_filter1d(flags, 2 * rows + 1, mode="constant", cval=0), dtype=bool
     )
 
 
 def find_stretches(flags: BoolArray, join: int) -> list[tuple[int, int]]:
-    """First and last row of each stretch of true rows, joining those at most `join` apart."""
+    """Find the stretches of true rows.
+
+    Parameters
+    ----------
+    flags : (n,) bool array
+        The flags.
+    join : int
+        Stretches at most this many rows apart are one.
+
+    Returns
+    -------
+    list of (int, int)
+        First and last row of each.
+    """
     rows = np.flatnonzero(flags)
     if not rows.size:
         return []

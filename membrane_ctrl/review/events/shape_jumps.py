@@ -18,7 +18,16 @@ _SIGMA_OVER_MAD = 1.4826
 
 
 def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
-    """Steps of the figure between cycles (terms 5 to 11, less the share of a deeper bowl)."""
+    """Find steps of the figure between cycles, by its terms 5 to 11 less the share of a deeper
+    bowl.
+
+    Parameters
+    ----------
+    shapes : Shapes
+        The measured figures of a run, n cycles.
+    held : (n,) bool array
+        Whether the mirror was held during each.
+    """
     moved_um = np.abs(np.diff(shapes.displacement_um, prepend=np.nan, append=np.nan))
     still = ~(np.fmax(moved_um[:-1], moved_um[1:]) > JUMP_STILL_UM)
     good = held & still & (shapes.verdict != "rejected")

@@ -17,7 +17,15 @@ class HeldTime:
         self.held_s = 0.0
 
     def add_times(self, time_s: Column, held: BoolArray) -> None:
-        """Add (n,) times and whether the mirror was held at each."""
+        """Add the next ticks; intervals longer than a gap do not count.
+
+        Parameters
+        ----------
+        time_s : (n,) array
+            Times of the ticks.
+        held : (n,) bool array
+            Whether the mirror was held at each.
+        """
         if not time_s.size:
             return
         # Intervals that begin with the last time of the block before; longer ones are gaps

@@ -116,8 +116,21 @@ def screen_pose(geometry: GeometryConfig, error: ScreenError | None = None) -> S
 def pixel_directions(
     camera: CameraConfig, pose: CameraPose, columns: FloatArray, rows: FloatArray
 ) -> FloatArray:
-    """Unit vectors in world (N, 3) of the rays through the given pixel positions (N,), without the
-    lens' distortion.
+    """Return the rays through pixel positions; the distortion of the lens is taken out of these.
+
+    Parameters
+    ----------
+    camera : CameraConfig
+        Focal length, pixel pitch, principal point and distortion.
+    pose : CameraPose
+        Pose of the camera in world.
+    columns, rows : (N,) array
+        Pixel positions.
+
+    Returns
+    -------
+    (N, 3) array
+        Unit vectors in world.
     """
     focal_px = camera.focal_mm * 1000.0 / camera.pixel_um
     column_px, row_px = camera.principal

@@ -162,7 +162,20 @@ class FilmShape:
     def height_mm(
         self, x_mm: FloatArray, y_mm: FloatArray, displacement_um: float = 0.0
     ) -> FloatArray:
-        """Height above the vertex at points of any (equal) shape."""
+        """Return the height above the vertex at points of the mirror.
+
+        Parameters
+        ----------
+        x_mm, y_mm : array
+            The points, of equal shape.
+        displacement_um : float
+            Of the centre; positive is a deeper bowl.
+
+        Returns
+        -------
+        array
+            In mm, of the points' shape.
+        """
         flat = film_heights(
             self.terms_at(displacement_um),
             self.sag_at_mm(displacement_um),

@@ -112,7 +112,22 @@ def height_and_slopes(
 
 @compile_loop()
 def film_heights(terms: FilmTerms, sag_mm: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Heights in mm above the vertex at the points (x, y), all (n,)."""
+    """Return the heights of the film above its vertex.
+
+    Parameters
+    ----------
+    terms : FilmTerms
+        The film as numbers.
+    sag_mm : float
+        Depth of its bowl.
+    x_mm, y_mm : (n,) array
+        Points of the mirror.
+
+    Returns
+    -------
+    (n,) array
+        In mm.
+    """
     h_mm = np.empty(x_mm.size)
     for n in range(x_mm.size):
         h_mm[n] = height_and_slopes(terms, sag_mm, x_mm[n], y_mm[n])[0]

@@ -140,5 +140,18 @@ def pattern_sequence(
 
 
 def screen_light(levels: FloatArray, light: Light) -> FloatArray:
-    """Share of a white screen's light: gamma, and the leak of a black screen."""
+    """Return the light that the screen emits at levels, as a share of a white screen's.
+
+    Parameters
+    ----------
+    levels : array
+        Grey levels from 0 to 1.
+    light : Light
+        Gamma of the panel, and the light of a black screen.
+
+    Returns
+    -------
+    array
+        Of the levels' shape.
+    """
     return np.asarray(light.leak + (1.0 - light.leak) * np.clip(levels, 0.0, 1.0) ** light.gamma)

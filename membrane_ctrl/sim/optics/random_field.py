@@ -53,7 +53,19 @@ class RandomField:
         self._time_s = -math.inf
 
     def evaluate_at(self, time_s: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """The field at places of the square; beyond it that of its edge."""
+        """Return the field at a time; beyond its square it is that of its edge.
+
+        Parameters
+        ----------
+        time_s : float
+            Must not fall: the field is a process that goes forward.
+        x_mm, y_mm : (rows, columns) array
+            Places, of equal shape.
+
+        Returns
+        -------
+        (rows, columns) array
+        """
         # Each amplitude is a first-order process of unit variance.
         if time_s > self._time_s:
             keep = math.exp(-(time_s - self._time_s) / self._memory_s)

@@ -33,9 +33,18 @@ _STEPS = 5  # of the first frames of a tracking set: 72 degrees in x, twice that
 
 
 def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, Any]:
-    """The content of `capture.toml` (schema membrane-capture/1).
+    """Return the content of `capture.toml` (schema membrane-capture/1) for a simulated set.
 
-    `readings_um` (frames,) are the laser's readings.
+    Parameters
+    ----------
+    spec : SimulationSpec
+        The bench, the set, and what a person states of them.
+    readings_um : (frames,) array
+        Readings of the laser.
+
+    Returns
+    -------
+    dict
     """
     # What a person would state of the bench: perhaps not what it is.
     geometry = _make_config_table(spec.stated_geometry or spec.optics.geometry)
@@ -70,7 +79,15 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
 
 
 def write_capture_toml(folder: Path, spec: SimulationSpec, readings_um: FloatArray) -> None:
-    """Write `capture.toml`."""
+    """Write `capture.toml` into the folder of a simulated set.
+
+    Parameters
+    ----------
+    folder : Path
+        It must exist.
+    spec, readings_um : as in `capture_table`
+        -
+    """
     (folder / "capture.toml").write_bytes(tomli_w.dumps(capture_table(spec, readings_um)).encode())
 
 
