@@ -2,7 +2,7 @@
 
 `python tests/shake.py [--every A B] [--still A B] [--hogs N] [--seed N] COMMAND...` stops all
 processes of the command for `still` seconds at random moments, `every` so many seconds. The clock
-goes on meanwhile.
+continues meanwhile.
 """
 
 from __future__ import annotations

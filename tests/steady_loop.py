@@ -1,8 +1,8 @@
 """The event loop of the tests: its time stops whenever the machine does.
 
 A virtual machine that is paused for a second, or a processor that others take, stops a test's
-device and its client alike, while the clock goes on. On this loop such a pause causes no time-out;
-a device that is silent while the loop runs still is.
+device and its client alike, while the clock continues. On this loop such a pause causes no
+time-out; a device that is silent while the loop runs still is.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ _.vent_um_per_s  # of the simulated truth, packed as a whole
 _.sent  # of an event, written as a whole
 _.writable  # of a file that Arrow writes to
 Barometer, Thermometer  # contracts of drivers, which packages of others fill
-FilmThermometer, RingThermometer, Hygrometer  # likewise
+FilmThermometer, RingThermometer, Hygrometer  # the same
 _.film_strain_ppm, _.ring_strain_ppm, _.climate_figure_um, _.climate_sigma_um  # rows, by name
 _.ring_per_k  # of a fit, by its name
 _.reason_code  # compared with the rest of its dataclass

@@ -78,7 +78,7 @@ def be_client(name: str, out: Path, ca: str, pva: str) -> None:
     """Read until killed; say when values came that are fresh."""
     record, read = LineLog(out), CLIENTS[name](ca, pva)
     while True:
-        with contextlib.suppress(Exception):  # whatever the library raises: the client goes on
+        with contextlib.suppress(Exception):  # whatever the library raises: the client continues
             if min(read()) > time.time() - FRESH_S:
                 record(fresh=True)
         time.sleep(0.05)

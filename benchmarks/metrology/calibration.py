@@ -3,7 +3,7 @@
 Accuracy: five sets a seed, rendered and decoded as `calibrate` does, at a quarter of the camera's
 resolution with the noise of the sixteen pixels that each large one stands for (16-bit frames). The
 true bench is drawn from the parameters' sigmas: the paper's 2 mm, 2 mm and 0.3 degrees, 0.5 degrees
-of screen tilt, and the other eight likewise.
+of screen tilt, and the same for the other eight.
 Covariance: a hundred seeds of traced points with the information of all pixels.
 """
 

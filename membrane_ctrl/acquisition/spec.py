@@ -1,4 +1,4 @@
-"""What the acquisition process needs to know about its run.
+"""What the acquisition process needs of its run.
 
 Imports nothing heavy, as the parent process imports it.
 """

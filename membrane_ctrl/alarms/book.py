@@ -231,7 +231,7 @@ class AlarmBook:
             kind = self._list_due(alarm, now_s)
             if kind is None:
                 continue
-            # The alarm remembers what its people know
+            # The alarm stores what its people have been sent
             if kind == "cleared":
                 del self._alarms[name]
             elif kind == "raised":

@@ -7,7 +7,7 @@ import resource
 from collections.abc import Iterator
 from pathlib import Path
 
-_MEMORY_BYTES = 400_000_000  # beyond what the process has; an honest answer has some kilobytes
+_MEMORY_BYTES = 400_000_000  # beyond what the process has; a usual answer has some kilobytes
 
 
 @contextlib.contextmanager

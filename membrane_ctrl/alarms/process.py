@@ -32,7 +32,7 @@ _IDLE_S = 15.0  # with nothing to send; a process that hangs then could not send
 
 @dataclass(frozen=True, slots=True)
 class AlarmsSpec:
-    """What the process needs to know about the run."""
+    """What the process needs of the run."""
 
     clock: RunClock
     telemetry: ring.RingAddress

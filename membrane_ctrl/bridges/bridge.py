@@ -96,7 +96,7 @@ class Bridge:
         given : object
             Its number or text, as the client sent it.
         role, who : str
-            Role and name of the client, where the bridge knows them; the configured role limits
+            Role and name of the client, where the bridge has them; the configured role limits
             both.
 
         Returns

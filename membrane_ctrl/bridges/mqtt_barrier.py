@@ -18,7 +18,7 @@ PublishMarker = Callable[[str], Awaitable[None]]
 
 
 class OrderBarrier:
-    """The markers of one pair of connections; `instance` tells them
+    """The markers of one pair of connections; `instance` distinguishes them
     from those of other processes.
     """
 

@@ -2,12 +2,13 @@
 name can see.
 
 The claim is a retained message on `membrane/NAME/owner`. Its owner publishes it again every
-`BEAT_S`, and at once when it hears another bridge, so a claim without an owner is recognised by its
-silence. A bridge that starts
+`BEAT_S`, and at once when another bridge publishes, so a claim without an owner is recognised by
+its silence. A bridge that starts
 
 1. reads the retained claim, and publishes its own, not retained;
 2. listens: `SETTLE_S` if there is no other claim, `SILENT_S` if there is one;
-3. ends with an error as soon as it hears a live claim that outranks its own; else it is the owner.
+3. ends with an error as soon as it receives a live claim that outranks its own; else it is the
+   owner.
 
 Two claims are compared by the time since which they are owned; a bridge that is not an owner yet
 ranks behind every owner, and equal ones are ordered by their random identifiers. So of two bridges

@@ -45,8 +45,8 @@ caller: contextvars.ContextVar[str] = contextvars.ContextVar(
 
 
 class AnonymousClients:
-    """Every client is a plain user: asyncua's own manager makes an administrator of whoever says
-    `admin`.
+    """Every client is a plain user: asyncua's own manager makes an administrator of any client that
+    states `admin`.
     """
 
     def get_user(self, *_: Any, **__: Any) -> User:

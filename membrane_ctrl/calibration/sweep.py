@@ -18,7 +18,7 @@ from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
 WHY = "calibration of the optics"
 _OBSERVE_S = 10.0  # averaging time for pressure and leak, which are noisy
 _SHAPE_WITHIN_S = 90.0  # a rejected cycle pauses up to a minute
-_SET_WITHIN_S = 180.0  # likewise, and a slow machine reconstructs for seconds
+_SET_WITHIN_S = 180.0  # the same, and a slow machine reconstructs for seconds
 _ARRIVED_UM = 0.5  # the ramp's end is exponential
 _MEAN_S = 5.0  # the mirror must be inside the band for this long
 # A motion that takes longer than this factor of its planned time, and these seconds more, has

@@ -21,7 +21,7 @@ class FleetHold(Section):
     token_file: str | None = None
     """File with a token of that service; without it, the variable MEMBRANE_CTRL_TOKEN."""
     authority_file: str | None = None
-    """CA of the service's certificate. Set it if the system does not know it."""
+    """CA of the service's certificate. Set it if the system has no such CA."""
 
     @model_validator(mode="after")
     def _require_one_place(self) -> "FleetHold":

@@ -309,7 +309,7 @@ class MirrorConfig(Section):
 
 
 class OpticsConfig(Section):
-    """What deflectometry must know about the bench."""
+    """What deflectometry needs of the bench."""
 
     geometry: GeometryConfig = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9)
     camera: CameraConfig = CameraConfig()

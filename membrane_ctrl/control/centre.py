@@ -84,7 +84,7 @@ _STATES = _PLANT + CLONES
 
 @dataclass(slots=True)
 class SensorWatch(StateNode):
-    """What the filter knows of one sensor."""
+    """State of one sensor in the filter."""
 
     seen_s: float = -math.inf  # arrival of the last accepted reading
     taken_s: float = -math.inf  # when it was taken

@@ -8,7 +8,7 @@ from membrane_ctrl.model.state_tree import StateNode
 
 
 class Sensor(IntEnum):
-    """What sees the centre, or what moves it."""
+    """A sensor of the centre, or a cause of its motion."""
 
     LASER = 0
     OPTICS = 1

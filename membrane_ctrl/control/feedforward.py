@@ -1,4 +1,4 @@
-"""Flow that cancels the weather before the laser sees its effect. Pure.
+"""Flow that cancels the weather before the laser shows its effect. Pure.
 
 Ambient pressure moves the centre by g_p (µm/Pa) at once, gas temperature by g_T (µm/K), and the
 gas follows the air with a lag T_g. The speed that cancels them is

@@ -172,7 +172,7 @@ class InnerLoop:
         self._forget_output()
         self.memory.measured.reset(displacement_um)
         self._hold_setpoint_at(displacement_um)
-        self._ramp.place(math.nan)  # placed by the first step, which knows the trim
+        self._ramp.place(math.nan)  # placed by the first step, which has the trim
         self._pid.place(self._limiter.place(flow_um_per_s))
         self._curve.note_stop()
         self.memory.leak.skip_step()
@@ -286,9 +286,9 @@ class InnerLoop:
         """P on the centre that the gas in transit leads to, and the ramp's own speed; the leak is
         the integrator.
 
-        The prediction takes dead time and lag out of the loop, and the filter, which knows the flow
-        after its limits, cannot wind up. Everything that `_step_on_laser` needs follows, so that
-        either may take over at any tick.
+        The prediction takes dead time and lag out of the loop, and the filter, whose model contains
+        the flow after its limits, cannot wind up. Everything that `_step_on_laser` needs follows,
+        so that either may take over at any tick.
         """
         self.memory.measured.reset(estimate.um)
         shaped_um, ramp_um_per_s = self._shape_setpoint(given, estimate.um, dt_s)

@@ -8,7 +8,7 @@ branch for falling commands if there is hysteresis.
 There is no flow between rest and the least running flow: a wanted flow in that gap goes to the
 nearer end, so that the error of the gap has no fixed sign. (Always running would add gas that
 nothing removes, always stopping would lose the least flow: each is a bias.) The rest is left to the
-integrator, which does not know about the gap, but sees the resulting error.
+integrator, which has no model of the gap, but integrates the resulting error.
 """
 
 from bisect import bisect_right
@@ -159,7 +159,7 @@ class PumpCurve:
         self._start_fraction = pump.start_fraction
         self._rising = make_branch(pump, pump.curve_um_per_s)
         self._falling = make_branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
-        # Below its first command a measured curve knows no running pump, on its falling branch
+        # Below its first command a measured curve contains no running pump, on its falling branch
         # either
         self._least_fraction = max(
             pump.stall_fraction + STALL_MARGIN, self._falling.lowest_fraction

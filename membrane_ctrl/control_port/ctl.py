@@ -70,7 +70,7 @@ def _print_answer(action: str, answer: dict[str, Any], as_json: bool) -> int:
         lock = f": word {answer['lock']['word']}" if "lock" in answer else ""
         print(f"{action}: done{lock}{state}", file=sys.stderr)
     if answer.get("problem"):
-        print(f"{action}: NOT STORED, only this run knows: {answer['problem']}", file=sys.stderr)
+        print(f"{action}: NOT STORED, valid in this run only: {answer['problem']}", file=sys.stderr)
         return errors.Exit.DEVICE_FAILED
     return errors.Exit.DONE
 

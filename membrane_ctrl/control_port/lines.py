@@ -15,7 +15,7 @@ import time
 LINE_BYTES_MAX = 65_536
 
 _READ_BYTES = 16_384
-# Lines a second, as a token bucket. An honest hold sends ten states a second, and after a fault
+# Lines a second, as a token bucket. A real hold sends ten states a second, and after a fault
 # some tens of events.
 _BURST = 1000.0
 _PER_S = 200.0

@@ -44,5 +44,5 @@ class Outcome:
         if not answer.get("ok"):
             return cls.refused(command, str(answer.get("refused")))
         if answer.get("problem"):
-            return cls.failed(command, f"not stored, only this run knows: {answer['problem']}")
+            return cls.failed(command, f"not stored, valid in this run only: {answer['problem']}")
         return cls.succeeded(command)

@@ -19,7 +19,7 @@ from membrane_ctrl.controller.commands import SAME_AS, TABLE
 
 VERSION = 1
 
-# The longest honest message is `gains` with every key of the loop: 900 bytes. 8 kB are parsed in
+# The longest valid message is `gains` with every key of the loop: 900 bytes. 8 kB are parsed in
 # 0.1 ms.
 MESSAGE_BYTES = 8192
 

@@ -8,7 +8,7 @@ command may stand behind any number of others. Then
    answer;
 2. the others are executed one after the other, ten a second, and at most `_ORDINARY_MOST` of them
    wait;
-3. a request for which there is no room is refused at once, so its sender knows.
+3. a request for which there is no room is refused at once, with an answer to its sender.
 
 Reading costs the ticks time. The connections read in turn (`ReadingTurns`), a bounded number of
 lines in each turn.

@@ -1,4 +1,4 @@
-"""Runs the estimate of the centre beside the states, if `estimator.process_value` asks for it."""
+"""Runs the estimate of the centre beside the states, if `estimator.process_value` requires it."""
 
 import math
 from collections.abc import Collection
@@ -65,7 +65,7 @@ class CentreEstimationState(StateNode):
 
 
 class CentreEstimation:
-    """Runs the estimate beside the states if `estimator.process_value` asks for it."""
+    """Runs the estimate beside the states if `estimator.process_value` requires it."""
 
     def __init__(self, config: Config, memory: CentreEstimationState | None = None) -> None:
         self.memory = memory or CentreEstimationState()

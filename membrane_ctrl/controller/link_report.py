@@ -18,7 +18,7 @@ class LinkReport:
         Why the devices gave no valid answer to this tick's reading or the last tick's command;
         empty if they did. For people.
     devices : LinkState
-        What the bench knows of its single devices.
+        What the bench has recorded of its single devices.
     """
 
     wait_ms: float = 0.0

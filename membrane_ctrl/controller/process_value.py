@@ -3,7 +3,7 @@
 The estimate needs the pump's dead time and lag, and a second sensor of the centre or of the
 weather. While it holds the mirror, it is judged in two ways: by what the PI on the laser would have
 done (`control/predicted_pi.py`), and by its errors, which are uncorrelated if the pump responds as
-assumed (`control/error_correlation.py`). If either speaks against it, the PI is tried for a minute
+assumed (`control/error_correlation.py`). If either contradicts it, the PI is tried for a minute
 and a half. If the PI is better, it stays for a time that doubles with each such case. Either loop
 takes over without a bump (`control/inner_loop.py`).
 
@@ -51,12 +51,12 @@ _WARM_UP_INTEGRAL_TIMES = 2.0
 _WORSE_SIGMAS = 2.0
 _WORSE_SHARE = 1.05
 _CORRELATED = 0.33
-# An identified response that the prediction speaks for by so many standard deviations is doubted
+# An identified response that the prediction favours by so many standard deviations is doubted
 # only beyond a larger correlation: figures show that of the weather as well.
 _CORRELATED_IDENTIFIED = 0.5
 _BETTER_SIGMAS = 2.0
 # After a trial the PI stays unless it is worse by so many standard deviations: what began the trial
-# speaks for it. If the laser's noise hides a difference of so many, the camera decides.
+# favours it. If the laser's noise hides a difference of so many, the camera decides.
 _TRIAL_SPANS = 12
 _RETURNS_SIGMAS = 1.0
 _HIDDEN_SIGMAS = 2.0
@@ -431,7 +431,7 @@ class ProcessValueChoice:
         return [Maintenance(NOTICE, message)]
 
     def _is_pi_worse(self, pi_error: MeanSquare, estimate_error: MeanSquare) -> bool:
-        """Whether a trial speaks against the PI: by the laser, and where that shows no clear
+        """Whether a trial is evidence against the PI: by the laser, and where that shows no clear
         difference, by the camera.
         """
         lead = _count_sigmas(pi_error, estimate_error)

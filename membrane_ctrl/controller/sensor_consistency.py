@@ -200,7 +200,7 @@ class SensorConsistency:
         events += self._watch_redundancy(inputs.now_s, state, held)
         if state not in state_sets.ESTIMATED:
             return events + self._reset_comparisons()
-        # While the setpoint moves, the loss of gas says nothing about the film
+        # While the setpoint moves, the loss of gas is no evidence about the film
         moves = state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um
         if moves:
             self.memory.growth.note_ramp()
@@ -215,7 +215,7 @@ class SensorConsistency:
             if faulty == FaultySensor.LASER and held.held_by_optics
             else 0.0
         )
-        # A knock is over: the estimate knows the laser's new place. A laser that is knocked again
+        # A knock is over: the estimate has the laser's new place. A laser that is knocked again
         # and again is not.
         self.laser_moved = (
             self.memory.laser_fault_s > film_monitor.WARM_S

@@ -38,7 +38,7 @@ _COUNTS = {
 
 @dataclass(slots=True)
 class RunEnd:
-    """How a run ends, as its own process knows it: no disk is needed.
+    """How a run ends, from the memory of its own process: no disk is needed.
 
     Attributes
     ----------

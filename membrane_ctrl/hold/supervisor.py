@@ -161,7 +161,7 @@ class Supervisor:
             if not self._link_error:
                 self._link_failures.note_success(now_s)
             self._link_error = ""
-        # What else the tick may know: children, the twin's truth, commands since the last tick
+        # What else the tick may use: children, the twin's truth, commands since the last tick
         if now_s >= self._next_watch_s:
             self._next_watch_s = now_s + _CHILD_WATCH_S
             self._run_guarded("children", self._report_children)

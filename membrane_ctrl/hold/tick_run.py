@@ -90,7 +90,7 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
         latch = parts.make_latch(supervisor.record_event)
         systemd = SystemdNotify()
         wiring.tick_listeners = {
-            "locks": keeper.handle_tick,  # before the port, which asks for the outcome
+            "locks": keeper.handle_tick,  # before the port, which needs the outcome
             "control port": port.handle_tick,
             "latched-fault file": latch.handle_tick,
             "systemd": systemd.handle_tick,

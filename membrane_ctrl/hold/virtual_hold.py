@@ -1,4 +1,4 @@
-"""A hold on the twin in virtual time that begins in standby, as a session sees a hold."""
+"""A hold on the twin in virtual time that begins in standby, as a session uses a hold."""
 
 from collections.abc import Callable
 

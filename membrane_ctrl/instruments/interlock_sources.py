@@ -1,7 +1,7 @@
 """Makes the sources of the configured interlocks that are not inputs of the pump board.
 
 Interlocks at one Modbus device, or at one GPIO chip, are read by one source, as often as the
-fastest of them asks for and with the strictest age of an answer.
+fastest of them needs and with the strictest age of an answer.
 """
 
 from collections import defaultdict
@@ -69,7 +69,7 @@ def _make_source(members: list[Member], links: ModbusLinks) -> PolledSource:
             )
     except ValueError as error:
         raise InputError(f"devices.interlocks.{bits[0]}: {error}") from None
-    # Read as often, and no older, than the strictest of them asks for.
+    # Read as often, and no older, than the strictest of them needs.
     return PolledSource(
         source=source,
         bits=bits,

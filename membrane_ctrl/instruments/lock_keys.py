@@ -1,4 +1,4 @@
-"""The names by which locks know devices, on whatever port or address these are at present."""
+"""The names of devices in locks, which do not depend on a device's present port or address."""
 
 import contextlib
 import os

@@ -239,7 +239,7 @@ def figure_lines(found: MeasuredFigure) -> list[str]:
 
 
 def with_bar(value: float, sigma: float) -> str:
-    """A number with its 1 sigma, to two digits of that; without one the number says so."""
+    """A number with its 1 sigma, to two digits of that; without one, the number states that."""
     if not math.isfinite(sigma):
         return f"{value:.4g} (no error bar)"
     if sigma <= 0:

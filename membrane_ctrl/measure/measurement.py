@@ -64,7 +64,7 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
 
     Raises InputError if the set or its reference is invalid.
     """
-    # The set, and the one that has its fringe orders. It need not know its film's depth.
+    # The set, and the one that has its fringe orders. It need not state its film's depth.
     begin = time.perf_counter()
     capture = read_set(folder, geometry)
     where = capture.head.folder / "capture.toml"

@@ -1,1 +1,1 @@
-"""Values, errors, files and bytes that every room above knows: no control, no device."""
+"""Values, errors, files and bytes that every package above uses: no control, no device."""

@@ -62,7 +62,7 @@ class Ended(
     notable=True,
     urgent=True,
 ):
-    """The run is over; without the control process the recorder knows only `exit`."""
+    """The run is over; without the control process only `exit` is recorded."""
 
     exit: str
     exit_code: int | None = None
@@ -184,8 +184,8 @@ class LatchWritten(
 class LockNotStored(
     Event,
     kind="lock_not_stored",
-    sentence="The lock {word} is not stored: {message}. Do: mend the disk; until then only this run "  # noqa: E501
-    "knows the lock",
+    sentence="The lock {word} is not stored: {message}. Do: mend the disk; until then it is "
+    "valid in this run only",
     level=LogLevel.ERROR,
     opens=(Topic.LOCK_STORAGE,),
     subject="word",

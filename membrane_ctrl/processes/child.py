@@ -51,7 +51,7 @@ class Child:
         try:
             with _group_blocked():
                 self._process.start()
-        except BaseException:  # a signal arrived, and the caller does not know the child yet
+        except BaseException:  # a signal arrived, and the caller has no handle of the child yet
             self.stop(1.0)
             raise
 

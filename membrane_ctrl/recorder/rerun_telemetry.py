@@ -41,7 +41,7 @@ class TelemetryStreams:
         self._rest = np.empty((0, len(telemetry.FIELDS)))  # not in the overview yet
 
     def start_segment(self) -> None:
-        """Restart every lane: a new file does not know the last state of the previous one."""
+        """Restart every lane: a new file does not have the last state of the previous one."""
         self._codes.clear()
 
     def send_rows(self, rows: telemetry.Rows) -> None:

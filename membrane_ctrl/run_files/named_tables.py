@@ -74,7 +74,7 @@ def _to_utc(time_s: Column, origin_utc: datetime) -> pa.Array:
 
 
 def _name_codes(codes: Column, words: Mapping[int, str]) -> pa.Array:
-    """Names of codes; one that this version does not know is `code 99`."""
+    """Names of codes; one that this version does not have is `code 99`."""
     there = np.isfinite(codes)
     found, places = np.unique(np.where(there, codes, 0.0), return_inverse=True)
     names = [words.get(int(code), f"code {code:g}") for code in found]

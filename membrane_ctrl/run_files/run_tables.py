@@ -213,7 +213,7 @@ class RunTables:
 
     @property
     def part_counts(self) -> dict[str, int]:
-        """Number of parts per table: a reader that finds fewer knows that the last ones are
+        """Number of parts per table: if a reader finds fewer, the last ones are
         missing.
         """
         return {name: writer.part_count for name, writer in self._writers.items()}

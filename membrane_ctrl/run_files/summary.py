@@ -39,9 +39,9 @@ class EnteredState(StateNode):
 
 @dataclass(slots=True)
 class Summary(StateNode):
-    """Accumulates everything the recorder sees; `as_dict` gives `summary.json` at any time.
+    """Accumulates all that is recorded; `as_dict` gives `summary.json` at any time.
 
-    "True" is the target minus what the twin knows of the mirror's centre: on a real bench those
+    "True" is the target minus the true centre of the twin's mirror: on a real bench those
     keys are null.
     """
 

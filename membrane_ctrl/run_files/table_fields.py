@@ -73,7 +73,7 @@ def make_spec(
     group_rows : int
         Rows of one row group in Parquet, which is read as a whole.
     layout : tuple of (str, str)
-        What a reader must know of the lengths of lists.
+        What a reader needs of the lengths of lists.
     part_s : float
         Time after which the journal becomes a Parquet part.
     """

@@ -19,7 +19,7 @@ _TARGET = "membrane_ctrl.service.alarm_process:alarm_process_main"
 
 
 class AlarmChild:
-    """The alarm process, as the service sees it.
+    """The alarm process, in the service.
 
     Parameters
     ----------

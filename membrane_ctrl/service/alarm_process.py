@@ -33,7 +33,7 @@ _IDLE_S = 15.0
 
 @dataclass(frozen=True, slots=True)
 class AlarmProcessSpec:
-    """What the process needs to know.
+    """What the process needs.
 
     Attributes
     ----------

@@ -139,7 +139,7 @@ class EndedRun:
         return f"run ended {self.ended_utc:%Y-%m-%d %H:%M:%S} UTC: {self.cause}"
 
     def lines(self) -> tuple[str, ...]:
-        """All that people need to know, a line each; the headline first."""
+        """All that people need, a line each; the headline first."""
         lines = [self.headline]
         if self.fault is not None and self.fault_utc is not None:
             limit = f" (limit: {self.fault.limit})" if self.fault.limit else ""

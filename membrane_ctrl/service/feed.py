@@ -2,7 +2,7 @@
 their history.
 
 One connection and one reader serve any number of viewers. The hold never waits for this process:
-the port drops a client that does not read, and a ring overwrites what nobody has taken.
+the port drops a client that does not read, and a ring overwrites what has not been read.
 """
 
 import math

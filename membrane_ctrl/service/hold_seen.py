@@ -1,4 +1,4 @@
-"""What the service knows of a hold at one moment."""
+"""What the service has received of a hold up to one moment."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class HoldSeen:
 
     @property
     def silent(self) -> str:
-        """Why the shown status must not be believed; empty if it may be."""
+        """Why the shown status must not be relied on; empty if it may be."""
         if self.problem:
             return self.problem if self.ended is None else self.ended.headline
         age_s = time.monotonic() - self.seen_s

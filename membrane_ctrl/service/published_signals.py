@@ -62,7 +62,7 @@ def signal_values(seen: HoldSeen) -> dict[str, Value]:
     found["run"] = seen.name
     if seen.silent:
         return {**found, "state": "no contact", "why": seen.silent}
-    # What `ctl status` tells, and the newest tick.
+    # What `ctl status` prints, and the newest tick.
     status, row = seen.status, seen.status.get("row") or {}
     found |= {
         "state": str(status.get("state", "")),

@@ -38,7 +38,7 @@ class ServiceFeed(HoldFeed):
         self._role: Role | None = None
 
     def signal_values(self) -> dict[str, Value]:
-        """The values of the published signals; the other service knows those of the figure."""
+        """The values of the published signals; the other service has those of the figure."""
         values = super().signal_values()
         if not self.seen.silent:
             values |= {name: value for name, value in self._values.items() if name in values}

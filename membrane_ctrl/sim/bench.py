@@ -23,7 +23,7 @@ _STEPS_AT_ONCE = 4000
 
 @dataclass(frozen=True, slots=True)
 class BenchSpec:
-    """What a bench process needs to know; picklable."""
+    """What a bench process needs; picklable."""
 
     twin: TwinConfig
     pump: PumpConfig

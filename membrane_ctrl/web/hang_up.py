@@ -1,4 +1,4 @@
-"""Hangs up on viewers who do not read what they are sent."""
+"""Closes the connections of viewers who do not read what they are sent."""
 
 import asyncio
 import sys
@@ -11,7 +11,7 @@ _STUCK_S = 20.0  # for a message to leave
 
 
 class HangUp:
-    """ASGI middleware: hangs up on a viewer who does not read, and says so.
+    """ASGI middleware: closes the connection of a viewer who does not read, and prints that.
 
     Engine.io notices a viewer who does not answer its pings, within 24 s; a viewer who answers but
     cannot be written to is noticed here.

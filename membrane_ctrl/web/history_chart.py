@@ -79,7 +79,7 @@ def make_history_chart(
     places = list(range(count))
     return {
         "animation": False,
-        "useUTC": True,  # the local time is in the values: ECharts knows no time zone of the bench
+        "useUTC": True,  # the local time is in the values: ECharts has no time zone of the bench
         "aria": {"enabled": True},
         "grid": grids,
         "axisPointer": {"link": [{"xAxisIndex": "all"}], "label": {"show": False}},

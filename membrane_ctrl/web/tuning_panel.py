@@ -232,7 +232,7 @@ class TuningPanel:
                     self._buttons.append(button)
 
     async def _answer(self, seen: SessionSeen, choice: str) -> None:
-        """Ask for a confirmation, answer, and say what became of it."""
+        """Ask for a confirmation, answer, and show the outcome."""
         question = f"{seen.progress.asks} {choice or 'none'}"
         if not await confirm(question, enter_confirms=True) or not self._may():
             return

@@ -58,7 +58,7 @@ class FakeCamera:
     clock: VirtualClock
     exposure_s: float = 0.02
     broken: bool = False
-    own_pixels: NDArray[np.uint8] | None = None  # for a camera that cannot write where it is told
+    own_pixels: NDArray[np.uint8] | None = None  # for a camera that cannot write to a given place
     frames: int = 0
 
     def grab(self, out: Pixels | None = None) -> Frame:

@@ -118,7 +118,7 @@ class Hold:
         self.settle(at_s + 12.0)
 
     def take(self, estimate: ShapeEstimate) -> None:
-        """As the acquisition publishes a figure, and the supervisor what the acquisition tells."""
+        """As the acquisition publishes a figure, and the supervisor what the acquisition sends."""
         HandClock.moment_s = estimate.time_s
         self.rings["shapes"].put(pack_estimate(estimate))
         for event in self.hear(estimate):

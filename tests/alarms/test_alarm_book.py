@@ -36,7 +36,7 @@ def test_a_condition_must_stand_for_its_time() -> None:
     book.take_sign(BAD, 0.0)
     assert book.step(9.9) == []
     assert book.step(10.0) == [AlarmMessage("raised", "leak", "warning", "it leaks")]
-    assert book.step(11.0) == [], "told once"
+    assert book.step(11.0) == [], "sent once"
 
 
 def test_an_alarm_that_clears_before_its_time_is_not_sent() -> None:
@@ -73,7 +73,7 @@ def test_without_an_acknowledgement_more_people_receive_the_alarm() -> None:
     book.take_sign(GOOD, 5000.0)
     (notice,) = book.step(5030.0)
     assert (notice.kind, notice.escalated) == ("cleared", True), (
-        "who was woken is told that it is over"
+        "a person who was woken also gets the end"
     )
 
 
@@ -170,5 +170,5 @@ def test_another_recorder_begins_without_the_formers_trouble_and_reports_its_own
     disk.step(1.0)
     assert not disk.book.note_standing("recorder")
     RecorderErrors(disk.hear).report_error("disk", "less than 500 MB free", DiskLow)
-    assert disk.step(40.0) == [], "the same alarm, not told off and told again"
+    assert disk.step(40.0) == [], "the same alarm, not cleared and raised again"
     assert disk.step(900.0) == [("escalated", LOW)]

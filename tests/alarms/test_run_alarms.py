@@ -112,7 +112,7 @@ def test_the_hold_sends_after_half_a_minute_without_a_service(world: World) -> N
     world.step(30.0)
     assert world.phones.lab == [("hold", "fault", "raised")]
     world.step(40.0, fault("over_pressure", 40.0))
-    assert len(world.phones.lab) == 1, "the same alarm goes on"
+    assert len(world.phones.lab) == 1, "the same alarm continues"
 
 
 def test_a_service_that_comes_later_repeats_nothing(world: World) -> None:

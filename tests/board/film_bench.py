@@ -1,7 +1,7 @@
 """The twin's film in real time behind one of two boards: `python -m tests.board.film_bench
 qemu|python FOLDER`.
 
-Prints the board's URL, runs until it is told to stop, then writes the true displacement to
+Prints the board's URL, runs until it is stopped, then writes the true displacement to
 FOLDER/truth.txt, one line a sample. `qemu`: the C firmware on an emulated Cortex-M3; `python`: the
 Python emulator. Both speak Modbus RTU.
 """

@@ -45,7 +45,7 @@ async def the_program_ends_in_a_hold() -> list[str]:
             board_of(rig).raises = way != "cancelled"
             await asyncio.sleep(2.5 * TICK_S)
             rig.now()
-            rig.must(rig.task.done(), "the run goes on")
+            rig.must(rig.task.done(), "the run continues")
             rig.must(not rig.still(), "the program ended and left the pump running")
             violations += [f"{way}: {what}" for what in rig.violations]
     return violations
@@ -277,7 +277,7 @@ async def instruments_hold_a_mirror() -> list[str]:
             )
             rig.must(
                 abs(row.gauge_pressure_pa - truth.gauge_pressure_pa) < 4.0,
-                "the pressure told is not the true one",
+                "the reported pressure is not the true one",
             )
             readback = row.pump_readback_fraction
             rig.must(abs(readback - rig.plant.pump_given) < 0.2, f"read-back {readback:.2f}")
@@ -410,7 +410,7 @@ async def another_instrument_in_its_place() -> list[str]:
         await rig.wait(0.2)
         lab.gauge.table, lab.gauge.plugged = BronkhorstRegisters(other), True
         await rig.wait(2.0)
-        rig.must(math.isnan(rig.heard[-1].row.gauge_pressure_pa), "another gauge is believed")
+        rig.must(math.isnan(rig.heard[-1].row.gauge_pressure_pa), "another gauge's value is used")
         await rig.wait(RAMP_S)
         await rig.wait(3.0, rig.still)
         return rig.violations

@@ -174,7 +174,7 @@ def a_door_that_is_open_while_the_program_ends() -> list[str]:
     stage.wait(1.0)
     stage.ask("stop")
     stage.wait(3.0, stage.still)
-    stage.must(stage.run.finished is not None, "the run goes on")
+    stage.must(stage.run.finished is not None, "the run continues")
     stage.must(stage.state != State.FAULT, "a fault")
     return stage.violations
 

@@ -50,7 +50,7 @@ class QuickBench(EmulatedBench):
 class Person:
     """Answers by the key of a question: a text, or texts in turn; `y` or Enter otherwise.
 
-    After a failed stage the person stops, unless told otherwise.
+    After a failed stage the person stops, unless the test states otherwise.
     """
 
     def __init__(self, **answers: str | list[str]) -> None:

@@ -1,4 +1,6 @@
-"""`safe` stops the pump whoever has the board, takes no claim, and leaves clearing to a person."""
+"""`safe` stops the pump although another program has the board, takes no claim, and leaves clearing
+to a person.
+"""
 
 from __future__ import annotations
 

@@ -541,7 +541,7 @@ def test_transit_is_a_dead_time_and_a_lag(delay_s: float, lag_s: float) -> None:
 def _follow(
     reading: ReadingNoise, level: LearnedFactor, noise: float, walk: float, steps: int = 12_000
 ) -> list[float]:
-    """Follow a walk seen with noise, both told as 1 a step, with what is learned; the last 5,000
+    """Follow a walk seen with noise, both stated as 1 a step, with what is learned; the last 5,000
     error to sigma.
     """
     rng = np.random.default_rng(4)

@@ -16,7 +16,7 @@ from membrane_ctrl.control_port.outcome import Outcome
         ({"ok": True, "problem": ""}, "lock: done", True),
         (
             {"ok": True, "problem": "disk full"},
-            "lock: not stored, only this run knows: disk full",
+            "lock: not stored, valid in this run only: disk full",
             False,
         ),
         ({"ok": False, "refused": "not now: done"}, "lock refused: not now: done", False),

@@ -181,7 +181,9 @@ async def test_watch_streams_status_and_events(tmp_path: Path) -> None:
         run.state = State.MANUAL
         run.tick()
         assert (await eve.get() or {})["status"]["state"] == "manual"
-        assert "event" not in await ann.ask(do="status"), "only who watches is told"
+        assert "event" not in await ann.ask(do="status"), (
+            "only a client that watches receives events"
+        )
 
 
 async def test_alarms_are_acknowledged_on_record(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ def moved_um(ticks: list[VirtualTick]) -> float:
 
 
 def list_used_sensors(ticks: list[VirtualTick]) -> list[str]:
-    """Which sensors hold the mirror, as it was told."""
+    """Which sensors hold the mirror, as reported."""
     return [
         ", ".join(event.sensors)
         for tick in ticks

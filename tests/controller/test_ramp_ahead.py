@@ -1,4 +1,4 @@
-"""A pump stronger than configured lifts the mirror ahead of the ramp, which goes on."""
+"""A pump stronger than configured lifts the mirror ahead of the ramp, which continues."""
 
 from __future__ import annotations
 

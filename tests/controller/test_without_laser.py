@@ -438,7 +438,7 @@ def _judge_jump(um: float, seen: bool) -> None:
     ids=["seen", "unseen by the camera"],
 )
 def test_a_jump_of_the_film_is_corrected_for_any_camera_reading(seen: bool) -> None:
-    """The gauge is the third witness: it sides with the laser, and what the mount was blamed for is
+    """The gauge is the third sensor: it agrees with the laser, and what the mount was blamed for is
     undone.
     """
     _judge_jump(-25.0, seen)
@@ -475,7 +475,7 @@ def test_a_jump_at_the_start_that_the_camera_misses_is_corrected(
     config: Config, jump_s: float
 ) -> None:
     """The gauge is asked from the fifth second of settling on;
-    before that the laser is believed.
+    before that the laser counts.
     """
     verdict, off_um = _early(config, jump_s, -40.0, _blind(-40.0, jump_s))
     assert (verdict, off_um) == ("optics", pytest.approx(0.0, abs=2.0))

@@ -1,4 +1,4 @@
-"""Thousands of transactions of each link under random faults: no wrong value is believed."""
+"""Thousands of transactions of each link under random faults: no wrong value is accepted."""
 
 from __future__ import annotations
 

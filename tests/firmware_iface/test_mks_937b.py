@@ -168,8 +168,8 @@ def test_a_true_step_passes_with_its_second_reading() -> None:
     ids=str,
 )
 def test_with_each_fault_no_false_pressure(faults: SerialFaults) -> None:
-    """Off by a step of the gate at most: a corrupted last digit cannot be told from noise without a
-    checksum.
+    """Off by a step of the gate at most: a corrupted last digit cannot be distinguished from noise
+    without a checksum.
     """
 
     async def test(bench: Bench) -> None:

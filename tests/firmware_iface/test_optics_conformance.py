@@ -19,7 +19,7 @@ EXPOSURE_S = 0.01
 
 
 class Wire:
-    """An emulated camera: numbered frames, lost, late or frozen when told."""
+    """An emulated camera: numbered frames, lost, late or frozen on request."""
 
     def __init__(self, view: Any) -> None:
         self.view = view

@@ -227,7 +227,7 @@ def _wrong(
 
 
 def _outside(place: Path) -> dict[str, tuple[int, int]]:
-    """Size and time of all beside the folder that is spoiled, but for what a command was told to
+    """Size and time of all beside the folder that is spoiled, but for what a command had to
     write.
     """
     return {
@@ -266,7 +266,7 @@ def work(first: int, last: int, root: Path, good: Path, only: str | None) -> Non
 
     typer.main.get_command = functools.cache(
         typer.main.get_command
-    )  # making it anew takes four times what a case does
+    )  # making it again takes four times what a case does
     warnings.simplefilter("error")
     warnings.simplefilter(
         "ignore", RuntimeWarning

@@ -87,7 +87,7 @@ def test_a_hold_tunes_itself(tmp_path: Path) -> None:
 
 
 def _killed_and_resumed(logs: Path) -> None:
-    """Another session on the same hold is killed once it has identified, and goes on from there."""
+    """Another session on the same hold, killed once it has identified, continues from there."""
     words = [
         sys.executable,
         "-m",

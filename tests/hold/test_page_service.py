@@ -247,7 +247,7 @@ def test_a_page_is_there_during_and_after_a_killed_hold_and_a_hold_outlives_it(
                 service.kill()
                 service.wait(30.0)
                 assert find_service(logs) is None
-                assert hold.poll() is None, "the hold goes on"
+                assert hold.poll() is None, "the hold continues"
         with holding(tmp_path) as hold:
             until(lambda: find_service(logs))
             usual = f":{DEFAULT_PORT}/"  # another program of this machine may have that port

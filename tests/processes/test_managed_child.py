@@ -16,7 +16,7 @@ from membrane_ctrl.processes.managed_child import ManagedChild
 
 
 class FakeChild:
-    """A child that ends when told to."""
+    """A child that ends on command."""
 
     name = "recorder"
 

@@ -6,7 +6,7 @@ other names. For each scenario `NAME` it has
 =====================  ==================  =====================================================
 `NAME/commands`        (ticks, 2) float64  pump and vent fraction that each tick commands
 `NAME/codes`           (ticks, 6) int32    state, state of the shape loop, safe level, fault, board
-                                           latches to clear, exit code (-1 while the run goes on)
+                                           latches to clear, exit code (-1 while the run continues)
 `NAME/events`          (events, 3) int32   tick, identity, count of numbers. Events of one kind and
                                            one code have one identity; identities count from 0 in
                                            order of appearance

@@ -1,4 +1,4 @@
-"""Each message once, whoever reads: the feed across a recorder's death."""
+"""Each message once, by one reader or the next: the feed across a recorder's death."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tests of a comparison: alike runs seldom differ, differences are found, rows state their
+"""The tests of a comparison: equal runs seldom differ, differences are found, rows state their
 test.
 """
 

@@ -163,7 +163,7 @@ def test_one_run_that_cannot_go_keeps_no_other_and_remains_of_a_crash_go_too(
     keeping.watch_disk(0.0, [])
     assert [report.kind for report in reports] == ["recorder_error", "run_deleted"]
     keeping.watch_disk(RETENTION_INTERVAL_S, [])
-    assert len(reports) == 2, "told once"
+    assert len(reports) == 2, "reported once"
     monkeypatch.undo()
     (tmp_path / "20261001T110000Z-old").rename(tmp_path / "by-hand")
     keeping.watch_disk(2 * RETENTION_INTERVAL_S, [])

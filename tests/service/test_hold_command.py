@@ -50,7 +50,7 @@ async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) 
             "mqtt", "latch"
         )
         assert time.monotonic() - begin_s < 1.0
-        waiting, _ = frozen.accept()  # the hold goes on
+        waiting, _ = frozen.accept()  # the hold continues
         waiting.sendall(
             b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n'
         )

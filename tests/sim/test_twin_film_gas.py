@@ -159,7 +159,7 @@ def test_one_softer_film_moves_trapped_gas(
     moved_um(bench, 1.0)
     before = bench.truth().displacement_um
     monkeypatch.setattr(film, softer, soft)
-    bench.advance(20.0)  # into the next block, where the coefficients are made anew
+    bench.advance(20.0)  # into the next block, where the coefficients are made again
     assert bench.truth().displacement_um - before == pytest.approx(expected_um, abs=0.3)
 
 

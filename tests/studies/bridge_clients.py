@@ -55,7 +55,7 @@ def _sweeps(record: LineLog, read: Read) -> None:
     while True:
         try:
             made_s = list(read())
-        except Exception as error:  # whatever the library raises: the client goes on
+        except Exception as error:  # whatever the library raises: the client continues
             record(failed=f"{type(error).__name__}: {error}"[:200])
         else:
             record(names=len(made_s), oldest_s=round(time.time() - min(made_s), 3))

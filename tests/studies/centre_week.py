@@ -134,7 +134,7 @@ def _upsets(seed: int) -> Iterator[tuple[float, str, float]]:
 def _slow(
     seed: int, days: float
 ) -> tuple[DailyTemperature | PressureWeather | LaserDrift | LeakChange, ...]:
-    """What goes on beside: a day's temperature, highs and lows, a drifting mount, a leak that grows
+    """What happens beside: a day's temperature, highs and lows, a drifting mount, a leak that grows
     and shrinks.
     """
     rng = np.random.default_rng([22, seed])

@@ -63,7 +63,7 @@ class Means:
             self.restart()
 
     def restart(self) -> None:
-        """Begin a window anew."""
+        """Begin a new window."""
         self._sum_um, self._n = 0.0, 0
 
     @property

@@ -1,4 +1,4 @@
-"""The pump's curve on actuators that nobody told the product of: second world, defaults in the
+"""The pump's curve on actuators of an unstated product: second world, defaults in the
 configuration.
 """
 
@@ -224,7 +224,7 @@ def tuned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
 def test_a_stuck_pump_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It goes on giving what holds the mirror, whatever it is told."""
+    """It continues to give what holds the mirror, whatever is commanded."""
     ForeignHold.plant = ForeignPlant(ForeignPump("straight", 5.3), laser_um=0.5, weather=0.3)
     monkeypatch.setattr(ForeignHold, "stuck_fraction", 0.31)
     assert tuned(tmp_path, monkeypatch, "pump") == Exit.REJECTED

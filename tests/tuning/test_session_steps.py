@@ -325,7 +325,7 @@ def test_a_drift_that_is_not_seen_asks_for_minutes() -> None:
 
 
 class OuterRig:
-    """A hold whose shapes during the trial are given; notes what it is told."""
+    """A hold whose shapes during the trial are given; notes its commands."""
 
     loop = LOOP
 

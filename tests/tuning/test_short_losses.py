@@ -84,7 +84,7 @@ def test_80_ms_without_the_laser_end_no_experiment(kind: str) -> None:
     tune = [row for row in rows if row.state == State.TUNE]
     missing = [row for row in tune if math.isnan(row.filtered_um)]
     assert len(missing) >= 9
-    # the experiment's own flow goes on while nothing is read
+    # the experiment's own flow continues while nothing is read
     if kind == "pump_map":
         assert {round(row.pump_fraction, 6) for row in tune[1:]} <= {0.0, 0.7}
 

@@ -37,7 +37,7 @@ class SaturatingPump(TwinBench):
 
 
 class StuckPump(TwinBench):
-    """From a time on the pump delivers its holding flow whatever it is told."""
+    """From a time on the pump delivers its holding flow whatever is commanded."""
 
     stuck_from_s = math.inf
 

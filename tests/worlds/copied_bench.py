@@ -1,6 +1,6 @@
 """Copies of a virtual bench with its controller, so that tests share one computed start of a hold.
 
-A copy goes on exactly as the original would, and neither changes the other.
+A copy continues exactly as the original would, and neither changes the other.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ copyreg.pickle(struct.Struct, _remake)  # which `copy` does not know
 
 
 class Originals(Generic[T]):
-    """Objects that are made once a process; whoever asks gets a copy.
+    """Objects that are made once a process; each caller gets a copy.
 
     Parameters
     ----------

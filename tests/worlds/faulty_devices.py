@@ -176,7 +176,7 @@ class MemoryWire(SerialPort):
         return 0.0
 
     def open(self, receiver: Receiver) -> None:
-        """Open anew. Raises LinkDownError when it is not plugged in."""
+        """Open again. Raises LinkDownError when it is not plugged in."""
         if not self.plugged:
             raise LinkDownError(f"{self.name}: there is no such port")
         self._receiver = receiver

@@ -1,4 +1,4 @@
-"""A session of two questions that writes what it was told: a stand-in for `commission --messages`.
+"""A session of two questions that writes its answers: a stand-in for `commission --messages`.
 
 python small_session.py FOLDER --messages [--twin]
 """

@@ -231,8 +231,8 @@ def _run_relays(
 ) -> tuple[Record, Finished]:
     """Relays until the gain is known, or the data ask for the pump's map, each followed by a hold.
 
-    One that the guard stopped tells as much of its time as another, unless the mirror jumped: gusts
-    and a laser's noise stop sound experiments, too.
+    One that the guard stopped is as good for its duration as another, unless the mirror jumped:
+    gusts and a laser's noise stop sound experiments, too.
     """
     done: Record | None = None
     finished = Finished(ExperimentEnd.INTERRUPTED, "")

@@ -26,7 +26,7 @@ _STRAYED = 2.0
 
 @dataclass(slots=True)
 class GuardState(StateNode):
-    """The motion that the guard sees, and how the experiment has ended."""
+    """The motion that the guard has measured, and how the experiment has ended."""
 
     motion: MotionState = field(default_factory=MotionState)
     ended: Finished | None = None

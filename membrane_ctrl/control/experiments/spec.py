@@ -26,7 +26,7 @@ class ExperimentSpec(Section):
     """A named, bounded experiment about the holding flow.
 
     What the bounds are for: half an hour of a person's time; an excursion that the safety table's
-    following error (60 µm) never sees; flows that a film pump can have.
+    following error (60 µm) never reaches; flows that a film pump can have.
     """
 
     version: Literal[1] = 1

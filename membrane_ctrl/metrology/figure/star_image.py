@@ -1,8 +1,8 @@
 """The image of a distant point on the mirror's axis: focus, path differences, point spread function
 and Strehl ratio at a wavelength.
 
-A plane wave along the axis reaches the point P of the mirror and goes on to the focus F. Its path,
-counted from a plane in front of the mirror, is
+A plane wave along the axis reaches the point P of the mirror and is reflected to the focus F. Its
+path, counted from a plane in front of the mirror, is
 
     L = |F - P| - z.
 

@@ -8,8 +8,8 @@ orthotropic film (`ring_waves`).
 
 No film obeys a law exactly. Its misfit is a random figure of unknown size that stays, or grows
 with a power of the sag; both are taken from what the law leaves, here and in the terms that it
-says nothing about, and all results are averaged over what the figures allow. So a wrong law widens
-the error bars instead of moving the numbers.
+contain no evidence about, and all results are averaged over what the figures allow. So a wrong law
+widens the error bars instead of moving the numbers.
 """
 
 from collections.abc import Callable, Sequence

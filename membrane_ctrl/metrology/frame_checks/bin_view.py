@@ -1,9 +1,9 @@
 """Light, fringe contrast, wrapped phase and mask of each bin, from the usable frames of a set.
 
 The light of a bin has three estimates, the mean of the x fringes, that of the y fringes, and white
-minus black; the fringes' swing likewise. The median of three is right when one of them is wrong,
-so that one bad frame, whichever it is, does not spoil the picture that all frames are compared
-with.
+minus black; the fringes' swing in the same way. The median of three is right when one of them is
+wrong, so that one bad frame, whichever it is, does not spoil the picture that all frames are
+compared with.
 """
 
 from collections.abc import Collection

@@ -1,7 +1,7 @@
 """Square cells of bins, over each of which what changes slowly over the mirror is a plane.
 
 The functions after `Cells` do the same for one block, compiled. One small loop a function, and a
-block's rows in one array: so the compiler knows that nothing overlaps, and finds vector
+block's rows in one array: so the compiler can prove that nothing overlaps, and finds vector
 instructions on any processor. A block's planes fit the second cache.
 """
 

@@ -23,7 +23,7 @@ RESPONSE_POWERS = (2, 3, 4, 5)
 
 @dataclass(frozen=True)
 class CrossedScene:
-    """The bench as a frame of crossed fringes sees it.
+    """The bench of a frame of crossed fringes.
 
     It has n bins inside the analysis radius, in the order of their cells.
 

@@ -365,7 +365,7 @@ class FrameFitter:
         errors : (2, n) array
             Residual times the light's derivatives by the phases of x and y, weighted as in the fit.
         weights : (2, n) array
-            Squares of these derivatives, weighted likewise.
+            Squares of these derivatives, with the same weights.
         """
         waves = self._compute_light_waves(shifts_rad, fit.surface, fit.light)[:2]
         weights = self.scene.edge * fit.weights

@@ -138,7 +138,7 @@ class Budget:
         return steady_mm2 + motion.covariance_mm2
 
     def find_motion(self, earlier: "Budget") -> MotionFinding | None:
-        """Motions of the bench since another set; None if a budget does not know their effects."""
+        """Motions of the bench since another set; None if a budget does not have their effects."""
         if self.motion is None or earlier.motion is None:
             return None
         return self.motion.find(earlier.motion, self.steady_change_covariance(earlier))

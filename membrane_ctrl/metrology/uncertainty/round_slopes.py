@@ -85,7 +85,7 @@ class RoundSlopes:
         used = filled.min(axis=1) > 0
 
         # Variance of a ring's mean, from the scatter of its four. Neighbours have about the same
-        # scatter, and four means know theirs badly: it is averaged over three rings.
+        # scatter, and that of four means is poorly known: it is averaged over three rings.
         scatter = np.var(of_groups[used], axis=1, ddof=1) / _GROUPS
         three = np.ones(3)
         neighbours = np.convolve(np.ones(scatter.size), three, "same")

@@ -32,7 +32,7 @@ SCHEMA = "membrane-report/1"
 def make_verdict(analysis: Analysis) -> tuple[Word, str]:
     """A word that selects the colour, and the verdict as a sentence."""
     run, ticks = analysis.run, analysis.ticks
-    # The simulated bench knows the true error; a real one has the readings.
+    # The simulated bench records the true error; a real one has the readings.
     series = analysis.true or analysis.reading
     whole = format_span(ticks.end_s - ticks.start_s)
     names = [anomaly.name for anomaly in analysis.anomalies]

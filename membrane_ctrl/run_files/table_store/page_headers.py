@@ -1,4 +1,4 @@
-"""Walks the page headers of a Parquet column chunk, to know its memory before Arrow takes it.
+"""Walks the page headers of a Parquet column chunk, to find its memory before Arrow allocates it.
 
 A page header states the size to which its page unpacks and the number of its values, and Arrow
 believes it. It is a structure in Thrift's compact protocol (`parquet.thrift`: `PageHeader`,

@@ -448,7 +448,7 @@ def test_flicker_is_corrected_and_the_rest_is_in_the_error_bar() -> None:
 def test_bands_of_a_pulsed_backlight_are_removed_from_full_and_fringes_cycles(
     share: float, most_um: float
 ) -> None:
-    """They moved the figure by 0.3 and 1.6 µm in cycles called ok; large ones are told."""
+    """They moved the figure by 0.3 and 1.6 µm in cycles called ok; large ones are reported."""
     row, random = (
         np.arange(float(OPTICS.camera.height_px))[:, None] / OPTICS.camera.height_px,
         np.random.default_rng(3),

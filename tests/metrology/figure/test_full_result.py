@@ -150,7 +150,7 @@ def test_motion_is_removed_from_the_phase() -> None:
 def test_noisy_pictures_move_no_film_and_hide_no_motion(
     motion_um: Callable[[float], float], most_um: float, most_left_um: float
 ) -> None:
-    """The laser tells a motion from x to y with a noise of 0.7 µm, most of which was taken out of a
+    """The laser shows a motion from x to y with a noise of 0.7 µm, most of which was taken out of a
     film at rest.
     """
     optics, rng, off_um, sigma_um, left_um, film_um = (

@@ -1,5 +1,5 @@
 """Bands of a pulsed backlight in the phase steps of a set: found, removed, and not mistaken for
-what looks alike.
+what looks the same.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""One effect at a time that `measure` is not told of, rendered by a ray tracer that shares no code
-with it.
+"""One effect at a time that `measure` has no statement of, rendered by a ray tracer that shares no
+code with it.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ def test_the_slow_motion_of_a_held_film_gives_no_false_lines(seed: int) -> None:
 @pytest.mark.parametrize("seed", [307, 312])
 def test_a_line_that_one_rate_alone_shows_may_be_any_of_its_aliases(seed: int) -> None:
     """48 Hz is six times a rate of 8: where two rates of three are blind, another frequency may
-    look alike.
+    look the same.
     """
     time_s, coeffs_um, planted = watched(seed, rates_hz=(8.0, 8 / 1.09, 8 / 1.17), noise_nm=6.0)
     found = find_modes(time_s, coeffs_um)
@@ -227,7 +227,7 @@ Searches = list[dict[int, float]]
 def heard(
     monkeypatch: pytest.MonkeyPatch, listener: VibrationFollower, lines: Searches, day: float = 0.0
 ) -> list[list[Event]]:
-    """What a hold tells in minutes, from a day on, in which modes, by the number of their shape,
+    """What a hold reports in minutes, from a day on, in which modes, by the number of their shape,
     have these lines.
     """
     event_lists: list[list[Event]] = []
