@@ -517,9 +517,28 @@ def _words_outside_limits(register: register_map.Register) -> list[int]:
 
 
 async def examine(url: str, unit_id: int = 1, timeout_s: float = 0.5) -> list[CheckResult]:
-    """Return all findings about the board at a Modbus URL.
+    """Examine the board at a Modbus URL.
 
-    Raises LinkError if it is absent or another program holds it, ValueError for a bad URL.
+    Parameters
+    ----------
+    url : str
+        Of the board.
+    unit_id : int
+        Modbus unit.
+    timeout_s : float
+        Of one exchange.
+
+    Returns
+    -------
+    list of CheckResult
+        All findings.
+
+    Raises
+    ------
+    LinkError
+        The board is absent, or another program holds it.
+    ValueError
+        The URL is wrong.
     """
     link = ModbusLinks().link(url, unit_id, timeout_s)
     await link.connect()

@@ -63,9 +63,24 @@ class ScreenRaster:
 
 
 def compute_pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]:
-    """Light (0..1) of every pixel, (height, width); dark outside the region.
+    """Return the light of every pixel of a screen that shows a pattern.
 
-    Raises ValueError for a role or Gray bit that is unknown.
+    Parameters
+    ----------
+    pattern : Pattern
+        Role, axis, index and phase step.
+    raster : ScreenRaster
+        The screen's pixels, and the pattern's region on it.
+
+    Returns
+    -------
+    (height, width) float32 array
+        From 0 to 1; dark outside the region.
+
+    Raises
+    ------
+    ValueError
+        An unknown role or Gray bit.
     """
     side_mm = 2 * raster.half_side_mm
     s_mm = {axis: raster.from_low_edge_mm(axis) for axis in "xy"}

@@ -40,8 +40,21 @@ def list_changes(old: Section, new: Section, keys: Collection[str] = ()) -> dict
 
 
 def edit_text(text: str, changed: dict[str, dict[str, Any]], path: Path) -> str:
-    """The configuration's text with these keys of its tables; nothing else changes, or InputError
-    is raised.
+    """Return a configuration's text with some keys replaced; nothing else changes.
+
+    Parameters
+    ----------
+    text : str
+        TOML.
+    changed : dict of dict of Any
+        New values by table and key.
+    path : Path
+        For the message.
+
+    Raises
+    ------
+    InputError
+        The edited text would not read as exactly the wanted tables.
     """
     import tomlkit
     from tomlkit.exceptions import TOMLKitError

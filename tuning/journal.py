@@ -87,8 +87,19 @@ def make_entry(
 
 
 def append_entry(logs: Path, what: GainsEntry) -> None:
-    """Append an entry. Raises InputError if it cannot be written;
-    symbolic links are not followed.
+    """Append an entry to the journal; symbolic links are not followed.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder of runs and sessions.
+    what : GainsEntry
+        The entry.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
     """
     path = logs / "tuning" / _FILE
     with errors.convert_write_errors(path):
@@ -121,9 +132,23 @@ def read_entries(logs: Path) -> list[GainsEntry]:
 
 
 def find_roll_back(logs: Path, gains_only: bool = False) -> GainsEntry:
-    """The newest gains kept and not rolled back since. Raises InputError if there are none.
+    """Find the newest gains that were kept and not rolled back since.
 
-    A time constant of the shape loop counts too, unless `gains_only`.
+    Parameters
+    ----------
+    logs : Path
+        Folder of runs and sessions.
+    gains_only : bool
+        A time constant of the shape loop does not count.
+
+    Returns
+    -------
+    GainsEntry
+
+    Raises
+    ------
+    InputError
+        There are none.
     """
     for found in _list_used_gains(logs):
         if found.shape_s is None or not gains_only:

@@ -22,9 +22,23 @@ INDEPENDENT_KEYS = ("setpoint_um", "bleed_fraction", "probe_um", "change_max")
 
 
 def continue_on_hold(folder: SessionFolder, link: HoldLink) -> SessionFolder:
-    """The session, if it can continue with this hold, perhaps a later one than it began on.
+    """Return the session if it can continue with this hold, perhaps a later one than it began on.
 
-    Raises InputError if pump, loop or present gains are not those that its data are for.
+    Parameters
+    ----------
+    folder : SessionFolder
+        The session.
+    link : HoldLink
+        The hold.
+
+    Returns
+    -------
+    SessionFolder
+
+    Raises
+    ------
+    InputError
+        Pump, loop or present gains are not those that its data are for.
     """
     where = f"the hold {link.name}"
     require_same_bench(where, link.config, folder)
@@ -56,7 +70,22 @@ def require_same_devices(path: Path | str, config: schema.Config, folder: Sessio
 
 
 def require_same_bench(path: Path | str, config: schema.Config, folder: SessionFolder) -> None:
-    """Raises InputError if the gains are for another pump or another loop."""
+    """Require that the gains of a session are for this pump and this loop.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file or hold, for the message.
+    config : Config
+        Its configuration.
+    folder : SessionFolder
+        The session.
+
+    Raises
+    ------
+    InputError
+        A key differs that is neither a gain nor independent of the gains.
+    """
     require_same_devices(path, config, folder)
     tuned = folder.config
     for section in ("pump", "loop"):

@@ -61,9 +61,24 @@ def list_installed(group: str) -> list["EntryPoint"]:
 
 
 def load_driver(name: str, kind: DriverKind) -> Any:
-    """Import the driver class that another package installs under this name.
+    """Import the driver class that another package installs under a name.
 
-    Raises ValueError if none or several do, or if it cannot be loaded.
+    Parameters
+    ----------
+    name : str
+        Of the driver.
+    kind : DriverKind
+        Its entry point group.
+
+    Returns
+    -------
+    Any
+        The class.
+
+    Raises
+    ------
+    ValueError
+        None or several packages do, or it cannot be loaded.
     """
     return _load_entry(name, kind.name, list_installed(kind.group))
 

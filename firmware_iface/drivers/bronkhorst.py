@@ -78,10 +78,25 @@ class ParameterPort(Protocol):
 
 
 async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> DeviceIdentity:
-    """Connect and identify the instrument.
+    """Connect and identify an instrument.
 
-    Raises DeviceRefusedError: another type of instrument, or another serial number than `serial`
-    (if that is not empty).
+    Parameters
+    ----------
+    port : ParameterPort
+        Its parameters, over either protocol.
+    types : tuple of str
+        Expected device types.
+    serial : str
+        Expected serial number; empty for any.
+
+    Returns
+    -------
+    DeviceIdentity
+
+    Raises
+    ------
+    DeviceRefusedError
+        Another type of instrument, or another serial number.
     """
     await port.connect()
     found = await port.text(DEVICE_TYPE)

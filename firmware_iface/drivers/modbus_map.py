@@ -83,11 +83,25 @@ def load_preset(name: str) -> dict[str, Any]:
 
 
 def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bool]:
-    """The map, configured keys over those of the preset, and whether the device supports function
-    8.
+    """Make the map of a device from configured keys over those of a preset.
 
-    Raises ValueError (an unknown preset, a missing key, an address or a raw value that the device
-    does not have).
+    Parameters
+    ----------
+    given : dict of Any
+        Keys of the configuration; None for those that are not set.
+    preset_name : str
+        Empty for none.
+
+    Returns
+    -------
+    map : ValueMap
+    fence : bool
+        Whether the device supports function 8.
+
+    Raises
+    ------
+    ValueError
+        An unknown preset, a missing key, an address or a raw value that the device does not have.
     """
     # Keys of the configuration over those of the preset.
     defaults = load_preset(preset_name) if preset_name else {}

@@ -91,8 +91,15 @@ class StreamParser:
 
 
 def distance_mm(raw: float, range_mm: float) -> float:
-    """Distance from the start of the measuring range (page 65, without mastering): (1.02 x / 65520
-    - 0.01) range.
+    """Return the distance from the start of the measuring range: (1.02 x / 65520 - 0.01) range
+    (manual, page 65, without mastering).
+
+    Parameters
+    ----------
+    raw : float
+        Digital value x.
+    range_mm : float
+        Measuring range of the sensor.
     """
     return (1.02 * raw / _RAW_MAX - 0.01) * range_mm
 

@@ -177,7 +177,22 @@ class VaisalaPtb330(line_link.LineDriver):
 def decode_message(message: re.Match[str], name: str) -> BarometerMessage:
     """Check and convert a message that has the form of `FORMAT`.
 
-    Raises LinkError (wrong checksum, or a pressure that the instrument cannot measure).
+    Parameters
+    ----------
+    message : Match[str]
+        The match.
+    name : str
+        Of the instrument, for the error.
+
+    Returns
+    -------
+    BarometerMessage
+        Its pressure is NaN if the instrument reports a fault of its own.
+
+    Raises
+    ------
+    LinkError
+        Wrong checksum, or a pressure that the instrument cannot measure.
     """
     # The sum of all characters, then what the instrument says of its own state.
     checked, pressure, flags, counter, serial, checksum = message.groups()

@@ -147,6 +147,14 @@ class Optoncdt1420Emulator(LineDevice):
 
 
 def encode_three_bytes(value: int, first: bool) -> bytes:
-    """18 bits as low, middle and high byte with their marks (page 67)."""
+    """Encode a value as low, middle and high byte with their marks (manual, page 67).
+
+    Parameters
+    ----------
+    value : int
+        18 bits.
+    first : bool
+        Whether it is the first value of a measurement.
+    """
     low, middle, high = value & 0x3F, value >> 6 & 0x3F, value >> 12 & 0x3F
     return bytes([low, 0x40 | middle, (0x80 if first else 0xC0) | high])

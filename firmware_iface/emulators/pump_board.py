@@ -151,8 +151,14 @@ class BoardState:
         return self._settable["vent_command_fraction"]
 
     def advance(self, now_s: float, sample: BoardSample) -> None:
-        """Take the newest sample at a time (on any axis),
-        then let the board's own protections act.
+        """Take the newest sample, then let the board's own protections act.
+
+        Parameters
+        ----------
+        now_s : float
+            Time on any axis that does not fall.
+        sample : BoardSample
+            What the sensors measure.
         """
         passed_s = now_s - self._now_s
         self._now_s = now_s
@@ -217,8 +223,23 @@ class BoardState:
         self._settable["pump_command_fraction"] = 0.0
 
     def read(self, address: int, count: int) -> list[int]:
-        """Words of one instant. Raises RegisterRefusal (illegal address) if one of them does not
-        exist.
+        """Return the words of one instant.
+
+        Parameters
+        ----------
+        address : int
+            Of the first register.
+        count : int
+            How many.
+
+        Returns
+        -------
+        list of int
+
+        Raises
+        ------
+        RegisterRefusal
+            Illegal address: one of them does not exist.
         """
         values = self._collect_values()
         whole = self._by_span.get((address, count))

@@ -34,6 +34,15 @@ class SetpointWeight:
         self.memory.slow.reset(setpoint_um)
 
     def update(self, setpoint_um: float, dt_s: float) -> float:
-        """Setpoint as seen by the loop."""
+        """Return the setpoint as the loop uses it: the weight's share of a change at once, the rest
+        with Ti.
+
+        Parameters
+        ----------
+        setpoint_um : float
+            The ramped setpoint.
+        dt_s : float
+            Since the last tick.
+        """
         slow_um = self.memory.slow.update(setpoint_um, dt_s, self.ti_s)
         return slow_um + self.weight * (setpoint_um - slow_um)

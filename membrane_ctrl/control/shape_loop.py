@@ -101,7 +101,15 @@ class ShapeLoop:
         self._time_constant_s = time_constant_s
 
     def switch(self, on: bool, now_s: float) -> None:
-        """Switch on, taking a new reference from the present trim, or off, holding the trim."""
+        """Switch the loop on, with a new reference from the present trim, or off, holding the trim.
+
+        Parameters
+        ----------
+        on : bool
+            Whether it runs.
+        now_s : float
+            Time of the tick.
+        """
         if on and self.memory.state == telemetry.ShapeState.OFF:
             self.lock(now_s)
         elif not on:

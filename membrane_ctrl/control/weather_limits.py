@@ -8,7 +8,20 @@ _TEMPERATURE_C = (-20.0, 60.0)
 
 
 def explain_weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
-    """Name the sensor with an impossible reading; absent ones (NaN) do not count."""
+    """Name the sensor with an impossible reading, and the remedy.
+
+    Parameters
+    ----------
+    ambient_pressure_pa : float
+        NaN without a barometer.
+    air_temperature_c : float
+        NaN without a thermometer.
+
+    Returns
+    -------
+    str
+        Empty if both are possible or absent.
+    """
     if not _is_possible(ambient_pressure_pa, _PRESSURE_PA):
         return (
             f"the barometer reads {ambient_pressure_pa:g} Pa: check its unit; the feed-forward "

@@ -16,11 +16,27 @@ class RecentCount(StateNode):
     times_s: deque[float] = field(default_factory=deque)
 
     def add(self, now_s: float, most: int) -> None:
-        """Count one; no more are kept than `too_many` needs."""
+        """Count an event; no more are kept than `too_many` needs.
+
+        Parameters
+        ----------
+        now_s : float
+            Time of the tick.
+        most : int
+            As in `too_many`.
+        """
         self.times_s.append(now_s)
         if len(self.times_s) > most + 1:
             self.times_s.popleft()
 
     def too_many(self, now_s: float, most: int) -> bool:
-        """Whether there were more than allowed."""
+        """Return whether there were more events than allowed within ten minutes.
+
+        Parameters
+        ----------
+        now_s : float
+            Time of the tick.
+        most : int
+            Allowed number.
+        """
         return len(self.times_s) > most and now_s - self.times_s[0] <= _UNSTEADY_S

@@ -46,7 +46,16 @@ class SafeLevels:
         return self.memory.safe_level
 
     def enter(self, safe_level: SafeLevel, now_s: float) -> None:
-        """Enter a level if it is deeper than the present one."""
+        """Enter a level if it is deeper than the present one.
+
+        Parameters
+        ----------
+        safe_level : SafeLevel
+            The level that the verdict requires.
+        now_s : float
+            Time of the tick. A hold of the mean flow that follows soon after another one lasts only
+            what that left of its time.
+        """
         memory = self.memory
         if safe_level > memory.safe_level:
             left_s = max(0.0, memory.used_s - (now_s - memory.cleared_s))

@@ -38,12 +38,23 @@ def continue_from(
     sag_sensitivity: FloatArray,
     held_weights: HeldWeights | None = None,
 ) -> Controller:
-    """Make a controller that continues from a snapshot of a run with this configuration.
+    """Make a controller that continues from a snapshot.
 
     Raises
     ------
     UnknownSnapshotError
         The snapshot is damaged, of another layout, or does not fit the configuration.
+
+    Parameters
+    ----------
+    snapshot : bytes
+        As `take_snapshot` has made it.
+    config : Config
+        The configuration of the same run.
+    sag_sensitivity : (terms,) array
+        Zernike coefficients of a Hencky bowl per sag, in µm per µm.
+    held_weights : HeldWeights or None
+        Weights of the scalar that the loop holds; None for the vertex.
     """
     memory = decode_snapshot(snapshot)
     try:

@@ -164,9 +164,23 @@ class CaptureSet:
 
 
 def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> CaptureHead:
-    """Read `capture.toml`. Raises InputError.
+    """Read `capture.toml` of a set.
 
-    `geometry` replaces the set's own, with the lens and pitch calibrated with it.
+    Parameters
+    ----------
+    folder : str or Path
+        The set.
+    geometry : GeometryFile or None
+        Replaces the set's own geometry, with the lens and pitch calibrated with it.
+
+    Returns
+    -------
+    CaptureHead
+
+    Raises
+    ------
+    InputError
+        The file is missing or describes no valid set.
     """
     folder = Path(folder)
     path = folder / "capture.toml"
@@ -232,8 +246,21 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
 
 
 def read_set(folder: str | Path, geometry: GeometryFile | None = None) -> CaptureSet:
-    """Read a capture set with its images. Raises InputError as `read_head`, and if no frame is
-    usable.
+    """Read a capture set with its images.
+
+    Parameters
+    ----------
+    folder, geometry : as in `read_head`
+        -
+
+    Returns
+    -------
+    CaptureSet
+
+    Raises
+    ------
+    InputError
+        As `read_head`; also if no frame is usable, or the frames have too many pixels.
     """
     head = read_head(folder, geometry)
     camera = head.optics.camera
@@ -311,10 +338,24 @@ def assemble_set(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet
 
 
 def anchor_head(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
-    """Head of a fringes set; its geometry holds for the stated displacement, else for its
+    """Return the head of a fringes set with the geometry of its stated displacement, else of its
     reference's.
 
-    Raises InputError if the two cannot belong together.
+    Parameters
+    ----------
+    head : CaptureHead
+        Of the fringes set.
+    reference : CaptureHead
+        Of the set that gives its fringe orders.
+
+    Returns
+    -------
+    CaptureHead
+
+    Raises
+    ------
+    InputError
+        The two cannot belong together: another camera, another pattern.
     """
     ours = head.optics
     theirs = reference.optics
@@ -390,9 +431,25 @@ def require_inside(name: str, folder: Path, path: Path) -> None:
 
 
 def reference_of(name: str, folder: Path, path: Path) -> Path:
-    """The folder of the set that anchors this one.
+    """Return the folder of the set that anchors this one.
 
-    Raises InputError for a name that cannot be a folder.
+    Parameters
+    ----------
+    name : str
+        As the set states it, relative to its own folder.
+    folder : Path
+        The set.
+    path : Path
+        Its `capture.toml`, for the message.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        The name cannot be a folder.
     """
     try:
         return (folder / name).resolve()

@@ -54,7 +54,19 @@ class ExportedMap:
         return np.isfinite(self.height_mm)
 
     def top_down(self, counts_per_mm: float, missing: int) -> IntArray:
-        """Heights as whole numbers, first row at +y."""
+        """Return the heights as whole numbers, first row at +y.
+
+        Parameters
+        ----------
+        counts_per_mm : float
+            Counts of one mm.
+        missing : int
+            Stands for cells that were not measured.
+
+        Returns
+        -------
+        (rows, columns) int64 array
+        """
         counts = np.rint(np.nan_to_num(self.height_mm) * counts_per_mm)
         whole = np.where(self.is_measured, counts, missing)
         return whole[::-1].astype(np.int64)
@@ -102,7 +114,15 @@ def _check_map(where: Path, x_mm: FloatArray, y_mm: FloatArray, height_mm: Float
 
 
 def fit_fringe_terms(seen: ExportedMap, terms: int) -> grid_fit.GridFit:
-    """Prepare the fit of the first `terms` Fringe terms to the measured cells."""
+    """Prepare the fit of Fringe Zernike terms to the measured cells.
+
+    Parameters
+    ----------
+    seen : ExportedMap
+        The map.
+    terms : int
+        How many, from the first.
+    """
     orders = [zernike.fringe_set_orders(j + 1) for j in range(terms)]
     x = seen.x_mm / seen.radius_mm
     y = seen.y_mm / seen.radius_mm
@@ -110,10 +130,17 @@ def fit_fringe_terms(seen: ExportedMap, terms: int) -> grid_fit.GridFit:
 
 
 def remove_parts(seen: ExportedMap, names: list[str]) -> ExportedMap:
-    """The map without the named parts.
+    """Return the map without some parts.
 
     Piston, tilt and power are fitted together; what is not named stays. `sphere` leaves the
     deviation along the best sphere's normal, and then the other parts of that.
+
+    Parameters
+    ----------
+    seen : ExportedMap
+        The map.
+    names : list of str
+        Keys of `REMOVABLE`, or "sphere".
     """
     height = seen.height_mm
     measured = seen.is_measured

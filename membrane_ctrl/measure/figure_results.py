@@ -59,10 +59,26 @@ class MeasuredFigure:
 def measured_figure(
     measurement: Measurement, bars: ErrorBars | None, nominal_radius_mm: float | None = None
 ) -> MeasuredFigure | None:
-    """Evaluate the figure of a measurement; None if it has no usable one, or hardly a cell.
+    """Evaluate the figure of a measurement.
 
-    Raises InputError for a nominal radius that no sphere over the aperture has; negative ones are
-    convex.
+    Parameters
+    ----------
+    measurement : Measurement
+        The set and its height.
+    bars : ErrorBars or None
+        Its error bars.
+    nominal_radius_mm : float or None
+        Radius of the sphere to compare with; negative for a convex one.
+
+    Returns
+    -------
+    MeasuredFigure or None
+        None if there is no usable figure, or hardly a cell of it.
+
+    Raises
+    ------
+    InputError
+        No sphere of this radius spans the aperture.
     """
     full, mirror = measurement.full, measurement.head.optics.mirror
     if nominal_radius_mm is not None and not abs(nominal_radius_mm) > mirror.analysis_radius_mm:
@@ -134,7 +150,20 @@ def figure_table(
 def make_quantity(
     value: float, of_noise: float, of_geometry: float
 ) -> dict[str, float | None] | None:
-    """A number with its error bars, null where there is none; None if the number does not exist."""
+    """Make one number of `result.json` with its error bars.
+
+    Parameters
+    ----------
+    value : float
+        NaN if it does not exist.
+    of_noise, of_geometry : float
+        1 sigma of each cause; NaN if unknown, which becomes null.
+
+    Returns
+    -------
+    dict of float or None or None
+        None if the number does not exist.
+    """
     if not math.isfinite(value):
         return None
     return {

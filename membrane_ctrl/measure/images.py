@@ -20,10 +20,24 @@ _SHORT = 3  # the type of a 16-bit number in a TIFF
 
 
 def decoded_image(data: bytes, flags: int) -> AnyArray:
-    """The pixels of an image file.
+    """Decode an image file of unknown origin.
 
-    Raises ValueError if it is not an image, is cut short, or has more than `PIXELS_MAX` pixels.
-    `data` is the file's content: PNG, TIFF, BMP or JPEG; `flags` are those of `cv2.imdecode`.
+    Parameters
+    ----------
+    data : bytes
+        The file's content: PNG, TIFF, BMP or JPEG.
+    flags : int
+        Those of `cv2.imdecode`.
+
+    Returns
+    -------
+    (rows, columns) or (rows, columns, channels) array
+        The pixels.
+
+    Raises
+    ------
+    ValueError
+        It is no image, is cut short, or has more than `PIXELS_MAX` pixels.
     """
     if data.startswith(_PNG) and b"IEND" not in data[-12:]:
         # the decoder would write to the terminal, and might fill the rest with black

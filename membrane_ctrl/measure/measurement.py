@@ -60,9 +60,24 @@ class Measurement:
 
 
 def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Measurement:
-    """Measure one set, whatever its frames show; `geometry` replaces the set's own.
+    """Measure one set, whatever its frames show.
 
-    Raises InputError if the set or its reference is invalid.
+    Parameters
+    ----------
+    folder : str or Path
+        The set.
+    geometry : GeometryFile or None
+        Replaces the set's own.
+
+    Returns
+    -------
+    Measurement
+        With the verdict; a set that gives no figure is `rejected`, which is no error.
+
+    Raises
+    ------
+    InputError
+        The set or its reference is invalid.
     """
     # The set, and the one that has its fringe orders. It need not state its film's depth.
     begin = time.perf_counter()
@@ -155,7 +170,24 @@ def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
 
 
 def checked_set(capture: CaptureSet, anchor: Anchor | None) -> Checked:
-    """Check the frames and fit the bins. Raises RejectedSetError if they give no figure."""
+    """Check the frames of a set and fit its bins.
+
+    Parameters
+    ----------
+    capture : CaptureSet
+        The set.
+    anchor : Anchor or None
+        Fringe orders of another set, for a set of fringes alone.
+
+    Returns
+    -------
+    Checked
+
+    Raises
+    ------
+    RejectedSetError
+        The frames give no figure.
+    """
     stack = stack_of(capture)
     optics = capture.head.optics
     if capture.head.kind == "frequencies":

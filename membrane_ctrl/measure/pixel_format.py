@@ -68,9 +68,21 @@ def find_pixel_mistake(frames: Image) -> str:
 
 
 def find_size_mistake(seen: tuple[int, ...], stated: tuple[int, int], dtype: np.dtype) -> str:
-    """Name the packing that explains a picture of another size than stated; empty if none does.
+    """Name the packing that explains a picture of another size than stated.
 
-    Both sizes are (height, width).
+    Parameters
+    ----------
+    seen : tuple of int
+        Height and width of the picture.
+    stated : tuple[int, int]
+        Height and width as stated.
+    dtype : np.dtype
+        Of its pixels.
+
+    Returns
+    -------
+    str
+        For people; empty if none does.
     """
     if len(seen) != 2 or seen[0] != stated[0]:
         return ""

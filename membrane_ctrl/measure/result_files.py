@@ -37,9 +37,26 @@ def write_arrays(path: Path, **arrays: NDArray[Any]) -> None:
 
 
 def read_arrays(path: Path, names: tuple[str, ...], most: int) -> list[FloatArray]:
-    """The named arrays of an untrusted `.npz`, each of 64-bit floats and at most `most` of them.
+    """Read arrays from an untrusted `.npz`; nothing larger than allowed is allocated.
 
-    Raises OSError, or ValueError if it is not such a file. Nothing larger is allocated.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    names : tuple of str
+        The arrays to read.
+    most : int
+        Largest number of values of each.
+
+    Returns
+    -------
+    list of arrays
+        64-bit floats, in the order of `names`.
+
+    Raises
+    ------
+    OSError, ValueError
+        It cannot be read, or is not such a file.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(read_bytes(path, _ARRAYS_BYTES))) as archive:

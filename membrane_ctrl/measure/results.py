@@ -147,12 +147,19 @@ def error_bars(
 
 
 def apply_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
-    """The measurement with the verdict that its error bars allow.
+    """Return the measurement with the verdict that its error bars allow.
 
     A doubt degrades an `ok`, and so does a geometry that rim or slopes contradict. The figure is
     unusable if slopes belong to no surface and no stated uncertainty explains them, or if a
     contradicted geometry has a lens model that folds within the picture: such a model is wrong far
     from its fold, too.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        The set and its height.
+    bars : ErrorBars or None
+        Its error bars; without any the verdict stays.
     """
     if bars is None or measurement.verdict == "rejected":
         return measurement

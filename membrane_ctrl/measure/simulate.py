@@ -294,7 +294,15 @@ def _make_progress_counter(total: int) -> Callable[[int], None] | None:
 
 
 def shrink_camera(camera: CameraConfig, shrink: int) -> CameraConfig:
-    """The same camera with pixels `shrink` times as large, and as many times fewer along a side."""
+    """Return a camera of the same field with fewer, larger pixels.
+
+    Parameters
+    ----------
+    camera : CameraConfig
+        The camera.
+    shrink : int
+        How many times larger the pixels are.
+    """
     column, row = camera.principal
     # pixel centres are integers: the middle of the first large pixel is (shrink - 1) / 2
     first = (shrink - 1) / 2

@@ -451,7 +451,25 @@ def common_size(folders: Iterable[Path]) -> tuple[tuple[int, int], float]:
 
 
 def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tuple[float, float]]:
-    """Named points from NAME=X,Y in mm; A, B and C if none are given. Raises InputError."""
+    """Read the points of a stability run from the command line.
+
+    Parameters
+    ----------
+    given : tuple of str
+        NAME=X,Y each, in mm; A, B and C if there are none.
+    analysis_radius_mm : float
+        Points must lie within it.
+
+    Returns
+    -------
+    dict of tuple[float, float]
+        x and y by name.
+
+    Raises
+    ------
+    InputError
+        A text of another form, or a point outside.
+    """
     points: dict[str, tuple[float, float]] = {}
     for text in given:
         name, _, place = text.partition("=")

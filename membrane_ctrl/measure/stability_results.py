@@ -26,10 +26,22 @@ def series_head(points: Iterable[str]) -> tuple[str, ...]:
 def read_series(
     path: Path, points: int, most: int = 4000
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read times (n,), point heights (n, points) and coefficients (n, terms) of the sets with a
-    figure.
+    """Read the sets with a figure from the series of a stability run.
 
-    At most about `most` of them, evenly spaced, however long the run.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    points : int
+        Number of its points.
+    most : int
+        Read about this many sets at most, evenly spaced.
+
+    Returns
+    -------
+    time_s : (n,) array
+    heights_um : (n, points) array
+    coeffs_um : (n, terms) array
     """
     with path.open(newline="", encoding="utf-8") as file:
         # Every stride-th row, so that at most `most` are left; the first line is the head.

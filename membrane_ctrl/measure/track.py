@@ -141,10 +141,27 @@ def track_command(
 def track_set(
     folder: Path, geometry: GeometryFile | None = None, file: Path | None = None
 ) -> Track:
-    """Measure the figures of a set's frames; `file` is the geometry's, with its covariance.
+    """Measure the figures of a set's frames.
 
-    Raises InputError if the set or its reference is invalid, RejectedError if the reference gives
-    no usable figure.
+    Parameters
+    ----------
+    folder : Path
+        The set of crossed patterns.
+    geometry : GeometryFile or None
+        Replaces its own and its reference's.
+    file : Path or None
+        The geometry's file, which has its covariance.
+
+    Returns
+    -------
+    Track
+
+    Raises
+    ------
+    InputError
+        The set or its reference is invalid.
+    RejectedError
+        The reference gives no usable figure.
     """
     content = read_track(folder)
     path = folder / "capture.toml"

@@ -64,8 +64,15 @@ class FrameRing:
 
     @classmethod
     def for_optics(cls, optics: OpticsConfig, kept_cycles: int = 1) -> FrameRing:
-        """A ring for a full cycle (2 x (N sinusoids + 4 Gray) + white + black) or `kept_cycles`
-        fringes, plus one.
+        """Make a ring that keeps a full cycle (2 x (N sinusoids + 4 Gray) + white + black) and one
+        frame more.
+
+        Parameters
+        ----------
+        optics : OpticsConfig
+            Camera and pattern.
+        kept_cycles : int
+            Cycles of fringes to keep, if that is more.
         """
         camera = optics.camera
         slots = max(2 * (optics.pattern.steps + 4) + 2, kept_cycles * 2 * optics.pattern.steps) + 1
@@ -145,8 +152,19 @@ class FrameReader:
         return [head for head in heads if head is not None]
 
     def copy(self, head: FrameHead, step: int = 1) -> Pixels | None:
-        """Copy of a frame's pixels, every `step`-th in both directions; None once they are
-        overwritten.
+        """Copy the pixels of a frame.
+
+        Parameters
+        ----------
+        head : FrameHead
+            The frame.
+        step : int
+            Every `step`-th pixel in both directions.
+
+        Returns
+        -------
+        (rows, columns) array or None
+            None once the frame has been overwritten.
         """
         slots = self._slots
         if slots.after(head.index) != head.index + 1:

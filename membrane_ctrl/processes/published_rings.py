@@ -47,11 +47,26 @@ def is_control_alive(run_dir: Path) -> bool:
 
 
 def attach_rings(run_dir: Path, whole: Collection[str] = ()) -> dict[str, RingReader]:
-    """Return readers of a run's rings, each at its newest message; those of `whole` at their
-    oldest.
+    """Attach readers to the rings of a run, each at its newest message.
 
-    Raises FileNotFoundError if the run has published none or is over; OSError or RingError for
-    foreign rings.
+    Parameters
+    ----------
+    run_dir : Path
+        The run.
+    whole : collection of str
+        Names of rings to read from their oldest message.
+
+    Returns
+    -------
+    dict of RingReader
+        Readers by name.
+
+    Raises
+    ------
+    FileNotFoundError
+        The run has published none, or is over.
+    OSError, RingError
+        The addresses are not those of our rings.
     """
     readers: dict[str, RingReader] = {}
     with ExitStack() as stack:

@@ -21,11 +21,30 @@ def run_jobs(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> Iterator[Iterable[_Result]]:
-    """Results of a job for each item, in order: in this process, on processes, or on a Dask cluster
-    instead.
+    """Run a job for many items, in this process, on processes, or on a Dask cluster.
 
-    Raises InputError if Dask is not installed or its address is wrong, DeviceError if it does not
-    answer or a worker was killed.
+    Parameters
+    ----------
+    job : callable
+        A function of one item; picklable.
+    items : sequence of _Item
+        The items.
+    workers : int
+        Processes; 1 is this one.
+    scheduler : str or None
+        Address of a Dask scheduler, instead of processes.
+
+    Returns
+    -------
+    iterator of iterable of _Result
+        The results, in the order of the items.
+
+    Raises
+    ------
+    InputError
+        Dask is not installed, or its address is wrong.
+    DeviceError
+        The scheduler does not answer, or a worker was killed.
     """
     if scheduler is not None:
         with _dask_client(scheduler) as client:

@@ -67,6 +67,23 @@ def repair_run(run_dir: Path, in_place: bool = False) -> list[FileFinding]:
 
     Repaired files go to `repaired/` or replace the originals; the part cut off the event log stays
     beside it as `.torn`. A missing summary is always written in place.
+
+    Parameters
+    ----------
+    run_dir : Path
+        The run.
+    in_place : bool
+        Replace the originals.
+
+    Returns
+    -------
+    list of FileFinding
+        A finding for each file.
+
+    Raises
+    ------
+    InputError
+        It is no run folder, or the run is still in progress.
     """
     if not (run_dir / "config.toml").is_file():
         raise errors.InputError(f"{run_dir}: not a run folder (no config.toml)")

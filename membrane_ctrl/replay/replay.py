@@ -240,7 +240,21 @@ def decisions_of(logged: Iterable[tuple[float, Event]]) -> list[Decision]:
 
 
 def find_first_tick(frames: Iterable[InputsFrame], from_s: float) -> int:
-    """The last tick before a time of the run that has a snapshot; 1 if there is none."""
+    """Return the tick from which a replay must begin: the last one before a time that has a
+    snapshot.
+
+    Parameters
+    ----------
+    frames : iterable of InputsFrame
+        The recorded inputs, in order.
+    from_s : float
+        The time of the run.
+
+    Returns
+    -------
+    int
+        1 if there is no snapshot.
+    """
     begin = 1
     for frame in frames:
         for record in frame.records[np.isin(frame.records["tick"], list(frame.snapshots))]:
@@ -254,8 +268,16 @@ def find_first_tick(frames: Iterable[InputsFrame], from_s: float) -> int:
 def recorded_ticks(
     frames: Iterable[InputsFrame], begin: int = 1, snapshots: bool = True
 ) -> Iterator[RecordedTick | Gap]:
-    """Yield the ticks of a record in order from `begin` on,
-    with a `Gap` wherever some are missing.
+    """Yield the ticks of a record in order, with a `Gap` wherever some are missing.
+
+    Parameters
+    ----------
+    frames : iterable of InputsFrame
+        The recorded inputs, in order.
+    begin : int
+        First tick.
+    snapshots : bool
+        Whether the ticks carry their snapshots.
     """
     estimates: dict[float, shape_estimate.ShapeEstimate] = {}
     last, last_s = begin - 1, 0.0
@@ -305,7 +327,17 @@ def drop_repeats(decisions: list[Decision]) -> list[Decision]:
 
 
 def find_unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -> list[str]:
-    """Differences between two lists of decisions, as sentences; times may differ by `slack_s`."""
+    """Return the differences between two lists of decisions, as sentences.
+
+    Parameters
+    ----------
+    recorded : list of Decision
+        Decisions of the run.
+    today : list of Decision
+        Decisions of the replay.
+    slack_s : float
+        By how much times may differ.
+    """
     lines: list[str] = []
     recorded, today = drop_repeats(recorded), drop_repeats(today)
     for place in range(max(len(recorded), len(today))):

@@ -159,9 +159,16 @@ def read_entry(folder: Path) -> RunEntry:
 
 
 def resolve_run(run: str | Path, logs_dir: str | Path = "logs") -> Path:
-    """Find the run's folder: a path; a run's name, or the end of it, below `logs`; or `last`.
+    """Return the folder of a run.
 
     Raises InputError if no run, or more than one, matches.
+
+    Parameters
+    ----------
+    run : str or Path
+        A path; a run's name or a part of it, below the logs; or `last`.
+    logs_dir : str or Path
+        Folder of the runs.
     """
     run, logs_dir = Path(run), Path(logs_dir)
     if run.exists() or not logs_dir.is_dir():

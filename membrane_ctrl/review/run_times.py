@@ -10,13 +10,20 @@ from membrane_ctrl.model.durations import parse_duration_s
 
 
 def moment_s(text: str, origin_utc: datetime) -> float:
-    """Seconds of the run for a written time: `03:12[:30]` (UTC), ISO 8601, or `+90s`, `+1h5m` from
-    its start.
+    """Return the seconds of the run of a written time: `03:12[:30]` (UTC), ISO 8601, or `+90s`,
+    `+1h5m` from its start.
 
     A time of day means its first occurrence after the start of the run. The plus sign may be
     omitted.
 
     Raises InputError if it is none of these.
+
+    Parameters
+    ----------
+    text : str
+        As a person wrote it.
+    origin_utc : datetime
+        Start of the run.
     """
     text = text.strip()
     if re.fullmatch(r"\+? *0+[dhms]?", text):  # the start, which is not a valid duration
@@ -47,7 +54,25 @@ def moment_s(text: str, origin_utc: datetime) -> float:
 
 
 def part_s(origin_utc: datetime, start: str | None, end: str | None) -> tuple[float, float]:
-    """The part of a run between two written times; None: unlimited. Raises InputError."""
+    """Return the part of a run between two written times.
+
+    Parameters
+    ----------
+    origin_utc : datetime
+        Start of the run.
+    start, end : str or None
+        As a person wrote them; None is unlimited.
+
+    Returns
+    -------
+    tuple[float, float]
+        First and last second; infinite if unlimited.
+
+    Raises
+    ------
+    InputError
+        A text is no time, or the first is not before the last.
+    """
     start_s = -math.inf if start is None else moment_s(start, origin_utc)
     until_s = math.inf if end is None else moment_s(end, origin_utc)
     if not start_s < until_s:

@@ -19,7 +19,17 @@ class DetailLevel(IntEnum):
 
 
 def decide_detail_level(free_mb: float, min_free_mb: float, before: DetailLevel) -> DetailLevel:
-    """Level of detail for this much free space, given the previous level."""
+    """Decide how much is recorded, with hysteresis.
+
+    Parameters
+    ----------
+    free_mb : float
+        Free space of the disk.
+    min_free_mb : float
+        The space that must stay free.
+    before : DetailLevel
+        The previous level.
+    """
     level = _level_for_free_space(free_mb, min_free_mb)
     return max(level, min(before, _level_for_free_space(free_mb / _HYSTERESIS, min_free_mb)))
 

@@ -118,8 +118,19 @@ class HoldParts(StateNode):
 
 
 def held_at(level: Mapping[str, Column], time_s: Column) -> BoolArray:
-    """Return (n,) whether the mirror was settled in `hold` at each time, to within a window of the
+    """Return whether the mirror was settled in `hold` at some times, to within a window of the
     level.
+
+    Parameters
+    ----------
+    level : mapping of (windows,) arrays
+        Columns of a level.
+    time_s : (n,) array
+        Times of the run.
+
+    Returns
+    -------
+    (n,) bool array
     """
     starts_s = level["time_s"]
     if not starts_s.size:

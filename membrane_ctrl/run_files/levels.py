@@ -84,9 +84,16 @@ def first_level(ticks: Mapping[str, Column]) -> Columns:
 
 
 def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
-    """A level of longer windows from a finer one; means are weighted by the number of ticks.
+    """Make a level of longer windows from a finer one; means are weighted by the number of ticks.
 
     The coarser level lacks the signals and codes that the finer one lacks.
+
+    Parameters
+    ----------
+    level : mapping of (windows,) arrays
+        Columns of the finer level.
+    window_s : float
+        Length of the new windows.
     """
     if not level["time_s"].size:
         return {name: np.empty(0) for name in level}

@@ -149,8 +149,17 @@ class Run:
         return named_tables.named_table(level, self.origin_utc)
 
     def cycles(self, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
-        """The measured figure, one row per cycle: times, `z1_um` and all other terms, sag, quality,
-        verdict.
+        """Return the measured figures, one row per cycle.
+
+        Parameters
+        ----------
+        start_s, end_s : float
+            The part of the run.
+
+        Returns
+        -------
+        Table
+            Times, `z1_um` and all other terms, sag, quality, verdict.
         """
         found = self.shapes()
         wanted = (found.time_s >= start_s) & (found.time_s < end_s)
@@ -251,8 +260,19 @@ class Run:
     def tick_blocks(
         self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf
     ) -> Iterator[Block]:
-        """Telemetry as arrays, codes as numbers, in blocks: a month needs no more memory than a
-        night.
+        """Read telemetry in blocks: a month needs no more memory than a night.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Columns; the time is read as well.
+        start_s, end_s : float
+            The part of the run.
+
+        Returns
+        -------
+        iterator of Block
+            Arrays by name, codes as numbers.
         """
         wanted = _with_time(names)
         return self._iterate_blocks(table_specs.TICKS, wanted, start_s, end_s)

@@ -23,14 +23,32 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: Config) -> Path:
-    """Make `<logs_dir>/20261121T012345Z-<name>` with `run.json`, and `config.toml` including every
-    default.
+    """Make the folder `<logs_dir>/20261121T012345Z-<name>` with `run.json`, and `config.toml`
+    including every default.
 
-    A second run in the same second gets the suffix `-2`.
+    Parameters
+    ----------
+    logs_dir : Path
+        Folder of the runs.
+    name : str
+        Letters, digits, dot, dash and underscore.
+    started_utc : datetime
+        Start of the run; a second run in the same second gets the suffix `-2`.
+    config : Config
+        As it runs.
 
-    Raises InputError if the name has characters other than letters, digits, dot, dash and
-    underscore. Raises DeviceError, and leaves nothing behind, if the folder cannot be written or
-    the disk has less than `recording.min_free_mb` free.
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    InputError
+        The name has other characters.
+    DeviceError
+        The folder cannot be written, or the disk has less than `recording.min_free_mb` free;
+        nothing is left behind.
     """
     if not _NAME.fullmatch(name):
         raise errors.InputError(

@@ -93,8 +93,15 @@ class LogHistogram(StateNode):
 
 
 def count_least_ticks(window_s: float, rate_hz: float) -> float:
-    """Ticks that a window must have: nine tenths, or all but one, which may have come just behind
-    its end.
+    """Return how many ticks a window must have: nine tenths, or all but one, which may have come
+    just behind its end.
+
+    Parameters
+    ----------
+    window_s : float
+        Length of the window.
+    rate_hz : float
+        Ticks a second.
     """
     ticks = window_s * rate_hz
     return min(_LEAST_SHARE * ticks, ticks - 1)
@@ -118,7 +125,15 @@ class SecondMeans(StateNode):
     last: float = math.nan
 
     def add(self, time_s: Column, values: Column) -> None:
-        """Add (n,) values at their times, which rise; those that are not finite are omitted."""
+        """Add values at their times; those that are not finite are omitted.
+
+        Parameters
+        ----------
+        time_s : (n,) array
+            Rising, also from block to block.
+        values : (n,) array
+            The values.
+        """
         finite = np.isfinite(values)
         # The second that is not complete yet goes before the new values
         second = np.append(self.second, np.floor(time_s[finite] + 1e-9))

@@ -108,7 +108,18 @@ class Shapes:
         return {"time_s": self.time_s} | coeffs | numbers | {"verdict": self.verdict}
 
     def heights_um(self, x: Column, y: Column) -> Column:
-        """(n, points) height above the vertex at points of the unit disc (mirror radius 1), µm."""
+        """Return the heights of all figures above their vertex at points of the mirror.
+
+        Parameters
+        ----------
+        x, y : (points,) array
+            Points of the unit disc; the mirror's radius is 1.
+
+        Returns
+        -------
+        (n, points) array
+            µm.
+        """
         return self.parameters_um() @ make_height_basis(x, y)
 
     def parameters_um(self) -> Column:
@@ -123,7 +134,18 @@ class Shapes:
 
 
 def make_height_basis(x: Column, y: Column) -> Column:
-    """(terms + 1, points): height above the vertex per unit of each parameter."""
+    """Return the height above the vertex per unit of each parameter.
+
+    Parameters
+    ----------
+    x, y : (points,) array
+        Points of the unit disc.
+
+    Returns
+    -------
+    (terms + 1, points) array
+        The last row is that of the Hencky bowl.
+    """
     units = np.eye(ZERNIKE_TERMS + 1)
     return np.stack([Surface(unit[:-1], unit[-1], 1.0).height(x, y) for unit in units])
 
@@ -218,7 +240,18 @@ def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
 def difference_map_um(
     estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate
 ) -> Map:
-    """Height minus that of the reference, each above its own vertex; µm, as `height_map_mm`."""
+    """Return the map of a change: height minus that of the reference, each above its own vertex.
+
+    Parameters
+    ----------
+    estimate, reference : ShapeEstimate
+        The two figures.
+
+    Returns
+    -------
+    (m, m) array
+        µm, NaN outside the mirror.
+    """
     change_um = estimate.coeffs_um - reference.coeffs_um
     return change_map_um(np.append(change_um, estimate.hencky_um - reference.hencky_um))
 
@@ -269,7 +302,7 @@ def without_noll_terms(height: AnyArray, indices: Sequence[int]) -> AnyArray:
     Parameters
     ----------
     height : (m, m) array
-        Map of the unit disc, on the grid of `Shapes`; NaN outside it.
+        Map of the unit disc, on the grid of this module's maps; NaN where it is not measured.
     indices : sequence of int
         Noll indices of the terms.
 

@@ -55,13 +55,22 @@ class BenchReport:
 
 
 def serve_bench(spec: BenchSpec, ready: Connection) -> None:
-    """Serve the bench in a spawned process until `processes.STOP`, or until `linger_s` after the
-    parent's end.
+    """Serve the bench in a spawned process, until `processes.STOP` or until `linger_s` after the
+    parent's end. SIGINT is ignored: Ctrl-C goes to the whole terminal, and the bench must
+    outlive the controller's safe stop.
 
     `ready` gets one BenchReport; a bench that cannot be built or cannot listen reports that and
     ends. SIGINT is
     ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe
     stop.
+
+    Parameters
+    ----------
+    spec : BenchSpec
+        The bench.
+    ready : Connection
+        Receives one BenchReport; a bench that cannot be built or cannot listen reports that and
+        ends.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if spec.speed <= 1.0:

@@ -32,8 +32,8 @@ class Gas:
     def step(
         self, added_ml: float, follow: float, ambient_pa: float, air_k: float, volume: float
     ) -> None:
-        """One time step: gas added (or lost), warmed towards the air, and back in balance with the
-        films.
+        """Advance by one time step: gas added (or lost), warmed towards the air, and back in
+        balance with the films.
 
         Ideal gas in films of volume V = c p^(1/3): with u = p^(1/3), (ambient + u^3) c u = P V of
         the gas. The left side is convex and almost linear in u (u^3 is 0.6 % of ambient), so that
@@ -42,6 +42,19 @@ class Gas:
 
         `added_ml` is reference mL in minus out, `follow` the share of the difference to the air
         temperature that this step closes, `volume` the c of both films in m^3 per Pa^(1/3).
+
+        Parameters
+        ----------
+        added_ml : float
+            Reference mL in minus out.
+        follow : float
+            Share of the difference to the air's temperature that this step closes.
+        ambient_pa : float
+            Pressure of the room.
+        air_k : float
+            Temperature of the room.
+        volume : float
+            The c of both films, in m^3 per Pa^(1/3).
         """
         amount_ml = self.amount_ml + added_ml
         self.amount_ml = amount_ml if amount_ml > 0.0 else 0.0  # a third of the time of max()
@@ -53,7 +66,15 @@ class Gas:
         self.root_pa = u if u > 0.0 else 0.0
 
     def root_pa_per_ml(self, ambient_pa: float, volume: float) -> float:
-        """du/d(amount) at constant temperature and ambient pressure."""
+        """Return du/d(amount) at constant temperature and ambient pressure.
+
+        Parameters
+        ----------
+        ambient_pa : float
+            Pressure of the room.
+        volume : float
+            The c of both films, in m^3 per Pa^(1/3).
+        """
         joule_per_ml = JOULE_PER_ML * self.temperature_k / REFERENCE_K
         return joule_per_ml / (volume * (ambient_pa + 4 * self.gauge_pressure_pa))
 
@@ -61,7 +82,17 @@ class Gas:
 def fill_gas(
     gauge_pressure_pa: float, temperature_k: float, ambient_pa: float, volume: float
 ) -> Gas:
-    """Gas at a gauge pressure between films of `volume` m^3 per Pa^(1/3)."""
+    """Return the gas at a gauge pressure between films.
+
+    Parameters
+    ----------
+    gauge_pressure_pa, ambient_pa : float
+        Pressures.
+    temperature_k : float
+        Of the gas.
+    volume : float
+        The c of both films, in m^3 per Pa^(1/3).
+    """
     root_pa = gauge_pressure_pa ** (1 / 3)
     pv = (ambient_pa + gauge_pressure_pa) * volume * root_pa
     return Gas(pv / (JOULE_PER_ML * temperature_k / REFERENCE_K), temperature_k, root_pa)

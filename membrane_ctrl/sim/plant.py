@@ -93,7 +93,18 @@ class Plant:
         return self._steps * STEP_S
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
-        """Set the commands. Raises ValueError unless both are 0..1."""
+        """Set the commands of pump and vent.
+
+        Parameters
+        ----------
+        pump_fraction, vent_fraction : float
+            From 0 to 1.
+
+        Raises
+        ------
+        ValueError
+            One is not.
+        """
         if not (0 <= pump_fraction <= 1 and 0 <= vent_fraction <= 1):
             raise ValueError(
                 f"pump {pump_fraction:g} and vent {vent_fraction:g} must be fractions 0..1"

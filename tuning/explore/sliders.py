@@ -25,7 +25,16 @@ class Sliders:
     filter_s: float
 
     def make_gains(self, model: plant_model.PlantModel, dt_s: float) -> closed_loop.Gains:
-        """PI gains, K = 1 / (k (tc + d)), Ti = c (tc + d): SIMC for c = 4 (Skogestad 2003)."""
+        """Return the gains of a setting: K = 1 / (k (tc + d)), Ti = c (tc + d), SIMC for c = 4
+        (Skogestad 2003).
+
+        Parameters
+        ----------
+        model : PlantModel
+            The plant, with its gain k; d is its effective delay.
+        dt_s : float
+            Period of a tick.
+        """
         slowed_s = self.closed_loop_s + tuning_rules.compute_effective_delay_s(
             model, dt_s, self.filter_s
         )
@@ -34,7 +43,13 @@ class Sliders:
         )
 
     def within_reach(self, model: plant_model.PlantModel, dt_s: float) -> Sliders:
-        """The nearest setting that the sliders offer."""
+        """Return the nearest setting that the sliders offer.
+
+        Parameters
+        ----------
+        model, dt_s : as in `make_gains`
+            -
+        """
         low_s, high_s = find_time_constants_s(model, dt_s)
         return Sliders(
             _clip(self.closed_loop_s, low_s, high_s),
@@ -46,7 +61,15 @@ class Sliders:
     def place_near(
         cls, gains: closed_loop.Gains, model: plant_model.PlantModel, dt_s: float
     ) -> Sliders:
-        """The setting of the sliders that gives these gains, as far as they reach."""
+        """Return the setting that gives some gains, as far as the sliders reach.
+
+        Parameters
+        ----------
+        gains : Gains
+            The gains.
+        model, dt_s : as in `make_gains`
+            -
+        """
         slowed_s = 1 / (model.gain * max(gains.kp_per_s, 1e-9))
         delay_s = tuning_rules.compute_effective_delay_s(model, dt_s, gains.filter_s)
         within = _clip(slowed_s - delay_s, DELAYS[0] * delay_s, DELAYS[1] * delay_s)
@@ -55,7 +78,15 @@ class Sliders:
 
 
 def find_time_constants_s(model: plant_model.PlantModel, dt_s: float) -> tuple[float, float]:
-    """The shortest and the longest closed-loop time constant of the slider."""
+    """Return the shortest and the longest closed-loop time constant of the slider, in s.
+
+    Parameters
+    ----------
+    model : PlantModel
+        The plant.
+    dt_s : float
+        Period of a tick.
+    """
     delay_s = tuning_rules.compute_effective_delay_s(model, dt_s, 0.0)
     return DELAYS[0] * delay_s, DELAYS[1] * delay_s
 

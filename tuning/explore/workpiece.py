@@ -50,10 +50,23 @@ class Workpiece:
 
 
 def load_workpiece(path: Path, logs: Path) -> Workpiece:
-    """The workpiece of a session folder or of a run folder.
+    """Load what is explored, from a session folder or from a run folder.
 
-    Raises InputError if it is neither, a session without quiet hold, or a run without 200 s of
-    undisturbed hold.
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    logs : Path
+        Folder of runs and sessions.
+
+    Returns
+    -------
+    Workpiece
+
+    Raises
+    ------
+    InputError
+        It is neither, a session without quiet hold, or a run without 200 s of undisturbed hold.
     """
     return (
         load_from_session(folder.open_session(path))
@@ -80,8 +93,15 @@ def load_from_session(opened: folder.SessionFolder) -> Workpiece:
 
 
 def load_from_run(path: Path, logs: Path) -> Workpiece:
-    """Weather of a run's longest undisturbed hold; plant of the newest session, else as the
-    configuration assumes.
+    """Load the weather of a run's longest undisturbed hold, and a plant.
+
+    Parameters
+    ----------
+    path : Path
+        The run.
+    logs : Path
+        Where the newest session is searched for, which gives the plant; without one it is as the
+        configuration assumes.
     """
     run = open_run(path)
     loop = run.config.loop

@@ -74,7 +74,20 @@ class ActuatorKind:
 
 
 def recognise_actuator(record: Record, identified: Identified) -> ActuatorKind:
-    """The kind of actuator that the record of the experiments shows."""
+    """Recognise the kind of actuator from the record of the experiments.
+
+    Parameters
+    ----------
+    record : Record
+        Readings and commanded flow of the experiments.
+    identified : Identified
+        The plant that was fitted to them.
+
+    Returns
+    -------
+    ActuatorKind
+        One lag, two lags, or a lag with backlash.
+    """
     model = identified.model
     plain = _fit_remaining(record, identified, model, record.flow_um_per_s, 0.0)
     swing = float(np.ptp(np.quantile(record.flow_um_per_s, _SWING_QUANTILES)))
@@ -108,7 +121,19 @@ def recognise_actuator(record: Record, identified: Identified) -> ActuatorKind:
 
 
 def follow_with_play(flow_um_per_s: Series, play_um_per_s: float) -> Series:
-    """The flow that an actuator with play follows; it begins in the middle of its play."""
+    """Return the flow that an actuator with play follows; it begins in the middle of its play.
+
+    Parameters
+    ----------
+    flow_um_per_s : (n,) array
+        Commanded flow.
+    play_um_per_s : float
+        Half the width of the play: the flow stays until the command is this far away.
+
+    Returns
+    -------
+    (n,) array
+    """
     followed = np.empty(flow_um_per_s.size)
     value = float(flow_um_per_s[0])
     for i, flow in enumerate(flow_um_per_s.tolist()):

@@ -59,7 +59,20 @@ class Gains:
 
 
 def make_frequencies(dt_s: float, points: int = 400) -> Series:
-    """Angular frequencies from far below any loop to Nyquist, evenly in their logarithm."""
+    """Return angular frequencies from far below any loop to Nyquist, evenly in their logarithm.
+
+    Parameters
+    ----------
+    dt_s : float
+        Period of a tick.
+    points : int
+        How many.
+
+    Returns
+    -------
+    (points,) array
+        rad/s.
+    """
     return np.geomspace(SLOWEST_RAD_PER_S, np.pi / dt_s, points)
 
 
@@ -87,7 +100,20 @@ def compute_pump_response(model: PlantModel, w_rad_per_s: Series, dt_s: float) -
 
 
 def compute_controller_response(gains: Gains, w_rad_per_s: Series) -> ComplexArray:
-    """Compute the response (n,) from error to commanded flow, C F."""
+    """Compute the response from error to commanded flow, C F of the module's equation.
+
+    Parameters
+    ----------
+    gains : Gains
+        Of the PID and its filter.
+    w_rad_per_s : (n,) array
+        Angular frequencies.
+
+    Returns
+    -------
+    (n,) complex array
+        1/s.
+    """
     s = 1j * w_rad_per_s
     three_terms = 1 + 1 / (s * gains.ti_s) + s * gains.td_s
     return np.asarray(gains.kp_per_s * three_terms / (1 + s * gains.filter_s))

@@ -45,6 +45,20 @@ class DisturbanceModel:
 
         The feed-forward takes a channel's movement x away as far as the pump is in time: x (1 - H),
         with H the pump behind the feed-forward's filter; the sensor's noise comes in through H.
+
+        Parameters
+        ----------
+        w_rad_per_s : (n,) array
+            Angular frequencies.
+        model : PlantModel
+            The plant.
+        loop : LoopConfig
+            Which weather channels the feed-forward uses, with their gains and filters.
+
+        Returns
+        -------
+        (n,) array
+            µm^2 s.
         """
         dt_s = self.rest.dt_s
         pump = closed_loop.compute_pump_response(model, w_rad_per_s, dt_s)
@@ -63,7 +77,20 @@ class DisturbanceModel:
         return np.asarray(total, dtype=float)
 
     def feedforward_psd(self, w_rad_per_s: Series, loop: LoopConfig) -> Series:
-        """Two-sided spectrum of the flow that the loop's feed-forward asks for, (µm/s)^2 s."""
+        """Return the two-sided spectrum of the flow that the feed-forward commands.
+
+        Parameters
+        ----------
+        w_rad_per_s : (n,) array
+            Angular frequencies.
+        loop : LoopConfig
+            Which weather channels the feed-forward uses, with their gains and filters.
+
+        Returns
+        -------
+        (n,) array
+            (µm/s)^2 s.
+        """
         total = np.zeros_like(w_rad_per_s)
         for weather, used, gain, filter_s in self._list_channels(loop):
             if not used:

@@ -205,7 +205,20 @@ def _explain_colour(record: Record) -> str:
 
 
 def find_bent_curve(record: Record, identified: Identified) -> list[FitFinding]:
-    """The problem, if one gain does not describe both halves of the pump's range."""
+    """Find whether one gain describes both halves of the pump's range.
+
+    Parameters
+    ----------
+    record : Record
+        Readings and commanded flow of the experiments.
+    identified : Identified
+        The plant that was fitted to them.
+
+    Returns
+    -------
+    list of FitFinding
+        One finding if the two gains differ beyond their errors and by more than a share; else none.
+    """
     found = fit_two_gains(record, identified)
     least = max(_BENT_SIGMAS * found.difference_sigma, _BENT_SHARE * identified.model.gain)
     if abs(found.above - found.below) < least:

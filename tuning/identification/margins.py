@@ -45,11 +45,20 @@ class Margins:
 
 
 def compute_margins(gains: Gains, model: PlantModel, dt_s: float) -> Margins:
-    """Margins of a loop sampled every `dt_s`.
+    """Return the margins of a sampled loop.
 
     L has two poles at the origin (mirror and integrator) and none to the right, so that the loop is
     stable if and only if the phase at every gain crossing is above -180 deg. Stability is read from
     the number of turns of 1 + L about 0, which also sees loops with several crossings.
+
+    Parameters
+    ----------
+    gains : Gains
+        Of the PID and its filter.
+    model : PlantModel
+        The plant.
+    dt_s : float
+        Period of a tick.
     """
     # Up to Nyquist's frequency, or to 20 over the delay.
     fastest_rad_per_s = max(np.pi / dt_s, 20 / max(model.delay_s, _FINE_DT_S))
@@ -92,7 +101,18 @@ def is_stable(response: ComplexArray) -> bool:
 
 
 def find_sensitivity_peak(gains: Gains, model: PlantModel, dt_s: float) -> float:
-    """Ms on a coarse grid (to 1 %), for searches; infinite for an unstable loop."""
+    """Return the peak Ms of the sensitivity on a coarse grid (to 1 %), for searches.
+
+    Parameters
+    ----------
+    gains, model, dt_s : as in `compute_margins`
+        -
+
+    Returns
+    -------
+    float
+        Infinite for an unstable loop.
+    """
     response = compute_loop_response(gains, model, make_frequencies(dt_s), dt_s)
     if not is_stable(response):
         return math.inf

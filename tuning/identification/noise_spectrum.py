@@ -118,7 +118,20 @@ class Noise:
 
 
 def remove_pump_motion_um(record: Record, model: plant_model.PlantModel) -> Series:
-    """z: the readings without the effect of pump and mean leak, (n,) µm."""
+    """Return z: the readings without the effect of pump and mean leak.
+
+    Parameters
+    ----------
+    record : Record
+        n ticks; missing readings are filled.
+    model : PlantModel
+        Gain, dead time and lag of the pump.
+
+    Returns
+    -------
+    (n,) array
+        µm.
+    """
     driven = plant_model.compute_driven_um(
         record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s
     )

@@ -61,7 +61,20 @@ class NoiseModel:
     gamma: float
 
     def whitened(self, moved_um: Series, dt_s: float) -> Series:
-        """Prediction errors from the increments of the noise."""
+        """Return the prediction errors of the noise model.
+
+        Parameters
+        ----------
+        moved_um : (n,) array
+            Increments of the noise from tick to tick.
+        dt_s : float
+            Period of a tick.
+
+        Returns
+        -------
+        (n,) array
+            µm; white if the model is right.
+        """
         phi = math.exp(-dt_s / _FILM_S)
         zeros = [1.0, -(self.beta + self.gamma), self.beta * self.gamma]
         return np.asarray(lfilter([1.0, -phi], zeros, moved_um), dtype=float)

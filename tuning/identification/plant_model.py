@@ -51,7 +51,22 @@ class PlantModel:
 
 
 def delay_series(series: Series, delay_s: float, dt_s: float) -> Series:
-    """Values `delay_s` ago, linear between samples; the first value before the record."""
+    """Return a series as it was some time ago, linear between samples.
+
+    Parameters
+    ----------
+    series : (n,) array
+        The values.
+    delay_s : float
+        How long ago.
+    dt_s : float
+        Time between samples.
+
+    Returns
+    -------
+    (n,) array
+        The first value stands for those before the record.
+    """
     if delay_s == 0:
         return series
     ticks = np.arange(series.size, dtype=float)
@@ -105,8 +120,19 @@ def compute_driven_um(
 
 
 def compute_pump_share_um(record: Record, model: PlantModel) -> Series:
-    """Motion of the centre due to pump and leak alone, with the mean of a record's readings,
-    (n,).
+    """Return the motion of the centre due to pump and leak alone.
+
+    Parameters
+    ----------
+    record : Record
+        n ticks with the commanded flow.
+    model : PlantModel
+        The plant.
+
+    Returns
+    -------
+    (n,) array
+        µm, with the mean of the record's readings.
     """
     x = compute_driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     leaked_um = model.leak_um_per_s * np.arange(len(record)) * record.dt_s

@@ -246,10 +246,17 @@ class Surveyed:
 
 
 def is_stuck(fit: PumpFit, rising: Branch) -> bool:
-    """Whether it is certain that no command so far gives a flow that matters.
+    """Return whether it is certain that no command so far gives a flow that matters.
 
     A pump that is stuck at what leaks makes the mirror look tight, so that a share of the leak does
     not suffice as a limit.
+
+    Parameters
+    ----------
+    fit : PumpFit
+        Leak, and flows by their commands.
+    rising : Branch
+        The branch of commands from below.
     """
     if not rising.flows.size:
         return False

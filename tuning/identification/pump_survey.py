@@ -108,8 +108,14 @@ class PumpSurvey:
         return sum(run.dt_s * run.fraction.size for run in self.runs)
 
     def add_run(self, run: PumpRun, completed: bool) -> None:
-        """Learn from a run; one that its guard stopped counts as well, and the next ones go less
-        far.
+        """Add a run. One that its guard stopped counts as well, and the next ones go less far.
+
+        Parameters
+        ----------
+        run : PumpRun
+            Commands and readings of one round.
+        completed : bool
+            Whether the guard let it end.
         """
         self._rounds += 1
         duration_s = run.fraction.size * run.dt_s

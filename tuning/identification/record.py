@@ -32,7 +32,17 @@ class Record:
     def from_samples(
         cls, dt_s: float, flows_um_per_s: Sequence[float], samples: Sequence[BenchSample]
     ) -> Record:
-        """Make a record from samples and the flows that followed them."""
+        """Make a record from samples and the flows that followed them.
+
+        Parameters
+        ----------
+        dt_s : float
+            Time between samples.
+        flows_um_per_s : sequence of float
+            Commanded after each sample.
+        samples : sequence of BenchSample
+            As many.
+        """
         columns = [
             [getattr(sample, field.name) for sample in samples] for field in fields(BenchSample)
         ]
@@ -75,7 +85,15 @@ class Record:
         return [float(samples) * self.dt_s for samples in ends - begins]
 
     def cut(self, start_s: float, stop_s: float) -> Record:
-        """The samples from `start_s` up to, but excluding, `stop_s`."""
+        """Return the samples of a part of the record.
+
+        Parameters
+        ----------
+        start_s : float
+            From here on, counted from the first sample.
+        stop_s : float
+            Up to here, excluded.
+        """
         cut = slice(round(start_s / self.dt_s), round(stop_s / self.dt_s))
         return Record(self.dt_s, *(column[cut] for column in self._list_columns()))
 

@@ -87,7 +87,21 @@ class WeatherFit:
 
 
 def lag_series(series: Series, lag_s: float, dt_s: float) -> Series:
-    """Series (n,) behind a first-order lag that starts at its first value."""
+    """Return a series behind a first-order lag that starts at its first value.
+
+    Parameters
+    ----------
+    series : (n,) array
+        The values.
+    lag_s : float
+        Time constant.
+    dt_s : float
+        Time between samples.
+
+    Returns
+    -------
+    (n,) array
+    """
     share = lag_step_fraction(dt_s, lag_s)
     from_first = series - series[0]
     followed = np.asarray(lfilter([share], [1.0, share - 1.0], from_first), dtype=float)

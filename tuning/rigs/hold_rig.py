@@ -86,7 +86,15 @@ class HoldRig:
         return record, setpoints
 
     def around(self, held: Record, limit_um: float = 10.0) -> operating_point.OperatingPoint:
-        """Operating point of an experiment, from the hold before it."""
+        """Return the operating point of an experiment.
+
+        Parameters
+        ----------
+        held : Record
+            The hold before it: its mean flow and noise.
+        limit_um : float
+            How far the mirror may move from the setpoint.
+        """
         return make_operating_point(held, self.loop, self.pump, limit_um)
 
     def perform(self, spec: ExperimentSpec) -> tuple[Record, experiment.Finished]:

@@ -41,8 +41,19 @@ class TicksByFigures:
     def add_rows(
         self, rows: Sequence[telemetry.TelemetryRow], shapes: Sequence[shape_estimate.ShapeEstimate]
     ) -> list[telemetry.TelemetryRow]:
-        """Return the ticks that are complete, of these and earlier ones; NaN where no figure shows
-        the mirror.
+        """Add new ticks and figures, and return the ticks that are complete.
+
+        Parameters
+        ----------
+        rows : sequence of TelemetryRow
+            The newest ticks, in order.
+        shapes : sequence of ShapeEstimate
+            The newest figures, in order.
+
+        Returns
+        -------
+        list of TelemetryRow
+            Of these and earlier ones; the displacement is NaN where no figure shows the mirror.
         """
         self._waiting.extend(rows)
         for shape in shapes:

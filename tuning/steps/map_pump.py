@@ -80,6 +80,25 @@ def map_pump(
     The session restarts on it. The gains stay if they suit the measured actuator; else they
     become slower ones that do. Raises RejectedError with what to do if there is no curve, or the
     steps contradict it; the former curve and gains are then restored.
+
+    Parameters
+    ----------
+    session : SessionFolder
+        The session.
+    rig : HoldRig
+        Holds the mirror.
+    limit_um : float
+        How far the mirror may move from the setpoint.
+
+    Returns
+    -------
+    tuple[MappedPump, SessionFolder]
+        The curve, and the session as it continues with it.
+
+    Raises
+    ------
+    RejectedError
+        There is no curve, or steps of the flow contradict it; with what to do.
     """
     before = rig.pump
     try:
@@ -247,8 +266,14 @@ def _wait_for_return(rig: HoldRig) -> bool:
 
 
 def make_pump_run(rows: Sequence[telemetry.TelemetryRow], dt_s: float) -> pump_run.PumpRun:
-    """The ticks of an experiment with pump commands; the hold before
-    and after it does not count.
+    """Make the record of an experiment with pump commands from the rows of a hold.
+
+    Parameters
+    ----------
+    rows : sequence of TelemetryRow
+        Ticks before, during and after the experiment; only those in state `tune` count.
+    dt_s : float
+        Period of a tick.
     """
     # the first still has the loop's command
     tune = [row for row in rows if row.state == telemetry.State.TUNE][1:]

@@ -19,8 +19,17 @@ _TIMED_TO_MINUTES = ("flow step", "noise change")
 
 
 def find_excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> list[FoundEvent]:
-    """The 1 s mean of the error leaves the band without a fault, pause, ramp or event that explains
-    it.
+    """Find where the 1 s mean of the error leaves the band without a fault, pause, ramp or event
+    that explains it.
+
+    Parameters
+    ----------
+    level : Level
+        Columns of the 1 s level.
+    band_um : float
+        Half width of the band.
+    known : sequence of FoundEvent
+        Events that were found before.
     """
     time_s, error_um = level["time_s"], level["mean_error_um"]
     # Seconds beyond the band, without those that a fault, a pause or a ramp explains

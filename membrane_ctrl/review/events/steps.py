@@ -83,10 +83,21 @@ def mean_differences(values: Column, half: int, skip: int) -> Column:
 
 
 def local_sigma(values: Column, share: float = 0.5) -> Column:
-    """(n,) robust standard deviation of stretches of the series, constant within each, about 0.
+    """Return a robust standard deviation of stretches of a series about 0, constant within each.
 
     The quantile `share` of the absolute values is compared with that of a normal distribution. Half
     (the median) is the most robust, but fails for values that mostly repeat.
+
+    Parameters
+    ----------
+    values : (n,) array
+        The series; NaN values are left out.
+    share : float
+        The quantile to use, from 0 to 1.
+
+    Returns
+    -------
+    (n,) array
     """
     result = np.full(values.size, np.nan)
     sigmas = float(special.ndtri(0.5 * (1 + share)))
@@ -103,7 +114,13 @@ def local_sigma(values: Column, share: float = 0.5) -> Column:
 
 
 def step_confidence(sigmas: float, looked_at: int) -> float:
-    """1 minus the probability that (normal) noise alone makes a step this high anywhere in
-    `looked_at` places.
+    """Return 1 minus the probability that normal noise alone makes a step this high anywhere.
+
+    Parameters
+    ----------
+    sigmas : float
+        Height of the step in standard deviations.
+    looked_at : int
+        Number of places that were examined.
     """
     return float(max(0.0, 1.0 - looked_at * special.erfc(sigmas / np.sqrt(2))))

@@ -163,6 +163,18 @@ def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> 
 
     A gap in the times (s, ascending, in the column `time_name`) is longer than 5 s and three of
     their usual steps.
+
+    Parameters
+    ----------
+    columns : mapping of Column
+        Columns of n rows by name.
+    time_name : str
+        The column of times.
+
+    Returns
+    -------
+    dict of Column
+        The same columns with a row of NaN in every gap.
     """
     time_s = columns[time_name]
     steps_s = np.diff(time_s)

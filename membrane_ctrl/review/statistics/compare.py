@@ -46,11 +46,21 @@ class Difference:
 
 
 def compare_analyses(ours: Analysis, theirs: Analysis) -> list[Difference]:
-    """Differences of two analyses.
+    """Compare two analyses number by number.
 
     Means are tested between blocks: each run gives one every five minutes, and Welch's t test asks
     whether the two sets differ. Spreads are tested so, too, and as a whole (`spread_p`); slopes by
     their own standard errors.
+
+    Parameters
+    ----------
+    ours, theirs : Analysis
+        Analyses of two runs, or of two parts.
+
+    Returns
+    -------
+    list of Difference
+        Every number that both have, with the probability of its difference by chance.
     """
     found: list[Difference] = []
     for name, a, b in (

@@ -92,10 +92,17 @@ def describe_error(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
 
 
 def slow_spectrum(time_s: Column, means: Column) -> power_spectrum.Spectrum:
-    """Spectrum of 1 s means in segments half as long as the longest gapless stretch: three in a
-    whole hold.
+    """Return the spectrum of 1 s means in segments half as long as the longest gapless stretch:
+    three in a whole hold.
 
     `time_s` (n,) are the middles of the seconds; gaps up to 5 s are bridged.
+
+    Parameters
+    ----------
+    time_s : (n,) array
+        Middles of the seconds.
+    means : (n,) array
+        Their means.
     """
     if not time_s.size:
         return power_spectrum.power_spectrum(np.empty(0), 1.0)
@@ -111,7 +118,20 @@ def slow_spectrum(time_s: Column, means: Column) -> power_spectrum.Spectrum:
 
 
 def fill_short_gaps(values: Singles, most: int) -> Singles:
-    """Gaps of at most `most` values filled with straight lines; longer ones stay NaN."""
+    """Fill short gaps with straight lines; longer ones and those at the ends stay NaN.
+
+    Parameters
+    ----------
+    values : (n,) array
+        The series; NaN in gaps.
+    most : int
+        Longest gap to fill, in values.
+
+    Returns
+    -------
+    (n,) array
+        A copy.
+    """
     gap = ~np.isfinite(values)
     # Where gaps begin and end, in turn
     padded = np.concatenate(([False], gap, [False])).astype(np.int8)

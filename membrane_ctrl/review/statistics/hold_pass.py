@@ -74,8 +74,16 @@ class HoldPass:
 def hold_pass(
     run: Run, span_s: tuple[float, float], part_s: tuple[float, float] = (-np.inf, np.inf)
 ) -> HoldPass:
-    """Pass once through a run, or a part of it; `span_s` is its first and last second, from a
-    level.
+    """Pass once through the ticks of a run, or of a part of it.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    span_s : tuple[float, float]
+        First and last second of the run, from a level.
+    part_s : tuple[float, float]
+        The part, in s.
     """
     collected = _Collector(run, span_s, math.isfinite(part_s[0]))
     for block in run.tick_blocks(NAMES, *part_s):

@@ -33,7 +33,20 @@ class Spectrum:
     segments: int  # number averaged; 0: nothing was long enough
 
     def band_rms(self, low_hz: float, high_hz: float) -> float:
-        """RMS between two frequencies, low one excluded; NaN if no frequency lies there."""
+        """Return the RMS between two frequencies.
+
+        Parameters
+        ----------
+        low_hz : float
+            Excluded.
+        high_hz : float
+            Included.
+
+        Returns
+        -------
+        float
+            NaN if no frequency lies there.
+        """
         inside = (self.frequency_hz > low_hz) & (self.frequency_hz <= high_hz)
         if not inside.any():
             return float("nan")
@@ -97,8 +110,14 @@ class Band:
 
 
 def band_rms(fast: Spectrum, slow: Spectrum) -> list[Band]:
-    """RMS in each of `BANDS_HZ`: from the ticks' spectrum where it resolves a band, else from the 1
-    s means.
+    """Return the RMS in each of `BANDS_HZ`.
+
+    Parameters
+    ----------
+    fast : Spectrum
+        Spectrum of the ticks, used where it resolves a band.
+    slow : Spectrum
+        Spectrum of the 1 s means, for the others.
     """
     edges_hz = [*BANDS_HZ, float(fast.frequency_hz[-1])]
     bands = []
@@ -116,8 +135,19 @@ def unseen_s(found: list[Band]) -> float:
 
 
 def combine_densities(fast: Spectrum, slow: Spectrum) -> tuple[Column, Column]:
-    """Frequencies (Hz) and one density, which uses the 1 s means below the resolution of the ticks'
-    spectrum.
+    """Join two spectra: the 1 s means below the resolution of the ticks' spectrum, the ticks above.
+
+    Parameters
+    ----------
+    fast : Spectrum
+        Spectrum of the ticks.
+    slow : Spectrum
+        Spectrum of the 1 s means.
+
+    Returns
+    -------
+    frequency_hz, density : (n,) array
+        Without frequency 0.
     """
     # Where the ticks' spectrum begins to count: everywhere if there is no slower one
     from_hz = 0.0

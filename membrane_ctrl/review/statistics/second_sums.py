@@ -25,7 +25,15 @@ class SecondSums:
         self._series = series
 
     def add(self, time_s: Column, values: Column) -> None:
-        """Take in (n,) times and (series, n) values, all finite or NaN together."""
+        """Add values to the sums of their seconds.
+
+        Parameters
+        ----------
+        time_s : (n,) array
+            Times, rising.
+        values : (series, n) array
+            All finite or all NaN at each time.
+        """
         if not time_s.size:
             return
         second = np.floor(time_s + 1e-9).astype(np.int32)

@@ -69,6 +69,20 @@ def show_source(
     """Open a file or a server's page on this machine's screen; return when the window is closed.
 
     The cursor is put at a moment; `meanwhile` runs while the window is open and ends with it.
+
+    Parameters
+    ----------
+    source : Path or str
+        File, or the page's URL.
+    at : CursorTime or None
+        Where the cursor is put.
+    meanwhile : Meanwhile
+        Runs while the window is open, and ends with it.
+
+    Returns
+    -------
+    int
+        The exit code.
     """
     _require_screen()
     port = free_port()
@@ -106,11 +120,28 @@ def put_cursor(
 def serve_source(
     source: Path | str, bind: str, port: int, meanwhile: Meanwhile = lambda _: None
 ) -> int:
-    """Serve a file, or a page for a server's data, to browsers until interrupted; `meanwhile` as
-    for `show_source`.
+    """Serve a file, or a page for a server's data, to browsers until interrupted.
 
-    Raises DeviceError if it cannot listen there, or the viewer does not start. `bind` is 127.0.0.1,
-    or an address of this machine for remote viewers; `port` is that of the page, 0 for a free one.
+    Parameters
+    ----------
+    source : Path or str
+        File, or URL of the data.
+    bind : str
+        127.0.0.1, or an address of this machine for remote viewers.
+    port : int
+        Of the page; 0 for a free one.
+    meanwhile : Meanwhile
+        As for `show_source`.
+
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    DeviceError
+        It cannot listen there, or the viewer does not start.
     """
     port = port or free_port()
     _require_listening(bind, port)

@@ -52,7 +52,20 @@ class JournalWriter:
             raise
 
     def append_batch(self, first_row: int, batch: pa.RecordBatch) -> None:
-        """Append a batch and sync it: all of it or nothing. Raises OSError."""
+        """Append a batch and sync it: all of it or nothing.
+
+        Parameters
+        ----------
+        first_row : int
+            Number of its first row in the table.
+        batch : RecordBatch
+            The rows.
+
+        Raises
+        ------
+        OSError
+            The disk did not take it.
+        """
         message = shuffle_batch(batch).serialize()
         self._append_frame(_pack_frame(first_row, batch.num_rows, message))
 
@@ -128,7 +141,24 @@ def read_schema(frame: JournalFrame) -> pa.Schema:
 
 
 def read_batch(frame: JournalFrame, schema: pa.Schema) -> pa.RecordBatch:
-    """The record batch in a frame. Raises pa.ArrowException, OSError or ValueError."""
+    """Read the record batch of a frame of unknown origin.
+
+    Parameters
+    ----------
+    frame : JournalFrame
+        The frame.
+    schema : Schema
+        Of the table.
+
+    Returns
+    -------
+    RecordBatch
+
+    Raises
+    ------
+    pa.ArrowException, OSError, ValueError
+        The frame is damaged, or no recorder writes such a frame.
+    """
     message = pa.ipc.read_message(_unpack_frame(frame))
     if message.type != "record batch" or _is_compressed(memoryview(message.metadata)):
         raise ValueError("a frame that no recorder writes")
@@ -197,10 +227,25 @@ class LostBytes:
 def read_journal(
     data: bytes, group_rows: int, schema: pa.Schema
 ) -> Iterator[JournalBlock | LostBytes]:
-    """Rows of a journal in blocks of about `group_rows`, and its damaged stretches, in order.
+    """Read the rows of a journal in blocks, and its damaged stretches, in order.
 
-    `schema` replaces that of a journal whose first frame is damaged. Raises pa.ArrowException,
-    OSError or ValueError if the journal's own schema cannot be read.
+    Parameters
+    ----------
+    data : bytes
+        The file.
+    group_rows : int
+        Rows of a block, about.
+    schema : Schema
+        Replaces that of a journal whose first frame is damaged.
+
+    Returns
+    -------
+    iterator of JournalBlock or LostBytes
+
+    Raises
+    ------
+    pa.ArrowException, OSError, ValueError
+        The journal's own schema cannot be read.
     """
     frames = find_frames(data)
     if frames and frames[0].rows == 0:

@@ -77,8 +77,21 @@ def unpack_footer(text: str) -> bytes | None:
 
 
 def append_entry(disk: Disk, folder: Path, entry: PartEntry) -> None:
-    """Append a part's line and sync it, in place of a torn last line. Raises OSError; a torn line
-    is then cut off.
+    """Append a part's line to the manifest and sync it, in place of a torn last line.
+
+    Parameters
+    ----------
+    disk : Disk
+        The system calls.
+    folder : Path
+        Of the table.
+    entry : PartEntry
+        What the part holds.
+
+    Raises
+    ------
+    OSError
+        The disk did not take it; a torn line is then cut off.
     """
     path = folder / MANIFEST
     line = file_checksums.dumps_checked(entry.model_dump()) + "\n"

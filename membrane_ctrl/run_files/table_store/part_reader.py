@@ -92,8 +92,14 @@ class PartReader:
     def iterate_groups(
         self, names: Sequence[str], start_s: float, end_s: float
     ) -> Iterator[pa.Table | LostGroup]:
-        """Columns of the row groups that may have rows from `start_s` up to `end_s`; the file has
-        all of `names`.
+        """Read the row groups that may have rows of a part of the run.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Columns; the file has all of them.
+        start_s, end_s : float
+            The part; the end is excluded.
         """
         metadata = self._parquet.metadata
         for number in range(metadata.num_row_groups):

@@ -21,10 +21,23 @@ from membrane_ctrl.run_files.table_store.part_writer import write_part
 
 
 def seal_journal(disk: Disk, folder: Path, number: int, table: spec.TableSpec) -> None:
-    """Make the part of a journal; may be repeated after a kill at any step.
+    """Make the part of a journal: write, sync, rename, record, and only then remove the journal.
 
-    A journal without any intact row stays, for people. Raises OSError (full disk, or a journal that
-    cannot be read): the journal stays as well.
+    Parameters
+    ----------
+    disk : Disk
+        The system calls.
+    folder : Path
+        Of the table.
+    number : int
+        Of the journal, and of the part.
+    table : TableSpec
+        Columns and limits.
+
+    Raises
+    ------
+    OSError
+        The disk is full, or the journal cannot be read; the journal stays.
     """
     source = spec.journal_path(folder, number)
     target = spec.part_path(folder, number)

@@ -94,8 +94,15 @@ def camera_pose(geometry: GeometryConfig) -> CameraPose:
 
 
 def screen_pose(geometry: GeometryConfig, error: ScreenError | None = None) -> ScreenPose:
-    """Pose of the screen: as given, or O' = b (-cos alpha, 0, sin alpha) and perpendicular to OO';
-    then the error.
+    """Return the pose of the screen: as given, or O' = b (-cos alpha, 0, sin alpha) and
+    perpendicular to OO'; then the error.
+
+    Parameters
+    ----------
+    geometry : GeometryConfig
+        The stated bench.
+    error : ScreenError or None
+        By which the true screen differs from it.
     """
     face = geometry.screen or ScreenPoseConfig()
     given = face.pose

@@ -106,7 +106,20 @@ class Disturber:
         return moved
 
     def light_disturbance(self, time_s: float, pattern: Pattern) -> FloatArray:
-        """Factor of the screen's light, and counts of the room's, (2, rows, columns)."""
+        """Return what disturbs the light at a moment.
+
+        Parameters
+        ----------
+        time_s : float
+            The moment.
+        pattern : Pattern
+            What the screen shows.
+
+        Returns
+        -------
+        (2, rows, columns) array
+            Factor of the screen's light, and counts of the room's, at the nodes.
+        """
         wanted = self._wanted
         nodes = self._nodes
         # The screen: dust, bands of the backlight, ageing, patches, and what the last picture left.

@@ -33,7 +33,22 @@ NO_ADDED_LIGHT = AddedLight(np.zeros((0, 0), np.float32), 0, 0)
 
 
 def light_of_pattern(shown: Pattern, config: PatternConfig, light: Light) -> ScreenLight:
-    """Light of a pattern inside its region, a square with its low edges at 0."""
+    """Return the light of a pattern inside its region, a square with its low edges at 0.
+
+    Parameters
+    ----------
+    shown : Pattern
+        The pattern.
+    config : PatternConfig
+        Its period and size.
+    light : Light
+        Gamma of the panel, and the light of a black screen.
+
+    Returns
+    -------
+    ScreenLight
+        A function of places (s_x, s_y) in mm.
+    """
     side_mm = config.periods * config.period_mm
     if shown.role == "crossed":
 

@@ -119,7 +119,16 @@ def make_front_film(mirror: MirrorConfig, sag_mm: float, seed: int | None) -> Fr
 
 
 def gas_excess_of(stated: FrontFilmConfig, gauge_pa: float) -> float:
-    """Index of the gas between the films less that of the air outside, by their densities."""
+    """Return the index of the gas between the films less that of the air outside, by their
+    densities.
+
+    Parameters
+    ----------
+    stated : FrontFilmConfig
+        The gas, its temperature, and the pressure of the room.
+    gauge_pa : float
+        Pressure of the gas above the room's.
+    """
     inside = _index_less_one(stated.gas, stated.ambient_pa + gauge_pa, stated.gas_k)
     return inside - _index_less_one("air", stated.ambient_pa, stated.gas_k)
 

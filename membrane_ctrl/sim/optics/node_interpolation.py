@@ -12,7 +12,20 @@ from membrane_ctrl.model.kernel_cache import compile_loop
 
 
 def node_positions(pixels: int, step: int) -> FloatArray:
-    """Pixel positions of the nodes along one side of the picture."""
+    """Return the positions of the nodes along one side of the picture.
+
+    Parameters
+    ----------
+    pixels : int
+        Length of the side.
+    step : int
+        Pixels between nodes.
+
+    Returns
+    -------
+    (nodes,) array
+        In pixels; one before the first pixel and two after the last.
+    """
     return np.asarray(np.arange(-1, -(-pixels // step) + 2) * step, dtype=np.float64)
 
 

@@ -82,6 +82,15 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
 
     Crossed fringes have none (`shade_crossed`). Raises ValueError if the pattern's role or Gray bit
     is unknown.
+
+    Parameters
+    ----------
+    pattern : Pattern
+        Role, index and phase step.
+    config : PatternConfig
+        Period and number of periods.
+    light : Light
+        Gamma of the panel, and the light of a black screen.
     """
     # Sinusoids: cells of one period, which repeat.
     phi = np.linspace(0.0, 2.0 * np.pi, _SINE_CELLS + 1) - np.pi

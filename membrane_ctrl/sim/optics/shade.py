@@ -12,8 +12,20 @@ from membrane_ctrl.sim.optics.pixel_noise import GOLDEN, LOW_16, MIX_1, random_6
 def vignetting_loss(
     width_px: int, height_px: int, corner_loss: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Loss by column (W,) and by row (H,); their sum is corner_loss (distance from the middle /
-    distance of the corner)^2.
+    """Return the loss of light towards the corners as a sum of one by column and one by row:
+    corner_loss (distance from the middle / distance of the corner)^2.
+
+    Parameters
+    ----------
+    width_px, height_px : int
+        Of the picture.
+    corner_loss : float
+        Share that a corner loses.
+
+    Returns
+    -------
+    by_column : (W,) array
+    by_row : (H,) array
     """
     columns = np.arange(width_px) - (width_px - 1) / 2.0
     rows = np.arange(height_px) - (height_px - 1) / 2.0

@@ -99,6 +99,13 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     `displacement_um` (frames,); `coeffs_um` (ZERNIKE_TERMS,), Noll with the surface 0 at the
     vertex, if these terms represent the shape. `truth.json`: the same numbers without the maps, and
     the request.
+
+    Parameters
+    ----------
+    folder : Path
+        It must exist.
+    spec : SimulationSpec
+        The set.
     """
     displacement_um = np.array([spec.displacement_um(frame) for frame in range(len(spec.patterns))])
     mean_um = _mean_um(spec)

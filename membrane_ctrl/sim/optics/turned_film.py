@@ -43,7 +43,15 @@ class MirrorSeat:
 
     @classmethod
     def drawn(cls, angle_deg: float, seed: int) -> "MirrorSeat":
-        """A mirror that a hand has turned by about this angle."""
+        """Draw how a hand seats a mirror that it has turned.
+
+        Parameters
+        ----------
+        angle_deg : float
+            The intended turn, counter-clockwise as the camera sees the mirror.
+        seed : int
+            The same seed gives the same seat.
+        """
         rng = np.random.default_rng((120, seed))
         shift_x, shift_y = (_SHIFT_SIGMA_MM * rng.standard_normal(2)).tolist()
         tilt_x, tilt_y = (_TILT_SIGMA_RAD * rng.standard_normal(2)).tolist()
@@ -60,12 +68,21 @@ class MirrorSeat:
 
 
 def turn_film(film: FilmShape, seat: MirrorSeat, displacement_um: float) -> FilmShape:
-    """The film as the bench sees it in the turned mirror, at about this displacement.
+    """Return the film as the bench sees it in the turned mirror.
 
     The film is evaluated at points of the mirror's own frame. Its difference from the bowl that
     stands as usual is fitted with `MAX_FILM_TERMS` Zernike terms: nanometres are left.
 
     Raises ValueError for a film with ripples, wrinkles or bumps, which no such terms represent.
+
+    Parameters
+    ----------
+    film : FilmShape
+        In the mirror's own frame; without ripples, wrinkles and bumps.
+    seat : MirrorSeat
+        How the mirror was turned, shifted and tilted.
+    displacement_um : float
+        About which it is evaluated.
     """
     if film.ripples or film.wrinkles or film.bumps:
         raise ValueError("a turned mirror: only for a film without ripples, wrinkles and bumps")
