@@ -179,7 +179,7 @@ def decode_message(message: re.Match[str], name: str) -> BarometerMessage:
 
     Parameters
     ----------
-    message : Match[str]
+    message : re.Match
         The match.
     name : str
         Of the instrument, for the error.

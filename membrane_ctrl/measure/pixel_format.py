@@ -74,7 +74,7 @@ def find_size_mistake(seen: tuple[int, ...], stated: tuple[int, int], dtype: np.
     ----------
     seen : tuple of int
         Height and width of the picture.
-    stated : tuple[int, int]
+    stated : (int, int)
         Height and width as stated.
     dtype : np.dtype
         Of its pixels.

@@ -62,7 +62,7 @@ def map_picture(values: AnyArray, span: tuple[float, float]) -> rr.DepthImage:
     ----------
     values : (m, m) array
         The map; NaN is drawn as the lowest value, so a mask must cover it.
-    span : tuple[float, float]
+    span : (float, float)
         Lowest and highest value of the colours.
     """
     return rr.DepthImage(

@@ -78,8 +78,7 @@ def map_pump(
     """Measure the pump's curve, apply it on trial, check it with steps of the flow, and keep it.
 
     The session restarts on it. The gains stay if they suit the measured actuator; else they
-    become slower ones that do. Raises RejectedError with what to do if there is no curve, or the
-    steps contradict it; the former curve and gains are then restored.
+    become slower ones that do.
 
     Parameters
     ----------
@@ -92,13 +91,14 @@ def map_pump(
 
     Returns
     -------
-    tuple[MappedPump, SessionFolder]
+    (MappedPump, SessionFolder)
         The curve, and the session as it continues with it.
 
     Raises
     ------
     RejectedError
-        There is no curve, or steps of the flow contradict it; with what to do.
+        There is no curve, or steps of the flow contradict it; with what to do. The former curve
+        and gains are then restored.
     """
     before = rig.pump
     try:

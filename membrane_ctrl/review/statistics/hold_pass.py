@@ -80,9 +80,9 @@ def hold_pass(
     ----------
     run : Run
         The run.
-    span_s : tuple[float, float]
+    span_s : (float, float)
         First and last second of the run, from a level.
-    part_s : tuple[float, float]
+    part_s : (float, float)
         The part, in s.
     """
     collected = _Collector(run, span_s, math.isfinite(part_s[0]))
