@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 from patience import patient_check
 
-from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.config.toml_file import dump_toml, load_toml
@@ -23,25 +22,9 @@ from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.service.hold_seen import HoldSeen
 from membrane_ctrl.service.metrics import render_metrics
 from membrane_ctrl.sim.lab import Lab
+from tests.worlds.still_plant import StillPlant
 
 EXAMPLES = sorted(Path(__file__).parents[1].glob("membrane_ctrl/examples/*.toml"))
-
-
-class StillPlant:
-    """A mirror that stands, with a laser that sees it."""
-
-    def __init__(self) -> None:
-        self.outputs: list[tuple[float, float]] = []
-        self._counter = 0
-
-    def sample(self) -> BoardSample:
-        self._counter += 1
-        return BoardSample(
-            12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200
-        )
-
-    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
-        self.outputs.append((pump_fraction, vent_fraction))
 
 
 def test_there_are_examples() -> None:

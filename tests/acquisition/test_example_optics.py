@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 import pytest
 
-from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.sim.lab import Lab
 from tests.support.virtual_display import screenshot, virtual_display
 from tests.worlds.gige_camera import GigeCameraEmulator, gige_camera
+from tests.worlds.still_plant import StillPlant
 
 pytestmark = pytest.mark.real_time
 
@@ -45,16 +45,6 @@ GAMMA = 2.2
 LIGHT = (np.arange(256) / 255.0) ** GAMMA  # of a level
 STRIDE_PX = 5  # odd, so that as many bright as dark pixels of a checkerboard are sampled
 BLOCK_PX = 4  # each block of camera pixels sees the mean light of its part of the display
-
-
-class StillPlant:
-    """A mirror that does not move."""
-
-    def sample(self) -> BoardSample:
-        return BoardSample(12.5, 0, 600.0, 101_325.0, 22.5, 23.0, 1, 0.0)
-
-    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
-        assert pump_fraction == 0.0
 
 
 class Sight:

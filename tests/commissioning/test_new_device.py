@@ -17,13 +17,13 @@ import pytest
 from patience import patient_check
 
 from firmware_iface import drivers, role_bench, roles
-from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.instruments import role_drivers
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sim.lab import Lab
+from tests.worlds.still_plant import StillPlant
 
 ROOT = Path(__file__).parents[2]
 TEMPLATES = ROOT / "membrane_ctrl" / "commissioning" / "scaffold"
@@ -107,23 +107,6 @@ def test_what_is_written_passes_its_own_tests_and_the_linter(tmp_path: Path) -> 
     ]
     printed_text = tool(sys.executable, "-m", "pytest", *config, *made, cwd=tmp_path, path=where)
     assert "62 passed" in printed_text
-
-
-class StillPlant:
-    """A mirror that stands."""
-
-    def __init__(self) -> None:
-        self.outputs: list[tuple[float, float]] = []
-        self._counter = 0
-
-    def sample(self) -> BoardSample:
-        self._counter += 1
-        return BoardSample(
-            12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200
-        )
-
-    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
-        self.outputs.append((pump_fraction, vent_fraction))
 
 
 async def test_check_reads_an_installed_driver_through_its_emulator(

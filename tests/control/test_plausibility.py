@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from membrane_ctrl.control.plausibility import PlausibilityCheck
 from membrane_ctrl.model.events import FaultySensor
-from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
+from tests.worlds.sound_figure import SOUND_FIGURE
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
@@ -20,23 +21,8 @@ Story = Callable[
 ]  # time -> true sag change, laser's error, camera's error; µm
 
 
-def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate:
-    nothing = np.zeros(ZERNIKE_TERMS)
-    return ShapeEstimate(
-        time_s,
-        "fringes",
-        nothing,
-        0.0,
-        np.eye(ZERNIKE_TERMS),
-        sag_um,
-        1.0,
-        0.0,
-        1.0,
-        1.0,
-        80.0,
-        0.0,
-        verdict,  # type: ignore[arg-type]
-    )
+def estimate(time_s: float, sag_um: float, verdict: Verdict = "ok") -> ShapeEstimate:
+    return replace(SOUND_FIGURE, time_s=time_s, sag_um=sag_um, verdict=verdict)
 
 
 def judge_story(

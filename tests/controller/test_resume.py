@@ -31,6 +31,7 @@ from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.scenario import CheckedScenario, Expectation, play
+from tests.worlds.quiet_observation import GOOD
 
 RULES = {rule.name: rule for rule in TABLE}
 LINK_LOST, LATE = RULES["link_lost"], RULES["late"]
@@ -39,21 +40,7 @@ WATCHDOG, OVER_PRESSURE = (
     load_default_map().make_fault_mask(name) for name in ("watchdog", "over_pressure")
 )
 SHUT = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, 1, 0.0, False, 0)
-GONE = Observation(
-    link_up=True,
-    reading_age_s=0.0,
-    advance_age_s=0.0,
-    displacement_um=0.0,
-    displacement_valid=True,
-    jumps=0,
-    error_um=0.0,
-    gauge_pressure_pa=600.0,
-    pump_mismatch=0.0,
-    watchdog_tripped=False,
-    board_faults=0,
-    lateness_ms=0.0,
-    reading=SHUT,
-)
+GONE = replace(GOOD, reading=SHUT)
 LOST = replace(GONE, link_up=False)
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-
-import numpy as np
+from dataclasses import replace
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, EstimatorConfig
@@ -14,7 +13,7 @@ from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+from tests.worlds.sound_figure import SOUND_FIGURE
 
 SAG_UM = 37_100.0
 
@@ -60,23 +59,8 @@ class Seconds:
             self.events += self.consistency.compare_sensors(inputs, state, 1.0, held)
 
     def _shape(self) -> ShapeEstimate:
-        nothing = np.zeros(ZERNIKE_TERMS)
         sag_um = SAG_UM if self.camera_stuck else SAG_UM + 0.001 * (self.now_s % 7)
-        return ShapeEstimate(
-            self.now_s,
-            "fringes",
-            nothing,
-            0.0,
-            np.eye(ZERNIKE_TERMS),
-            sag_um,
-            1.0,
-            0.0,
-            1.0,
-            1.0,
-            80.0,
-            0.0,
-            "ok",
-        )
+        return replace(SOUND_FIGURE, time_s=self.now_s, sag_um=sag_um)
 
 
 def test_unexplained_gas_consumption_is_reported_until_the_hold_ends() -> None:

@@ -14,7 +14,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.roles import NO_READING
 from membrane_ctrl.cli import run
 from membrane_ctrl.commissioning import first_config as wizard
@@ -24,25 +23,9 @@ from membrane_ctrl.controller.safety import SafetyTable
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.lab import Lab
 from tests.worlds.quiet_observation import GOOD
+from tests.worlds.still_plant import StillPlant
 
 TICKS = 10
-
-
-class StillPlant:
-    """A mirror that stands."""
-
-    def __init__(self) -> None:
-        self._counter = 0
-
-    def sample(self) -> BoardSample:
-        """What its sensors show."""
-        self._counter += 1
-        return BoardSample(
-            12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200
-        )
-
-    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
-        """Nothing moves."""
 
 
 async def checked(path: Path) -> dict[str, str]:
