@@ -134,7 +134,12 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
     number, value = 'data-label="number"', 'data-label="value"'  # for a phone, one cell a line
     assert f"<td {number}>power_um</td><td {value}>{power_um:.6g}</td>" in page
     shown = re.findall(r"<img alt=\"(\w+)\"|<pre>|class=\"(verdict \w+)\"", page)
-    assert [name or mark for name, mark in shown][:4] == ["verdict good", "figure", "star", "residual"]
+    assert [name or mark for name, mark in shown][:4] == [
+        "verdict good",
+        "figure",
+        "star",
+        "residual",
+    ]
     assert page.index('alt="figure"') < page.index("power_um") < page.index("<pre>")
     assert figure["not_given"] == {}
     document = (tmp_path / "report.pdf").read_bytes()
