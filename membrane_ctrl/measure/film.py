@@ -23,6 +23,7 @@ _STIFFNESS_N_PER_M = 2.05e5
 _POISSON = 0.3
 _PRESSURE_PA = 600.0
 _PAPER_EDGE_MM = 3.0
+_SURELY_SHARED = 0.99  # probability beyond which a shared figure is stated as the cause
 _TOGETHER = 0.98  # correlation of two numbers that the sets determine only together
 _UNLIKE_LAW = 0.5  # share of the departure from Hencky that the law leaves: another law
 _SURELY_LEFT = 3.0  # sigmas beyond which the law leaves something
@@ -222,10 +223,11 @@ def _list_limits(
     """What these sets cannot determine, in words."""
     gauged = [figure.pressure_pa for figure in figures if np.isfinite(figure.pressure_pa)]
     notes = [
-        f"{waves.order} waves of {waves.rms_um:.3g} µm RMS, cause unknown; it looks like "
+        f"{_count_waves(waves.order)} of {waves.rms_um:.3g} µm RMS, cause unknown; it looks like "
         + " or ".join(_CAUSES[cause] for cause in waves.likely[:2])
         for waves in fit.unexplained
     ]
+    notes += [_describe_shared(waves) for waves in fit.shared]
 
     # What the sets do not determine.
     if not gauged:
@@ -268,6 +270,23 @@ def _list_limits(
     return notes
 
 
+def _count_waves(order: int) -> str:
+    """Waves around the ring, in words."""
+    if order == 1:
+        return "1 wave"
+    return f"{order} waves"
+
+
+def _describe_shared(waves: ring_waves.SharedWaves) -> str:
+    """Waves that may be the same in all sets."""
+    text = f"{_count_waves(waves.order)} of {waves.rms_um:.3g} µm RMS, "
+    elsewhere = "the lens, the mount, the geometry or the ring"
+    if waves.weight > _SURELY_SHARED:
+        return text + f"the same at all sags: not the film's; of {elsewhere}"
+    causes = " or ".join(_CAUSES[cause] for cause in waves.likely[:2])
+    return text + f"of no sure cause: the same at all sags ({elsewhere}), or {causes}"
+
+
 def _describe_together(pair: ring_waves.CausesTogether) -> str:
     """Which combination of two causes of waves the sets determine."""
     first, second = pair.causes
@@ -277,8 +296,9 @@ def _describe_together(pair: ring_waves.CausesTogether) -> str:
     sign = "+"
     if factor > 0:
         sign = "-"
+    waves = _count_waves(pair.order)
     return (
-        f"{_CAUSES[first]} and {_CAUSES[second]}, {pair.order} waves, are known only together "
+        f"{_CAUSES[first]} and {_CAUSES[second]}, {waves}, are known only together "
         f"(correlation {pair.correlation:+.3f}): the first {sign} {abs(factor):.3g} {unit} per "
         f"{other_unit} of the second is known to {scale * pair.sigma:.2g} {unit}"
     )
@@ -454,7 +474,7 @@ def _wave_line(wave: dict[str, Any]) -> str:
     if kind == "modulus":
         along = f", along {np.degrees(np.arctan2(sine, cosine)) / 2 % 180:.0f} degrees"
     return (
-        f"{origin:<11}{_CAUSES[kind]}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} "
+        f"{origin:<11}{_CAUSES[kind]}, {_count_waves(wave['order'])}: {amount:.3g} +- {sigma:.2g} "
         f"{unit}{along}"
     )
 

@@ -36,6 +36,7 @@ from membrane_ctrl.metrology.film.ring_waves import (
     CAUSES,
     CausesTogether,
     RingWave,
+    SharedWaves,
     UnexplainedWaves,
     azimuthal_terms,
     fit_waves,
@@ -104,6 +105,8 @@ class FilmFit:
         Waves of the ring with a cause.
     unexplained : tuple of UnexplainedWaves
         Waves without one.
+    shared : tuple of SharedWaves
+        Waves that are the same in all sets and of no cause.
     together : tuple of CausesTogether
         Causes of waves that are known only together.
     orthotropy : OrthotropicFilm or None
@@ -117,6 +120,7 @@ class FilmFit:
     left_mm: FloatArray
     waves: tuple[RingWave, ...]
     unexplained: tuple[UnexplainedWaves, ...]
+    shared: tuple[SharedWaves, ...]
     together: tuple[CausesTogether, ...]
     orthotropy: OrthotropicFilm | None
     misfit_um: float
@@ -187,6 +191,7 @@ def fit_film(
         left_mm=left_mm,
         waves=of_waves.waves,
         unexplained=of_waves.unexplained,
+        shared=of_waves.shared,
         together=of_waves.together,
         orthotropy=find_orthotropy(law, covariance, of_waves.waves),
         misfit_um=1e3 * size_mm,

@@ -3,6 +3,10 @@
 Each cause has a profile along the radius, and follows the sag in its own way: a ring that is not
 flat adds the same at any sag, an orthotropic film in proportion to it. A cause is stated only where
 these signatures explain the waves of its order; else the order's cause is unknown.
+
+A figure that all sets share competes with the causes: an error of the lens, the mount or the
+geometry has any profile, and stays. Both hypotheses, with it and without, are fitted and weighted
+by their evidence. Where it is likely, a cause is known only from what changes with the sag.
 """
 
 from collections.abc import Sequence
@@ -14,6 +18,8 @@ from numpy.polynomial import legendre
 from membrane_ctrl.metrology.film.film_figure import FilmFigure
 from membrane_ctrl.metrology.film.film_law import Bowl, HarmonicCause
 from membrane_ctrl.metrology.film.misfit_average import (
+    Solved,
+    average_models,
     average_over_misfits,
     misfit_covariances,
     shared_covariance,
@@ -40,6 +46,12 @@ _CAUSE_SIGMAS: dict[HarmonicCause, float] = {
     "shear": 0.3,
 }
 _OF_FILM = ("modulus", "shear")
+# Standard uncertainty, before any measurement, of a term of a figure that all sets share: that of a
+# lens or a mount.
+_SHARED_SIGMA_MM = 0.3
+# Least misfit of a term beside a shared figure. Without one, the terms that no law determines show
+# how much the sets share besides the causes.
+_LEAST_MISFIT_MM = 2e-4
 SURE_SIGMAS = 4.0  # beyond which a cause is stated
 _FOEPPL = 0.03  # relative change of an orthotropic film's wave by finite slopes
 # Share of the shear modulus that the square of the moduli's difference adds to four waves.
@@ -101,6 +113,28 @@ class UnexplainedWaves:
 
 
 @dataclass(frozen=True)
+class SharedWaves:
+    """Waves that may be a figure that all sets share; no cause is seen beyond doubt.
+
+    Attributes
+    ----------
+    order : int
+        m.
+    rms_um : float
+        RMS over the disc.
+    weight : float
+        Probability that there is such a figure; the rest is that of the causes alone.
+    likely : tuple of HarmonicCause
+        The causes, by what each leaves alone; the best first.
+    """
+
+    order: int
+    rms_um: float
+    weight: float
+    likely: tuple[HarmonicCause, ...]
+
+
+@dataclass(frozen=True)
 class CausesTogether:
     """Two causes of waves that the sets determine only together.
 
@@ -134,14 +168,17 @@ class WaveFit:
         All causes.
     unexplained : tuple of UnexplainedWaves
         Orders without a cause.
+    shared : tuple of SharedWaves
+        Orders that the sets may share, without a cause beyond doubt.
     together : tuple of CausesTogether
         Causes that are known only together.
     added_mm : (n, parameters) array
-        What the causes add to the parameters of each figure.
+        What causes and shared waves add to the parameters of each figure.
     """
 
     waves: tuple[RingWave, ...]
     unexplained: tuple[UnexplainedWaves, ...]
+    shared: tuple[SharedWaves, ...]
     together: tuple[CausesTogether, ...]
     added_mm: FloatArray
 
@@ -182,6 +219,7 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
     added = np.zeros((len(figures), ZERNIKE_TERMS))
     waves: list[RingWave] = []
     unexplained: list[UnexplainedWaves] = []
+    shared: list[SharedWaves] = []
     together: list[CausesTogether] = []
     for order, causes in CAUSES.items():
         # Cosine and sine terms of the order, (2, n, 3), and their fit by its causes.
@@ -192,23 +230,29 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
             _fit_parity(figures, terms[parity], causes, response, data[parity], seen_mm)
             for parity in (0, 1)
         ]
-        for parity, (amounts, _) in enumerate(fits):
-            added[:, terms[parity]] = response @ amounts
+        predicted = np.stack([response @ one.amounts + one.shared_mm for one in fits])
+        for parity, of_parity in enumerate(predicted):
+            added[:, terms[parity]] = of_parity
 
-        # Do the causes explain the waves?
-        left = data - np.stack([response @ amounts for amounts, _ in fits])
+        # Do the causes and what all sets share explain the waves?
+        left = data - predicted
         rms_mm = float(np.sqrt(np.sum(data**2) / len(figures)))
         left_mm = float(np.sqrt(np.sum(left**2) / len(figures)))
         explained = left_mm < max(_UNEXPLAINED * rms_mm, 2 * seen_mm)
-        if not explained and rms_mm > _LEAST_SEEN_MM:
-            likely = _rank_causes(causes, response, data)
-            unexplained.append(UnexplainedWaves(order, 1e3 * rms_mm, 1e3 * left_mm, likely))
-        together += _find_causes_together(order, causes, fits[0][1])
+        likely = _rank_causes(causes, response, data)
+        together += _find_causes_together(order, causes, fits[0].covariance)
         for k, cause in enumerate(causes):
-            amounts = np.array([found[k] for found, _ in fits])
-            sigmas = np.sqrt([covariance[k, k] for _, covariance in fits])
+            amounts = np.array([one.amounts[k] for one in fits])
+            sigmas = np.sqrt([one.covariance[k, k] for one in fits])
             waves.append(RingWave(cause, order, amounts, sigmas, explained))
-    return WaveFit(_widen_shear(waves), tuple(unexplained), tuple(together), added)
+        if rms_mm < _LEAST_SEEN_MM:
+            continue
+        if not explained:
+            unexplained.append(UnexplainedWaves(order, 1e3 * rms_mm, 1e3 * left_mm, likely))
+        elif not any(wave.seen for wave in waves[-len(causes) :]):
+            weight = max(one.shared_weight for one in fits)
+            shared.append(SharedWaves(order, 1e3 * rms_mm, weight, likely))
+    return WaveFit(_widen_shear(waves), tuple(unexplained), tuple(shared), tuple(together), added)
 
 
 def _widen_shear(waves: list[RingWave]) -> tuple[RingWave, ...]:
@@ -221,6 +265,28 @@ def _widen_shear(waves: list[RingWave]) -> tuple[RingWave, ...]:
     )
 
 
+@dataclass(frozen=True)
+class _ParityFit:
+    """The cosine or the sine terms of an order by its causes and a figure that all sets share.
+
+    Attributes
+    ----------
+    amounts : (causes,) array
+        Of the causes.
+    covariance : (causes, causes) array
+        Of the amounts.
+    shared_mm : (terms,) array
+        The figure that all sets share.
+    shared_weight : float
+        Probability that there is such a figure.
+    """
+
+    amounts: FloatArray
+    covariance: FloatArray
+    shared_mm: FloatArray
+    shared_weight: float
+
+
 def _fit_parity(
     figures: Sequence[FilmFigure],
     terms: IntArray,
@@ -228,27 +294,69 @@ def _fit_parity(
     response: FloatArray,
     data: FloatArray,
     seen_mm: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Amounts of the causes and their covariance, from the cosine or the sine terms of an order."""
-    prior_sigmas = np.array([_CAUSE_SIGMAS[cause] for cause in causes])
+) -> _ParityFit:
+    """Fit the cosine or the sine terms of an order.
+
+    Parameters
+    ----------
+    figures : sequence of FilmFigure
+        n of them.
+    terms : (k,) array
+        Places of the terms among a figure's parameters.
+    causes : sequence of HarmonicCause
+    response : (n, k, causes) array
+        Terms of one unit of each cause, mm.
+    data : (n, k) array
+        The terms, mm.
+    seen_mm : float
+        Size of a term that no law explains.
+    """
     noise = shared_covariance(figures, terms) + 1e-14 * np.eye(data.size)
     # A wave's misfit grows in several ways at once: a cause leaves another power of the sag than a
     # figure without one. A single power would have to explain the sets' differences to the noise,
     # which only a misfit as large as the wave does; the causes would then be free.
     mixed: FloatArray = np.mean(misfit_covariances(figures), axis=0)
     spread: FloatArray = np.kron(mixed, np.eye(terms.size))[None].astype(np.float64)
+    count = len(causes)
     of_film = [k for k, cause in enumerate(causes) if cause in _OF_FILM]
-    design = response.reshape(-1, len(causes))
-    prior_mean = np.zeros(len(causes))
-    size_mm = seen_mm
-    # Twice: what finite slopes change of an orthotropic film's waves follows from their size.
-    for _ in range(2):
-        found = average_over_misfits(
-            design, data.ravel(), noise, spread, prior_mean, prior_sigmas**-2, size_mm
-        )
-        waves_mm = response[..., of_film] @ found.mean[of_film]
-        size_mm = float(np.hypot(seen_mm, _FOEPPL * np.sqrt(np.mean(waves_mm**2))))
-    return found.mean, found.covariance
+    by_causes = response.reshape(-1, count)
+    by_shared_terms = np.tile(np.eye(terms.size), (len(figures), 1))
+    cause_sigmas = np.array([_CAUSE_SIGMAS[cause] for cause in causes])
+    shared_sigmas = np.full(terms.size, _SHARED_SIGMA_MM)
+
+    def solve(design: FloatArray, prior_sigmas: FloatArray, least_mm: float) -> Solved:
+        """The unknowns of one hypothesis, causes first; least_mm is the least misfit of a term."""
+        size_mm = least_mm
+        # Twice: what finite slopes change of an orthotropic film's waves follows from their size.
+        for _ in range(2):
+            found = average_over_misfits(
+                design,
+                data.ravel(),
+                noise,
+                spread,
+                np.zeros(prior_sigmas.size),
+                prior_sigmas**-2,
+                size_mm,
+            )
+            waves_mm = response[..., of_film] @ found.mean[of_film]
+            size_mm = float(np.hypot(least_mm, _FOEPPL * np.sqrt(np.mean(waves_mm**2))))
+        return found
+
+    # The two hypotheses, both with the causes' amounts and the shared terms as unknowns.
+    alone = solve(by_causes, cause_sigmas, seen_mm)
+    padded = np.zeros((count + terms.size, count + terms.size))
+    padded[:count, :count] = alone.covariance
+    without = replace(alone, mean=np.append(alone.mean, np.zeros(terms.size)), covariance=padded)
+    with_shared = solve(
+        np.hstack([by_causes, by_shared_terms]),
+        np.append(cause_sigmas, shared_sigmas),
+        _LEAST_MISFIT_MM,
+    )
+    both = average_models([without, with_shared])
+    weight = 1 / (1 + np.exp(np.clip(without.log_evidence - with_shared.log_evidence, -500, 500)))
+    return _ParityFit(
+        both.mean[:count], both.covariance[:count, :count], both.mean[count:], float(weight)
+    )
 
 
 def _find_causes_together(

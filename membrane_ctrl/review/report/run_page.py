@@ -347,9 +347,10 @@ def _describe_image(series: held_scalars.HeldSeries) -> list[tuple[str, str]]:
     if image is None:
         return [("image of a star", "the mirror has no focus in front of it")]
     wave = f"at {series.wavelength_um:g} µm"
+    radius_80_mm, sigma_mm = 1e-3 * image.radius_80_um, 1e-3 * series.radius_80_sigma_um
     radii = (
-        f"50 % of the light within {image.radius_50_um:.4g} µm, 80 % within "
-        f"{_format_value(image.radius_80_um, series.radius_80_sigma_um, 'µm')} (radius)"
+        f"50 % of the light within {format_number(1e-3 * image.radius_50_um)} mm, 80 % within "
+        f"{_format_value(radius_80_mm, sigma_mm, 'mm')} (radius)"
     )
     strehl = _format_value(image.strehl, series.strehl_sigma, "")
     if not image.resolved:
