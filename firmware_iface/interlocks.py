@@ -30,8 +30,19 @@ class CircuitMemory:
         self._asked_s = -math.inf
 
     def take(self, closed: Sequence[bool], asked_s: float) -> None:
-        """Take the answer to a request that was sent at a time. Raises LinkError if circuits are
-        missing.
+        """Take the answer to a request.
+
+        Parameters
+        ----------
+        closed : sequence of bool
+            Whether each circuit is closed.
+        asked_s : float
+            When the request was sent: an answer is as old as its question.
+
+        Raises
+        ------
+        LinkError
+            Circuits are missing.
         """
         if len(closed) != len(self._closed):
             raise roles.LinkError(
@@ -145,8 +156,14 @@ class CircuitPoller:
 
 
 def open_board_inputs(reading: roles.BenchReading, board_inputs: Mapping[int, int]) -> int:
-    """Bits of the interlocks at the board's inputs whose circuits are open; `board_inputs` as in
-    `InterlockBench`.
+    """Return the interlocks at the board's inputs whose circuits are open, one bit each.
+
+    Parameters
+    ----------
+    reading : BenchReading
+        With the state of all inputs.
+    board_inputs : mapping of int
+        Input of the board by the interlock's bit, as in `InterlockBench`.
     """
     return sum(
         1 << bit for bit, place in board_inputs.items() if not reading.interlock_inputs >> place & 1

@@ -189,7 +189,15 @@ class RegisterMap:
 
 
 def make_block(name: str, access: str, meaning: str, registers: Sequence[Register]) -> Block:
-    """A block of consecutive registers."""
+    """Make a block of consecutive registers.
+
+    Parameters
+    ----------
+    name, access, meaning : str
+        As in `registers.toml`.
+    registers : sequence of Register
+        In the order of their addresses, without gaps.
+    """
     layout = struct.Struct(">" + "".join(_TYPES[register.type][0] for register in registers))
     return Block(name, access, meaning, tuple(registers), layout)
 

@@ -17,7 +17,25 @@ def require(right: bool, problem: str) -> None:
 
 
 def require_error(act: Callable[[], object], kind: type[LinkError]) -> str:
-    """Require that a call fails with this error and a message of one line; return the message."""
+    """Require that a call fails with an error and a message of one line.
+
+    Parameters
+    ----------
+    act : callable
+        The call.
+    kind : type
+        The required error.
+
+    Returns
+    -------
+    str
+        The message.
+
+    Raises
+    ------
+    ConformanceError
+        It does not.
+    """
     try:
         act()
     except kind as error:

@@ -336,9 +336,20 @@ def _describe_ending(task: asyncio.Task[None]) -> str:
 
 
 async def answer(role: str, request: Awaitable[T]) -> T:
-    """A device's answer; an unexpected exception is a fault of that device, not the end of the run.
+    """Wait for a device's answer; an unexpected exception is a fault of that device, not the end of
+    the run.
 
-    Raises LinkError.
+    Parameters
+    ----------
+    role : str
+        Of the device, for the message.
+    request : awaitable
+        The answer to wait for.
+
+    Raises
+    ------
+    LinkError
+        The device or its driver failed.
     """
     try:
         return await request

@@ -52,12 +52,29 @@ class LineLink:
     async def query(
         self, command: str, answer: re.Pattern[str], longest: int = 80
     ) -> re.Match[str]:
-        """The answer to a command (without its end), whose whole text has the given form, line ends
-        included.
+        """Send a command and return its answer.
 
-        The pattern must match all that comes, except line ends before it, and nothing that is still
-        incomplete; more than `longest` characters are no answer. Raises LinkError (no answer of
-        this form in time), LinkDownError (the line is gone).
+        Parameters
+        ----------
+        command : str
+            Without its line end.
+        answer : Pattern[str]
+            Must match all that comes, line ends included, except line ends before it; and nothing
+            that is still incomplete.
+        longest : int
+            More characters than this are no answer.
+
+        Returns
+        -------
+        Match[str]
+            The match.
+
+        Raises
+        ------
+        LinkError
+            No answer of this form in time.
+        LinkDownError
+            The line is gone.
         """
         fence = self._make_question(self._fence.command, self._fence.answer, self._fence.longest)
         received_bytes = await self._exchange.ask(

@@ -110,7 +110,15 @@ def bytes_of_bits(count: int) -> int:
 
 
 def exception_error(what: str, code: int) -> LinkError:
-    """The error for an exception answer."""
+    """Return the error for an exception answer: refused, busy or another.
+
+    Parameters
+    ----------
+    what : str
+        The exchange, for the message.
+    code : int
+        Of the exception.
+    """
     kind: type[LinkError] = LinkError
     if code in _REFUSALS:
         kind = DeviceRefusedError

@@ -106,7 +106,22 @@ class RtuBus:
         return cls(serial_port.SerialPort(port, settings))
 
     def device(self, unit_id: int, timeout_s: float, fence: bool = True) -> "GuardedModbusRtu":
-        """The device with this unit id (1..247). Raises ValueError."""
+        """Return the device with a unit id on this bus.
+
+        Parameters
+        ----------
+        unit_id : int
+            From 1 to 247.
+        timeout_s : float
+            Of one exchange.
+        fence : bool
+            See `links.exchange`.
+
+        Raises
+        ------
+        ValueError
+            The unit id is none.
+        """
         return GuardedModbusRtu(self, unit_id, timeout_s, fence)
 
     def find_token(self) -> int:
@@ -151,8 +166,28 @@ class GuardedModbusRtu:
         await self._bus.exchange.close()
 
     async def read_holding(self, address: int, count: int) -> list[int]:
-        """Read holding registers (function code 3). Raises LinkError, LinkDownError,
-        DeviceRefusedError.
+        """Read holding registers (function code 3).
+
+        Parameters
+        ----------
+        address : int
+            Of the first.
+        count : int
+            How many.
+
+        Returns
+        -------
+        list of int
+            Their words.
+
+        Raises
+        ------
+        LinkError
+            No valid reply in time.
+        LinkDownError
+            The port is gone.
+        DeviceRefusedError
+            The device does not have these registers.
         """
         return await self._read(modbus_link.READ_HOLDING, address, count)
 
@@ -180,9 +215,21 @@ class GuardedModbusRtu:
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
 
-        Raises LinkError (no valid reply in time: the device may or may not have executed it),
-        LinkDownError (the port is gone; the same holds), DeviceRefusedError (the device refused and
-        changed nothing).
+        Parameters
+        ----------
+        address : int
+            Of the first.
+        words : sequence of int
+            Their values.
+
+        Raises
+        ------
+        LinkError
+            No valid reply in time: the device may or may not have executed it.
+        LinkDownError
+            The port is gone; the same holds.
+        DeviceRefusedError
+            The device refused and changed nothing.
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         pdu = struct.pack(
@@ -270,11 +317,24 @@ class ModbusLinks:
     def link(
         self, url: str, unit_id: int, timeout_s: float, fence: bool = True
     ) -> modbus_link.AnyModbusLink:
-        """The device `unit_id` at `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`, not yet
-        connected.
+        """Return the link to a device, not yet connected.
 
-        `fence`: see `links.exchange`; TCP does not use it. Raises ValueError for a URL that is
-        neither.
+        Parameters
+        ----------
+        url : str
+            `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`; devices of one serial port
+            share its bus.
+        unit_id : int
+            Modbus unit.
+        timeout_s : float
+            Of one exchange.
+        fence : bool
+            See `links.exchange`; TCP does not use it.
+
+        Raises
+        ------
+        ValueError
+            The URL is neither.
         """
         if not url.startswith("rtu:"):
             host, port = parse_tcp_url(url)

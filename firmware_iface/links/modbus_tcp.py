@@ -160,10 +160,28 @@ class GuardedModbusTcp:
             self._late.note_late(self._clock() - request_s)
 
     async def read_holding(self, address: int, count: int) -> list[int]:
-        """Read `count` holding registers (function code 3).
+        """Read holding registers (function code 3).
 
-        Raises LinkError (no valid reply in time), LinkDownError (the connection is gone),
-        DeviceRefusedError (the device does not have these registers).
+        Parameters
+        ----------
+        address : int
+            Of the first.
+        count : int
+            How many.
+
+        Returns
+        -------
+        list of int
+            Their words.
+
+        Raises
+        ------
+        LinkError
+            No valid reply in time.
+        LinkDownError
+            The connection is gone.
+        DeviceRefusedError
+            The device does not have these registers.
         """
         return await self._read(READ_HOLDING, address, count)
 
@@ -197,9 +215,21 @@ class GuardedModbusTcp:
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
 
-        Raises LinkError (no valid reply in time: the device may or may not have carried it out),
-        LinkDownError (the connection is gone; the same holds), DeviceRefusedError (the device
-        refused and changed nothing).
+        Parameters
+        ----------
+        address : int
+            Of the first.
+        words : sequence of int
+            Their values.
+
+        Raises
+        ------
+        LinkError
+            No valid reply in time: the device may or may not have carried it out.
+        LinkDownError
+            The connection is gone; the same holds.
+        DeviceRefusedError
+            The device refused and changed nothing.
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         reply = await self._exchange_pdu(

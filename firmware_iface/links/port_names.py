@@ -45,9 +45,21 @@ def check_port_name(name: str) -> str:
 def resolve_port_path(
     name: str, comports: Callable[[], Iterable[Any]] = list_ports.comports
 ) -> str:
-    """Present path of the port with this name.
+    """Return the present path of the port with a name.
 
-    Raises LinkDownError (not plugged in), DeviceRefusedError (several adapters have the name).
+    Parameters
+    ----------
+    name : str
+        A path, or `usb:VID:PID[:SERIAL]`.
+    comports : callable
+        Lists the ports of the machine.
+
+    Raises
+    ------
+    LinkDownError
+        It is not plugged in.
+    DeviceRefusedError
+        Several adapters have the name.
     """
     wanted = _USB_NAME.fullmatch(name)
     if wanted is None:

@@ -157,7 +157,15 @@ class AlarmBook:
         return alarm is not None and math.isinf(alarm.gone_s)
 
     def take_sign(self, sign: Sign, now_s: float) -> None:
-        """Take a sign."""
+        """Take a sign that a condition is there, or over.
+
+        Parameters
+        ----------
+        sign : Sign
+            What it is about.
+        now_s : float
+            Time of the sign, on the clock of `step`.
+        """
         alarm = self._alarms.get(sign.name)
         if alarm is None or (sign.bad and sign.always_new and math.isfinite(alarm.gone_s)):
             if sign.bad:

@@ -65,7 +65,17 @@ class Watcher:
         self.send_due(now_s)
 
     def take_news(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
-        """Take rows and events."""
+        """Take the newest rows and events of the run.
+
+        Parameters
+        ----------
+        rows : sequence of bytes
+            Packed telemetry rows, in order.
+        events : sequence of bytes
+            Events as JSON, in order.
+        now_s : float
+            Second of the run.
+        """
         for message in events:
             self._take_event(json.loads(message), now_s)
         for row in rows:

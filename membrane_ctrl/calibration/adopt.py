@@ -8,9 +8,24 @@ from membrane_ctrl.model import errors, files
 
 
 def adopt_geometry(new: Path, place: Path) -> Path | None:
-    """Put a geometry where the configuration looks for it; returns where the previous one is kept.
+    """Put a geometry where the configuration looks for it.
 
-    Raises DeviceError if it cannot be written; the old one then stays in place.
+    Parameters
+    ----------
+    new : Path
+        The file of the geometry.
+    place : Path
+        Where the configuration looks.
+
+    Returns
+    -------
+    Path or None
+        Where the previous one is kept; None if there was none.
+
+    Raises
+    ------
+    DeviceError
+        It cannot be written; the old one then stays in place.
     """
     with errors.convert_write_errors(place, errors.DeviceError):
         place.parent.mkdir(parents=True, exist_ok=True)

@@ -10,8 +10,19 @@ from membrane_ctrl.metrology.rays.geometry import Geometry
 def compare_geometries(
     optics: schema.OpticsConfig, origin: GeometryOrigin, new: GeometryFile
 ) -> list[str]:
-    """Lines that compare the geometry in use (`optics`, `origin`) with the new one, in numbers that
-    a tape measure can check.
+    """Compare the geometry in use with a new one, in numbers that a tape measure can check.
+
+    Parameters
+    ----------
+    optics, origin : OpticsConfig
+        The geometry in use, and where it comes from.
+    new : GeometryFile
+        The new one.
+
+    Returns
+    -------
+    list of str
+        Lines to print.
     """
     old = "by hand"
     if origin.calibrated_utc:

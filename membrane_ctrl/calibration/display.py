@@ -45,8 +45,28 @@ def calibrate_display(config: Config, source: str, as_json: bool) -> int:
 def measure_display(
     bench: optical_bench.OpticalBench, clock: exposures.CycleClock, width_px: int, height_px: int
 ) -> tuple[Settling, DisplayResponse]:
-    """Open the bench and measure its screen. Raises LinkError, or ValueError if the camera cannot
-    see the screen.
+    """Open the bench and measure its screen.
+
+    Parameters
+    ----------
+    bench : OpticalBench
+        Camera and screen, closed.
+    clock : CycleClock
+        Of the exposures.
+    width_px, height_px : int
+        Of the screen.
+
+    Returns
+    -------
+    tuple[Settling, DisplayResponse]
+        Its settling, and its response to grey levels.
+
+    Raises
+    ------
+    LinkError
+        A device fails.
+    ValueError
+        The camera cannot see the screen.
     """
     bench.camera.open()
     bench.screen.open()

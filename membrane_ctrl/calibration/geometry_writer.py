@@ -22,7 +22,31 @@ def write_geometry(
     optics: OpticsConfig,
     findings: Sequence[verdict.CalibrationFinding],
 ) -> str:
-    """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
+    """Write `geometry.toml`.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    solution : Solution
+        The solved bench, with its covariance.
+    problem : Problem
+        The sets.
+    optics : OpticsConfig
+        The stated bench.
+    findings : sequence of CalibrationFinding
+        What the verdict has found.
+
+    Returns
+    -------
+    str
+        Its hash.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
     films = [(solution.states[k], problem.sets[k]) for k in problem.film_sets]
 
     # Residual of the slopes, and what the noise of the screen points makes of it.

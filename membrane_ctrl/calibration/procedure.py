@@ -39,7 +39,20 @@ class Procedure:
     progress: Progress
 
     def times_s(self, head: CalibrationHead, missing: tuple[int, ...]) -> list[float]:
-        """Duration of each step in s: the missing sets, and the return."""
+        """Return the duration of each step: the missing sets, and the return to the start.
+
+        Parameters
+        ----------
+        head : CalibrationHead
+            The plan.
+        missing : tuple of int
+            Numbers of the sets that are not taken yet.
+
+        Returns
+        -------
+        list of float
+            Seconds.
+        """
         stops = [self.held.setpoint_um, *(head.setpoints_um[k] for k in missing), head.start_um]
         return [move_and_set_s(self.held, a, b, self.link.config) for a, b in pairwise(stops)]
 

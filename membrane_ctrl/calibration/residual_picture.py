@@ -20,9 +20,19 @@ _SCALE_PERCENTILE = 98
 
 
 def draw_residuals(path: Path, solution: solver.Solution) -> None:
-    """Draw the mean s_x and s_y residuals of all sets over the camera's picture, on a common scale.
+    """Draw the mean residuals of all sets over the camera's picture, on a common scale.
 
-    Raises OSError if the file cannot be written.
+    Parameters
+    ----------
+    path : Path
+        The picture to write.
+    solution : Solution
+        The solved bench.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
     """
     count = len(solution.states)
     edges = _cell_edges(solution)

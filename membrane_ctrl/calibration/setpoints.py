@@ -75,6 +75,13 @@ def setpoint_reach(held: HeldMirror, config: schema.Config) -> Reach:
 
     The margin is the largest following error, so that a mirror that lags behind its setpoint trips
     no limit during a move. The pressure of a Hencky bowl grows with the cube of its sag.
+
+    Parameters
+    ----------
+    held : HeldMirror
+        The mirror as it is held now.
+    config : Config
+        With the limits of the safety table.
     """
     limits = config.limits
     margin_um = limits.following_error_max_um
@@ -169,5 +176,15 @@ def ramp_s(held: HeldMirror, from_um: float, to_um: float, config: schema.Config
 
 
 def move_and_set_s(held: HeldMirror, from_um: float, to_um: float, config: schema.Config) -> float:
-    """Duration of the move, of settling and of the set, in s."""
+    """Return the duration of a move, of settling and of the set, in s.
+
+    Parameters
+    ----------
+    held : HeldMirror
+        The mirror as it is held now.
+    from_um, to_um : float
+        Setpoints.
+    config : Config
+        With the ramp of the setpoint.
+    """
     return ramp_s(held, from_um, to_um, config) + SETTLE_S + _SET_S

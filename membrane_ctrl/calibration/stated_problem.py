@@ -51,9 +51,25 @@ def known_sigmas(optics: OpticsConfig, free: Mapping[str, float]) -> dict[str, f
 
 
 def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions) -> Problem:
-    """The least-squares problem of the sets.
+    """Make the least-squares problem of the sets.
 
-    Raises InputError if the stated geometry cannot be calibrated.
+    Parameters
+    ----------
+    bundle : Bundle
+        The sets and their stated bench.
+    free : dict of float
+        Prior sigmas of the parameters that `--free` names.
+    options : CalibrateOptions
+        Of the command.
+
+    Returns
+    -------
+    Problem
+
+    Raises
+    ------
+    InputError
+        The stated geometry cannot be calibrated.
     """
     # The stated bench, and how well each of its parameters is known.
     known = known_sigmas(bundle.optics, free)

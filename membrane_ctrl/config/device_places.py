@@ -38,11 +38,22 @@ def find_shared(
     interlocks: Sequence[settings.InterlockDriver],
     name_link: Callable[[str], Hashable] | None = None,
 ) -> str:
-    """One line on two roles that use the same place; empty if there are none.
+    """Find two roles that use the same register, channel, coil or line.
 
-    `roles` has the settings of each role's device. `name_link` gives one and the same value for
-    links that lead to one device, however spelt; without it only the text of a link is compared, as
-    far as it can be without asking the machine.
+    Parameters
+    ----------
+    roles : mapping of object
+        Settings of each role's device, by role.
+    interlocks : sequence of InterlockDriver
+        Settings of the interlocks.
+    name_link : callable or None
+        Returns one and the same value for links that lead to one device, however spelt; without it
+        only the text of a link is compared.
+
+    Returns
+    -------
+    str
+        One line for a person; empty if there are none.
     """
     seen: dict[Hashable, DevicePlace] = {}
     for place in list_places(roles, interlocks, name_link or normalise_link):

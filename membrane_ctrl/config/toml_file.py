@@ -27,10 +27,25 @@ _QUOTED_PART = re.compile(r"""["']\s*\.""")
 
 
 def load_toml(path: str | Path, model: type[Model], follow: bool = True) -> Model:
-    """Read a TOML file as `model`; `follow` is False in a folder from an untrusted source
-    (`model.files`).
+    """Read and validate a TOML file.
 
-    Raises InputError with one line that names the file, the field and a valid value.
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    model : type
+        The schema.
+    follow : bool
+        False in a folder from an untrusted source (`model.files`).
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    InputError
+        With one line that names the file, the field and a valid value.
     """
     path = Path(path)
     return _parse_model(read_toml(path, follow), path, model, follow)
@@ -161,7 +176,22 @@ def parse_tables(tables: dict[str, Any], model: type[Model], where: str) -> Mode
 def prune_unknown_keys(
     table: dict[str, Any], model: type[BaseModel], prefix: str = ""
 ) -> tuple[str, ...]:
-    """Remove unknown keys, so that sets from newer versions can be read; returns their names."""
+    """Remove unknown keys from a table, so that sets of newer versions can be read.
+
+    Parameters
+    ----------
+    table : dict of Any
+        Is changed.
+    model : type
+        The schema.
+    prefix : str
+        Of the returned names.
+
+    Returns
+    -------
+    tuple of str
+        Names of the removed keys.
+    """
     ignored: list[str] = []
     known = {(field.alias or name): field.annotation for name, field in model.model_fields.items()}
     for key in list(table):

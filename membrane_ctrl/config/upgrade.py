@@ -72,10 +72,26 @@ def upgrade_text(text: str, changed: Sequence[ChangedKey] = CHANGED_KEYS) -> Upg
 
 
 def upgrade_file(path: Path, write: bool, changed: Sequence[ChangedKey] = CHANGED_KEYS) -> str:
-    """Upgrade a configuration file; returns the difference, empty if nothing changes.
+    """Upgrade a configuration file; the former one is kept beside it as `NAME.former`.
 
-    Without `write` the file stays. The former file is kept beside it as `NAME.former`. Raises
-    InputError for a file that cannot be read, or that is refused after the upgrade.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    write : bool
+        Without it the file stays.
+    changed : sequence of ChangedKey
+        The renamed keys.
+
+    Returns
+    -------
+    str
+        The difference; empty if nothing changes.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or is refused after the upgrade.
     """
     try:
         text = files.read_text(path, follow=True)

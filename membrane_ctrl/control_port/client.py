@@ -74,7 +74,17 @@ class PortClient:
     def unix(
         cls, path: str | Path, notice: Callable[[str], None], answer_s: float = ANSWER_S
     ) -> PortClient:
-        """Connect to a socket file; connection and greeting take `answer_s` at most."""
+        """Connect to a socket file.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+        notice : callable
+            Receives the unsolicited notices of the hold, such as a loss of command.
+        answer_s : float
+            Longest time for connection and greeting.
+        """
         path = Path(path)
         until_s = time.monotonic() + answer_s
         connection = socket.socket(socket.AF_UNIX)

@@ -90,7 +90,22 @@ class Commander:
         return ""
 
     def begin_session(self, session: CommandSession, take_over: bool, now_s: float) -> str:
-        """Give command to a session; returns why not, or an empty text."""
+        """Give command to a session.
+
+        Parameters
+        ----------
+        session : CommandSession
+            The session.
+        take_over : bool
+            Also if another client has command.
+        now_s : float
+            Time of the request.
+
+        Returns
+        -------
+        str
+            Why not; empty if it has command.
+        """
         if self.session is not None and self.session.id == session.id:
             return ""
         if not take_over and (refusal := self._explain_refusal(session.who, now_s)):

@@ -39,8 +39,28 @@ class Where:
 
 
 def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
-    """Send a request to a running hold. Raises InputError for a refusal, DeviceError without an
-    answer.
+    """Send a request to a running hold and print its answer.
+
+    Parameters
+    ----------
+    request : dict of Any
+        With its name as `do`.
+    where : Where
+        Of the hold.
+    as_json : bool
+        Print the answer as JSON.
+
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    InputError
+        The hold refuses the request.
+    DeviceError
+        No answer.
     """
     if where.service is not None:
         return _ask_service(request, where.service, as_json)
@@ -291,10 +311,27 @@ def _print_notice(text: str) -> None:
 def connected(
     where: Where, notice: Callable[[str], None] = _print_notice, answer_s: float = ANSWER_S
 ) -> PortClient:
-    """Connect to the hold that `where` names. Raises InputError for another run, DeviceError if no
-    hold answers.
+    """Connect to the hold that a place names.
 
-    Connection and greeting take `answer_s` at most.
+    Parameters
+    ----------
+    where : Where
+        The place.
+    notice : callable
+        Receives the unsolicited notices of the hold.
+    answer_s : float
+        Longest time for connection and greeting.
+
+    Returns
+    -------
+    PortClient
+
+    Raises
+    ------
+    InputError
+        Another run is there.
+    DeviceError
+        No hold answers.
     """
     path = socket_path(where)
     if where.socket is None and where.run is None and not path.exists():

@@ -24,7 +24,20 @@ class FairQueue(Generic[T]):
         return sum(len(items) for items in self._waiting.values())
 
     def put(self, kind: str, item: T) -> bool:
-        """Add an item; returns whether there was room for one more of its kind."""
+        """Add an item.
+
+        Parameters
+        ----------
+        kind : str
+            Of the item.
+        item : T
+            The item.
+
+        Returns
+        -------
+        bool
+            Whether there was room for one more of its kind.
+        """
         items = self._waiting.setdefault(kind, deque())
         if len(items) >= self._most_each:
             return False

@@ -158,7 +158,27 @@ class Listeners:
 
 
 def listeners_for(config: PortConfig, logs_dir: Path, stack: contextlib.ExitStack) -> Listeners:
-    """Bind the configured socket; the stack closes it. Raises InputError or DeviceError."""
+    """Bind the configured socket.
+
+    Parameters
+    ----------
+    config : PortConfig
+        Of the port.
+    logs_dir : Path
+        Folder of the runs, in which the socket is by default.
+    stack : ExitStack
+        Closes it.
+
+    Returns
+    -------
+    Listeners
+        Without a socket if the port is not enabled.
+
+    Raises
+    ------
+    InputError, DeviceError
+        It cannot be bound.
+    """
     if not config.enabled:
         return Listeners()
     path = config.socket_in(logs_dir)

@@ -12,8 +12,15 @@ _PART = re.compile(r"([0-9]+(?:\.[0-9]+)?)([dhms])")
 
 
 def pause_s(failures: int, first_s: float = 1.0, longest_s: float = 60.0) -> float:
-    """Wait after a number of consecutive failures: `first_s`, doubled with each; 0 without a
-    failure.
+    """Return the wait after consecutive failures: `first_s`, doubled with each failure, up to
+    `longest_s`.
+
+    Parameters
+    ----------
+    failures : int
+        Their number; 0 gives no wait.
+    first_s, longest_s : float
+        The wait after the first, and the longest one.
     """
     if failures < 1:
         return 0.0

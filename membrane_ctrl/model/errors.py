@@ -67,8 +67,16 @@ def os_reason(error: OSError) -> str:
 def convert_write_errors(
     target: Path, kind: type[CommandError] = InputError, remedy: str = ""
 ) -> Iterator[None]:
-    """Turn an OSError of the block, which writes `target`, into a command's error with the reason
-    and a remedy.
+    """Turn an OSError of the block into a command's error with the reason and a remedy.
+
+    Parameters
+    ----------
+    target : Path
+        What the block writes.
+    kind : type
+        The error to raise.
+    remedy : str
+        Appended to the message.
     """
     try:
         yield

@@ -50,10 +50,23 @@ def folder_handle(folder: Path) -> Iterator[int]:
 
 
 def open_plain(path: Path, follow: bool = False) -> BinaryIO:
-    """A plain file, opened for reading; `follow` links of a path that the user named.
+    """Open a plain file for reading.
 
-    Raises OSError if it is missing, a link, in a linked folder, or no plain file; `strerror` states
-    which.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    follow : bool
+        Follow links; only for a path that the user named.
+
+    Returns
+    -------
+    BinaryIO
+
+    Raises
+    ------
+    OSError
+        It is missing, a link, in a linked folder, or no plain file; `strerror` states which.
     """
     with contextlib.ExitStack() as stack:
         if follow:
@@ -65,8 +78,26 @@ def open_plain(path: Path, follow: bool = False) -> BinaryIO:
 
 
 def read_bytes(path: Path, most_bytes: int, follow: bool = False) -> bytes:
-    """The content of a plain file. Raises OSError as `open_plain`,
-    and for more than `most_bytes`.
+    """Read a plain file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    most_bytes : int
+        Largest size.
+    follow : bool
+        As in `open_plain`.
+
+    Returns
+    -------
+    bytes
+        Its content.
+
+    Raises
+    ------
+    OSError
+        As `open_plain`, and for a larger file.
     """
     with open_plain(path, follow) as file:
         size = os.fstat(file.fileno()).st_size
@@ -83,7 +114,27 @@ def read_bytes(path: Path, most_bytes: int, follow: bool = False) -> bytes:
 def read_text(
     path: Path, most_bytes: int = SMALL_BYTES, errors: str = "strict", follow: bool = False
 ) -> str:
-    """As `read_bytes`, decoded. Raises also UnicodeDecodeError, depending on `errors`."""
+    """Read a plain file as UTF-8.
+
+    Parameters
+    ----------
+    path, most_bytes, follow : as in `read_bytes`
+        -
+    errors : str
+        As of `bytes.decode`.
+
+    Returns
+    -------
+    str
+        Its content.
+
+    Raises
+    ------
+    OSError
+        As `read_bytes`.
+    UnicodeDecodeError
+        It is not UTF-8, depending on `errors`.
+    """
     return read_bytes(path, most_bytes, follow).decode("utf-8", errors)
 
 
@@ -95,9 +146,19 @@ def resolve_user_path(path: Path) -> Path:
 
 
 def write_text_atomic(path: Path, text: str) -> None:
-    """Write UTF-8 text beside `path`, sync it, and move it into place atomically. Raises OSError.
+    """Write UTF-8 text beside a file, sync it, and move it into place atomically.
 
-    A lone surrogate, allowed in JSON but not in UTF-8, is written as its JSON escape.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    text : str
+        A lone surrogate, allowed in JSON but not in UTF-8, is written as its JSON escape.
+
+    Raises
+    ------
+    OSError
+        It cannot be written; the former file stays.
     """
     write_bytes_atomic(path, text.encode("utf-8", "backslashreplace"))
 
@@ -130,7 +191,20 @@ def fresh_text(path: Path) -> TextIO:
 
 
 def append_text(path: Path, text: str) -> None:
-    """Append to a plain file without hard links; make it if missing. Raises OSError."""
+    """Append text to a plain file without hard links; make it if it is missing.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    text : str
+        UTF-8.
+
+    Raises
+    ------
+    OSError
+        It cannot be written, or has a second name elsewhere.
+    """
     with folder_handle(path.parent) as folder:
         descriptor = _require_regular(_open_checked(path, _APPEND, folder), path)
         with os.fdopen(descriptor, "ab") as file:

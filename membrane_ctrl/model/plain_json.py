@@ -16,7 +16,15 @@ _DIGITS_MAX = 19  # enough for a 64-bit counter; longer numbers are floats
 
 
 def dumps(value: Any, indent: int | None = None) -> str:
-    """JSON text; NaN and infinity become null, unsupported types become their `str`."""
+    """Return JSON text; NaN and infinity become null, unsupported types become their `str`.
+
+    Parameters
+    ----------
+    value : Any
+        Of any type.
+    indent : int or None
+        As of `json.dumps`.
+    """
     return json.dumps(
         _replace_non_finite(value), ensure_ascii=False, default=str, allow_nan=False, indent=indent
     )

@@ -80,7 +80,15 @@ class RunStatus:
         return replace(self, row=row, since_s=self.since_s if same else row.mono_s)
 
     def after_event(self, event: events.Event, mono_s: float = math.nan) -> "RunStatus":
-        """The status after an event; most change nothing."""
+        """Return the status after an event; most events change nothing.
+
+        Parameters
+        ----------
+        event : Event
+            The event.
+        mono_s : float
+            Second of the run at which it happened.
+        """
         changes = event.notice_changes(self.notices)
         notices = apply_changes(self.notices, changes)
         if notices is self.notices:

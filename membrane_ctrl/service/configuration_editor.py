@@ -76,7 +76,24 @@ class ConfigurationEditor:
 
     def check(self, name: str, text: str) -> CheckedText:
         """Check a text that is to become a configuration: syntax, values, and how they fit
-        together. Devices are checked when a hold starts. Raises InputError for a wrong name.
+        together. Devices are checked when a hold starts.
+
+        Parameters
+        ----------
+        name : str
+            Of the configuration.
+        text : str
+            TOML.
+
+        Returns
+        -------
+        CheckedText
+            The errors and warnings.
+
+        Raises
+        ------
+        InputError
+            The name is wrong.
         """
         path = self._find_path(name)
         if len(text.encode("utf-8", "replace")) > TEXT_BYTES_MAX:

@@ -46,6 +46,13 @@ class ConnectionGuard:
     def add(self, client: Client, transport: asyncio.Transport) -> None:
         """Give a new connection a place; disconnect the stranger that was active longest ago if
         there is none.
+
+        Parameters
+        ----------
+        client : Client
+            Address and port of the sender.
+        transport : Transport
+            Of the connection.
         """
         self._strangers[client] = transport
         if len(self._strangers) > self._strangers_max:

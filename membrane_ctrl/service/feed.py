@@ -77,7 +77,15 @@ class Seconds:
         self._at = -1
 
     def add(self, utc_s: float, values: dict[str, float]) -> None:
-        """Add one tick; missing values are left out."""
+        """Add one tick to the means of its second.
+
+        Parameters
+        ----------
+        utc_s : float
+            Time of the tick; must not fall.
+        values : dict of float
+            By name of the signal; those that are not finite are left out.
+        """
         if math.floor(utc_s) != self._at:
             self._close()
             self._at = math.floor(utc_s)
@@ -463,7 +471,15 @@ def _join_series(parts: Sequence[Series]) -> Series:
 
 
 def thinned(series: Series, span_s: float) -> Series:
-    """The series in windows of equal length, at most `_POINTS_MAX`; a NaN row after each gap."""
+    """Return a series in windows of equal length; a NaN row stands for each gap.
+
+    Parameters
+    ----------
+    series : Series
+        Minimum, mean and maximum of seconds.
+    span_s : float
+        Length of the whole chart; it has at most `_POINTS_MAX` windows.
+    """
     if not series.utc_s.size:
         return series
     # The first row of each window.

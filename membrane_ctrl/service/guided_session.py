@@ -142,7 +142,22 @@ class GuidedSession:
         return path
 
     def start(self, name: str, simulated: bool, who: str) -> None:
-        """Start a session, or resume the one of that name. Raises InputError, DeviceError."""
+        """Start a session, or resume the one of that name.
+
+        Parameters
+        ----------
+        name : str
+            Of its folder.
+        simulated : bool
+            On the emulated bench.
+        who : str
+            The viewer.
+
+        Raises
+        ------
+        InputError, DeviceError
+            The name is wrong, another session runs, or the program does not start.
+        """
         folder = self.find_folder(name)
         if self._units and not simulated:
             raise errors.InputError(_UNITS_REFUSAL)
@@ -178,7 +193,22 @@ class GuidedSession:
         _log(f"{who} has started the guided session {name}")
 
     def answer(self, number: int, text: str, who: str) -> None:
-        """Answer the question of a number. Raises InputError if it waits no longer."""
+        """Answer a question of the session.
+
+        Parameters
+        ----------
+        number : int
+            Of the question: each is answered once.
+        text : str
+            The answer.
+        who : str
+            The viewer.
+
+        Raises
+        ------
+        InputError
+            The question waits no longer, or the answer is too long.
+        """
         if len(text) > _ANSWER_MOST:
             raise errors.InputError(f"longer than {_ANSWER_MOST} characters")
         with self._lock:

@@ -48,7 +48,15 @@ class Heartbeat:
         self._threads: dict[str, threading.Thread] = {}
 
     def step(self, now_s: float, text: str) -> None:
-        """Send what is due, and never wait: each sender has a thread."""
+        """Send what is due, and never wait: each sender has a thread.
+
+        Parameters
+        ----------
+        now_s : float
+            Monotonic time.
+        text : str
+            Of the message.
+        """
         for name, send in self._senders.items():
             thread = self._threads.get(name)
             if now_s < self._due_s[name] or (thread is not None and thread.is_alive()):

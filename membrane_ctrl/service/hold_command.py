@@ -25,6 +25,17 @@ def ask_hold(where: Where, run: str, request: Message, limits: SendLimits = NO_L
     have none of these conditions.
 
     Raises DeviceError without an answer, or if another run is listening.
+
+    Parameters
+    ----------
+    where : Where
+        Of the hold.
+    run : str
+        Name of the run; a safety command goes to any run that listens.
+    request : Message
+        The command.
+    limits : SendLimits
+        Until when the command may be sent, and what else refuses it.
     """
     with connected(where, notice=_ignore_notice) as client:
         if not is_safety_command(str(request["do"])):

@@ -34,7 +34,20 @@ class Budgets:
     _tokens: OrderedDict[tuple[str, ...], tuple[float, float]] = field(default_factory=OrderedDict)
 
     def wait_s(self, key: tuple[str, ...], now_s: float) -> float:
-        """Return the seconds until this key has a token; 0 if it has one."""
+        """Return the time until a key has a token.
+
+        Parameters
+        ----------
+        key : tuple of str
+            What the budget is of.
+        now_s : float
+            Monotonic time.
+
+        Returns
+        -------
+        float
+            Seconds; 0 if it has one.
+        """
         return max(0.0, 1.0 - self._filled(key, now_s)) * self.refill_s
 
     def take(self, key: tuple[str, ...], now_s: float) -> None:

@@ -53,7 +53,15 @@ class PublicAddress:
         return f"HttpOnly; SameSite=Strict; Path={self.prefix or '/'}{secure}"
 
     def admits_origin(self, origin: str, host: str) -> bool:
-        """Whether a request that names this `Origin` and `Host` comes from the page itself."""
+        """Return whether a request comes from the page itself.
+
+        Parameters
+        ----------
+        origin : str
+            Its `Origin` header.
+        host : str
+            Its `Host` header.
+        """
         if self.origin and normalised_origin(origin) == self.origin:
             return True
         return origin.partition("://")[2] == host

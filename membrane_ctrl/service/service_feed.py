@@ -88,8 +88,13 @@ class ServiceFeed(HoldFeed):
 def make_feed(where: Where, with_signals: bool = False) -> HoldFeed:
     """Return what follows a hold, wherever it is.
 
-    Of a hold behind a service, `with_signals` gets the published signals, for bridges; else the
-    events, for the page.
+    Parameters
+    ----------
+    where : Where
+        Of the hold: on this machine, or behind a service.
+    with_signals : bool
+        Of a hold behind a service, get the published signals, for bridges; else the events, for the
+        page.
     """
     if where.service is None:
         return HoldFeed(where)
