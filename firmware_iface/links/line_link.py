@@ -58,7 +58,7 @@ class LineLink:
         ----------
         command : str
             Without its line end.
-        answer : Pattern[str]
+        answer : re.Pattern
             Must match all that comes, line ends included, except line ends before it; and nothing
             that is still incomplete.
         longest : int

@@ -152,6 +152,7 @@ def _search(fit: Callable[[float], _Fit], bounds: tuple[float, float]) -> tuple[
     """The value in the bounds with the least cost, searched in its logarithm, and its fit."""
     # A coarse grid finds the valley, a bounded search its bottom.
     low, high = (math.log(bound) for bound in bounds)
+    # A coarse search over the whole range; then a fine one between the neighbours of its best.
     coarse = np.linspace(low, high, 6)
     costs = [fit(math.exp(at)).cost for at in coarse.tolist()]
     place = int(np.argmin(costs))

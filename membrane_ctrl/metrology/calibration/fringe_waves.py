@@ -72,6 +72,7 @@ def _fit_waves_mm(
     out = np.zeros_like(phases.screen_mm)
     if not phases.period_mm:
         return out
+    # Residuals, with the weights that outliers have lost.
     left_mm = forward_model.residual_mm(
         bench, phases, state.surface, state.vertex_z_mm, state.moved_screens
     )
@@ -93,11 +94,13 @@ def _fit_waves_mm(
         powers = [(p, q) for p in orders for q in range(_SMOOTH_ORDER + 1 - p)]
         smooth = [column**p * row**q for p, q in powers]
         for axis in range(2):
+            # Cosine and sine of each harmonic, even over the picture and growing along its sides.
             phase_rad = rad_per_mm * phases.screen_mm[axis, some]
             waves = []
             for k in _WAVES:
                 for wave in (np.cos(k * phase_rad), np.sin(k * phase_rad)):
                     waves += [wave * 1.0, wave * column, wave * row]
+            # Weighted least squares; only the waves are kept.
             design = np.stack([*waves, *smooth], axis=1) * root[some, None]
             right = left_mm[axis, some] * root[some]
             amplitudes = np.linalg.lstsq(design, right, rcond=None)[0]

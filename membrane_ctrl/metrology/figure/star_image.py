@@ -91,6 +91,7 @@ def image_star(axis_mm: FloatArray, height_mm: FloatArray, wavelength_um: float)
     mask = np.isfinite(height_mm)
     rows, columns = np.nonzero(mask)
     points = np.stack((axis_mm[columns], axis_mm[rows], height_mm[mask]))
+    # Path differences in the focus, on the map's grid.
     focus_mm, path_mm = find_paths(points)
     path_um = 1e3 * (path_mm - path_mm.mean())
     paths = np.zeros(mask.shape)
@@ -100,6 +101,7 @@ def image_star(axis_mm: FloatArray, height_mm: FloatArray, wavelength_um: float)
     size = _PADDING * len(axis_mm)
     field = np.fft.fftshift(np.fft.fft2(waves, (size, size)))
     spread = np.abs(field) ** 2 / np.count_nonzero(mask) ** 2
+    # Width of a pixel in the focus: wavelength times distance over the padded aperture.
     step_mm = float(axis_mm[1] - axis_mm[0])
     distance_mm = float(focus_mm[2] - points[2].min())
     pixel_um = wavelength_um * distance_mm / (size * step_mm)

@@ -417,6 +417,7 @@ def unexplained_term_mm(figures: Sequence[FilmFigure], bowls: Bowl, reach: float
                 columns = columns.reshape(-1, columns.shape[-1])
                 amounts = np.linalg.lstsq(columns, data.ravel(), rcond=None)[0]
                 data = data - (columns @ amounts).reshape(data.shape)
+            # What is left beyond the noise, per figure and free number.
             squares += (float(np.sum(data**2)) - noise) / len(figures)
             freedom += terms.size - fitted
     if freedom:

@@ -210,6 +210,7 @@ def _search_axis(
     for k in stack.gray(AXES[axis]):
         if k in excluded:
             continue
+        # Bins that are surely on one side of the frame's edges.
         bit = stack.patterns[k].index
         shown, from_edge_rad = gray_bit(phase_rad, bit)
         saturated = binned.saturated[k].reshape(-1)[scene.index]
@@ -404,6 +405,8 @@ def _score_places(
             whole_power += of_frame_power
             power += of_frame_power - np.sum(found[:, :-1] ** 2, axis=1)
             product += found[:, -1]
+        # Least squares of one amplitude: product / power; it lowers the sum of squares by the
+        # score.
         determined = power > _LEAST_DETERMINED * whole_power + 1e-9
         power = power[determined]
         product = product[determined]

@@ -78,12 +78,14 @@ def _track_phases(sums, index, cosine, sine, turn, mirror, slope, last, out, sta
     """
     for first in range(start, stop, _BLOCK):
         end = min(first + _BLOCK, stop)
+        # The phasor of each point, without the film's motion.
         c = out[1, first:end]
         s = out[2, first:end]
         _combine_sums(sums, index, cosine, first, c)
         _combine_sums(sums, index, sine, first, s)
         if turn[1] != 0:
             _remove_motion(c, s, slope[first:end], turn, mirror)
+        # Its angle to the last phasor, which is the change of the phase.
         _relative_angle(
             c, s, last[1, first:end], last[2, first:end], out[3, first:end], out[4, first:end]
         )

@@ -149,6 +149,7 @@ def map_reflections(
     shows = np.any(np.all(np.abs(images_mm) < reach_mm, axis=1), axis=0)
     if not shows.any():
         return None
+    # A disc around it, wider by the spacing of the coarse places.
     low = everywhere[:, shows].min(axis=1)
     high = everywhere[:, shows].max(axis=1)
     centre = (low + high) / 2

@@ -108,6 +108,7 @@ def trace_gas_lens(
     GasLens
     """
     # Places spread evenly over the disc, on bowls of two depths.
+    # Places spread evenly over the disc: a sunflower, whose angle grows by the golden one.
     k = np.arange(_PLACES)
     rho = np.sqrt((k + 0.5) / (_PLACES - 0.5))
     theta = k * np.pi * (3 - np.sqrt(5))

@@ -420,6 +420,7 @@ def slope_field(  # type: ignore[no-untyped-def]
         _look_up_face(screen, face, first, count, off)
         for k in range(count):
             p = first + k
+            # The bisector of the rays, and the slope of the surface at the same place.
             x, y, gx, gy = measured_slope(rays, t, screen, off[k], pinhole, plane, p)
             _h, hx, hy, _ev = evaluate_surface(poly, excess, amplitude, x / radius, y / radius)
             out[0, p] = x

@@ -116,6 +116,7 @@ def face_height(face, a, b):  # type: ignore[no-untyped-def]
     w, wa, wb : float
         Height in mm, and its derivatives by s_x and s_y.
     """
+    # The bow, with its slopes; then the map on top of it.
     w = face.bow_per_mm * (a * a + b * b)
     wa = 2 * face.bow_per_mm * a
     wb = 2 * face.bow_per_mm * b

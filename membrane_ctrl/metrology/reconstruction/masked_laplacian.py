@@ -172,16 +172,19 @@ class MaskedLaplacian:
         right, down = self._links[level]
         h, residual, _ = self._memory[level]
         h[:] = 0.0
+        # Gauss-Seidel forward: what is left is smooth.
         _smooth_sweep(right, down, rhs, h, True)
         if level + 1 == len(self._links):
             for _ in range(_COARSEST_SWEEPS):
                 _smooth_sweep(right, down, rhs, h, False)
                 _smooth_sweep(right, down, rhs, h, True)
         else:
+            # The residual on the coarser grid, solved there, corrects this one.
             _apply_laplacian(right, down, h, residual)
             np.subtract(rhs, residual, out=residual)
             coarse = self._memory[level + 1][2]
             _restrict_to_coarse(residual, coarse)
             _prolong_to_fine(self._cycle(level + 1, coarse), h, _OVER_CORRECTION)
+        # And backward: a symmetric cycle, as conjugate gradients need.
         _smooth_sweep(right, down, rhs, h, False)
         return np.asarray(h)

@@ -32,6 +32,7 @@ class LightSquares:
     """
 
     def __init__(self, scene: CrossedScene) -> None:
+        # Squares of the mirror; those at the rim that have few bins are not whole.
         self._number = _assign_squares(scene.position_mm, scene.surface.radius_mm, _SQUARES_ACROSS)
         self._count = np.bincount(self._number)
         self._whole = self._count > _WHOLE * np.median(self._count)
@@ -47,6 +48,7 @@ class LightSquares:
         self._scatter = np.sqrt(means[1] / 2)
         mean_fringe = np.hypot(means[2:4], means[4:]).sum(axis=0)
         self._fringe_share = mean_fringe / self._level_adu
+        # Where fringes do not average out in a square, its level is no measure of the light.
         usual_share = float(np.median(self._fringe_share[self._whole]))
         self._even = self._whole & (self._fringe_share <= max(_UNEVEN, usual_share))
 

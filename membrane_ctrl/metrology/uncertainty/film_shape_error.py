@@ -171,6 +171,7 @@ def _absorbed_terms(
 def _mean_of_rings(rings: RoundSlopes, absorbed: FloatArray, radius_mm: float) -> FloatArray:
     """Mean radial slopes (rings, k), in radii, that the fit leaves of the round terms beyond it."""
     # Points of each ring.
+    # Points on circles within each ring.
     share = (np.arange(_RADII) + 0.5) / _RADII
     width_mm = (rings.outer_mm - rings.inner_mm)[:, None]
     radius = rings.inner_mm[:, None] + width_mm * share

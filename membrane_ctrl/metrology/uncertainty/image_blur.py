@@ -85,12 +85,14 @@ def estimate_blur_px(
         Sigma of the Gaussian, pixels.
     """
     # |grad phase|^2 of x and of y, per pixel.
+    # |grad phase|^2 of x and of y, per pixel.
     squares = []
     for phase in predicted_rad:
         grid = np.full(shape, np.nan)
         grid.reshape(-1)[index] = phase
         square = np.sum(np.square(np.gradient(grid)), axis=0)
         squares.append(square.reshape(-1)[index] / bin_px**2)
+    # What the contrast of x over that of y depends on.
     difference = squares[0] - squares[1]
     with np.errstate(divide="ignore", invalid="ignore"):
         contrast = np.log(swings[0]) - np.log(swings[1])

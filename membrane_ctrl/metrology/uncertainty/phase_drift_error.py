@@ -44,6 +44,7 @@ def phase_drift_source(
     drift_mm = scale * np.array([of_axis.drift_rad for of_axis in shifts])
     times = np.array([of_axis.frames.mean() for of_axis in shifts])
     later = (times - times.mean())[:, None]
+    # Each body that moves steadily in one way that its two shifts of the picture determine.
     nominal = bench.geometry()
     effects = [np.zeros_like(bench.surface.parameters)]
     for group, columns in zip(GROUPS, group_columns(), strict=True):

@@ -149,6 +149,7 @@ class _SlopesOfScreen:
     def __init__(self, tracer: Tracer, surface: Surface, position_mm: FloatArray) -> None:
         self._tracer = tracer
         self._surface = surface
+        # Rays from the pinhole to the points of the surface, and what they see of the screen.
         height_mm = tracer.vertex_z_mm + surface.height(position_mm[0], position_mm[1])
         way_mm = np.vstack([position_mm, height_mm]) - tracer.geometry.pinhole_mm[:, None]
         rays = way_mm / np.linalg.norm(way_mm, axis=0)
@@ -180,6 +181,7 @@ class _PartGrid:
     """A grid about the vertex over the part with reflections and the mirror around it."""
 
     def __init__(self, left: LeftReflections) -> None:
+        # A grid about the vertex whose cells have some points each.
         position_mm = left.position_mm
         reach_mm = float(np.max(np.hypot(*position_mm)))
         area_mm2 = np.pi * (np.ptp(position_mm[0]) / 2) * (np.ptp(position_mm[1]) / 2)

@@ -78,6 +78,7 @@ def _find_long_steps(held: found_event.Level) -> list[found_event.FoundEvent]:
 def _find_short_steps(held: found_event.Level) -> list[found_event.FoundEvent]:
     """The largest step, if it is far above the scatter on both sides."""
     # The place with the largest difference of means on both sides.
+    # Student's t of the flow after each window against the flow before it.
     windows = levels.coarser_level(held, SHORT_WINDOW_S)
     flow = _holding_flow(windows)
     places = range(SHORT_HALF, flow.size - SHORT_HALF)

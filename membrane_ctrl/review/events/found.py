@@ -126,6 +126,7 @@ def pressure_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
 
 def find_laser_glitches(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Readings that jump and jump back, not explained by air pressure or a lost laser."""
+    # Seconds in which a lost laser or a step of the pressure explains a jump.
     lost = level["max_displacement_quality"] > 0
     barometer = level["mean_ambient_pressure_pa"]
     stepped = np.zeros(lost.size, dtype=bool)
@@ -137,6 +138,7 @@ def find_laser_glitches(level: found_event.Level) -> list[found_event.FoundEvent
         (level["state"] == State.HOLD) & ~stepped & ~found_event.widen_flags(lost, LOST_MOVES_S)
     )
     calm = ~found_event.widen_flags(~np.isfinite(barometer), DOOR_MOVES_S)
+    # Jumps and returns in the seconds that are left.
     low_um, mean_um, high_um = (level[f"{kind}_displacement_um"] for kind in ("min", "mean", "max"))
     found = reading_glitches.find_glitches(low_um, mean_um, high_um, usable, calm)
     time_s = level["time_s"]
@@ -213,6 +215,7 @@ def find_lateness_bursts(level: found_event.Level) -> list[found_event.FoundEven
 def find_noise_changes(level: found_event.Level) -> list[found_event.FoundEvent]:
     """The spread of the error changes for minutes."""
     # Each second of the hold, with the number of its minute.
+    # Seconds of the held mirror, numbered by their minute.
     held = _select_held(level)
     minute = np.floor(held["time_s"] / 60).astype(int)
     error = held["mean_error_um"]

@@ -28,6 +28,7 @@ def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
     held : (n,) bool array
         Whether the mirror was held during each.
     """
+    # Cycles of a held mirror that stands still.
     moved_um = np.abs(np.diff(shapes.displacement_um, prepend=np.nan, append=np.nan))
     still = ~(np.fmax(moved_um[:-1], moved_um[1:]) > JUMP_STILL_UM)
     good = held & still & (shapes.verdict != "rejected")
@@ -35,12 +36,15 @@ def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
         return []
     # all terms of a month take 190 MB (36 of them)
     terms = shapes.coeffs_um[good, 4:11] - np.outer(shapes.sag_um[good], zernike_projection()[4:11])
+    # The mean of the cycles after each place less that of those before, as RMS over the terms.
     change = np.stack([mean_differences(term, JUMP_HALF_CYCLES, 0) for term in terms.T])
     size = np.sqrt((change**2).sum(axis=0))
+    # Its usual size and scatter, both robust: a jump is far above them.
     scale = np.nanmedian(size)
     sigma = _SIGMA_OVER_MAD * float(np.nanmedian(np.abs(size - scale))) + 1e-12
     score = np.nan_to_num((size - scale) / sigma)
     rows = np.flatnonzero((np.nan_to_num(size) >= JUMP_LEAST_UM) & (score >= JUMP_LEAST_SIGMAS))
+    # One jump for each stretch of high scores: the largest.
     groups = []
     if rows.size:
         groups = np.split(rows, np.flatnonzero(np.diff(rows) > 2 * JUMP_HALF_CYCLES) + 1)

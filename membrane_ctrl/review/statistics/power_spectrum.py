@@ -73,6 +73,8 @@ def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) 
     frequency_hz = np.asarray(np.fft.rfftfreq(length, 1 / rate_hz), dtype=np.float64)
     if values.size < length:
         return Spectrum(frequency_hz, np.full(frequency_hz.size, np.nan), 0)
+    # Half overlapping segments, without a copy; those with a gap are left out, and each loses its
+    # mean.
     pieces = np.lib.stride_tricks.sliding_window_view(values, length)[:: length // 2]
     window = signal.get_window("hann", length)
     power = np.zeros(frequency_hz.size)
@@ -86,6 +88,7 @@ def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) 
         count += len(batch)
     if not count:
         return Spectrum(frequency_hz, np.full(frequency_hz.size, np.nan), 0)
+    # Periodograms become a density by the rate and the window's power.
     scale = 1.0 / (rate_hz * (window**2).sum())
     density = power * scale / count
     # Add the negative frequencies; 0 and, for an even length, half the rate have none

@@ -124,6 +124,7 @@ def _choose_pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) ->
     """
     # For each cycle, the one that comes `lag_s` later
     time_s = good.time_s
+    # Each cycle with the one that is nearest to a lag later.
     half_s = 0.5 * float(np.median(np.diff(time_s)))
     other = np.searchsorted(time_s, time_s + lag_s - half_s)
     other = np.minimum(other, time_s.size - 1)

@@ -174,10 +174,12 @@ class Disturber:
         far, with an exponential memory.
         """
         nodes = self._nodes
+        # The mean phasor of each axis, with the pattern that is shown now.
         shown = np.exp(1j * np.array([pattern.shift_rad, pattern.shift_y_rad]))
         keep = math.exp(min(0.0, self._retained_s - time_s) / _RETENTION_S)
         self._retained = keep * self._retained + (1.0 - keep) * shown
         self._retained_s = time_s
+        # Fringes with that contrast and phase, at the nodes.
         rad_per_mm = 2 * math.pi * pattern.index / nodes.side_mm
         wave_x, wave_y = (
             np.real(phasor * np.exp(1j * (rad_per_mm * s_mm - math.pi)))

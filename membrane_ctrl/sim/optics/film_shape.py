@@ -206,6 +206,7 @@ class FilmShape:
 def _film_terms(film: FilmShape) -> FilmTerms:
     """The film as numbers for the kernel, its offset chosen so that h(0, 0) = 0."""
     # Ripples as wave vectors, wrinkles and bumps as rows of numbers in mm.
+    # Ripples as waves (amplitude, k_x, k_y, phase); wrinkles and bumps as rows of numbers.
     ripples = []
     for ripple in film.ripples:
         rad_per_mm = 2.0 * pi / ripple.wavelength_mm
