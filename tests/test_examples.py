@@ -179,7 +179,7 @@ def test_a_preset_refuses_what_its_device_does_not_have(
     assert "devices.pump" in line
 
 
-def test_the_dashboard_asks_for_metrics_that_exist() -> None:
+def test_the_dashboard_queries_metrics_that_exist() -> None:
     dashboard = json.loads(EXAMPLES[0].with_name("grafana.json").read_text())
     status = RunStatus(TelemetryRow(*(0.0 for _ in FIELDS)))
     seen = HoldSeen("run", status=status_table(status), seen_s=math.inf, problem="")

@@ -165,7 +165,7 @@ def test_the_tick_is_pure(file: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["safety", "safety_rule", "observation", "state_sets"])
-def test_safety_knows_only_plain_data(name: str) -> None:
+def test_safety_imports_only_plain_data(name: str) -> None:
     (file,) = files_of(f"membrane_ctrl/controller/{name}.py")
     may = {"firmware_iface.roles", "membrane_ctrl.controller.link_report"}
     may |= {f"membrane_ctrl.controller.{other}" for other in ("safety_rule", "observation")}
@@ -270,12 +270,12 @@ def test_no_data_is_run_or_unpickled(folder: str) -> None:
         "def f():\n    import yaml",
     ],
 )
-def test_the_rule_sees_what_would_run_data(tmp_path: Path, line: str) -> None:
+def test_the_rule_finds_what_would_run_data(tmp_path: Path, line: str) -> None:
     (tmp_path / "bad.py").write_text(line + "\n")
     assert unsafe(tmp_path / "bad.py")
 
 
-def test_the_rules_see_a_broken_one(tmp_path: Path) -> None:
+def test_the_rules_find_a_broken_one(tmp_path: Path) -> None:
     """The checker itself: it finds an import inside a function."""
     bad = tmp_path / "bad.py"
     bad.write_text("def f():\n    from membrane_ctrl.metrology import phase\n")

@@ -150,7 +150,7 @@ def test_a_hold_of_an_installed_copy_leaves_nothing_behind(installed: Installed)
 
 
 @pytest.mark.campaign
-def test_an_outside_program_sees_the_types(installed: Installed) -> None:
+def test_an_outside_program_has_the_types(installed: Installed) -> None:
     (installed.empty / "program.py").write_text(_PROGRAM)
     (installed.empty / "mypy.ini").write_text("[mypy]\nfollow_imports = silent\n")
     words = ["-m", "mypy", "--strict", "--python-executable", str(installed.python), "program.py"]

@@ -90,7 +90,7 @@ def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
     assert not any(weak.check_estimate(cycle) for _ in range(2 * CYCLES))
 
 
-def test_rejected_cycles_and_stated_geometries_say_nothing() -> None:
+def test_rejected_cycles_and_stated_geometries_report_nothing() -> None:
     rejected = replace(CYCLE, verdict="rejected", slope_residual_urad=900.0)
     drift = GeometryWatch(in_force(), 4)
     assert not any(drift.check_estimate(rejected) for _ in range(2 * CYCLES))

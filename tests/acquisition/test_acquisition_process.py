@@ -175,7 +175,7 @@ def test_without_a_camera_the_process_reports_it_and_ends(stack: ExitStack) -> N
     assert "no camera" in run.reports[-1]["message"]
 
 
-def test_small_sensor_sees_the_same_field() -> None:
+def test_a_small_sensor_has_the_same_field() -> None:
     full = OpticsConfig()
     coarse = coarse_optics(full)
     assert (coarse.camera.width_px, coarse.camera.height_px) == (408, 341)

@@ -309,7 +309,7 @@ async def test_mqtt_publishes_obeys_and_survives_restarts(tmp_path: Path) -> Non
 
 
 @pytest.mark.campaign
-async def test_opc_ua_and_epics_tell_refuse_and_obey(tmp_path: Path) -> None:
+async def test_opc_ua_and_epics_publish_refuse_and_obey(tmp_path: Path) -> None:
     ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
     settings = SERVERS.format(**ports)
     async with held(tmp_path) as run, bridges(tmp_path, settings):

@@ -166,7 +166,7 @@ def test_faults_and_notices_are_in_words() -> None:
         ("tune", "keep", False),
     ],
 )
-async def test_a_bridge_asks_by_its_role(
+async def test_a_bridge_sends_commands_with_its_role(
     tmp_path: Path, role: str, command: str, refused: bool
 ) -> None:
     async with port_run(tmp_path) as run:
@@ -180,7 +180,7 @@ async def test_a_bridge_asks_by_its_role(
         assert (command in bridge.commands) is not refused
 
 
-async def test_a_bridge_locks_for_nobody_and_removes_no_lock(tmp_path: Path) -> None:
+async def test_a_bridge_sets_and_removes_no_lock(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
         bridge = bridge_with(
             "tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock"

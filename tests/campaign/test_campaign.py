@@ -58,7 +58,7 @@ def test_equal_seeds_give_equal_runs() -> None:
     assert run_case(case, at("hold"), 5) == run_case(case, at("hold"), 5)
 
 
-def test_the_watch_sees_a_blind_safety_table(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_watch_detects_a_blind_safety_table(monkeypatch: pytest.MonkeyPatch) -> None:
     def blind(self: SafetyTable, state: State, observation: Observation) -> Verdict:
         return Verdict(None)
 
@@ -67,7 +67,9 @@ def test_the_watch_sees_a_blind_safety_table(monkeypatch: pytest.MonkeyPatch) ->
         assert run_case(case_called(name), at("hold"), 1).violations, name
 
 
-def test_the_watch_sees_safe_levels_that_stay_on_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_watch_detects_safe_levels_that_stay_on_the_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def stay(self: SafeLevels, safe_level: SafeLevel, now_s: float) -> None:
         self.memory.safe_level = SafeLevel.HOLD_FLOW
 
@@ -76,7 +78,7 @@ def test_the_watch_sees_safe_levels_that_stay_on_the_first(monkeypatch: pytest.M
         assert run_case(case_called(name), at("hold"), 1).violations, name
 
 
-def test_the_watch_sees_a_board_without_a_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_watch_detects_a_board_without_a_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
     from firmware_iface.emulators.pump_board import BoardState
 
     monkeypatch.setattr(BoardState, "_latch_fault", lambda self, mask: None)

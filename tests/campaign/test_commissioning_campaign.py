@@ -116,7 +116,7 @@ def test_a_film_of_another_law_is_refused_with_its_remedy(tmp_path: Path) -> Non
     assert emulated.bench.board.pump_fraction == 0.0
 
 
-def test_a_dead_zone_that_nobody_stated_is_refused(tmp_path: Path) -> None:
+def test_an_unstated_dead_zone_is_refused(tmp_path: Path) -> None:
     """The pump gives nothing below a tenth of its drive, and was stated as proportional."""
     foreign = ForeignPlant(ForeignPump("straight", full_um_per_s=88.0), seed=2)
     foreign.lower(500.0)

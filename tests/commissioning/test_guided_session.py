@@ -98,7 +98,7 @@ def test_a_clear_film_in_front_is_written_and_taken_back(tmp_path: Path, bench: 
     assert load_toml(tmp_path / CONFIGURATION, Config).optics.mirror.front_film is None
 
 
-def test_a_stated_front_film_stays_if_nobody_answers(tmp_path: Path, bench: QuickBench) -> None:
+def test_a_stated_front_film_stays_without_an_answer(tmp_path: Path, bench: QuickBench) -> None:
     (tmp_path / CONFIGURATION).write_text("[optics.mirror.front_film]\nbulge_mm = 61.0\n")
     run_stages(tmp_path, bench, Person(), "mirror")
     front = load_toml(tmp_path / CONFIGURATION, Config).optics.mirror.front_film
@@ -165,7 +165,7 @@ def test_wrong_wiring_is_found(
     assert bench.bench.board.pump_fraction == 0.0
 
 
-def test_a_laser_that_does_not_see_the_flat_film_is_explained(
+def test_a_laser_without_a_reading_of_the_flat_film_is_explained(
     tmp_path: Path, bench: QuickBench
 ) -> None:
     run_stages(tmp_path, bench, Person(), *DESK)

@@ -130,7 +130,7 @@ async def test_check_reads_an_installed_driver_through_its_emulator(
     assert (probe["identity"], probe["reading"]) == ("Acme Gauge A0001 1.0", "600 Pa")
 
 
-def test_devices_and_config_know_an_installed_driver(
+def test_devices_and_config_list_an_installed_driver(
     gauge: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.commissioning.devices.find_cameras", lambda: ([], []))

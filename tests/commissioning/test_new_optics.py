@@ -64,7 +64,7 @@ def test_its_configuration_is_complete(role: str, tmp_path: Path) -> None:
     assert tables[role].name == f"acme_{role}"
 
 
-def test_devices_and_config_know_an_installed_camera_and_screen(
+def test_devices_and_config_list_an_installed_camera_and_screen(
     loaded: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.syspath_prepend(install_studio(loaded / "site"))

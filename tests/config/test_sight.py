@@ -179,7 +179,7 @@ def test_the_share_is_that_of_the_twin_s_exact_rays(alpha_deg: float) -> None:
     assert trace_view(optics, 37.1).measured == pytest.approx(true, abs=0.04)
 
 
-def test_a_film_of_unknown_depth_has_the_benefit_of_the_doubt() -> None:
+def test_a_film_of_unknown_depth_is_doubted_only_where_no_depth_fits() -> None:
     flatter = optics_of(mirror={"sag_mm": 3.71})
     assert find_doubt(flatter, depth_known=False) is None
     for alpha_deg in (30.0, 1.41):

@@ -106,7 +106,7 @@ def test_the_error_bars_hold(name: str) -> None:
         assert np.median(sigmas) < 0.5 * sum_s
 
 
-def test_a_longer_pattern_knows_more() -> None:
+def test_a_longer_pattern_has_a_smaller_error() -> None:
     sigmas = [
         np.mean([Record(count=count).identify(seed).sum_sigma_s for seed in range(10)])
         for count in (2, 4, 6)

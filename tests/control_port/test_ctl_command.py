@@ -59,7 +59,7 @@ def test_every_action_is_a_request_that_the_port_reads(action: str, asked: Asked
 
 
 @pytest.mark.parametrize("name", ["lock", "latch"])
-def test_a_lock_has_two_names_and_may_say_why(name: str, asked: Asked) -> None:
+def test_a_lock_has_two_names_and_may_have_a_reason(name: str, asked: Asked) -> None:
     assert run(["ctl", name, "hands inside"]) == 0
     request = protocol.parse(json.dumps(asked[0]).encode())
     assert (request.do, request.text) == ("latch", "hands inside")

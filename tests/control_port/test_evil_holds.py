@@ -163,7 +163,7 @@ def test_a_flood_of_valid_messages_is_given_up(tmp_path: Path) -> None:
     assert count[0] < 5000
 
 
-def test_honest_bursts_of_events_pass(tmp_path: Path) -> None:
+def test_bursts_of_events_of_a_real_hold_pass(tmp_path: Path) -> None:
     burst = [
         json.dumps({"event": {"kind": "mark", "text": str(number)}}).encode()
         for number in range(300)
@@ -248,7 +248,7 @@ def test_feeds_outlive_every_peer_and_leave_others_alone(
 
 
 @pytest.mark.real_time
-def test_a_fleet_lists_the_honest_hold_beside_any_peers(
+def test_a_fleet_lists_the_real_hold_beside_any_peers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ctl, "_FLEET_S", 4.0)
@@ -277,7 +277,7 @@ def test_a_fleet_lists_the_honest_hold_beside_any_peers(
     assert all("no contact" in line for line in lines[:-1])
 
 
-def test_an_honest_message_passes_unchanged() -> None:
+def test_a_valid_message_passes_unchanged() -> None:
     status = evil.STATUS | {"gains": {"kp_per_s": 1, "ti_s": 2.5, "td_s": 0.0}, "commander": None}
     message = {"number": 3, "ok": True, "status": status, "loop": {"rate_hz": 50.0}, "pump": {}}
     assert answers.check_message(message_syntax.decode(json.dumps(message).encode())) == message

@@ -54,7 +54,7 @@ async def test_a_lock_has_its_author_session_word_and_time_as_inputs_of_the_tick
         assert lock.set_utc.endswith("+00:00")
 
 
-async def test_the_page_speaks_for_its_viewer_and_the_lower_role_counts(tmp_path: Path) -> None:
+async def test_the_page_acts_for_its_viewer_and_the_lower_role_counts(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
         command = await taken(run, HOLD, do="latch", text="x", on_behalf=BEHALF)
         assert command.who == "page:bob"

@@ -177,7 +177,7 @@ def test_the_notice_gives_a_limit_where_the_noise_hides_the_error() -> None:
         ("identified", 0.0, 0.03, True),
     ],
 )
-def test_an_identified_response_is_doubted_less_where_the_prediction_speaks_for_it(
+def test_an_identified_response_is_doubted_less_where_the_prediction_favours_it(
     pump_response: str, correlation: float, excess_um2: float, tried: bool
 ) -> None:
     estimator = ESTIMATOR.model_copy(update={"pump_response": pump_response})

@@ -455,7 +455,7 @@ def test_an_unclaimed_board_can_be_stopped_and_stays_stopped() -> None:
     assert bench.state.pump_fraction == 0.0
 
 
-def test_an_old_board_knows_neither_claim_nor_stop(old: Bench) -> None:
+def test_an_old_board_has_neither_claim_nor_stop(old: Bench) -> None:
     assert {block.name for block in old.map.blocks} == {
         "identity",
         "sensors",

@@ -140,7 +140,7 @@ async def test_what_the_sensors_show_does_not_help_to_command(
         assert secret not in [words[at : at + 2] for at in range(len(words) - 1)]
 
 
-async def test_anybody_may_stop_and_the_holder_sees_it_and_clears_it(
+async def test_any_program_may_stop_and_the_holder_reads_that_and_clears_it(
     holder: PumpBoard, other: Plain, plant: CountingPlant
 ) -> None:
     assert await other.stop() == 0
@@ -192,7 +192,7 @@ async def test_the_close_of_one_that_was_refused_disarms_nothing(
     assert board.state.read(49, 1) == [1]
 
 
-async def test_who_lost_the_claim_sees_it_in_the_next_reading(
+async def test_a_lost_claim_is_in_the_next_reading(
     holder: PumpBoard, other: Plain, plant: CountingPlant, clock: ManualClock
 ) -> None:
     clock.now_s += 1.0  # killed or stopped for longer than the period

@@ -266,7 +266,7 @@ def hold_keyence(spoil: Callable[[KeyenceDlRs1aEmulator], None], timeout_s: floa
     return run_virtual(run())
 
 
-def test_a_silent_laser_is_not_a_laser_that_sees_nothing() -> None:
+def test_a_silent_laser_is_not_a_laser_without_a_target() -> None:
     def fall_silent(emulator: KeyenceDlRs1aEmulator) -> None:
         emulator.faults.silent = True
 

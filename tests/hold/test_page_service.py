@@ -107,7 +107,7 @@ def test_the_service_is_a_program_of_its_own(
         ("", "code 2"),
     ],
 )
-def test_a_service_that_ends_says_why(
+def test_a_service_that_ends_prints_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last_words: str, problem: str
 ) -> None:
     ending = "sys.exit(2)"

@@ -92,7 +92,7 @@ def test_names_have_titles_and_accept_dashes_for_underscores(
     assert "bright_day: no such scenario" in capsys.readouterr().err
 
 
-def test_a_file_cannot_ask_for_more_than_fits_in_memory(tmp_path: Path) -> None:
+def test_a_file_cannot_require_more_than_fits_in_memory(tmp_path: Path) -> None:
     path = tmp_path / "many.toml"
     path.write_text(
         'title = "x"\nduration_s = 1e7\n[[at]]\ntime_s = 0.0\nwrong = "silent"\nfor_s = '

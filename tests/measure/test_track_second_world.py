@@ -162,7 +162,7 @@ def test_weak_bands_are_known_before_light_is_taken_from_the_first_frames(tmp_pa
     assert np.abs(found.terms).max() < 4
 
 
-def test_bands_that_the_fit_takes_are_seen_in_what_little_it_leaves(tmp_path: Path) -> None:
+def test_bands_that_the_fit_absorbs_show_in_its_small_residual(tmp_path: Path) -> None:
     """In noise, without first steps, the first frames were 13 sigma off: 0.8 µm of a term of order
     29.
     """

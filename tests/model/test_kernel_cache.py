@@ -69,7 +69,7 @@ def test_a_disk_that_fills_up_costs_time_only(
     assert "No space left on device" in capsys.readouterr().err
 
 
-def test_no_other_module_asks_numba_for_a_cache() -> None:
+def test_no_other_module_enables_the_cache_of_numba() -> None:
     asking = {
         path.relative_to(PACKAGE).as_posix()
         for path in PACKAGE.rglob("*.py")

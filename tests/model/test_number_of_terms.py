@@ -66,7 +66,7 @@ def test_the_excess_replaces_piston() -> None:
     assert len(NOLL_INDICES[1:]) + 1 == PARAMETERS
 
 
-def test_kernels_know_the_degree() -> None:
+def test_kernels_have_the_degree() -> None:
     assert 2 * kernels.SLOPE_MONOMIALS == ZERNIKE_DEGREE * (ZERNIKE_DEGREE + 1)
     assert kernels.PRODUCT_DEGREE == 2 * (ZERNIKE_DEGREE - 1)
 

@@ -113,7 +113,7 @@ def test_a_message_that_is_no_event_becomes_an_unreadable_event(message: bytes) 
         ({"kind": "fault", "name": 3}, UnknownEvent({"mono_s": 2, "kind": "fault", "name": 3})),
     ],
 )
-def test_a_line_of_a_run_as_what_it_means(line: dict[str, object], event: Event) -> None:
+def test_a_line_of_a_run_becomes_its_event(line: dict[str, object], event: Event) -> None:
     each = parse_logged_line({"mono_s": 2, **line})
     assert (each.mono_s, each.event) == (2.0, event)
     assert each.line["kind"] == event.kind

@@ -161,7 +161,7 @@ def test_the_next_recorder_continues_and_everything_is_recorded_once(
     assert not (tmp_path / ".recorder-state").exists()
 
 
-def test_the_page_of_the_next_recorder_knows_the_gains(tmp_path: Path, stack: ExitStack) -> None:
+def test_the_page_of_the_next_recorder_has_the_gains(tmp_path: Path, stack: ExitStack) -> None:
     run = Run(tmp_path, stack, Config())
     first = run.recorder(0)
     gains = {

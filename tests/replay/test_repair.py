@@ -169,7 +169,7 @@ def test_a_run_that_is_still_recorded_is_left_alone(folder: Path) -> None:
         repair_run(folder)
 
 
-def test_the_command_reports_what_it_did(
+def test_the_command_reports_its_actions(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     repair_run(folder, in_place=True)

@@ -139,7 +139,7 @@ def test_the_interval_of_the_slope_covers_the_truth_as_often_as_stated(memory: f
 @pytest.mark.parametrize(
     ("count", "step_s", "tau_s"), [(60, 60.0, 300.0), (600, 1.0, 30.0), (600, 1.0, 100.0)]
 )
-def test_the_interval_of_a_short_record_knows_that_the_line_took_up_its_wander(
+def test_the_interval_of_a_short_record_allows_for_the_wander_that_the_line_took_up(
     count: int, step_s: float, tau_s: float
 ) -> None:
     rng, memory = np.random.default_rng(0), np.exp(-step_s / tau_s)

@@ -70,7 +70,7 @@ def test_the_rate_is_that_of_the_ticks(folder: Path, text: str | None) -> None:
     assert found.reading.windows == right.reading.windows
 
 
-def test_without_ticks_the_seconds_know_the_rate(tmp_path: Path) -> None:
+def test_without_ticks_the_seconds_give_the_rate(tmp_path: Path) -> None:
     folder = written(tmp_path, HOURS)
     assert recorded_rate_hz(folder) == 10.0
     for path in (folder / "ticks").glob("ticks*"):

@@ -96,7 +96,7 @@ def test_a_failure_is_printed_once_without_the_address(
     assert error_lines == ["heartbeat: url: refused with status 404", "heartbeat: url: works again"]
 
 
-def test_a_monitor_that_hangs_delays_nobody() -> None:
+def test_a_monitor_that_hangs_delays_no_other() -> None:
     entered, leave = threading.Event(), threading.Event()
     others: list[str] = []
 

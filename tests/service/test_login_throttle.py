@@ -61,7 +61,7 @@ def device_of(found: Accounts, name: str) -> str:
     return device.partition("=")[2].partition(";")[0]
 
 
-def test_one_wrong_password_a_minute_keeps_nobody_out(clock: Clock, evaluated: list[str]) -> None:
+def test_one_wrong_password_a_minute_keeps_no_user_out(clock: Clock, evaluated: list[str]) -> None:
     found = accounts()
     for _ in range(5):
         guess_password(found, "anna", WRONG)

@@ -152,7 +152,7 @@ def test_present_gains_that_are_as_good_are_no_miss() -> None:
     assert math.isclose(make_row()["limit_um"], 10.0)
 
 
-def test_a_session_knows_the_gains_that_the_start_has_limited() -> None:
+def test_a_session_has_the_gains_that_the_start_has_limited() -> None:
     """It went back to the stated ones of a quick pump, with which a slow one swings by 11 µm."""
     laboratory = draw_laboratory(5)
     stated = laboratory.config()

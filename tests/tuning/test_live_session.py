@@ -55,7 +55,7 @@ def held(log: LiveLog, seconds: float, displacement_um: float = 0.5) -> None:
         log.add_tick(row(tick, displacement_um))
 
 
-def test_a_reader_beside_the_session_sees_what_it_does(tmp_path: Path) -> None:
+def test_a_reader_beside_the_session_reads_its_progress(tmp_path: Path) -> None:
     log, reader = logged(tmp_path), LiveReader(tmp_path)
     assert reader.read_new()["time_s"] == []
     log.log_entry("step", "observe", planned_s=300.0, after_s=320.0)
@@ -322,7 +322,7 @@ def test_the_terminal_answers_as_ever_and_an_unfit_answer_of_the_page_does_not(
     assert not (tmp_path / ANSWER).exists()
 
 
-def test_who_sees_the_question_sees_its_answers(tmp_path: Path) -> None:
+def test_a_reader_of_the_question_reads_its_answers(tmp_path: Path) -> None:
     log, reader = logged(tmp_path), LiveReader(tmp_path)
     log.log_entry("asks", "which?", among=("lively", "calm"))
     reader.read_new()

@@ -167,7 +167,7 @@ def test_a_pump_whose_first_percent_holds_the_mirror_is_mapped(tmp_path: Path) -
 
 
 @pytest.mark.campaign
-def test_a_survey_holds_the_mirror_on_what_it_knows_so_far(tmp_path: Path) -> None:
+def test_a_survey_holds_the_mirror_on_the_curve_so_far(tmp_path: Path) -> None:
     """With the line of the defaults the hold of a pump 15 times its leak swings by 20 µm, and was
     not surveyed. Its flow is 6 times what the defaults state, which the start test refuses.
     """
@@ -400,7 +400,7 @@ def test_a_rise_through_the_leak_is_followed_further_than_one_below_it(
 
 
 @pytest.mark.parametrize(("leak", "finer"), [(0.4, True), (12.0, False)])
-def test_a_kink_that_the_hold_sees_is_followed(leak: float, finer: bool) -> None:
+def test_a_kink_that_the_hold_detects_is_followed(leak: float, finer: bool) -> None:
     """A dead zone ends at 0.31, hidden within 2 % of the full flow; but a hold on that curve saw k
     = 1.2.
     """
@@ -432,7 +432,7 @@ def test_a_start_behind_noise_is_a_jump_and_a_slope_is_none(
 
 
 @pytest.mark.parametrize("late_s", [0.1, 0.9])
-def test_the_guard_of_a_round_knows_how_late_the_pump_is(
+def test_the_guard_of_a_round_allows_for_the_delay_of_the_pump(
     monkeypatch: pytest.MonkeyPatch, late_s: float
 ) -> None:
     """It looked 0.4 s ahead of a pump that answers after 1.1 s, and the mirror sank by 10.8 µm."""
@@ -559,7 +559,7 @@ def test_a_mirror_that_slow_gains_leave_above_gets_its_own(above_um: float, back
         ([(0.7, 0.3, False)] * 3, [120.0, 240.0, 480.0], True),
     ],
 )
-def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
+def test_steps_that_show_little_or_contradict_the_curve_are_repeated_for_longer(
     monkeypatch: pytest.MonkeyPatch,
     seen: list[tuple[float, float, bool]],
     lasted_s: list[float],

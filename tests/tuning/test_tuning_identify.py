@@ -26,7 +26,7 @@ def test_recovers_a_plant_from_nearly_clean_data() -> None:
     assert found.model.leak_um_per_s == pytest.approx(TRUTH.leak_um_per_s, rel=5e-3)
 
 
-def test_error_bars_are_honest() -> None:
+def test_error_bars_cover_the_errors() -> None:
     """Of 16 fits, at 2 sigma 95 % should hold the truth; fewer than 13 would be a chance of 1 in
     150.
     """
@@ -38,13 +38,13 @@ def test_error_bars_are_honest() -> None:
     assert np.mean([f.sigma.gain for f in fits]) < 0.04
 
 
-def test_residuals_of_the_true_structure_are_white_and_know_nothing_of_the_flow() -> None:
+def test_residuals_of_the_true_structure_are_white_and_independent_of_the_flow() -> None:
     found = identify_plant(record(TRUTH, seed=5))
     assert found.whiteness_p > 1e-3
     assert found.independence_p > 1e-3
 
 
-def test_whiteness_and_independence_see_what_they_are_for() -> None:
+def test_whiteness_and_independence_detect_a_wrong_model() -> None:
     rng = np.random.default_rng(1)
     e, u = rng.standard_normal(4000), rng.standard_normal(4000)
     assert compute_whiteness_p(np.convolve(e, [1.0, 0.3], "same")) < 1e-6

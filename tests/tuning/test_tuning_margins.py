@@ -248,7 +248,7 @@ def test_nothing_predicted_is_below_the_bound_and_the_search_comes_near_it() -> 
         assert found_um < predict_loop(other, PUMP, weather, loop).std_um
 
 
-def test_demands_hold_where_the_weather_asks_for_nothing() -> None:
+def test_demands_hold_although_the_weather_leaves_little() -> None:
     """With feed-forward the weather leaves so little that the least variance alone would switch the
     loop off.
     """

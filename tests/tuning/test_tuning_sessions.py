@@ -141,7 +141,7 @@ OF_THE_TWIN = "twin_hold.py"  # starts the simulated bench for `tune run --twin`
     sorted(path for path in Path(tuning.__file__).parent.rglob("*.py") if path.name != OF_THE_TWIN),
     ids=lambda p: p.name,
 )
-def test_tuning_knows_nothing_of_the_simulated_bench(file: Path) -> None:
+def test_tuning_imports_nothing_of_the_simulated_bench(file: Path) -> None:
     """A tuner that knew the simulator would tune the simulator."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []

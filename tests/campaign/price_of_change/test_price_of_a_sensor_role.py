@@ -85,7 +85,7 @@ def found(source: ChangedSource, lab: Path) -> dict[str, Any]:
     return printed
 
 
-def test_configuration_check_and_wizard_know_it(found: dict[str, Any]) -> None:
+def test_configuration_check_and_wizard_have_it(found: dict[str, Any]) -> None:
     assert found["key"]
     assert found["checked"][ROLE] == "600 Pa"
     assert any(question.startswith(f"{ROLE}: driver, ") for question in found["questions"])

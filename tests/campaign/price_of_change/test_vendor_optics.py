@@ -93,7 +93,7 @@ def output(site: Path, *words: object, code: int = 0) -> str:
     return printed
 
 
-def test_no_place_of_ours_knows_them() -> None:
+def test_no_module_of_the_product_names_them() -> None:
     names = ("studio_cam", "studio_wall", "studio_optics")
     texts = [
         path

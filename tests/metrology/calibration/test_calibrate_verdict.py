@@ -121,7 +121,7 @@ def test_sets_that_are_too_close_are_refused() -> None:
     assert "at least 1 mm" in finding.description
 
 
-def test_without_a_laser_fringes_and_ring_say_it() -> None:
+def test_without_a_laser_fringes_and_ring_show_it() -> None:
     silent = edited(reading(lambda d: float("nan")), 1, 2, 3, 4)
     held = good().problem(prior_sigmas({"laser_relative": 0.0}), silent)
     solution = solve_calibration(held)
@@ -210,7 +210,7 @@ def test_sets_that_are_close_are_used_with_a_word() -> None:
     assert "8 mm would determine the sag better" in finding.description
 
 
-def test_the_monitor_waits_for_many_cycles_and_forgives_one() -> None:
+def test_the_monitor_waits_for_many_cycles_and_ignores_one() -> None:
     monitor = DriftMonitor(1.0, 0.6)  # 0.8 of it is film and geometry
     for residual_urad in [1.05] * CYCLES + [40.0, float("nan")]:
         monitor.add(residual_urad, 0.6)

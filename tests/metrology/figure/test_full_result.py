@@ -188,7 +188,7 @@ def test_noisy_pictures_move_no_film_and_hide_no_motion(
 
 
 @pytest.mark.parametrize(("flicker", "swing_um"), [(0.02, 0.0), (0.0, 14.0)], ids=["lamp", "film"])
-def test_the_frames_say_what_light_they_had_and_where_the_film_was(
+def test_the_frames_show_what_light_they_had_and_where_the_film_was(
     flicker: float, swing_um: float
 ) -> None:
     """Beside the light of their own axis, in which both leave waves, they would say a tenth too
@@ -250,7 +250,7 @@ def test_ripple_and_dent_are_in_the_map_and_not_in_the_fit() -> None:
     assert result.height_mm()[middle, middle] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_dust_has_no_say() -> None:
+def test_dust_has_no_weight() -> None:
     optics, rng = bench(), np.random.default_rng(5)
     stack = good_set(optics)
     clean = measured(stack, optics).surface.height(X, Y)

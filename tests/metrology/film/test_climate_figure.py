@@ -110,7 +110,7 @@ def test_the_tick_predicts_by_the_constants_of_the_law() -> None:
         assert sensitivity.terms_um[10] / unit_um == pytest.approx(CHANGE_SPHERICAL, rel=1e-3)
 
 
-def test_the_twin_changes_its_figure_by_another_law_alike() -> None:
+def test_the_twin_changes_its_figure_equally_by_another_law() -> None:
     terms_um = compute_climate_sensitivity(RADIUS_MM, SAG_MM).terms_um
     predicted = [terms_um[noll - 1] for noll in ROUND_TERMS]
     assert 100 * compute_figure_change_per_ppm() == pytest.approx(

@@ -184,7 +184,7 @@ def test_rim_harmonics_are_those_of_the_surface() -> None:
     assert np.allclose(series, height, atol=1e-10)
 
 
-def test_averaged_points_say_what_the_bins_say() -> None:
+def test_averaged_points_give_the_result_of_the_bins() -> None:
     truth = make(np.zeros(len(NAMES)), seed=2, points=20_000)
     phases, bench = truth.sets[2], BenchGeometry(STATED)
     state = SetState(SURFACE, 0.0)

@@ -125,7 +125,7 @@ def test_a_single_film_has_no_lens() -> None:
     assert geometry.cushion is None
 
 
-def test_both_faces_alone_bend_like_a_shell() -> None:
+def test_both_faces_without_gas_bend_rays_like_a_shell() -> None:
     """Without gas the film alone moves the points by 14 um, against the gas."""
     cushion = GEOMETRY.cushion
     assert cushion is not None

@@ -121,7 +121,7 @@ def test_a_line_that_one_rate_alone_shows_may_be_any_of_its_aliases(seed: int) -
 
 
 @pytest.mark.parametrize("seed", [302, 309])
-def test_a_line_that_one_rate_cannot_see_makes_no_other(seed: int) -> None:
+def test_a_line_hidden_at_one_rate_makes_no_other(seed: int) -> None:
     """At one of the rates it may have the alias of drift; what it leaves there is not nothing."""
     time_s, coeffs_um, planted = watched(seed, rates_hz=(15, 15 / 1.09, 15 / 1.17), noise_nm=6.0)
     unaliased = [line for line in find_modes(time_s, coeffs_um) if not line.aliases_hz]
@@ -132,7 +132,7 @@ def test_a_line_that_one_rate_cannot_see_makes_no_other(seed: int) -> None:
     )
 
 
-def test_a_hold_does_not_tell_of_a_line_that_may_be_another() -> None:
+def test_a_hold_does_not_report_a_line_that_may_be_another() -> None:
     assert (
         VibrationFollower().search_minute(*watched(4, lines_hz=(48.0,), rates_hz=(20.0,))[:2]) == []
     )
