@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from membrane_ctrl.metrology.rays.surface import PARAMETERS
 from membrane_ctrl.metrology.uncertainty.budget import Budget, Source
+from tests.studies.resumable_answers import answers
 from tests.studies.second_benches import draw_bench
 from tests.studies.second_world_errors import MeasuredErrors
 from tests.studies.second_world_tables import (
@@ -65,7 +67,9 @@ def test_wrong_oks_are_compared_with_those_of_exact_bars() -> None:
     given = [*GIVEN, lucky, degraded]
     assert expected_wrong_oks(given) == 0.25
     assert share_far(given) == (1 / 3, 3 * 19)
-    assert "0.2 benches (3.1 %)" in page({"quarter": given})
+    text = page({"quarter": given})
+    assert "numbers of `ok` sets beyond 3 sigma, of 57 | 33.33 % | 0.27 % | 0.5 % |" in text
+    assert "with one of their numbers beyond 3 sigma | 1, 12.5 % | 0.2, 3.1 % | |" in text
 
 
 def test_the_chance_of_independent_numbers_is_that_of_a_normal_law() -> None:
@@ -108,7 +112,7 @@ def test_the_page_lists_the_worst_cases() -> None:
     assert "| 4 | - |  | refused: only 0 bins see the pattern in the mirror |" in text
     assert "6 benches at a quarter of the resolution, 2.0 s of a core each" in text
     assert "2 benches at full size" in text
-    assert "| `ok` beyond 3 sigma, of all benches | 1, 16.7 % | 0.5 % |" in text
+    assert "with one of their numbers beyond 3 sigma | 1, 16.7 % |" in text
 
 
 def test_a_seed_draws_the_same_bench_at_any_resolution() -> None:
@@ -127,3 +131,17 @@ def test_all_causes_are_drawn_and_a_bench_has_about_three() -> None:
         counts.update(draw_bench(seed, 0.05).planted.keys())
     assert 3 < counts.total() / benches < 6
     assert {"second reflection, share", "previous picture, share", "no laser"} <= set(counts)
+
+
+def test_answers_begin_at_any_seed_and_are_measured_once(tmp_path: Path) -> None:
+    path = tmp_path / "answers.jsonl"
+    asked: list[int] = []
+
+    def measure(seed: int) -> dict[str, Any]:
+        asked.append(seed)
+        return {"seed": seed}
+
+    answers(path, 2, measure, first=5)
+    given = answers(path, 3, measure, first=5)
+    assert [one["seed"] for one in given] == [5, 6, 7]
+    assert asked == [5, 6, 7]

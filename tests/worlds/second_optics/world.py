@@ -112,6 +112,11 @@ class World:
         rows = np.abs(np.linspace(-1, 1, self.bench.size_px[1]))[:, None]
         self._vignetting = 1 - VIGNETTING * (columns**2 + rows**2) / 2
 
+    def move_bench(self, camera: FloatArray, screen: FloatArray) -> None:
+        """Move camera and screen from now on, in six degrees of freedom each (`SIX`)."""
+        self.bench = self.bench.moved(camera, screen)
+        self._at_rest = {}
+
     # -- frames in memory
 
     def frames(
