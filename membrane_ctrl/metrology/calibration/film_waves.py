@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from membrane_ctrl.metrology.calibration import model_tests, turn_tests, verdict
+from membrane_ctrl.metrology.calibration.bump_within_set import find_bump_within_set
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve_calibration
 from membrane_ctrl.metrology.film import film_form, terms_beyond_fit
 
@@ -54,6 +55,13 @@ def solve_any_film(
             return solution, findings
     except ValueError as error:
         refused = error
+    # A camera that was bumped in the middle of a set looks like many other things.
+    bump = find_bump_within_set(problem)
+    if bump is not None:
+        finding = verdict.describe_bump_within(problem, bump)
+        if refused is not None:
+            raise ValueError(finding.description)
+        return solution, (finding,)
     unturned = _solve_unturned(problem, progress)
     if unturned is not None:
         return unturned

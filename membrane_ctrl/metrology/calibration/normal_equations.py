@@ -41,13 +41,16 @@ class Equations:
     moved_screens : tuple of arrays
         Of each screen elsewhere, (MOVED + LOCAL + COMMON + 1, squared): its own unknowns first,
         which `sums` eliminates.
+    y_sums : (LOCAL + COMMON + 1, LOCAL + COMMON + 1) array
+        The part of `sums` of the y fringes, with the screen at its own place.
     """
 
     sums: FloatArray
     residual_mm: FloatArray
     robust: RobustWeights
     residual_rms_mm: float
-    moved_screens: tuple[FloatArray, ...] = ()
+    moved_screens: tuple[FloatArray, ...]
+    y_sums: FloatArray
 
     @property
     def variance(self) -> float:
@@ -165,6 +168,7 @@ def linearise_set(
     root_weights = np.sqrt(robust.weights / robust.variance) / phases.sigma_mm
     residual_mm = np.empty_like(phases.screen_mm)
     moved_screens = []
+    y_sums = np.zeros_like(sums)
     for k, there, poses, some in forward_model.screen_views(
         bench, turns, phases, state.moved_screens
     ):
@@ -184,7 +188,10 @@ def linearise_set(
             motion_mm,
             deeper_mm,
         )
-        found, residual_mm[:, some] = _sum_fringes(parts, root_weights[some], k > 0)
+        by_axis, residual_mm[:, some] = _sum_fringes(parts, root_weights[some], k > 0)
+        found = by_axis[0] + by_axis[1]
+        if not k:
+            y_sums = by_axis[1]
         if k:
             # What is known of the screen's move; then its own unknowns are eliminated.
             known, sigmas = phases.moved_screens[k - 1].make_prior(references.laser_sigma_um)
@@ -199,14 +206,14 @@ def linearise_set(
     weights = robust.weights / phases.sigma_mm**2
     mean_square_mm2 = np.mean(residual_mm**2 @ weights) / np.sum(weights)
     rms_mm = float(np.sqrt(mean_square_mm2))
-    return Equations(sums, residual_mm, robust, rms_mm, tuple(moved_screens))
+    return Equations(sums, residual_mm, robust, rms_mm, tuple(moved_screens), y_sums)
 
 
 def _sum_fringes(
     parts: Iterable[forward_model.Chunk], root: FloatArray, moved: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Sums of points, those of a moved screen with its own unknowns first, and their residuals (2,
-    n).
+    """Sums (2, ...) of the x and of the y fringes of points, those of a moved screen with its own
+    unknowns first, and their residuals (2, n).
 
     `root` (n,) are the square roots of the points' weights.
     """
@@ -214,7 +221,7 @@ def _sum_fringes(
     if moved:
         own = moved_screen.MOVED
     size = own + forward_model.LOCAL + COMMON + 1
-    sums = np.zeros((size, size))
+    sums = np.zeros((2, size, size))
     residual_mm = np.empty((2, root.size))
     # The columns that fringes have; the last one is the residual.
     columns = np.append(np.arange(own + forward_model.COLUMNS), size - 1)
@@ -224,9 +231,9 @@ def _sum_fringes(
         if moved:
             derivatives = _put_moves_first(derivatives)
         # x and then y: the rows of all unknowns and the residual, times the root of the weights.
-        for of_axis, residual in zip(derivatives, part.residual_mm, strict=True):
+        for own_sums, of_axis, residual in zip(sums, derivatives, part.residual_mm, strict=True):
             weighed = np.vstack([of_axis, residual]) * root[part.place]
-            sums[np.ix_(columns, columns)] += weighed @ weighed.T
+            own_sums[np.ix_(columns, columns)] += weighed @ weighed.T
     return sums, residual_mm
 
 

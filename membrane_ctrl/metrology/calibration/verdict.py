@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from membrane_ctrl.metrology.calibration import model_tests, set_state, turn_tests
+from membrane_ctrl.metrology.calibration.bump_within_set import BumpWithinSet
 from membrane_ctrl.metrology.calibration.solver import (
     Problem,
     Solution,
@@ -318,6 +319,16 @@ def _judge_camera(solution: Solution) -> list[Cause]:
     )
     explained = bump.fall - 2 * len(bump.turned_deg)
     return [Cause(explained, CalibrationFinding(True, description, bump.sets))]
+
+
+def describe_bump_within(problem: Problem, bump: BumpWithinSet) -> CalibrationFinding:
+    """Return the finding on a camera that was bumped in the middle of a set."""
+    yaw, pitch, roll = bump.turned_deg
+    description = (
+        f"the camera moved while {problem.sets[bump.index].name} was taken, between its x and its "
+        f"y frames: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees: repeat the set"
+    )
+    return CalibrationFinding(True, description, (bump.index,))
 
 
 def _judge_mounts(solution: Solution) -> list[Cause]:

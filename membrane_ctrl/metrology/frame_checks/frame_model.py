@@ -20,6 +20,7 @@ from membrane_ctrl.metrology.phase.gray_code import gray_bit
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
+_TINY = 1e-9  # instead of a division by zero
 COSINE, SINE, MOTION, SECOND_HARMONIC = range(1, 5)  # columns of a sinusoid's model
 # Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred µm, stay
 # inside.
@@ -143,6 +144,11 @@ class FrameSolution:
     def swing(self) -> float:
         """Swing b of a sinusoid, by b cos delta and b sin delta."""
         return float(np.hypot(self.coefficients[COSINE], self.coefficients[SINE]))
+
+    @property
+    def second_harmonic(self) -> float:
+        """Size of the second harmonic of a sinusoid, over its swing."""
+        return abs(float(self.coefficients[SECOND_HARMONIC])) / max(self.swing, _TINY)
 
 
 def solve_frame(seen: FloatArray, model: FrameModel, light: FloatArray) -> FrameSolution:

@@ -6,6 +6,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.frame_checks.frame_evidence import make_evidence
 from membrane_ctrl.metrology.frame_checks.frame_model import (
+    COSINE,
     MOTION,
     SECOND_HARMONIC,
     SINE,
@@ -27,6 +28,7 @@ _SMOOTH_ORDER = 4  # powers of the smooth deviations over the mirror with severa
 _FLAT_ORDER = 1  # with fewer: a constant alone
 # Patches across the picture: what a model leaves of a frame is independent from one to the next.
 _PATCHES = 12
+_CURVED = 0.01  # second harmonic over the swing beyond which a response is not straight
 _TINY = 1e-9  # instead of a division by zero
 
 
@@ -113,12 +115,16 @@ def estimate_light_and_film(
         found = []
         patches_rad = []
         for k in own:
-            # The second harmonic differs over the mirror, too: by blur, or by the angle of view.
             model = make_frame_model(stack, scene, k, float(readings_um[k]))
-            parts = [model.columns, model.columns[1] * contrast]
-            parts.append(model.columns[SECOND_HARMONIC] * contrast)
-            model = replace(model, columns=np.vstack(parts))
+            columns = np.vstack([model.columns, model.columns[COSINE] * contrast])
+            model = replace(model, columns=columns)
             solution = solve_frame(means[k], model, light_of_others)
+            # A curved response has harmonics, which differ over the mirror, too: by blur, or by the
+            # angle of view.
+            if solution.second_harmonic > _CURVED:
+                more = model.columns[SECOND_HARMONIC] * contrast
+                model = replace(model, columns=np.vstack([columns, more]))
+                solution = solve_frame(means[k], model, light_of_others)
             found.append(make_evidence(solution, model, light_of_others, 0.0, k))
             per_unit = np.array([1.0, -sensitivity.mean()])
             influence = per_unit @ solution.inverse[[SINE, MOTION]] @ solution.columns

@@ -19,6 +19,8 @@ from membrane_ctrl.model.arrays import FloatArray
 
 _SAG_WEIGHT = 1e3  # of the sag, relative to one height
 _GRID = 41  # points along the diameter
+# Points of a patch over the usual number, below which its slopes are a selection.
+_LEAST_COUNT = 0.7
 # Points of a ring at which the mean of a smooth slope is computed.
 _AZIMUTHS = 24
 _RADII = 4
@@ -122,8 +124,9 @@ def wave_effect(
 
     Returns
     -------
-    effect_mm : (parameters, 1) array
-        The error.
+    effects_mm : (parameters, 1 + waves) array
+        The error that the slopes show, and 1 sigma of what they do not: where wrinkles at the rim
+        or light scatter the slopes, or hide a part of the mirror, the waves' prior is left.
     noise_mm2 : float
         What the noise adds to the sum of its squares.
     """
@@ -137,20 +140,34 @@ def wave_effect(
     error = absorbed - _most_similar_surfaces()
 
     # Slopes that the fit leaves of each term beyond, and those that it left of the film, weighted.
+    # Where most slopes of a patch were left out, those that remain are a selection: wrinkles at the
+    # rim of one direction alone.
+    usual = float(np.median(patches.count[patches.count > 0]))
+    count = np.where(patches.count > _LEAST_COUNT * usual, patches.count, 0.0)
+    weights = np.sqrt(np.tile(count, 2))
     left = np.hstack([beyond - absorbed.T @ own for own, beyond in pairs]).T
-    weights = np.sqrt(np.tile(patches.count, 2))
     wave_left = (left * weights[:, None] / radius_mm)[:, terms_beyond_fit.WAVE]
     seen = patches.slopes.ravel() * weights
 
+    # The selection has pulled the fit: in the other patches the surface is free.
+    span, _ = np.linalg.qr(np.hstack(slopes).T * weights[:, None])
+    wave_left = wave_left - span @ (span.T @ wave_left)
+    seen = seen - span @ (span.T @ seen)
+
     # Amplitudes of the waves from the slopes, by least squares with their prior; then the error of
     # the parameters from the amplitudes.
-    scatter = max(float(np.mean(seen**2)), slope_variance)
+    mean_square = float(np.sum(seen**2)) / max(2 * np.count_nonzero(count), 1)
+    scatter = max(mean_square, slope_variance)
     sigmas_mm = np.array([wave.sigma_mm for wave in terms_beyond_fit.WAVES])
     normal = wave_left.T @ wave_left + scatter * np.diag(1 / sigmas_mm**2)
     amplitudes_of_slopes = np.linalg.solve(normal, wave_left.T)
-    answer = error[:, terms_beyond_fit.WAVE] @ amplitudes_of_slopes
-    effect_mm = (answer @ seen)[:, None]
-    return effect_mm, slope_variance * float(np.sum(answer**2))
+    error_of_waves = error[:, terms_beyond_fit.WAVE]
+    answer = error_of_waves @ amplitudes_of_slopes
+
+    # The amplitudes' covariance after these least squares.
+    unknown = error_of_waves @ np.linalg.cholesky(scatter * np.linalg.inv(normal))
+    effects_mm = np.column_stack([answer @ seen, unknown])
+    return effects_mm, slope_variance * float(np.sum(answer**2))
 
 
 def _absorbed_terms(

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from membrane_ctrl.metrology.calibration.bump_within_set import find_bump_within_set
 from membrane_ctrl.metrology.calibration.figure_uncertainty import (
     propagate_to_figure,
     seat_sigmas,
@@ -20,6 +21,7 @@ from membrane_ctrl.metrology.calibration.verdict import check_before_solving
 from membrane_ctrl.metrology.film import film_form
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas, usual_sigma
 from membrane_ctrl.metrology.rays.forward_model import LOCAL, SEAT
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.rays.turned_mirror import TurnedMirror
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES
@@ -177,6 +179,61 @@ def test_a_camera_that_was_bumped_is_no_unturned_figure() -> None:
     problem = truth.problem(EVERY, (*truth.sets[:3], other.sets[3]))
     (finding,) = (each for each in solve_any_film(problem)[1] if each.fatal)
     assert "the film's figure" not in finding.description
+
+
+def mixed_set(x: SetPhases, y: SetPhases) -> SetPhases:
+    """The x fringes of one set and the y fringes of another, in the bins that both have."""
+    places = [each.row_px * 1e4 + each.column_px for each in (x, y)]
+    _, of_x, of_y = np.intersect1d(*places, return_indices=True)
+    return replace(
+        x,
+        column_px=x.column_px[of_x],
+        row_px=x.row_px[of_x],
+        sigma_mm=x.sigma_mm[of_x],
+        screen_mm=np.stack([x.screen_mm[0][of_x], y.screen_mm[1][of_y]]),
+    )
+
+
+def bumped_truths(yaw_deg: float) -> tuple[Truth, Truth]:
+    """Three sets and one of a turned mirror, and the same after the camera turned."""
+    values = drawn_bench(np.random.default_rng(3))
+    bumped = values.copy()
+    bumped[NAMES.index("camera_yaw_deg")] += yaw_deg
+    turned = [TurnedSet(SMOOTH.seated(Seat(np.radians(120.0))), TurnedMirror(120.0))]
+    before, after = (
+        make_foreign_film(SMOOTH, each, 3, 500, sags_mm=SAGS_MM, turned=turned)
+        for each in (values, bumped)
+    )
+    return before, after
+
+
+@pytest.mark.parametrize(("index", "yaw_deg"), [(3, 0.02), (3, 0.001), (1, 0.001)])
+def test_a_bump_in_the_middle_of_a_set_is_found_with_its_angle(index: int, yaw_deg: float) -> None:
+    """17 and 350 µrad, of a turned mirror and of one that stands as usual."""
+    before, after = bumped_truths(yaw_deg)
+    sets = list(before.sets)
+    sets[index] = mixed_set(before.sets[index], after.sets[index])
+    found = find_bump_within_set(before.problem(EVERY, tuple(sets)))
+    assert found is not None
+    assert found.index == index
+    assert found.turned_deg == pytest.approx((yaw_deg, 0.0, 0.0), abs=2e-4)
+
+
+def test_neither_good_sets_nor_a_bump_before_a_set_are_one_in_its_middle() -> None:
+    before, after = bumped_truths(0.02)
+    assert find_bump_within_set(before.problem(EVERY)) is None
+    sets = (*before.sets[:3], after.sets[3])
+    assert find_bump_within_set(before.problem(EVERY, sets)) is None
+
+
+@pytest.mark.campaign
+def test_a_bump_in_the_middle_of_a_set_is_named() -> None:
+    """The sets seemed to contradict each other, without a cause."""
+    before, after = bumped_truths(0.02)
+    sets = (*before.sets[:3], mixed_set(before.sets[3], after.sets[3]))
+    (finding,) = (each for each in solve_any_film(before.problem(EVERY, sets))[1] if each.fatal)
+    assert finding.description.startswith("the camera moved while set3 was taken")
+    assert finding.sets == (3,)
 
 
 def test_a_set_of_the_mirror_as_it_stands_is_needed() -> None:
