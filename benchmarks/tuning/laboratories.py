@@ -2,7 +2,8 @@
 
 `python -m benchmarks.tuning.laboratories --count 40` adds lines of JSON for each to
 build/laboratories.jsonl; a second call continues where the first ended. `--part start` only
-starts them, `--part defaults` holds them with the defaults, `--part sessions` tunes them. It
+starts them, `--part defaults` holds them with the defaults, `--part sessions` tunes them.
+`--rate-hz 10` examines those of this tick rate only, which take a fifth of the time of 50 Hz. It
 writes the page docs/measurements/tuning-laboratories.md.
 """
 
@@ -20,6 +21,7 @@ from tests.studies.laboratory_sessions import (
     format_page,
     is_held,
 )
+from tests.worlds.drawn_laboratories import draw_laboratory
 
 FILE = Path("build/laboratories.jsonl")
 PAGE = Path("docs/measurements/tuning-laboratories.md")
@@ -47,12 +49,15 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--file", type=Path, default=FILE)
     parser.add_argument("--part", choices=PARTS, action="append", help="default: all")
+    parser.add_argument("--rate-hz", type=float, action="append", help="default: all")
     parser.add_argument("--page", type=Path, default=PAGE)
     given = parser.parse_args()
     given.file.parent.mkdir(parents=True, exist_ok=True)
     parts = given.part or PARTS
     known = {row["seed"]: row for row in read_rows(given.file)}
     for seed in range(given.first, given.first + given.count):
+        if given.rate_hz and draw_laboratory(seed).rate_hz not in given.rate_hz:
+            continue
         for part in parts:
             row = known.get(seed, {"parts": []})
             if part in row["parts"]:

@@ -75,19 +75,8 @@ class ExcursionGuard:
         self._limit_um = around.limit_um
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
-        """Run one tick: the experiment's step, then the way back, then the experiment's end.
-
-        Parameters
-        ----------
-        measurement : BenchSample
-            The reading; NaN for a lost one.
-        dt_s : float
-            Time since the last one.
-
-        Returns
-        -------
-        float or Finished
-            Flow in µm/s until the next reading, or the end with its reason.
+        """Run one tick as `Experiment.step` does: the experiment's step, then the way back, then
+        the experiment's end.
         """
         self._motion.update(measurement.displacement_um, dt_s)
         if self._motion.lost_s > _LOST_MAX_S:

@@ -109,20 +109,7 @@ class Trial:
         return self.spec.kind == "pump_map"
 
     def step(self, measurement: experiment.BenchSample, dt_s: float) -> float | experiment.Finished:
-        """Run one tick.
-
-        Parameters
-        ----------
-        measurement : BenchSample
-            The reading; NaN for a lost one.
-        dt_s : float
-            Time since the last one.
-
-        Returns
-        -------
-        float or Finished
-            What to put out until the next reading, or the end with its reason.
-        """
+        """Run one tick as `Experiment.step` does; a raw experiment gives pump commands."""
         self.memory.left_s -= dt_s
         if self.raw and self.memory.left_s < 0:
             return experiment.Finished(
