@@ -24,6 +24,7 @@ from membrane_ctrl.control import (
 )
 from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.control.feedforward import FeedForward, FeedForwardState
+from membrane_ctrl.control.limit_bias import LimitBias
 from membrane_ctrl.model.state_tree import StateNode
 
 _AT_TARGET_UM = 0.1  # of the ramp: the pump is probed only then
@@ -91,6 +92,8 @@ class InnerLoopState(StateNode):
     follows_estimate: bool = False  # the last automatic tick did
     # Where the loop on the estimate aims, less the setpoint: not 0 just after a hand-over
     aim_offset_um: float = 0.0
+    # Where it aims, less the setpoint, while the pump is often at a limit
+    limit_bias: LimitBias = field(default_factory=LimitBias)
 
 
 class InnerLoop:
@@ -170,6 +173,7 @@ class InnerLoop:
             The pump's present flow, or the mean it is known to need.
         """
         self._forget_output()
+        self.memory.limit_bias = LimitBias()
         self.memory.measured.reset(displacement_um)
         self._hold_setpoint_at(displacement_um)
         self._ramp.place(math.nan)  # placed by the first step, which has the trim
@@ -237,6 +241,9 @@ class InnerLoop:
             )
         else:
             self.memory.leak.add_loss(given.estimate.leak_um_per_s, filtered_um, dt_s)
+            is_in_range = 0.0 <= wanted_um_per_s <= self._limiter.flow_max_um_per_s
+            error_um = self.memory.shaped_um - given.estimate.um
+            self.memory.limit_bias.step(error_um, not is_in_range, dt_s)
         output = self._make_output(
             terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um
         )
@@ -294,8 +301,9 @@ class InnerLoop:
         shaped_um, ramp_um_per_s = self._shape_setpoint(given, estimate.um, dt_s)
         self.memory.matched.reset(shaped_um)
         self._pid.place(estimate.leak_um_per_s)
+        aim_um = shaped_um + self.memory.limit_bias.offset_um
         p_um_per_s = (
-            self._error_gain_per_s * (shaped_um - estimate.ahead_um)
+            self._error_gain_per_s * (aim_um - estimate.ahead_um)
             + self._due_gain * estimate.due_um_per_s
         )
         known_um_per_s = estimate.drift_um_per_s + ramp_um_per_s

@@ -282,7 +282,7 @@ def make_lqg_law(stated: LoopBench, weight: float) -> Law:
         flow = min(max(wanted, 0.0), stated.full_um_per_s)
         state = a @ state
         state[newest] = flow
-        return flow / stated.full_um_per_s
+        return float(flow / stated.full_um_per_s)
 
     return law
 
