@@ -12,8 +12,8 @@ from tuning.identification.two_gains import fit_two_gains
 
 MAP_THE_PUMP = "run `tune pump`"
 LARGER_LIMIT = "repeat `tune characterise` with a larger --limit-um"
-# Share of the readings. 6 % of them, lost singly or in gaps of 80 ms, move the fit by less than half
-# a standard deviation
+# Share of the readings. 6 % of them, lost singly or in gaps of 80 ms, move the fit by less than
+# half a standard deviation
 _LOST_MAX = 0.05
 # An error of k beyond +-20 % (2 sigma) changes Ms and variance by more than designs differ.
 _GAIN_SIGMA_MAX = 0.10
