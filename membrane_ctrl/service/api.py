@@ -86,7 +86,16 @@ async def _find_user(request: Request) -> WebUser:
     return user
 
 
+async def _find_feed(request: Request, hold: HoldName = "") -> HoldFeed:
+    feeds: Mapping[str, HoldFeed] = request.app.state.feeds
+    feed = feeds.get(hold)
+    if feed is None:
+        raise HTTPException(HTTPStatus.NOT_FOUND, f"no hold {hold!r}; known: {', '.join(feeds)}")
+    return feed
+
+
 User = Annotated[WebUser, Depends(_find_user)]
+Feed = Annotated[HoldFeed, Depends(_find_feed)]
 
 
 def make_api(
@@ -111,17 +120,17 @@ def make_api(
         description=_DESCRIPTION,
         redoc_url=None,
     )
-    streams: set[object] = set()
+    api.state.feeds = feeds
+    _add_state_routes(api, feeds)
+    _add_configuration_routes(api, starter, editor)
+    _add_start_routes(api, starter)
+    _add_command_routes(api)
+    _add_streams(api, feeds)
+    return api
 
-    async def find_feed(hold: HoldName = "") -> HoldFeed:
-        feed = feeds.get(hold)
-        if feed is None:
-            raise HTTPException(
-                HTTPStatus.NOT_FOUND, f"no hold {hold!r}; known: {', '.join(feeds)}"
-            )
-        return feed
 
-    Feed = Annotated[HoldFeed, Depends(find_feed)]
+def _add_state_routes(api: FastAPI, feeds: Mapping[str, HoldFeed]) -> None:
+    """Add the routes that read holds: state, signals, history, events and runs."""
 
     @api.get("/api/me")
     async def me(user: User) -> UserAnswer:
@@ -186,6 +195,12 @@ def make_api(
             entries = await RUN_LISTS.run(catalogue.list_entries, logs)
         return [_describe_run(entry) for entry in entries]
 
+
+def _add_configuration_routes(
+    api: FastAPI, starter: HoldStarter, editor: ConfigurationEditor
+) -> None:
+    """Add the routes that list, read, check and save configurations."""
+
     @api.get("/api/configurations")
     async def list_configurations() -> list[ConfigurationAnswer]:
         """What a hold can be started with."""
@@ -228,6 +243,10 @@ def make_api(
             saved = await CONFIGURATIONS.run(editor.save, name, body.text, body.digest, user.name)
         return ConfigurationTextAnswer(text=saved.text, digest=saved.digest)
 
+
+def _add_start_routes(api: FastAPI, starter: HoldStarter) -> None:
+    """Add the routes that start and restart holds."""
+
     @api.post("/api/start", status_code=HTTPStatus.ACCEPTED)
     async def start_hold(body: StartBody, user: User) -> CommandAnswer:
         """Start a hold; follow `/api/state` to see what becomes of it."""
@@ -260,6 +279,10 @@ def make_api(
         failure = starter.failure
         return CommandAnswer(done=not failure, text=failure)
 
+
+def _add_command_routes(api: FastAPI) -> None:
+    """Add the routes that send commands to a hold."""
+
     @api.post("/api/commands")
     async def send_command(
         body: CommandBody, user: User, feed: Feed, response: Response
@@ -285,6 +308,11 @@ def make_api(
         request |= {"do": command, "take_over": True}
         return await _send(feed, user, request, SAFETY_COMMANDS, response)
 
+
+def _add_streams(api: FastAPI, feeds: Mapping[str, HoldFeed]) -> None:
+    """Add what other programs follow: the stream of states and events, and the metrics."""
+    streams: set[object] = set()
+
     @api.get("/api/stream", response_class=StreamingResponse)
     async def stream(feed: Feed, hold: HoldName = "") -> StreamingResponse:
         """Server-sent events: `state` (as `/api/state`) when it changes, `event` for each event."""
@@ -308,8 +336,6 @@ def make_api(
         """All holds for Prometheus."""
         seen = {name: feed.seen for name, feed in feeds.items()}
         return Response(render_metrics(seen), media_type=METRICS_TYPE)
-
-    return api
 
 
 def describe_state(hold: str, seen: HoldSeen) -> StateAnswer:
