@@ -26,6 +26,7 @@ from tests.support.undrawn import undrawn_figures
 # starts.
 _LOCKS_FOLDER = tempfile.mkdtemp(prefix="membrane-locks-")
 _NUMBERS = itertools.count()
+_EMPTY_FOLDERS: list[Path] = []
 os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
 # The keys of a test's services are its own.
 _STATE_FOLDER = tempfile.mkdtemp(prefix="membrane-state-")
@@ -96,16 +97,25 @@ def undrawn() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True)
-def own_locks() -> Iterator[None]:
-    """The locks of a test are its own."""
+def _make_locks_folder() -> Path:
     folder = Path(
         _LOCKS_FOLDER, str(next(_NUMBERS))
     )  # mktemp would list the folders of all tests before
     folder.mkdir()
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def own_locks() -> Iterator[None]:
+    """The locks of a test are its own; a folder that a test leaves empty serves the next."""
+    if not _EMPTY_FOLDERS:
+        _EMPTY_FOLDERS.append(_make_locks_folder())
+    folder = _EMPTY_FOLDERS.pop()
     os.environ[lock_store.VARIABLE] = str(folder)
     yield
     os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
+    if folder.is_dir() and not any(folder.iterdir()):
+        _EMPTY_FOLDERS.append(folder)
 
 
 @pytest.fixture(autouse=True)

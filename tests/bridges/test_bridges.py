@@ -14,7 +14,7 @@ import pytest
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from membrane_ctrl.bridges import command_lanes, mqtt
+from membrane_ctrl.bridges import mqtt
 from membrane_ctrl.bridges.bridge import COMMANDS, TABLE, Bridge
 from membrane_ctrl.bridges.cli import app
 from membrane_ctrl.config.bridges import BridgesConfig, EpicsConfig, MqttConfig, OpcuaConfig
@@ -29,6 +29,8 @@ from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.service.hold_seen import HoldSeen
 from membrane_ctrl.service.published_signals import signal_values
 from tests.worlds.port_run import port_run
+
+pytestmark = pytest.mark.usefixtures("slow_answers_allowed")
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "bridges.md"
 STRANGE_NUMBERS = (
@@ -48,14 +50,7 @@ STRANGE_NUMBERS = (
     "--1",
     "½",
 )
-PATIENCE_S = 60.0  # a machine that runs the tests may pause for seconds
 FAULT = {"code": 7, "name": "laser_lost", "cause": "no light", "remedy": "clean it"}
-
-
-@pytest.fixture(autouse=True)
-def allow_slow_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command_lanes, "TIME_LIMIT_S", PATIENCE_S)
-    monkeypatch.setattr(command_lanes, "SAFETY_ANSWER_S", PATIENCE_S)
 
 
 def seen_hold(**row: float | None) -> HoldSeen:

@@ -18,7 +18,10 @@ from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.service.send_limits import SendLimits
 
+pytestmark = pytest.mark.usefixtures("slow_answers_allowed")
+
 SAFETY_KINDS = sorted(SAFETY)
+PATIENCE_S = 60.0
 
 
 class FakeHold:
@@ -57,7 +60,7 @@ async def texts_of(outcomes: Iterable[asyncio.Future[Outcome]]) -> list[str]:
 
 
 async def wait_for(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(10.0):
+    async with asyncio.timeout(PATIENCE_S):
         while not condition():  # noqa: ASYNC110  the condition changes on another thread
             await asyncio.sleep(0.005)
 

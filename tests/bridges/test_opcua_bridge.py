@@ -28,6 +28,8 @@ from tests.bridges.test_bridges import bridge_with, seen_hold
 from tests.worlds.free_port import free_port
 from tests.worlds.port_run import PortRun, port_run
 
+pytestmark = pytest.mark.usefixtures("slow_answers_allowed")
+
 PRECEDING_MAX = 10  # of about 150 commands that were sent before a safety command
 PASSWORDS = {"anna": "the right one", "reto": "only to read"}
 ROLES = {"anna": "operate", "reto": "read"}

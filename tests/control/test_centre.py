@@ -462,7 +462,7 @@ def test_relock_takes_a_new_zero_without_moving_the_centre() -> None:
     assert np.ptp(centres) < 0.2
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_the_mean_of_the_laser_defines_the_zero_of_the_optics(seed: int) -> None:
     """Its first second alone, in which five frames come, is up to 0.5 µm off."""
     rng = np.random.default_rng([seed, 11])

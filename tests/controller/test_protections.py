@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 from membrane_ctrl.config.schema import (
     Config,
@@ -324,7 +326,7 @@ def test_no_protection_is_lost_while_laser_and_estimate_exchange_the_loop(
     assert blind.moved_um < 10.0
 
 
-@pytest.mark.parametrize("um_per_s", [-0.05, 0.05])
+@pytest.mark.parametrize("um_per_s", [-0.05, pytest.param(0.05, marks=pytest.mark.campaign)])
 def test_slow_drift_of_the_optics_is_outvoted_by_laser_and_gauge(um_per_s: float) -> None:
     held = settled(config_of("estimate"), drifting(um_per_s)).fail(1200.0)
     assert [event.faulty for event in held.events_of(Plausibility)] == ["optics"]  # type: ignore[attr-defined]
@@ -394,8 +396,25 @@ UNDERTAKINGS = {
 }
 
 
-@pytest.mark.parametrize("spoil", [drifting(-5.0), drifting(1.0), stepping(-150.0), stepping(30.0)])
-@pytest.mark.parametrize("undertaking", list(UNDERTAKINGS))
+def _mark_every_other(*parameters: Iterable[object]) -> list[ParameterSet]:
+    """All combinations: half of them, with each pair of the first and the last, run fast; the
+    others belong to the campaign.
+    """
+    *first, last = (list(values) for values in parameters)
+    found = []
+    for number, chosen in enumerate(itertools.product(*first)):
+        for place, value in enumerate(last):
+            marks = () if (number + place) % 2 == 1 else (pytest.mark.campaign,)
+            found.append(pytest.param(*chosen, value, marks=marks))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("undertaking", "spoil"),
+    _mark_every_other(
+        UNDERTAKINGS, [drifting(-5.0), drifting(1.0), stepping(-150.0), stepping(30.0)]
+    ),
+)
 def test_wrong_optics_are_outvoted_whatever_the_hold_does(undertaking: str, spoil: Spoil) -> None:
     """Laser and gauge are sound; without a comparison while the film moves the loop follows the
     optics.
@@ -450,11 +469,16 @@ def test_figures_of_another_mirror_count_as_missing() -> None:
     assert held.moved_um < 2.0
 
 
-@pytest.mark.parametrize("undertaking", list(UNDERTAKINGS))
-@pytest.mark.parametrize("shape", [ShapeConfig(mode="track", track_rate_hz=RATE_HZ), ShapeConfig()])
-@pytest.mark.parametrize("process_value", ["laser", "estimate", *AUTO])
+@pytest.mark.parametrize(
+    ("process_value", "undertaking", "shape"),
+    _mark_every_other(
+        ["laser", "estimate", *AUTO],
+        UNDERTAKINGS,
+        [ShapeConfig(mode="track", track_rate_hz=RATE_HZ), ShapeConfig()],
+    ),
+)
 def test_sensors_without_faults_never_contradict_each_other(
-    undertaking: str, shape: ShapeConfig, process_value: str
+    process_value: str, undertaking: str, shape: ShapeConfig
 ) -> None:
     held = settled(config_of(process_value, shape=shape))
     held.command(UNDERTAKINGS[undertaking])

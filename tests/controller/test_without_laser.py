@@ -413,12 +413,14 @@ def _blind(um: float, jump_s: float = JUMP_S) -> Callable[[Wrong, float], None]:
     return fail
 
 
-def _judge_jump(um: float, seen: bool) -> None:
+def _judge_jump(um: float, seen: bool, config: Config = BY_ALL, shape_s: float = 0.06) -> None:
     ticks = held(
         JUMP_S + 14.0 + 200.0 / abs(um) + (um / 0.9 if um > 0 else -um / 3.0),
         _blind(0.0 if seen else um),
-        BY_ALL,
+        config,
         AmbientChange(JUMP_S, um / -0.358, 0.1),
+        None,
+        shape_s,
     )
     assert not events_of(ticks, Fault)
     faulty_sensors = [event.faulty for event in events_of(ticks, Plausibility)]
@@ -441,7 +443,7 @@ def test_a_jump_of_the_film_is_corrected_for_any_camera_reading(seen: bool) -> N
     """The gauge is the third sensor: it agrees with the laser, and what the mount was blamed for is
     undone.
     """
-    _judge_jump(-25.0, seen)
+    _judge_jump(-25.0, seen, BY_ALL.model_copy(update=AT_10_HZ), 0.2)
 
 
 def _early(

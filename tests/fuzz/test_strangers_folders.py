@@ -186,7 +186,7 @@ def test_a_small_part_that_would_be_gigabytes(folder: Path, capsys: Captured) ->
     path = folder / "ticks" / "ticks-0000.parquet"
     zeros = pa.array(np.zeros(20_000_000, np.int8))
     table = pa.table(
-        [zeros.cast(field.type) for field in TICKS.schema][:8], names=TICKS.schema.names[:8]
+        [zeros.cast(field.type) for field in list(TICKS.schema)[:4]], names=TICKS.schema.names[:4]
     )
     pq.write_table(table, path, compression="zstd", row_group_size=len(zeros))
     (path.parent / "manifest.jsonl").unlink()

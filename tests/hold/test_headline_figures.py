@@ -34,7 +34,11 @@ def read_from_console(name: str) -> str:
     return _format_held(model.make_view(0.0).held).plain
 
 
-@pytest.mark.parametrize("scenario", ["laser_loss", "leak_doubled", "pump_failing"])
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(
+    "scenario",
+    ["laser_loss", pytest.param("leak_doubled", marks=pytest.mark.campaign), "pump_failing"],
+)
 def test_four_places_agree(
     scenario: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,7 +14,7 @@ from membrane_ctrl.metrology.uncertainty.set_moment import (
     moment_sigma_um,
     step_sigma_um,
 )
-from tests.studies.second_world_errors import drawn_points_mm, measured_errors
+from tests.studies.second_world_errors import MeasuredErrors, drawn_points_mm, measured_errors
 from tests.worlds.second_optics import FRAME_S, Bench, Effects, Mirror, World
 
 FRAMES = 18
@@ -69,30 +69,37 @@ def test_a_film_at_rest_has_the_sigma_of_the_fringes_noise() -> None:
     assert 0.1 < np.mean(found) < 0.25
 
 
+def measured(course: Course | None, folder: Path, seed: int) -> MeasuredErrors:
+    """Errors of a set without a laser."""
+    effects = Effects(laser=False, film_motion_um=course)
+    world = World(Mirror(), Bench.paper(0.125), effects, seed=seed)
+    truth = world.write_set(folder)
+    points_mm = drawn_points_mm(np.random.default_rng(1), 20)
+    return measured_errors(folder, world.mirror, truth, points_mm)
+
+
+@pytest.fixture(scope="module")
+def at_rest(tmp_path_factory: pytest.TempPathFactory) -> MeasuredErrors:
+    """The set before, with which each moving film is compared."""
+    return measured(None, tmp_path_factory.mktemp("at-rest"), seed=1)
+
+
 @pytest.mark.parametrize("name", COURSES | BETWEEN)
 def test_a_change_of_the_sag_is_within_its_bar_whatever_moment_is_meant(
-    name: str, tmp_path: Path
+    name: str, tmp_path: Path, at_rest: MeasuredErrors
 ) -> None:
     """Film that moved by 5 µm during a set without a laser: the sag was 2 sigma off its mean over
     the set.
     """
-    points = drawn_points_mm(np.random.default_rng(1), 20)
-    found = []
     moving_film = (COURSES | BETWEEN)[name]
-    for seed, course in enumerate((None, moving_film)):
-        effects = Effects(laser=False, film_motion_um=course)
-        world = World(Mirror(), Bench.paper(0.125), effects, seed=1 + seed)
-        folder = tmp_path / f"set{seed}"
-        truth = world.write_set(folder)
-        found.append(measured_errors(folder, world.mirror, truth, points))
-    before, moving = found
-    assert before.error_um is not None
+    moving = measured(moving_film, tmp_path / "moving", seed=2)
+    assert at_rest.error_um is not None
     assert moving.error_um is not None
-    error_um = moving.error_um - before.error_um
-    ratio = error_um / moving.change_sigma_um(before)
+    error_um = moving.error_um - at_rest.error_um
+    ratio = error_um / moving.change_sigma_um(at_rest)
     assert np.abs(ratio).max() < 2.0
     of_mean_um = error_um[0] - moment_um(moving_film)
-    assert abs(of_mean_um) < 1.1 * moving.change_sigma_um(before)[0]
+    assert abs(of_mean_um) < 1.1 * moving.change_sigma_um(at_rest)[0]
 
 
 def test_a_step_between_the_axes_may_have_been_at_any_time_between_them() -> None:
