@@ -222,12 +222,15 @@ def commission(
         bool, typer.Option("--twin", help="Practise on the emulated bench, in virtual time.")
     ] = False,
     messages: Annotated[bool, typer.Option("--messages", hidden=True)] = False,
+    named_by_input: Annotated[bool, typer.Option("--named-by-input", hidden=True)] = False,
 ) -> int:
     """Take a bench from a box of parts to an accepted hold, step by step; leave a configuration and
     a report.
     """
-    from membrane_ctrl.commissioning.guide.command import commission_bench
+    from membrane_ctrl.commissioning.guide.command import commission_bench, commission_named
 
+    if named_by_input:
+        return commission_named(folder)
     if not twin:
         return commission_bench(folder, as_messages=messages)
     from membrane_ctrl.hold.virtual_hold import VirtualHold

@@ -1,16 +1,15 @@
 """The guided session of commissioning for viewers of the page: starts it, follows it, answers it.
 
 The session is a program of its own, the same that runs in a terminal, and it resumes sessions of
-either. Each question has a number, and an answer names it: an answer to an earlier question is
-refused, so a reload or a second click never confirms twice. If the service ends, the session
-notices the end of its input and stops safely.
+either; under systemd, one at the bench is a unit of its own (`session_links`). Each question has a
+number, and an answer names it: an answer to an earlier question is refused, so a reload or a second
+click never confirms twice. If the service ends, the session notices the end of its input and stops
+safely.
 """
 
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Sequence
@@ -27,6 +26,7 @@ from membrane_ctrl.commissioning.guide.session_messages import (
     MESSAGES,
     AnswerMessage,
     CheckMessage,
+    EndMessage,
     LineMessage,
     PlanMessage,
     QuestionMessage,
@@ -36,16 +36,18 @@ from membrane_ctrl.commissioning.guide.session_messages import (
 from membrane_ctrl.commissioning.guide.session_state import read_state
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.service.hold_starter import is_configuration_name
+from membrane_ctrl.service.session_links import (
+    SESSION_SOCKET,
+    ProgramLink,
+    SessionLink,
+    UnitLink,
+)
 
 LOG_NAME = "page.log"
 _MESSAGES_MOST = 2000  # of one start; a session of a day shows some hundred
 _SESSIONS_MOST = 100
 _ANSWER_MOST = 1000  # characters
 _ENDS_S = 150.0  # a hold lowers nothing, but closes its recording
-_UNITS_REFUSAL = (
-    "this service runs under systemd without access to devices: run `sudo -u membrane "
-    "membrane-ctrl commission FOLDER` in a terminal, or the emulated bench here"
-)
 
 
 ShownMessage = StageMessage | LineMessage | CheckMessage
@@ -104,19 +106,30 @@ class GuidedSession:
     folder : Path
         Of the sessions.
     units : bool
-        Whether the service is a unit of systemd, which has no access to devices.
+        Whether the service is a unit of systemd, which has no access to devices: a session at the
+        bench is another unit then.
     command : sequence of str, optional
         Another program than `membrane-ctrl commission`, for tests.
+    unit_socket : Path, optional
+        Where systemd listens for that unit.
     """
 
-    def __init__(self, folder: Path, units: bool = False, command: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        units: bool = False,
+        command: Sequence[str] = (),
+        unit_socket: Path = SESSION_SOCKET,
+    ) -> None:
         self._folder = folder
         self._units = units
+        self._unit_socket = unit_socket
         self._command = list(command) or [sys.executable, "-m", "membrane_ctrl", "commission"]
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="guided session")
         self._thread.submit(os.getpid).result()  # the thread keeps the present priority
         self._lock = threading.Lock()
-        self._process: subprocess.Popen[str] | None = None
+        self._link: SessionLink | None = None
+        self._end: EndMessage | None = None
         self._reader: threading.Thread | None = None
         self._seen = SeenSession()
 
@@ -159,38 +172,34 @@ class GuidedSession:
             The name is wrong, another session runs, or the program does not start.
         """
         folder = self.find_folder(name)
-        if self._units and not simulated:
-            raise errors.InputError(_UNITS_REFUSAL)
         self._thread.submit(self._start, name, folder, simulated, who).result()
 
     def _start(self, name: str, folder: Path, simulated: bool, who: str) -> None:
         with self._lock:
             if self._seen.is_running:
                 raise errors.InputError(f"the session {self._seen.name} runs; stop it first")
-            # The program that a terminal would run, with messages instead of text.
-            words = [*self._command, str(folder), "--messages"]
-            if simulated:
-                words.append("--twin")
-            with errors.convert_write_errors(folder, errors.DeviceError):
-                files.make_folder(folder)
-                log = files.fresh_text(folder / LOG_NAME)
-            with log:
-                self._process = subprocess.Popen(
-                    words,
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    stderr=log,
-                    encoding="utf-8",
-                    errors="replace",
-                    start_new_session=True,
-                )
+            link = self._open_link(name, folder, simulated)
             # A thread follows it, so that no viewer waits.
+            self._link, self._end = link, None
             self._seen = SeenSession(name, is_running=True)
             self._reader = threading.Thread(
-                target=self._follow, args=(self._process, name, folder), daemon=True
+                target=self._follow, args=(link, name, folder), daemon=True
             )
             self._reader.start()
         _log(f"{who} has started the guided session {name}")
+
+    def _open_link(self, name: str, folder: Path, simulated: bool) -> SessionLink:
+        """Start the program that a terminal would run, with messages instead of text."""
+        if self._units and not simulated:
+            return UnitLink(self._unit_socket, name)
+        words = [*self._command, str(folder), "--messages"]
+        if simulated:
+            words.append("--twin")
+        with errors.convert_write_errors(folder, errors.DeviceError):
+            files.make_folder(folder)
+            log = files.fresh_text(folder / LOG_NAME)
+        with log:
+            return ProgramLink(words, log)
 
     def answer(self, number: int, text: str, who: str) -> None:
         """Answer a question of the session.
@@ -213,21 +222,19 @@ class GuidedSession:
             raise errors.InputError(f"longer than {_ANSWER_MOST} characters")
         with self._lock:
             waiting = self._seen.question
-            if waiting is None or waiting.number != number or self._process is None:
+            if waiting is None or waiting.number != number or self._link is None:
                 raise errors.InputError("this question has been answered already")
             self._update(question=None)
-            assert self._process.stdin is not None
             given = AnswerMessage(number=number, answer=text)
-            with suppress(BrokenPipeError):
-                print(given.model_dump_json(), file=self._process.stdin, flush=True)
+            self._link.send_line(given.model_dump_json())
             _log(f"{who} answers {waiting.question.key}: {terminal.one_line(text)}")
 
     def stop(self, who: str) -> None:
         """Stop the session as Ctrl-C does: the pump is off, and it can be resumed."""
         with self._lock:
-            if self._process is None or not self._seen.is_running:
+            if self._link is None or not self._seen.is_running:
                 return
-            self._process.send_signal(signal.SIGINT)
+            self._link.interrupt()
         _log(f"{who} stops the guided session")
 
     def close(self) -> None:
@@ -237,26 +244,25 @@ class GuidedSession:
             self._reader.join(_ENDS_S)
         self._thread.shutdown()
 
-    def _follow(self, process: subprocess.Popen[str], name: str, folder: Path) -> None:
+    def _follow(self, link: SessionLink, name: str, folder: Path) -> None:
         """Take the messages of a session until it ends."""
-        assert process.stdout is not None
-        for line in process.stdout:
-            try:
-                message = MESSAGES.validate_json(line)
-            except ValidationError:
-                continue
-            with self._lock:
-                self._take_message(message)
-        code = process.wait()
-        process.stdout.close()
-        if process.stdin is not None:
-            with suppress(BrokenPipeError):
-                process.stdin.close()
+        with suppress(OSError):
+            for line in link.source:
+                try:
+                    message = MESSAGES.validate_json(line)
+                except ValidationError:
+                    continue
+                with self._lock:
+                    self._take_message(message)
+        code = link.close()
         with self._lock:
-            self._update(question=None, is_running=False, ended=_describe_end(code, name, folder))
+            ended = _describe_end(code, self._end, name, folder)
+            self._update(question=None, is_running=False, ended=ended)
 
     def _take_message(self, message: SessionMessage) -> None:
         match message:
+            case EndMessage():
+                self._end = message
             case PlanMessage():
                 self._update(plan=message.plan)
             case QuestionMessage():
@@ -286,20 +292,41 @@ def _read_entry(folder: Path) -> SessionEntry:
     return SessionEntry(folder.name, state.simulated, len(state.records))
 
 
-def _describe_end(code: int, name: str, folder: Path) -> str:
-    """How a session ended, for people."""
-    match code:
+def _describe_end(code: int | None, end: EndMessage | None, name: str, folder: Path) -> str:
+    """How a session ended, for people.
+
+    Parameters
+    ----------
+    code : int or None
+        Of the program, where this process started it.
+    end : EndMessage or None
+        The session's last message; None if it ended without one.
+    name : str
+    folder : Path
+        Of the session.
+    """
+    if code is None and end is None:
+        seen = "another one may run; `journalctl -u 'membrane-commission@*'` has its output"
+        return f"{name}: ended without a message: {seen}"
+    match code if end is None else end.code:
         case errors.Exit.DONE:
             return f"{name}: accepted; the report is below"
         case errors.Exit.REJECTED:
             return f"{name}: not accepted; the report states the reasons"
         case errors.Exit.INTERRUPTED:
             return f"{name}: stopped; start it again to resume it, here or in a terminal"
-    lines = ["no message"]
+    if end is not None:
+        return f"{name}: {terminal.one_line(end.problem)}"
+    return f"{name}: ended with code {code}: {_read_last_line(folder)}"
+
+
+def _read_last_line(folder: Path) -> str:
+    """The last line that a session's program printed beside its messages."""
+    lines: list[str] = []
     with suppress(OSError):
         text = (folder / LOG_NAME).read_text(encoding="utf-8", errors="replace")
-        lines = text.strip().splitlines() or lines
-    return f"{name}: ended with code {code}: {terminal.one_line(lines[-1])}"
+        lines = text.strip().splitlines()
+    return terminal.one_line(lines[-1]) if lines else "no message"
 
 
 def _log(text: str) -> None:

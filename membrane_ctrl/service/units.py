@@ -1,5 +1,6 @@
-"""What an installation adds to the system: the units of the service and of each hold, the rule that
-lets the service start holds, access to instruments and cameras, and real-time limits.
+"""What an installation adds to the system: the units of the service, of each hold and of guided
+sessions, the rule that lets the service start holds, access to instruments and cameras, and
+real-time limits.
 
 The files are written from the files in `examples/`, with the path of this program and its user.
 """
@@ -21,12 +22,16 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 USER = "membrane"
 SERVICE_UNIT = "membrane-service.service"
 HOLD_UNIT = "membrane-hold@.service"
+SESSION_UNIT = "membrane-commission@.service"
+SESSION_LISTENER = "membrane-commission.socket"
 _STATE = "/var/lib/membrane-ctrl"
 _CONFIGURATIONS = "/etc/membrane-ctrl"
 _PROGRAM = "/opt/membrane-ctrl/.venv/bin/membrane-ctrl"
 _TARGETS = {
     SERVICE_UNIT: "etc/systemd/system",
     HOLD_UNIT: "etc/systemd/system",
+    SESSION_UNIT: "etc/systemd/system",
+    SESSION_LISTENER: "etc/systemd/system",
     "50-membrane-ctrl.rules": "etc/polkit-1/rules.d",
     "70-membrane-ctrl.rules": "etc/udev/rules.d",
     "50-membrane-ctrl-limits.conf": "etc/security/limits.d",
@@ -34,6 +39,8 @@ _TARGETS = {
 }
 # Groups of serial ports and GPIO lines, and of cameras
 _DEVICE_GROUPS = ("dialout", "video")
+# Of the rules of udev: what is plugged in already gets its group without being plugged in again
+_DEVICE_SUBSYSTEMS = ("tty", "usb", "video4linux", "gpio")
 _SETTINGS = "service.toml"
 _SETTINGS_TEXT = f"""# Settings of the service (docs/how-to/service.md).
 logs = "{_STATE}/logs"
@@ -113,7 +120,7 @@ def install_units(root: Path, program: Path) -> list[Path]:
     if is_system:
         _run(["systemctl", "daemon-reload"])
         _apply_device_rules()
-        _run(["systemctl", "enable", "--now", SERVICE_UNIT])
+        _run(["systemctl", "enable", "--now", SESSION_LISTENER, SERVICE_UNIT])
     return written
 
 
@@ -128,16 +135,19 @@ def remove_units(root: Path) -> list[Path]:
     Raises
     ------
     DeviceError
-        A hold runs as a unit, a file cannot be removed, or a command of the system failed.
+        A hold or a guided session runs as a unit, a file cannot be removed, or a command of the
+        system failed.
     """
     is_system = root == Path("/")
     if is_system:
-        running = _run(["systemctl", "list-units", "--plain", "--no-legend", "membrane-hold@*"])
+        listing = ["systemctl", "list-units", "--plain", "--no-legend"]
+        running = _run([*listing, "membrane-hold@*", "membrane-commission@*"])
         if running.strip():
             unit = running.split()[0]
             raise errors.DeviceError(f"{unit} runs; stop it before: systemctl stop {unit}")
-        if (root / _TARGETS[SERVICE_UNIT] / SERVICE_UNIT).exists():
-            _run(["systemctl", "disable", "--now", SERVICE_UNIT])
+        for name in (SERVICE_UNIT, SESSION_LISTENER):
+            if (root / _TARGETS[name] / name).exists():
+                _run(["systemctl", "disable", "--now", name])
     removed = []
     for name, folder in _TARGETS.items():
         path = root / folder / name
@@ -173,7 +183,10 @@ def _apply_device_rules() -> None:
     """Apply the rules of udev and the socket buffers to the running system, where it has them."""
     if shutil.which("udevadm"):
         _run(["udevadm", "control", "--reload"])
-        _run(["udevadm", "trigger", "--subsystem-match=tty", "--subsystem-match=video4linux"])
+        subsystems = [f"--subsystem-match={name}" for name in _DEVICE_SUBSYSTEMS]
+        _run(["udevadm", "trigger", *subsystems])
+        # the rule of the latency is for adapters as they are plugged in
+        _run(["udevadm", "trigger", "--action=add", "--subsystem-match=usb-serial"])
     if shutil.which("sysctl"):
         _run(["sysctl", "--system"])
 

@@ -29,7 +29,10 @@ mkdir -p {_UNITS}/{_UNIT}.service.d /run/notices
 chown membrane /run/notices
 printf '[Service]\\n{_PLACES}\\n' | tee {_UNITS}/{_UNIT}.service.d/room.conf > {_UNITS}/twin.service
 echo "ExecStart={_PROGRAM} twin --config /etc/membrane-ctrl/twin.toml" >> {_UNITS}/twin.service
-cp '/opt/source/membrane_ctrl/examples/membrane-hold@.service' {_UNITS}
+cp /opt/source/membrane_ctrl/examples/membrane-*@.service {_UNITS}
+cp /opt/source/membrane_ctrl/examples/membrane-*.socket {_UNITS}
+mkdir -p {_UNITS}/membrane-commission@.service.d
+cp {_UNITS}/{_UNIT}.service.d/room.conf {_UNITS}/membrane-commission@.service.d
 systemctl daemon-reload
 systemctl start systemd-journald.service
 """

@@ -227,6 +227,77 @@ def test_the_service_reaches_a_desktops_display_once_it_may(room: Room) -> None:
         room.run("systemctl stop x")
 
 
+# Number of a serial adapter that is not there: open(2) finds no device, unless it is kept away
+ADAPTER = "/dev/ttyUSB7"
+REACHED, KEPT_AWAY = "No such device or address", "Operation not permitted"
+
+
+@pytest.mark.parametrize("unit", ["membrane-hold@.service", "membrane-commission@.service"])
+def test_units_at_the_bench_reach_a_serial_port(room: Room, unit: str) -> None:
+    edits = (
+        f"-e 's,^ExecStart=.*,ExecStart=/bin/sh -c \": < {ADAPTER}\",' -e '/^ExecStopPost/d' "
+        "-e '/^Standard/d' -e '/^Restart/d' -e 's/^Type=.*/Type=oneshot/'"
+    )
+    source = f"/opt/source/membrane_ctrl/examples/{unit}"
+    room.run(f"sed {edits} {source} > /run/units/reach.service; systemctl daemon-reload")
+    room.run(f"mknod -m 660 {ADAPTER} c 188 7; chgrp dialout {ADAPTER}")
+    try:
+        room.run("systemctl start reach || true")
+        seen = room.run("journalctl -u reach -o cat --no-pager")
+        assert REACHED in seen
+        assert KEPT_AWAY not in seen
+    finally:
+        room.run(f"rm {ADAPTER}; rm /run/units/reach.service; journalctl --rotate --vacuum-time=1s")
+
+
+GUIDED = """
+import sys, time
+sys.path.insert(0, "/opt/source")
+from pathlib import Path
+from membrane_ctrl.service.guided_session import GuidedSession
+
+ANSWERS = {
+    "devices.kind": "board",
+    "devices.board": "tcp://127.0.0.1:1502",
+    "camera.driver": "none",
+    "interlock1.driver": "none",
+    "mirror.relief_pa": "900",
+}
+session = GuidedSession(Path("/var/lib/membrane-ctrl/commissioning"), units=True)
+session.start("lab-1", simulated=False, who="ann")
+answered, until_s = 0, time.monotonic() + 100.0
+while session.seen.is_running and time.monotonic() < until_s:
+    asked = session.seen.question
+    if asked is None or asked.number == answered:
+        time.sleep(0.05)
+        continue
+    answered, key = asked.number, asked.question.key
+    print(key, asked.question.kind, flush=True)
+    if key.startswith("gauge_zero") or answered > 60:
+        break
+    yes = "y" if asked.question.kind == "confirmation" else asked.question.default
+    session.answer(answered, ANSWERS.get(key, yes), "ann")
+for message in session.seen.messages:
+    print(message, flush=True)
+session.close()
+print(session.seen.ended)
+"""
+
+
+def test_a_session_of_the_page_reaches_the_bench(room: Room) -> None:
+    room.fresh()
+    room.run("install -d -o membrane -g membrane /var/lib/membrane-ctrl/commissioning")
+    room.run(f"cat > /run/guided.py <<'END'\n{GUIDED}\nEND")
+    room.run("systemctl start membrane-commission.socket")
+    as_service = "setpriv --reuid membrane --regid membrane --init-groups"
+    python = "/opt/membrane-ctrl/.venv/bin/python3"
+    seen = room.run(f"cd /; {PLACES} {as_service} {python} /run/guided.py 2>&1")
+    assert "gauge_zero" in seen, seen
+    assert "lab-1: stopped; start it again" in seen
+    room.until(lambda: "active" in room.run("systemctl is-active membrane-commission.socket"))
+    assert room.run("systemctl list-units --no-legend 'membrane-commission@*'") == ""
+
+
 def test_what_dies_again_and_again_is_given_up_in_a_safe_state(room: Room) -> None:
     room.fresh(RESUMES + "most_per_day = 6\n")  # by default the daily count ends it earlier
     room.start()

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import io
+import socket
+import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.commissioning.guide.command import commission_named
+from membrane_ctrl.commissioning.guide.session_state import read_state
+from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.service.guided_session import GuidedSession, SeenSession
 from tests.worlds import small_session
 
@@ -108,11 +115,66 @@ def test_a_link_is_not_followed(guided: GuidedSession, tmp_path: Path) -> None:
         guided.start("lab-1", simulated=True, who="ann")
 
 
-def test_a_service_without_access_to_devices_names_the_terminal(tmp_path: Path) -> None:
-    session = GuidedSession(tmp_path, units=True, command=PROGRAM)
-    with pytest.raises(InputError, match="in a terminal"):
-        session.start("lab-1", simulated=False, who="ann")
+@pytest.fixture
+def listener(tmp_path: Path) -> Iterator[Path]:
+    """What systemd does for `membrane-commission.socket`: one program a connection."""
+    path = tmp_path / "listener"
+    sessions = tmp_path / "sessions"
+    sessions.mkdir()
+    program = [sys.executable, "-m", "membrane_ctrl"]
+    words = [*program, "commission", str(sessions), "--named-by-input"]
+    processes = []
+    with socket.socket(socket.AF_UNIX) as waiting:
+        waiting.bind(str(path))
+        waiting.listen()
+
+        def serve() -> None:
+            with suppress(OSError):
+                while True:
+                    connection, _ = waiting.accept()
+                    with connection:
+                        processes.append(
+                            subprocess.Popen(words, stdin=connection, stdout=connection)
+                        )
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield path
+        waiting.shutdown(socket.SHUT_RDWR)
+    for process in processes:
+        assert process.wait(PATIENCE_S) == 130
+
+
+def test_under_systemd_a_session_at_the_bench_is_a_unit(tmp_path: Path, listener: Path) -> None:
+    sessions = tmp_path / "sessions"
+    session = GuidedSession(sessions, units=True, unit_socket=listener)
+    session.start("lab-1", simulated=False, who="ann")
+    seen = wait_for(session, is_asked("mirror.preset"))
+    assert seen.question is not None
+    session.answer(seen.question.number, "paper", "ann")
+    wait_for(session, is_asked("mirror.change"))
     session.close()
+    assert session.seen.ended.startswith("lab-1: stopped; start it again")
+    state = read_state(sessions / "lab-1")
+    assert state is not None
+    assert not state.simulated
+
+
+def test_a_unit_that_is_not_installed_is_explained(tmp_path: Path) -> None:
+    session = GuidedSession(tmp_path, units=True, unit_socket=tmp_path / "nothing")
+    with pytest.raises(DeviceError, match="service install"):
+        session.start("lab-1", simulated=False, who="ann")
+    assert not session.seen.is_running
+    session.close()
+
+
+@pytest.mark.parametrize("line", ["", "x", '{"session": "../etc"}', '{"session": "a/b"}'])
+def test_only_a_plain_name_begins_a_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(f"{line}\n"))
+    with pytest.raises(InputError, match="names no session"):
+        commission_named(tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_program_that_fails_is_explained(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import configparser
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,16 @@ from membrane_ctrl.config.toml_file import load_toml
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.service import cli
 from membrane_ctrl.service.hold_starter import options_file
-from membrane_ctrl.service.units import HOLD_UNIT, SERVICE_UNIT, USER, install_units, remove_units
+from membrane_ctrl.service.session_links import SESSION_SOCKET
+from membrane_ctrl.service.units import (
+    HOLD_UNIT,
+    SERVICE_UNIT,
+    SESSION_LISTENER,
+    SESSION_UNIT,
+    USER,
+    install_units,
+    remove_units,
+)
 
 UNITS = "etc/systemd/system"
 RULES = "etc/polkit-1/rules.d/50-membrane-ctrl.rules"
@@ -25,11 +36,11 @@ SETTINGS = "etc/membrane-ctrl/service.toml"
 PROGRAM = Path("/srv/mirror/bin/membrane-ctrl")
 
 
-def unit_of(path: Path) -> configparser.SectionProxy:
+def unit_of(path: Path, section: str = "Service") -> configparser.SectionProxy:
     parser = configparser.RawConfigParser(strict=False)
     parser.optionxform = str  # type: ignore[assignment,method-assign]
     parser.read(path)
-    return parser["Service"]
+    return parser[section]
 
 
 def test_what_is_written_fits_together(tmp_path: Path) -> None:
@@ -57,6 +68,43 @@ def test_what_is_written_fits_together(tmp_path: Path) -> None:
         ("membrane-hold@../x.service", False),
     ):
         assert (re.search(pattern[1], unit) is not None) is allowed, unit
+
+
+def test_sessions_of_the_page_find_their_unit(tmp_path: Path) -> None:
+    install_units(tmp_path, PROGRAM)
+    settings = load_toml(tmp_path / SETTINGS, ServiceConfig)
+    listener = unit_of(tmp_path / UNITS / SESSION_LISTENER, "Socket")
+    assert listener["ListenStream"] == str(SESSION_SOCKET)
+    assert (listener["SocketUser"], listener["SocketMode"]) == (USER, "0600")
+    session = unit_of(tmp_path / UNITS / SESSION_UNIT)
+    start = f"{PROGRAM} commission {settings.commissioning} --named-by-input"
+    assert session["ExecStart"] == start
+    assert session["User"] == USER
+
+
+@pytest.mark.parametrize("name", [HOLD_UNIT, SESSION_UNIT])
+def test_units_at_the_bench_keep_its_devices(tmp_path: Path, name: str) -> None:
+    """Each of these makes a list of devices, which all others are not on."""
+    install_units(tmp_path, PROGRAM)
+    unit = unit_of(tmp_path / UNITS / name)
+    assert not {"PrivateDevices", "DeviceAllow", "DevicePolicy", "ProtectClock"} & set(unit)
+    assert unit["CapabilityBoundingSet"] == ""
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd")
+def test_systemd_knows_every_key(tmp_path: Path) -> None:
+    install_units(tmp_path, Path("/bin/true"))
+    names = (SERVICE_UNIT, HOLD_UNIT, SESSION_UNIT, SESSION_LISTENER)
+    paths = [str(tmp_path / UNITS / name) for name in names]
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", "--generators=no", *paths],
+        env={"SYSTEMD_UNIT_PATH": f"{tmp_path / UNITS}:", "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    own = [line for line in done.stderr.splitlines() if "membrane" in line]
+    assert own == []
 
 
 def test_devices_are_open_to_the_groups_of_the_unit(tmp_path: Path) -> None:

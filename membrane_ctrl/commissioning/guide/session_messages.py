@@ -59,11 +59,34 @@ class QuestionMessage(BaseModel):
     question: Question
 
 
+class EndMessage(BaseModel):
+    """The session has ended, with the exit code of its program.
+
+    Attributes
+    ----------
+    code : int
+    problem : str
+        Of an end by an error, in one line.
+    """
+
+    kind: Literal["end"] = "end"
+    code: int
+    problem: str = ""
+
+
 SessionMessage = Annotated[
-    LineMessage | PlanMessage | StageMessage | CheckMessage | QuestionMessage,
+    LineMessage | PlanMessage | StageMessage | CheckMessage | QuestionMessage | EndMessage,
     Field(discriminator="kind"),
 ]
 MESSAGES: TypeAdapter[SessionMessage] = TypeAdapter(SessionMessage)
+
+
+class BeginMessage(BaseModel):
+    """The first line to a session that systemd has started: its name below the folder of all."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    session: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
 
 
 class AnswerMessage(BaseModel):
@@ -129,6 +152,10 @@ class MessageDisplay(SessionDisplay):
                 raise EOFError
             if given.number == self._number:
                 return given.answer
+
+    def show_end(self, code: int, problem: str = "") -> None:
+        """Send that the session has ended."""
+        self._send(EndMessage(code=code, problem=problem))
 
     def _send(self, message: BaseModel) -> None:
         print(message.model_dump_json(), file=self._target, flush=True)
