@@ -6,7 +6,7 @@ from pathlib import Path
 
 from membrane_ctrl.commissioning.guide.bench_access import BenchAccess
 from membrane_ctrl.commissioning.guide.dialogue import SessionDisplay
-from membrane_ctrl.commissioning.guide.emulated_bench import EmulatedBench
+from membrane_ctrl.commissioning.guide.emulated_bench import EmulatedBench, MakeHold
 from membrane_ctrl.commissioning.guide.session import CommissioningSession
 from membrane_ctrl.commissioning.guide.session_state import SessionState, read_state
 from membrane_ctrl.commissioning.guide.stage import SessionPlan
@@ -38,8 +38,8 @@ class QuickBench(EmulatedBench):
     tuned: list[str]
     exit_code = 0
 
-    def __init__(self) -> None:
-        super().__init__(VirtualHold)
+    def __init__(self, make_hold: MakeHold = VirtualHold) -> None:
+        super().__init__(make_hold)
         self.tuned = []
 
     def run_tuning(self, folder: Path, config: object, command: str, show: object) -> int:

@@ -3,7 +3,8 @@
     python -m tests.support.release_check              # all
     python -m tests.support.release_check --only licences build
 
-An item that cannot be run here counts as missing. Nothing is published.
+An item that cannot be run here is named as not done: it neither fails nor passes, and the last line
+repeats it. Nothing is published.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import hashlib
 import importlib.metadata
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -26,7 +28,9 @@ from membrane_ctrl import __version__
 
 ROOT = Path(__file__).parents[2]
 _BUILD = "import sys; from setuptools import build_meta; print(build_meta.build_wheel(sys.argv[1]))"
+_AUDIT = ["-m", "pip_audit", "-r", "requirements.lock", "--no-deps", "--format", "json"]
 _SOURCE_DATE = "1704067200"  # 2024-01-01: any fixed time
+PASSED, MISSING, NOT_DONE = "passed", "missing", "not done"
 # Licences under which a dependency may be distributed with, or beside, BSD-3-Clause software
 _ALLOWED = (
     "mit", "bsd", "apache", "isc", "psf", "python software foundation", "mpl", "mozilla", "zlib",
@@ -37,9 +41,17 @@ _ALLOWED = (
 _EXTRAS = ("alarms", "web", "screen", "gpio", "mqtt", "h5", "fits", "data")
 
 
+class NotDoneError(Exception):
+    """An item cannot be run here; the message states why."""
+
+
 @dataclass(frozen=True, slots=True)
 class ReleaseItem:
-    """An item of the checklist; `find_problem` runs it, and returns an empty text if it passes."""
+    """An item of the checklist.
+
+    `find_problem` runs it, and returns an empty text if it passes. It raises NotDoneError if it
+    cannot be run here.
+    """
 
     name: str
     what: str
@@ -95,14 +107,50 @@ def check_licences() -> str:
 
 
 def check_vulnerabilities() -> str:
-    """No pinned package has a known vulnerability."""
+    """No pinned package has a known vulnerability. Raises NotDoneError without the service."""
     if importlib.util.find_spec("pip_audit") is None:
-        return "not run: install pip-audit, which asks a service on the internet"
+        raise NotDoneError("pip-audit, which asks a service on the internet, is not installed")
     done = subprocess.run(
-        [sys.executable, "-m", "pip_audit", "-r", "requirements.lock", "--no-deps"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return "" if done.returncode == 0 else _last_line(done.stdout + done.stderr)
+        [sys.executable, *_AUDIT], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return judge_audit(done.stdout, done.stderr)
+
+
+def judge_audit(output: str, messages: str) -> str:
+    """Judge what pip-audit printed.
+
+    It calls a package that its service does not answer for skipped, and ends as if all were well.
+
+    Parameters
+    ----------
+    output : str
+        Its report as JSON; empty or incomplete if it failed.
+    messages : str
+        Its standard error.
+
+    Returns
+    -------
+    str
+        The packages with known vulnerabilities; empty if there are none.
+
+    Raises
+    ------
+    NotDoneError
+        A package was not looked up.
+    """
+    try:
+        packages = json.loads(output)["dependencies"]
+    except (ValueError, KeyError, TypeError):
+        raise NotDoneError(f"no network: {_last_line(messages)}") from None
+    skipped = [package for package in packages if "skip_reason" in package]
+    found = [package["name"] for package in packages if package.get("vulns")]
+    if found:
+        return f"known vulnerabilities: {', '.join(found)}"
+    if skipped or not packages:
+        raise NotDoneError(
+            f"no network: {len(skipped)} of {len(packages)} packages were not looked up"
+        )
+    return ""
 
 
 def check_build() -> str:
@@ -177,12 +225,27 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--only", nargs="+", choices=[item.name for item in ITEMS], default=[])
     only = parser.parse_args().only
-    problems = {item.name: item.find_problem() for item in ITEMS if not only or item.name in only}
-    for item in ITEMS:
-        if item.name in problems:
-            problem = problems[item.name]
-            print(f"{'missing' if problem else 'passed':8} {item.name:16} {problem or item.what}")
-    return 1 if any(problems.values()) else 0
+    chosen = [item for item in ITEMS if not only or item.name in only]
+    return print_results([(item, *_run_item(item)) for item in chosen])
+
+
+def print_results(results: list[tuple[ReleaseItem, str, str]]) -> int:
+    """Print the table of items, their results and reasons; 1 if something is missing."""
+    for item, result, reason in results:
+        print(f"{result:8} {item.name:16} {reason or item.what}")
+    not_done = [item.name for item, result, _ in results if result == NOT_DONE]
+    if not_done:
+        print(f"not a complete check: {', '.join(not_done)} not done on this machine")
+    return 1 if any(result == MISSING for _, result, _ in results) else 0
+
+
+def _run_item(item: ReleaseItem) -> tuple[str, str]:
+    """The result of an item, and its reason."""
+    try:
+        problem = item.find_problem()
+    except NotDoneError as error:
+        return NOT_DONE, str(error)
+    return (MISSING, problem) if problem else (PASSED, "")
 
 
 def _build_wheel(folder: Path) -> str:

@@ -129,6 +129,9 @@ def _judge_hold(context: StageContext, figures: HoldFigures, faults: list[str]) 
     context.judge(
         "faults during the hold", float(len(faults)), thresholds.HOLD_FAULTS, "; ".join(faults)
     )
+    if not figures.held:
+        context.leave_out("error, pump and ticks of the hold", "the mirror was not held")
+        return
     context.judge(
         "standard deviation of the error during the hold",
         figures.std_um,

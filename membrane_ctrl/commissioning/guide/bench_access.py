@@ -109,6 +109,10 @@ class BenchAccess(Protocol):
         """
         ...
 
+    def find_latched_fault(self, folder: Path) -> str:
+        """The fault of an earlier hold that nobody has acknowledged; empty if there is none."""
+        ...
+
     def run_tuning(
         self, folder: Path, config: Config, command: str, show: Callable[[str], None]
     ) -> int:

@@ -22,7 +22,7 @@ from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.controller.command import Command
 from membrane_ctrl.model import events
 from membrane_ctrl.model.telemetry import State, TelemetryRow
-from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
 
 _WHO = "commission"
 _HELD_LEAST_SHARE = 0.99  # of the sag: limits.displacement_min_um while the mirror is filled
@@ -94,6 +94,7 @@ def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> Dep
     # Move there.
     link.send_command(Command("setpoint", _WHO, value=setpoint_um))
     if wait_for_row(link).state == State.STANDBY:
+        acknowledge_fault(context, link)
         link.send_command(Command("hold", _WHO))
     band_um = context.config.limits.band_um
 
@@ -110,10 +111,30 @@ def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> Dep
     return DepthPoint(sag_mm, pressure_pa)
 
 
+def acknowledge_fault(context: StageContext, link: HoldLink) -> None:
+    """Let a person clear the fault of an earlier hold, which keeps every later one in standby."""
+    latched = context.access.find_latched_fault(context.folder)
+    if not latched:
+        return
+    context.dialogue.show(f"  an earlier hold ended by a fault: {latched}")
+    if not context.dialogue.confirm("acknowledge", "Is its cause removed, and the film whole?"):
+        raise StageFailedError("the fault is not acknowledged: the pump is off")
+    link.send_command(Command("ack", _WHO))
+
+
+def read_sound_news(link: HoldLink) -> News:
+    """The news of the hold. Raises StageFailedError, with cause and remedy, on a fault."""
+    news = link.read_news()
+    for event in news.events:
+        if isinstance(event, events.Fault):
+            raise StageFailedError(f"the controller ended it: {event.sentence}; the pump is off")
+    return news
+
+
 def wait_for_row(link: HoldLink) -> TelemetryRow:
-    """The newest row."""
+    """The newest row. Raises StageFailedError on a fault."""
     while True:
-        rows = link.read_news().rows
+        rows = read_sound_news(link).rows
         if rows:
             return rows[-1]
 
@@ -127,13 +148,7 @@ def watch_rows(
     """Follow the hold until a row is as wanted. Raises StageFailedError on a fault or time-out."""
     began_s = shown_s = None
     while True:
-        news = link.read_news()
-        for event in news.events:
-            if isinstance(event, events.Fault):
-                raise StageFailedError(
-                    f"the controller ended it: {event.sentence}; the pump is off"
-                )
-        for row in news.rows:
+        for row in read_sound_news(link).rows:
             if began_s is None or shown_s is None:
                 began_s = shown_s = row.mono_s
             if is_done(row):
@@ -149,10 +164,10 @@ def watch_rows(
 
 
 def collect_rows(link: HoldLink, duration_s: float) -> list[TelemetryRow]:
-    """The rows of a time. Raises HoldError if the hold ends."""
+    """The rows of a time. Raises StageFailedError on a fault, HoldError if the hold ends."""
     rows: list[TelemetryRow] = []
     while not rows or rows[-1].mono_s - rows[0].mono_s < duration_s:
-        rows += link.read_news().rows
+        rows += read_sound_news(link).rows
     return rows
 
 

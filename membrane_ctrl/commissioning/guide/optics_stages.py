@@ -9,7 +9,11 @@ import numpy as np
 from membrane_ctrl.commissioning.guide import thresholds
 from membrane_ctrl.commissioning.guide.bench_access import HandAct, HandMotion
 from membrane_ctrl.commissioning.guide.dialogue import Choice
-from membrane_ctrl.commissioning.guide.inflation_stages import hold_depth, without_camera
+from membrane_ctrl.commissioning.guide.inflation_stages import (
+    hold_depth,
+    read_sound_news,
+    without_camera,
+)
 from membrane_ctrl.commissioning.guide.rim_edge import measure_rim_edge_px
 from membrane_ctrl.commissioning.guide.session_state import (
     CONFIGURATION,
@@ -166,7 +170,7 @@ def measure_figure(context: StageContext) -> None:
             found: list[ShapeEstimate] = []
             waited_s = 0.0
             while len(found) < _FIGURES and waited_s < _FIGURES_WITHIN_S:
-                news = link.read_news()
+                news = read_sound_news(link)
                 found += news.shapes
                 if len(news.rows) > 1:
                     waited_s += news.rows[-1].mono_s - news.rows[0].mono_s

@@ -38,6 +38,7 @@ from membrane_ctrl.instruments import (
 )
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.run_files.latched_fault import LatchedFile
 from membrane_ctrl.sessions.live_hold import HoldLink, live_hold
 
 T = TypeVar("T")
@@ -109,7 +110,7 @@ class RealBench:
         self, folder: Path, config: Config, name: str, by_frames: bool = False
     ) -> Iterator[HoldLink]:
         """Start `hold --standby` with the session's configuration, and stop it at the end."""
-        logs = folder / "logs"
+        logs = _find_logs(folder)
         logs.mkdir(parents=True, exist_ok=True)
         command = [
             *OWN_PROGRAM,
@@ -135,11 +136,16 @@ class RealBench:
         finally:
             _end_process(process)
 
+    def find_latched_fault(self, folder: Path) -> str:
+        """The fault that the session's runs have latched; empty if there is none."""
+        latched = LatchedFile(_find_logs(folder)).read()
+        return "" if latched is None else str(latched)
+
     def run_tuning(
         self, folder: Path, config: Config, command: str, show: Callable[[str], None]
     ) -> int:
         """Run `tune` on the hold that runs."""
-        logs = str(folder / "logs")
+        logs = str(_find_logs(folder))
         arguments = [*OWN_PROGRAM, "tune", command, "--logs", logs, "--yes", "--take-over"]
         code = run_shown(arguments, show)
         if code == 0:
@@ -147,6 +153,11 @@ class RealBench:
             saved = [*OWN_PROGRAM, "tune", "save", "--logs", logs, "--config", configuration]
             code = run_shown([*saved, "--yes"], show)
         return code
+
+
+def _find_logs(folder: Path) -> Path:
+    """Where a session's holds record their runs."""
+    return folder / "logs"
 
 
 async def stop_outputs(open_bench: roles.Bench) -> None:

@@ -1,6 +1,7 @@
 """Step 3: each sensor, actuator and protection is tried, without gas in the mirror.
 
-The pump runs only while the bench is open, with the vent open, and never while a question waits.
+The pump runs only while the bench is open, with the vent open and every interlock closed, and never
+while a question waits.
 """
 
 import math
@@ -9,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from firmware_iface import roles
+from firmware_iface.settings import InterlockDriver
 from membrane_ctrl.commissioning.guide import thresholds
 from membrane_ctrl.commissioning.guide.bench_access import (
     Action,
@@ -46,19 +48,54 @@ async def read_for(opened: OpenBench, duration_s: float) -> list[roles.BenchRead
     return readings
 
 
+def stop_at_open_circuit(
+    reading: roles.BenchReading, interlocks: tuple[InterlockDriver, ...]
+) -> None:
+    """Raise StageFailedError if a reading shows the circuit of an interlock open."""
+    words = [
+        f"{interlock.name} is open: {interlock.text}"
+        for bit, interlock in enumerate(interlocks)
+        if reading.interlocks_open >> bit & 1
+    ]
+    if words:
+        raise StageFailedError(
+            f"interlock {'; '.join(words)}. The pump is off. Close the circuit, then run this "
+            "stage again"
+        )
+
+
+async def wait_for_circuits(opened: OpenBench, interlocks: tuple[InterlockDriver, ...]) -> None:
+    """Wait until every source has been asked. Raises StageFailedError if a circuit is open."""
+    reading = await opened.bench.read()
+    for _ in range(round(_STOPPED_S / _PERIOD_S)):
+        if not reading.interlocks_open:
+            return
+        await opened.sleep(_PERIOD_S)
+        reading = await opened.bench.read()
+    stop_at_open_circuit(reading, interlocks)
+
+
 async def run_outputs(
-    opened: OpenBench, command: roles.BenchCommand, duration_s: float, gauge_most_pa: float
+    opened: OpenBench,
+    command: roles.BenchCommand,
+    duration_s: float,
+    gauge_most_pa: float,
+    interlocks: tuple[InterlockDriver, ...] = (),
 ) -> list[roles.BenchReading]:
     """Keep pump and vent commanded, then switch the pump off.
 
-    Raises StageFailedError, with the pump off and the vent open, if the pressure rises.
+    Raises StageFailedError, with the pump off and the vent open, if the pressure rises or one of
+    the interlocks opens.
     """
     readings: list[roles.BenchReading] = []
+    if interlocks:
+        await wait_for_circuits(opened, interlocks)
     try:
         for _ in range(round(duration_s / _PERIOD_S)):
             await opened.bench.write(command)
             await opened.sleep(_PERIOD_S)
             readings.append(await opened.bench.read())
+            stop_at_open_circuit(readings[-1], interlocks)
             if not readings[-1].gauge_pressure_pa < gauge_most_pa:
                 raise StageFailedError(
                     f"the gauge shows {readings[-1].gauge_pressure_pa:.0f} Pa with the vent open, "
@@ -160,6 +197,7 @@ def test_outputs(context: StageContext) -> None:
     """Run the vent, then the pump with the vent open: read-backs, and what is heard."""
     dialogue = context.dialogue
     limit_pa = _bench_pressure_pa(context)
+    interlocks = context.devices.interlocks
     # The vent first: with it open, the pump raises no pressure.
     if context.devices.vent_fitted:
         dialogue.wait("vent_try", "The vent opens for 3 s. Listen")
@@ -175,7 +213,7 @@ def test_outputs(context: StageContext) -> None:
         )
     dialogue.wait("pump_try", request)
     command = roles.BenchCommand(PUMP_FRACTION, 1.0)
-    seen = _act(context, lambda opened: run_outputs(opened, command, _RUN_S, limit_pa))
+    seen = _act(context, lambda opened: run_outputs(opened, command, _RUN_S, limit_pa, interlocks))
     _judge_readback(context, "pump", [reading.pump_fraction for reading in seen], PUMP_FRACTION)
     heard = dialogue.confirm("pump_heard", "Did the pump start, and stop again?")
     context.require("pump heard", heard, "yes" if heard else "no", "check its wires and power")
@@ -184,7 +222,8 @@ def test_outputs(context: StageContext) -> None:
 def test_watchdog(context: StageContext) -> None:
     """Stop commanding a running pump: the watchdog must stop it."""
     context.dialogue.wait("watchdog", "The pump runs, and the program stops commanding it. Listen")
-    late_s = _act(context, _time_watchdog)
+    interlocks = context.devices.interlocks
+    late_s = _act(context, lambda opened: _time_watchdog(opened, interlocks))
     context.judge(
         "pump off after the last command, beyond the watchdog's period",
         late_s,
@@ -194,12 +233,14 @@ def test_watchdog(context: StageContext) -> None:
     _clear_trip(context)
 
 
-async def _time_watchdog(opened: OpenBench) -> float:
+async def _time_watchdog(opened: OpenBench, interlocks: tuple[InterlockDriver, ...]) -> float:
     """Time beyond the watchdog's period until the pump's read-back is 0; NaN if it stays on."""
     command = roles.BenchCommand(PUMP_FRACTION, 1.0)
+    await wait_for_circuits(opened, interlocks)
     for _ in range(round(1.0 / _PERIOD_S)):
         await opened.bench.write(command)
         await opened.sleep(_PERIOD_S)
+        stop_at_open_circuit(await opened.bench.read(), interlocks)
     if (await opened.bench.read()).pump_fraction == 0.0:
         raise StageFailedError("the pump does not run: its watchdog cannot be tried")
     began_s = opened.now()
@@ -240,11 +281,13 @@ def test_cable(context: StageContext) -> None:
 async def _run_until_lost(context: StageContext, opened: OpenBench) -> bool:
     """Keep the pump commanded until the link is lost; False if it never is."""
     command = roles.BenchCommand(PUMP_FRACTION, 1.0)
+    interlocks = context.devices.interlocks
+    await wait_for_circuits(opened, interlocks)
     try:
         for round_number in range(round(_CABLE_S / _PERIOD_S)):
             await opened.bench.write(command)
             await opened.sleep(_PERIOD_S)
-            await opened.bench.read()
+            stop_at_open_circuit(await opened.bench.read(), interlocks)
             if round_number == round(1.0 / _PERIOD_S):
                 context.access.move_hand(HandMotion(HandAct.PULL_CABLE))
     except roles.LinkError:
