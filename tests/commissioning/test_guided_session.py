@@ -9,9 +9,11 @@ import pytest
 
 from membrane_ctrl.commissioning.check import DeviceProbe
 from membrane_ctrl.commissioning.guide.bench_access import HandAct, HandMotion
-from membrane_ctrl.commissioning.guide.dialogue import Dialogue
+from membrane_ctrl.commissioning.guide.dialogue import Choice, Dialogue
 from membrane_ctrl.commissioning.guide.inflation_stages import DepthPoint, judge_law
 from membrane_ctrl.commissioning.guide.mirror_design import PAPER_MIRROR
+from membrane_ctrl.commissioning.guide.real_bench import RealBench
+from membrane_ctrl.commissioning.guide.session import CommissioningSession
 from membrane_ctrl.commissioning.guide.session_state import (
     CONFIGURATION,
     HTML,
@@ -356,9 +358,30 @@ def test_a_damaged_state_is_named(tmp_path: Path) -> None:
 
 
 def test_numbers_are_asked_until_they_are_within_limits() -> None:
-    answers = ["x", "nan", "-1", "12,5"]
+    answers = ["x", "nan", "-1", "1,103", "12,5"]
     shown: list[str] = []
     display = TextDisplay(lambda key, prompt: answers.pop(0), shown.append)
     dialogue = Dialogue(display, {}, lambda: None)
     assert dialogue.ask_number("sag", "sag", 37.1, 0.1, 100.0, "mm") == 12.5
-    assert len(shown) == 3
+    assert len(shown) == 4
+
+
+def test_answers_are_remembered_by_their_meaning() -> None:
+    """A number in a list means another choice once the list has changed."""
+    answers = ["2", "12,50"]
+    remembered: dict[str, str] = {}
+    display = TextDisplay(lambda key, prompt: answers.pop(0), lambda line: None)
+    dialogue = Dialogue(display, remembered, lambda: None)
+    dialogue.ask_choice("port", "port?", [Choice(name="ttyUSB0"), Choice(name="ttyUSB1")])
+    dialogue.ask_number("sag", "sag", 37.1, 0.1, 100.0, "mm")
+    assert remembered == {"port": "ttyUSB1", "sag": "12.5"}
+
+
+def test_a_session_on_the_emulated_bench_names_its_option(
+    tmp_path: Path, bench: QuickBench
+) -> None:
+    person = Person(**{"mirror.seen": "quit"})
+    assert run_stages(tmp_path, bench, person, "mirror") == Exit.INTERRUPTED
+    assert f"`membrane-ctrl commission {tmp_path} --twin` resumes this session" in person.text
+    with pytest.raises(InputError, match="add --twin"):
+        CommissioningSession(tmp_path, RealBench(), person.display)

@@ -1,6 +1,7 @@
 """Questions to the person at the bench. `back` and `quit` are accepted as every answer."""
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import TypeVar
@@ -10,6 +11,7 @@ from pydantic import BaseModel, ConfigDict
 from membrane_ctrl.commissioning.guide.session_state import CheckRecord
 
 T = TypeVar("T")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")  # 1,103 is 1.103 or 1103
 BACK, QUIT = "back", "quit"
 # Accepted as well where no text is asked for: an interlock may be named `stop`
 _SHORT_BACK, _STOP = "b", "stop"
@@ -172,6 +174,8 @@ class Dialogue:
         """Ask for a number within limits."""
 
         def parse(text: str) -> float:
+            if _THOUSANDS.fullmatch(text):
+                raise ValueError("a comma before three digits has two meanings: write a point")
             try:
                 value = float(text.replace(",", "."))
             except ValueError:
@@ -238,7 +242,10 @@ class Dialogue:
             except ValueError as error:
                 self.show(f"  {error}")
                 continue
-            self._remembered[asked.key] = typed or default
+            # the value, not what was typed: a number in a list may mean another choice next time
+            self._remembered[asked.key] = (
+                f"{value:.12g}" if isinstance(value, float) else str(value)
+            )
             self._remember()
             return value
 

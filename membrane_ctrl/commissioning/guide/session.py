@@ -83,8 +83,11 @@ class CommissioningSession:
                 created_utc=_now_utc(), author=account_name(), simulated=self._access.simulated
             )
         if state.simulated != self._access.simulated:
-            kind = "the emulated bench" if state.simulated else "a real bench"
-            raise errors.InputError(f"{self._folder}: a session on {kind}; name another folder")
+            if state.simulated:
+                remedy = "a session on the emulated bench; add --twin, or name another folder"
+            else:
+                remedy = "a session on a real bench; leave out --twin, or name another folder"
+            raise errors.InputError(f"{self._folder}: {remedy}")
         return state
 
     def run(self) -> errors.Exit:
@@ -99,9 +102,9 @@ class CommissioningSession:
             while index < len(self._stages):
                 index = self._run_stage(index)
         except (StopSessionError, KeyboardInterrupt, EOFError):
-            self._dialogue.show(
-                "", f"stopped; `membrane-ctrl commission {self._folder}` resumes this session"
-            )
+            option = " --twin" if self._state.simulated else ""
+            command = f"membrane-ctrl commission {self._folder}{option}"
+            self._dialogue.show("", f"stopped; `{command}` resumes this session")
             return errors.Exit.INTERRUPTED
         return self._finish()
 
