@@ -1,6 +1,7 @@
 #!/bin/sh
 # Builds the image of the Containerfile, or, where containers cannot be built, the same system in a folder.
-#   packaging/container.sh image     podman or docker; the image membrane-ctrl
+#   packaging/container.sh image     podman, docker or buildah: the image membrane-ctrl, and a hold of the twin in it.
+#                                    buildah needs no daemon and, with chroot isolation, no namespaces of its own
 #   packaging/container.sh chroot    as root: the folder build/container/system, and a hold of the twin in it
 # The base is made of Debian's packages by mmdebstrap: no image is downloaded.
 set -eu
@@ -16,19 +17,37 @@ make_base() {  # $1: a .tar file, or a folder
 make_wheel() {
     rm -rf "$out/wheel" && mkdir -p "$out/wheel"
     "$python" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$out/wheel" .
-    cp requirements.lock packaging/install.sh "$out/wheel/"
+    cp requirements.lock packaging/install.sh packaging/slim.sh "$out/wheel/"
     # downloaded here, so that nothing in the image or folder needs a network
     "$python" -m pip download --quiet --only-binary :all: --python-version 3.11 -c requirements.lock \
         --dest "$out/wheel/wheels" "$(ls "$out"/wheel/membrane_ctrl-*.whl)[alarms,web,gpio]"
 }
+
+# What each way runs at the end
+hold="hold --twin --duration 20s --no-service"
 
 case ${1:-image} in
 image)
     make_wheel
     make_base "$out/base.tar"
     cp Containerfile "$out/"
-    builder=$(command -v podman || command -v docker)
-    "$builder" build --tag membrane-ctrl --file "$out/Containerfile" "$out"
+    builder=$(command -v podman || command -v docker || command -v buildah)
+    case $builder in
+    */buildah)
+        export BUILDAH_ISOLATION="${BUILDAH_ISOLATION:-chroot}"
+        buildah build --tag membrane-ctrl --file "$out/Containerfile" "$out"
+        container=$(buildah from membrane-ctrl)
+        # shellcheck disable=SC2086
+        buildah run "$container" -- membrane-ctrl $hold
+        buildah rm "$container" >/dev/null
+        ;;
+    *)
+        "$builder" build --tag membrane-ctrl --file "$out/Containerfile" "$out"
+        # shellcheck disable=SC2086
+        "$builder" run --rm membrane-ctrl $hold
+        ;;
+    esac
+    "$builder" images membrane-ctrl
     ;;
 chroot)
     make_wheel
@@ -41,7 +60,7 @@ chroot)
     unshare --mount sh -eu -c '
         mount --rbind /dev "$1/dev" && mount -t proc proc "$1/proc"
         chroot "$1" su -s /bin/sh -c "$2" membrane
-    ' sh "$out/system" "cd && membrane-ctrl hold --twin --duration 20s --no-service"
+    ' sh "$out/system" "cd && membrane-ctrl $hold"
     du -sm "$out/system" "$out/system/opt/membrane-ctrl/.venv"
     ;;
 *)

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TextIO
+from typing import IO
 
 from membrane_ctrl.commissioning.guide.session_messages import BeginMessage
 from membrane_ctrl.model import errors
@@ -34,7 +34,7 @@ class SessionLink(ABC):
         Of its messages; it ends with the session.
     """
 
-    source: TextIO
+    source: IO[str]
 
     @abstractmethod
     def send_line(self, line: str) -> None:
@@ -60,7 +60,7 @@ class ProgramLink(SessionLink):
         For what it prints beside its messages.
     """
 
-    def __init__(self, words: Sequence[str], log: TextIO) -> None:
+    def __init__(self, words: Sequence[str], log: IO[str]) -> None:
         self._process = subprocess.Popen(
             words,
             stdin=subprocess.PIPE,

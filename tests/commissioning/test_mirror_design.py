@@ -11,6 +11,7 @@ from membrane_ctrl.commissioning.guide.mirror_design import (
     MirrorFacts,
     derive_design,
 )
+from membrane_ctrl.commissioning.guide.mirror_stages import list_facts
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.sim.film import MIRROR_FILM, SETTLED_S
 from membrane_ctrl.sim.plant import NOMINAL_UM_PER_ML
@@ -63,3 +64,15 @@ def test_a_pump_below_the_leak_never_fills() -> None:
     assert derive_design(weak).pump_reserve > 1.0
     assert math.isinf(derive_design(weak).filling_s)
     assert derive_design(PAPER_MIRROR).filling_s == pytest.approx(7500, rel=0.05)
+
+
+def test_the_report_lists_the_data_in_words() -> None:
+    listed = dict(list_facts(PAPER_MIRROR))
+    assert listed["depth of the bowl to hold (sag)"] == "37.1 mm"
+    assert listed["Young's modulus of the film"] == "4.1 GPa"
+    assert listed["relief valve"] == "none"
+    assert listed["kind of pump"] == "diaphragm"
+    own = PAPER_MIRROR.model_copy(update={"relief_pa": 900.0, "front_bulge_mm": 63.4})
+    assert dict(list_facts(own))["opening pressure of the relief valve"] == "900 Pa"
+    assert dict(list_facts(own))["height of the clear film in front"] == "63.4 mm"
+    assert not [name for name, _ in list_facts(own) if "_" in name]

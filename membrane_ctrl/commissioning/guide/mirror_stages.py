@@ -119,6 +119,22 @@ def _ask_front_bulge_mm(context: StageContext, facts: MirrorFacts) -> float:
     )
 
 
+def list_facts(facts: MirrorFacts) -> list[tuple[str, str]]:
+    """The mirror's data in the words of their questions, with units."""
+    values = facts.model_dump()
+    listed = [
+        (question.partition(";")[0].partition(" (PET")[0], f"{values[key]:g} {unit}".rstrip())
+        for key, question, unit, _, _ in _QUESTIONS
+    ]
+    if facts.relief_pa == 0.0:
+        listed[-1] = ("relief valve", "none")
+    kind = _PROPORTIONAL if facts.pump_proportional else _DIAPHRAGM
+    listed.append(("kind of pump", kind))
+    if facts.front_bulge_mm > 0.0:
+        listed.append(("height of the clear film in front", f"{facts.front_bulge_mm:g} mm"))
+    return listed
+
+
 def explain_design(facts: MirrorFacts, design: MirrorDesign) -> list[str]:
     """What follows from the data, a line each, for people."""
     lowering = format_duration(design.lowering_s)

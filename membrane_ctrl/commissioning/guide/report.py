@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from membrane_ctrl.commissioning.guide.mirror_design import derive_design
-from membrane_ctrl.commissioning.guide.mirror_stages import explain_design
+from membrane_ctrl.commissioning.guide.mirror_stages import explain_design, list_facts
 from membrane_ctrl.commissioning.guide.session_state import (
     CONFIGURATION,
     HTML,
@@ -101,11 +101,10 @@ def _make_page(
     # then the mirror's data with what follows from them,
     if state.facts is not None:
         lines = explain_design(state.facts, derive_design(state.facts))
-        data = [(name, f"{value:g}") for name, value in state.facts.model_dump().items()]
         sections.append(
             PageSection(
                 "The mirror's data, and what follows",
-                [PageFacts(data), PageLines([line.strip() for line in lines])],
+                [PageFacts(list_facts(state.facts)), PageLines([line.strip() for line in lines])],
             )
         )
     # the checks of each step in the order of the procedure,
