@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from membrane_ctrl.cli.completion import complete_run
 from membrane_ctrl.cli.options import (
     ConfigOption,
     JsonOption,
@@ -127,7 +128,14 @@ def modes(
 
 
 def climate(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run of a night with figures.")],
+    run: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN",
+            help="A run of a night with figures: its folder, name, or `last`.",
+            autocompletion=complete_run,
+        ),
+    ],
     json: JsonOption = False,
 ) -> int:
     """Learn how temperature and humidity strain film and ring, from the figures of a night."""

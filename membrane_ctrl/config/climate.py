@@ -32,6 +32,10 @@ class ClimateConfig(Section):
     ring_follows_air_s: Annotated[float, Field(ge=0, le=1e6)] = 7200.0
     """Time constant with which the ring follows the air; used without a ring thermometer. Change it
     for a lighter or heavier ring."""
+    uneven_k: Annotated[float, Field(ge=0, le=100)] = 0.3
+    """Temperature of a patch of the film of some 90 mm over that of the rest, 1 sigma, that no
+    thermometer shows: a lamp, a hand, the screen (assumed). Lower it in a room without lamps and
+    people; raise it beside a window."""
     figure_max_um: Annotated[float, Field(gt=0, le=1e4)] = 3.0
     """Predicted change of the figure, RMS, that raises the notice `climate_figure`. Change it to
     what your optics need."""

@@ -20,6 +20,9 @@ from membrane_ctrl.model.state_tree import StateNode
 # Noll 11 (`metrology.film.climate_figure`, Poisson's ratio 0.38)
 CHANGE_RMS = 0.030539
 CHANGE_SPHERICAL = 0.012199
+# The same, RMS, for a patch of 0.18 radii (1 sigma) that is strained alone, mean over its places
+# (`sim.warm_patch`: 1.6 to 2.1 µm for 1 K of the paper's film)
+CHANGE_PATCH = 0.0150
 # Noise of a thermometer or hygrometer is no change of the film
 _SMOOTH_S = 30.0
 # Without its sensor a state wanders by this, 1 sigma, in the square root of an hour, and by at most

@@ -7,6 +7,7 @@ from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control import weather_limits
 from membrane_ctrl.control.climate import (
+    CHANGE_PATCH,
     CHANGE_RMS,
     CHANGE_SPHERICAL,
     Climate,
@@ -54,6 +55,9 @@ class ClimatePart:
         unit_um = 1e-3 * mirror.radius_mm**2 / mirror.sag_mm
         self._rms_um_per_ppm = CHANGE_RMS * unit_um
         self._spherical_um_per_ppm = CHANGE_SPHERICAL * unit_um
+        # By patches that no thermometer shows
+        patch_ppm = config.climate.film_ppm_per_k * config.climate.uneven_k
+        self._uneven_um = CHANGE_PATCH * unit_um * patch_ppm
         self._most_um = config.climate.figure_max_um
         self._sensors = ClimateSensors(self.memory.sensors)
         self._climate = Climate(config.climate, self.memory.climate)
@@ -62,6 +66,12 @@ class ClimatePart:
     def figure_um(self) -> float:
         """Predicted change of the figure since the begin of the hold, RMS; NaN if unknown."""
         return abs(self.memory.strain.excess_ppm) * self._rms_um_per_ppm
+
+    @property
+    def sigma_um(self) -> float:
+        """Standard deviation of that, with what an uneven temperature of the film adds."""
+        by_strain_um = self.memory.strain.sigma_ppm * self._rms_um_per_ppm
+        return math.hypot(by_strain_um, self._uneven_um)
 
     def step(self, reading: BenchReading | None, state: State, dt_s: float) -> list[Event]:
         """Follow one tick; returns the events.
@@ -113,7 +123,7 @@ class ClimatePart:
             "film_strain_ppm": strain.film_ppm,
             "ring_strain_ppm": strain.ring_ppm,
             "climate_figure_um": self.figure_um,
-            "climate_sigma_um": strain.sigma_ppm * self._rms_um_per_ppm,
+            "climate_sigma_um": self.sigma_um,
         }
 
     def _report_figure(self) -> list[Event]:
@@ -131,8 +141,9 @@ class ClimatePart:
         message = (
             f"the film is {strain.excess_ppm:+.0f} +- {strain.sigma_ppm:.0f} ppm longer than its "
             "ring since the hold began: the figure is predicted to have changed by "
-            f"{self.figure_um:.1f} µm RMS, {spherical_um:.1f} µm of it spherical, however well "
-            "the centre is held. Keep temperature and humidity steady, or measure a new reference"
+            f"{self.figure_um:.1f} +- {self.sigma_um:.1f} µm RMS, {spherical_um:.1f} µm of it "
+            "spherical, however well the centre is held. Keep temperature and humidity steady, or "
+            "measure a new reference"
         )
         return [Maintenance(FIGURE_NOTICE, message)]
 

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 
 import numpy as np
 
@@ -20,12 +21,13 @@ from membrane_ctrl.controller.command import Command
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.metrology.figure.held_quantities import find_held_weights
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
+from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.model import arrays, clock, errors, events, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.processes import ring
 from membrane_ctrl.sim import virtual_bench
-from membrane_ctrl.sim.climate import ROUND_TERMS, compute_figure_change_per_ppm
+from membrane_ctrl.sim.figure_changes import FigureChange, list_figure_changes
 from membrane_ctrl.sim.truth import Truth
 
 Rings = Mapping[str, ring.RingWriter]
@@ -34,6 +36,8 @@ ShapeSource = Callable[[float], shape_estimate.ShapeEstimate | None]
 # Change of sag of a cycle of rendered full-size frames at 50 Hz in typical weather: 0.007 µm
 # (docs/explanation/control.md).
 SAG_SIGMA_UM = 0.01
+# Quadrature over the disc: exact for the terms times a change of the film
+_RADII, _AZIMUTHS = 24, 48
 EXPOSURES_S = 0.9  # first to last frame of that cycle, over which the laser's readings are averaged
 
 
@@ -268,9 +272,8 @@ class TruthShape:
     def _find_climate_change(self, truth: Truth) -> FloatArray:
         """Terms of the figure that the room's climate has changed, at the present sag."""
         terms_um: FloatArray = np.zeros(ZERNIKE_TERMS)
-        if truth.excess_strain_ppm:
-            round_terms = [noll - 1 for noll in ROUND_TERMS]
-            terms_um[round_terms] = truth.excess_strain_ppm * compute_figure_change_per_ppm()
+        for change, amount in list_figure_changes(truth):
+            terms_um += amount * _find_terms(change)
         return terms_um
 
     def __call__(self, now_s: float) -> shape_estimate.ShapeEstimate | None:
@@ -300,3 +303,16 @@ class TruthShape:
             verdict="ok",
             cycle=self._cycle,
         )
+
+
+@cache
+def _find_terms(change: FigureChange) -> FloatArray:
+    """Terms (terms,) of a change of the film: means over the disc of height times term."""
+    nodes, weights = np.polynomial.legendre.leggauss(_RADII)
+    radius = np.sqrt((nodes + 1) / 2)
+    angle = 2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    x = np.outer(radius, np.cos(angle)).ravel()
+    y = np.outer(radius, np.sin(angle)).ravel()
+    height_um = np.polynomial.polynomial.polyval2d(x, y, np.array(change.poly_um))
+    mean = np.repeat(weights / 2, _AZIMUTHS) / _AZIMUTHS
+    return np.asarray(zernike.evaluate_terms(x, y) @ (mean * height_um))

@@ -4,7 +4,8 @@ The film follows the air within a minute, the ring within hours, the moisture of
 humidity within half an hour. What the film is then longer than its ring is a pre-strain below 0 of
 a film without pre-strain, solved by the least energy of `stretched_film`.
 
-A lamp warms a patch of the film; to first order its mean over the mirror counts.
+A lamp warms a patch of the film. Its mean over the mirror moves centre and figure as a temperature
+of the whole film would; the rest changes the figure only (`figure_changes`).
 """
 
 import math
@@ -36,6 +37,8 @@ FILM_FOLLOWS_HUMIDITY_S = 1800.0
 # A patch of 90 mm (1 sigma) that a lamp warms by 1 K is 6.5 % of the area
 LAMP_K = 1.0
 LAMP_SHARE = 0.065
+LAMP_SIGMA_MM = 90.0
+LAMP_PLACE_MM = (150.0, 90.0)
 POISSON_RATIO = 0.38
 _STEP = 2e-5  # of the pre-strain, for the derivative
 ROUND_TERMS = (1, 4, 11, 22)  # Noll indices of `compute_figure_change_per_ppm`
@@ -51,6 +54,7 @@ class ClimateBlock:
     ring_c: FloatArray
     humidity_percent: FloatArray
     excess_ppm: FloatArray
+    patch_k: FloatArray  # warming of the middle of a lamp's patch
     mirror_factor: FloatArray  # on sag and volume of the mirror at equal pressure
     back_factor: FloatArray
 
@@ -61,6 +65,7 @@ class ClimateBlock:
             "ring_temperature_c": float(self.ring_c[index]),
             "humidity_percent": float(self.humidity_percent[index]),
             "excess_strain_ppm": float(self.excess_ppm[index]),
+            "patch_k": float(self.patch_k[index]),
         }
 
 
@@ -80,6 +85,7 @@ class Room:
         """The climate at plant times, (steps,)."""
         zero_c = REFERENCE_K - _ZERO_C_K
         air_k, film_k, ring_k, humidity, moisture = self._waves(time_s)
+        patch_k = np.zeros_like(time_s)
         if self._kind == "lamp":
             lit = time_s % LAMP_EVERY_S
             warming = np.where(
@@ -87,7 +93,8 @@ class Room:
                 -np.expm1(-lit / FILM_FOLLOWS_AIR_S),
                 np.exp(-(lit - LAMP_S) / FILM_FOLLOWS_AIR_S),
             )
-            film_k = film_k + LAMP_K * LAMP_SHARE * warming
+            patch_k = LAMP_K * warming
+            film_k = film_k + LAMP_SHARE * patch_k
         film_ppm = FILM_PPM_PER_K * film_k + FILM_PPM_PER_PERCENT * moisture
         excess_ppm = film_ppm - RING_PPM_PER_K * ring_k
         mirror_factor = 1.0 + compute_sag_change_per_ppm() * excess_ppm
@@ -99,6 +106,7 @@ class Room:
             zero_c + ring_k,
             HUMIDITY_PERCENT + humidity,
             excess_ppm,
+            patch_k,
             mirror_factor,
             1.0 + back * excess_ppm,
         )
@@ -148,21 +156,31 @@ def compute_sag_change_per_ppm() -> float:
 
 
 @cache
+def compute_profile_change_per_ppm() -> FloatArray:
+    """Change of the height at equal sag for an excess strain of 1e-6, µm.
+
+    Coefficients (k,) of powers of v = (r / radius)^2. Heights are upward, 0 at vertex and rim.
+    """
+    depth = NOMINAL_SAG_MM / RADIUS_MM
+    heights = []
+    for sign in (-1, 1):
+        profile = np.array(solve_stretched_film(depth, sign * _STEP, POISSON_RATIO)[1])
+        # From 0 at the vertex to 1 at the rim, whatever the profile counts from
+        scale = profile.sum() - profile[0]
+        profile[0] = 0.0
+        heights.append(profile / scale)
+    return np.asarray(1e3 * NOMINAL_SAG_MM * (heights[0] - heights[1]) / (2 * _STEP) * 1e-6)
+
+
+@cache
 def compute_figure_change_per_ppm() -> FloatArray:
     """Change of the figure at equal sag for an excess strain of 1e-6: its `ROUND_TERMS` in µm.
 
     Heights are upward and the vertex is held.
     """
-    depth = NOMINAL_SAG_MM / RADIUS_MM
-    profiles = [solve_stretched_film(depth, s * _STEP, POISSON_RATIO)[1] for s in (-1, 1)]
     nodes, weights = np.polynomial.legendre.leggauss(40)
     v = (nodes + 1) / 2
-    # From 0 at the vertex to 1 at the rim, whatever the profile counts from
-    heights = [
-        (np.polynomial.polynomial.polyval(v, profile) - profile[0]) / (profile.sum() - profile[0])
-        for profile in profiles
-    ]
-    change_um = 1e3 * NOMINAL_SAG_MM * (heights[0] - heights[1]) / (2 * _STEP) * 1e-6
+    change_um = np.polynomial.polynomial.polyval(v, compute_profile_change_per_ppm())
     terms = [
         math.sqrt(2 * k + 1)
         * float(np.sum(weights / 2 * change_um * np.polynomial.legendre.Legendre.basis(k)(nodes)))

@@ -27,6 +27,7 @@ class Truth:
     ring_temperature_c: float = math.nan
     humidity_percent: float = math.nan
     excess_strain_ppm: float = 0.0  # strain of the film above that of its ring
+    patch_k: float = 0.0  # warming of the middle of a lamp's patch
 
     def pack(self) -> bytes:
         """The fields as doubles in their order."""

@@ -30,7 +30,12 @@ from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.formatting import format_span, one_line
 from membrane_ctrl.review.report.json import make_timeline
 from membrane_ctrl.review.report.pump_history import PumpSeen
-from membrane_ctrl.review.statistics import held_scalars, power_spectrum, shape_review
+from membrane_ctrl.review.statistics import (
+    climate_review,
+    held_scalars,
+    power_spectrum,
+    shape_review,
+)
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.run_files.shapes import without_terms
 
@@ -505,6 +510,30 @@ def draw_scalars(series: held_scalars.HeldSeries) -> Markup:
 
         panels.append(draw_image)
     return arrange_panels(draw_panel(draw, 3.1) for draw in panels)
+
+
+def draw_climate(climate: climate_review.ClimateReview) -> Markup:
+    """Temperatures and humidity over the run, and the predicted change of the figure."""
+    time, unit = hours_or_less(climate.time_s, float(np.ptp(climate.time_s)))
+
+    def draw_temperatures(_: Figure, plot: Any) -> None:
+        plot.plot(time, climate.film_c, color=BLUE, lw=0.9, label="film")
+        plot.plot(time, climate.ring_c, color=GREY, lw=0.9, label="ring")
+        plot.set(title="Temperature, °C", xlabel=unit)
+        plot.legend(loc="upper right", ncols=2)
+
+    def draw_humidity(_: Figure, plot: Any) -> None:
+        plot.plot(time, climate.humidity_percent, color=BLUE, lw=0.9)
+        plot.set(title="Relative humidity, %", xlabel=unit)
+
+    def draw_change(_: Figure, plot: Any) -> None:
+        plot.plot(time, climate.figure_um, color=BLUE, lw=0.9)
+        plot.axhline(climate.notice_um, color=ORANGE, lw=0.7, ls="--")
+        plot.set(title="Predicted change of the figure, RMS, µm (line: notice)", xlabel=unit)
+
+    return arrange_panels(
+        draw_panel(draw, 3.1) for draw in (draw_temperatures, draw_humidity, draw_change)
+    )
 
 
 def _draw_drift(plot: Any, shape: shape_review.ShapeReview) -> None:

@@ -10,6 +10,7 @@ from membrane_ctrl.model import events, program
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.formatting import format_span, format_time_beside
 from membrane_ctrl.review.statistics import (
+    climate_review,
     drift,
     held_scalars,
     power_spectrum,
@@ -124,6 +125,7 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         "unjudged": list(analysis.unjudged),
         "shape": None if analysis.shape is None else _make_shape(analysis.shape),
         "held": None if analysis.scalars is None else _make_scalars(analysis.scalars),
+        "climate": None if analysis.climate is None else _make_climate(analysis.climate),
         "anomalies": [asdict(anomaly) for anomaly in analysis.anomalies],
         "notes": list(run.notes),
         "exit": None if not run.summary else run.summary.get("exit"),
@@ -169,6 +171,28 @@ def _make_series(series: ErrorSeries | None) -> dict[str, Any] | None:
 
 def _make_slope(slope: drift.FittedSlope) -> dict[str, float | bool]:
     return asdict(slope) | {"significant": slope.is_significant}
+
+
+def _make_climate(climate: climate_review.ClimateReview) -> dict[str, Any]:
+    """Ranges of temperature and humidity, and what they predict at the end of the run."""
+    ranges = {}
+    for name, values in (
+        ("film_c", climate.film_c),
+        ("ring_c", climate.ring_c),
+        ("humidity_percent", climate.humidity_percent),
+    ):
+        known = values[np.isfinite(values)]
+        ranges[name] = [float(known.min()), float(known.max())] if known.size else None
+    figures_um = climate.figure_um[np.isfinite(climate.figure_um)]
+    return {
+        **ranges,
+        "film_ppm": climate.film_ppm,
+        "ring_ppm": climate.ring_ppm,
+        "figure_um": float(figures_um[-1]) if figures_um.size else None,
+        "figure_sigma_um": climate.last_sigma_um,
+        "figure_max_um": float(figures_um.max()) if figures_um.size else None,
+        "spherical_um": climate.spherical_um,
+    }
 
 
 def _make_scalars(series: held_scalars.HeldSeries) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Sequence
 
+import numpy as np
 from markupsafe import Markup
 
 from membrane_ctrl.model import program
@@ -29,6 +30,7 @@ from membrane_ctrl.review.report import figures
 from membrane_ctrl.review.report.json import make_timeline, make_verdict
 from membrane_ctrl.review.report.pump_history import PumpSeen, explain_pump_change
 from membrane_ctrl.review.statistics import (
+    climate_review,
     compare,
     drift,
     held_scalars,
@@ -94,6 +96,8 @@ def render_report(
         sections.append(PageSection("Figure", _list_shape(analysis.shape)))
     if analysis.scalars is not None:
         sections.append(PageSection("What was held", _list_scalars(analysis.scalars)))
+    if analysis.climate is not None:
+        sections.append(PageSection("Climate", _list_climate(analysis.climate)))
     if len(history) > 1:
         blocks = _list_history(history, analysis.run.config.pump.change_max)
         sections.append(PageSection("Pump over the runs", blocks))
@@ -339,6 +343,38 @@ def _list_scalars(series: held_scalars.HeldSeries) -> list[PageBlock]:
     ]
     facts += _describe_image(series)
     return [PageFacts(facts), PageDrawing(figures.draw_scalars(series))]
+
+
+def _list_climate(climate: climate_review.ClimateReview) -> list[PageBlock]:
+    """Temperature and humidity, and what they predict of the figure."""
+    facts = []
+    for name, values, unit in (
+        ("film", climate.film_c, "°C"),
+        ("ring", climate.ring_c, "°C"),
+        ("relative humidity", climate.humidity_percent, "%"),
+    ):
+        known = values[np.isfinite(values)]
+        seen = "no sensor"
+        if known.size:
+            seen = f"{known.min():.2f} to {known.max():.2f} {unit}, at the end {known[-1]:.2f}"
+        facts.append((name, seen))
+    figures_um = climate.figure_um[np.isfinite(climate.figure_um)]
+    if figures_um.size:
+        change = _format_value(float(figures_um[-1]), climate.last_sigma_um, "µm RMS")
+        facts += [
+            (
+                "strain since the hold began",
+                f"film {format_signed(climate.film_ppm)}, ring {format_signed(climate.ring_ppm)} "
+                "in 1e-6",
+            ),
+            (
+                "predicted change of the figure at a held centre",
+                f"{change} at the end, {format_signed(climate.spherical_um)} µm of it spherical; "
+                f"largest {format_number(float(figures_um.max()))} (notice beyond "
+                f"{climate.notice_um:g})",
+            ),
+        ]
+    return [PageFacts(facts), PageDrawing(figures.draw_climate(climate))]
 
 
 def _describe_image(series: held_scalars.HeldSeries) -> list[tuple[str, str]]:

@@ -11,7 +11,7 @@ from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events, list_unjudged
 from membrane_ctrl.review.events.found_event import FoundEvent
-from membrane_ctrl.review.statistics import held_scalars, shape_review
+from membrane_ctrl.review.statistics import climate_review, held_scalars, shape_review
 from membrane_ctrl.review.statistics.anomalies import Anomaly, find_anomalies
 from membrane_ctrl.review.statistics.error_series import ErrorSeries, describe_error
 from membrane_ctrl.review.statistics.hold_pass import (
@@ -63,6 +63,8 @@ class Analysis:
     shape : ShapeReview or None
     scalars : HeldSeries or None
         What was held: vertex, focus and distance from the reference.
+    climate : ClimateReview or None
+        Temperature and humidity of film and ring; None without a sensor.
     anomalies : tuple of Anomaly
     """
 
@@ -79,6 +81,7 @@ class Analysis:
     unjudged: tuple[str, ...]
     shape: shape_review.ShapeReview | None
     scalars: held_scalars.HeldSeries | None
+    climate: climate_review.ClimateReview | None
     anomalies: tuple[Anomaly, ...]
 
     @property
@@ -138,6 +141,7 @@ def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -
         unjudged=unjudged,
         shape=shape,
         scalars=scalars,
+        climate=climate_review.review_climate(run, level),
         anomalies=anomalies,
     )
 

@@ -9,6 +9,7 @@ from membrane_ctrl.metrology.film.climate_figure import compute_climate_sensitiv
 from membrane_ctrl.metrology.film.climate_fit import ClimateFit, Expansion, fit_climate
 from membrane_ctrl.model import errors, program
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.review.catalogue import resolve_run
 from membrane_ctrl.run_files.run import Run, open_run
 
 _SPHERICAL = 11  # Noll index
@@ -28,7 +29,8 @@ def climate_command(folder: Path, as_json: bool) -> int:
     Parameters
     ----------
     folder : Path
-        A run of some hours, held with figures, in which temperature or humidity changed.
+        A run of some hours, held with figures, in which temperature or humidity changed; its
+        name, or `last`.
     as_json : bool
         Print one object instead of lines.
 
@@ -42,7 +44,7 @@ def climate_command(folder: Path, as_json: bool) -> int:
     InputError
         The run has too little for a fit; the message states what.
     """
-    run = open_run(folder)
+    run = open_run(resolve_run(folder))
     mirror = run.config.optics.mirror
     sensitivity = compute_climate_sensitivity(mirror.radius_mm, mirror.sag_mm)
     ring_ppm_per_k = run.config.climate.ring_ppm_per_k

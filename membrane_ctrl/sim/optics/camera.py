@@ -1,7 +1,7 @@
 """Screen and camera of the twin: the screen as the camera sees it in the film, at any moment."""
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -14,6 +14,7 @@ from firmware_iface.optical_roles import Frame, Levels, Pattern, Pixels
 from firmware_iface.roles import LinkError
 from membrane_ctrl.config.schema import DisturbancesConfig, OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.sim.figure_changes import FigureChange, list_figure_changes
 from membrane_ctrl.sim.optics.bench_poses import (
     ScreenError,
     camera_pose,
@@ -40,6 +41,7 @@ from membrane_ctrl.sim.optics.shade_crossed import shade_crossed_rows
 from membrane_ctrl.sim.optics.shade_panel import PanelPicture, shade_panel_rows
 from membrane_ctrl.sim.optics.trace import Trace, trace_rays
 from membrane_ctrl.sim.optics.trace_cushion import trace_cushion
+from membrane_ctrl.sim.truth import Truth
 
 # Distance of the nodes on the mirror: a typical film's phase is then less than 1e-4 rad off the
 # exact trace (asserted in the tests).
@@ -79,7 +81,9 @@ class OpticsRenderer:
     _traces: OrderedDict[float, FloatArray] = field(
         default_factory=OrderedDict, init=False, repr=False
     )
-    _swings: dict[DrumMode, FloatArray] = field(default_factory=dict, init=False, repr=False)
+    _swings: dict[DrumMode | FigureChange, FloatArray] = field(
+        default_factory=dict, init=False, repr=False
+    )
     _pictures: int = field(default=0, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -122,6 +126,7 @@ class OpticsRenderer:
         out: Pixels | None = None,
         gain: float = 1.0,
         time_s: float = 0.0,
+        changes: Sequence[tuple[FigureChange, float]] = (),
     ) -> Pixels:
         """Return the picture of what is shown.
 
@@ -136,6 +141,8 @@ class OpticsRenderer:
             Exposure over the nominal one.
         time_s : float
             Of the exposure: the vibrations are those of this time.
+        changes : sequence of (FigureChange, float)
+            Small changes of the film's form, each with its amount.
 
         Raises
         ------
@@ -168,6 +175,8 @@ class OpticsRenderer:
             times_s = self._disturber.row_times_s(time_s)
         for mode in self.modes:
             nodes = nodes + mode.swing_um(times_s) * self._swing_maps(mode)[:_MAPS]
+        for change, amount in changes:
+            nodes = nodes + amount * self._swing_maps(change)[:_MAPS]
         if self._disturber is not None:
             pattern = _NO_PATTERN
             if isinstance(shown, Pattern):
@@ -385,9 +394,9 @@ class OpticsRenderer:
         images_mm = found.images_mm.reshape(4, *maps.shape[1:]) + self._side_mm / 2.0
         return np.concatenate([maps, images_mm])
 
-    def _swing_maps(self, mode: DrumMode) -> FloatArray:
-        """Change of the maps at the nodes by 1 µm of a mode: linear to 1e-4 of it, at any
-        displacement.
+    def _swing_maps(self, mode: DrumMode | FigureChange) -> FloatArray:
+        """Change of the maps at the nodes by 1 µm of a mode, or by an amount of 1 of a change:
+        linear to 1e-4 of it, at any displacement.
         """
         if mode not in self._swings:
             still = self._trace_film(self._directions, 0.0)
@@ -520,8 +529,13 @@ class TwinOptics:
         """Take one picture of what is shown, at the film's true position."""
         renderer = self._find_renderer()
         time_s = self._clock.now()
-        displacement_um = self._truth().displacement_um
-        picture = renderer.render_picture(shown, displacement_um, out, time_s=time_s)
+        position = self._truth()
+        changes: Sequence[tuple[FigureChange, float]] = ()
+        if isinstance(position, Truth):
+            changes = list_figure_changes(position)
+        picture = renderer.render_picture(
+            shown, position.displacement_um, out, time_s=time_s, changes=changes
+        )
         return Frame(picture, time_s)
 
     def _find_renderer(self) -> OpticsRenderer:

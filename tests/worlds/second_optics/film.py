@@ -83,6 +83,21 @@ class Material:
 
 
 @dataclass(frozen=True)
+class WarmPatch:
+    """A part of the film that has become longer, with a Gaussian profile; lengths in radii."""
+
+    strain: float
+    x: float = 0.0
+    y: float = 0.0
+    sigma: float = 0.18
+
+    def strain_at(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Strain of the relaxed film at its material points."""
+        square = (x - self.x) ** 2 + (y - self.y) ** 2
+        return np.asarray(self.strain * np.exp(-square / (2 * self.sigma**2)))
+
+
+@dataclass(frozen=True)
 class Ring:
     """Deviation of the ring from a plane circle: Fourier waves over the radius.
 
@@ -154,7 +169,13 @@ class Shape:
 class FilmSolver:
     """Equilibria of one film at prescribed depths of its centre."""
 
-    def __init__(self, material: Material, ring: Ring | None = None, degree: int = DEGREE) -> None:
+    def __init__(
+        self,
+        material: Material,
+        ring: Ring | None = None,
+        degree: int = DEGREE,
+        warm: WarmPatch | None = None,
+    ) -> None:
         self._ring = ring or Ring()
         self._degree = degree
         self._basis = _basis(degree)
@@ -169,6 +190,10 @@ class FilmSolver:
         self._stress_free = (
             self._metric_to_strain.T @ material.stiffness() @ self._unstrained
         )  # subtracted from stiffness times metric
+        # A warm film is relaxed at a longer metric: by 1 + 2 strain, the same along all directions
+        warmed = np.zeros_like(x) if warm is None else warm.strain_at(x, y)
+        longer = self._metric_to_strain.T @ material.stiffness() @ np.array([1.0, 1.0, 0.0])
+        self._relaxed = self._stress_free[:, None] + np.outer(longer, warmed)
         self._root = np.linalg.cholesky(self._stiffness).T
         self._given = [_ring_field(waves, degree) for waves in _ring_waves(self._ring)]
         self._given_at = [given.values(x, y) for given in self._given]
@@ -229,7 +254,7 @@ class FilmSolver:
             ]
         )
         weight = self._area * self._thickness
-        stress = self._stiffness @ metric - self._stress_free[:, None]
+        stress = self._stiffness @ metric - self._relaxed
 
         # change of the metric with each unknown, (3, points, 3 * size)
         change = np.empty((3, value.shape[0], 3 * size))
