@@ -45,7 +45,8 @@ _CAUSE_SIGMAS: dict[HarmonicCause, float] = {
     "modulus": 0.1,
     "shear": 0.3,
 }
-_OF_FILM = ("modulus", "shear")
+# Causes that strain the film: finite slopes change their waves. A ring that is not flat bends it.
+_BY_STRAIN = ("modulus", "shear", "prestrain", "round")
 # Standard uncertainty, before any measurement, of a term of a figure that all sets share: that of a
 # lens or a mount.
 _SHARED_SIGMA_MM = 0.3
@@ -53,9 +54,13 @@ _SHARED_SIGMA_MM = 0.3
 # how much the sets share besides the causes.
 _LEAST_MISFIT_MM = 2e-4
 SURE_SIGMAS = 4.0  # beyond which a cause is stated
-_FOEPPL = 0.03  # relative change of an orthotropic film's wave by finite slopes
+_FOEPPL = 0.03  # relative change of their waves by finite slopes
 # Share of the shear modulus that the square of the moduli's difference adds to four waves.
 _SECOND_ORDER = 2.0
+# Waves of order a + b and |a - b| that two waves a and b make in second order, over the product of
+# their RMS over the sag. Films of finite strains with two waves (a ring out of round and of flat
+# beside unequal moduli) leave 1.4 to 1.7 of the square as four waves.
+_PRODUCT = 2.0
 _UNEXPLAINED = 0.1  # share of an order's waves: if more is left, there is another cause
 _LEAST_SEEN_MM = 2e-3  # least RMS of an order's terms that is stated
 _TOGETHER = 0.95  # correlation of two causes that the sets determine only together
@@ -221,14 +226,17 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
     unexplained: list[UnexplainedWaves] = []
     shared: list[SharedWaves] = []
     together: list[CausesTogether] = []
+    sizes_mm = {order: _wave_rms_mm(_list_terms(figures, order)) for order in CAUSES}
+    sag_mm = float(np.mean([one.sag_mm for one in figures]))
     for order, causes in CAUSES.items():
         # Cosine and sine terms of the order, (2, n, 3), and their fit by its causes.
         terms = azimuthal_terms(order)
         response = wave_responses_mm(bowls, order, reach)
-        data = np.stack([[one.parameters_mm[part] for one in figures] for part in terms])
+        data = _list_terms(figures, order)
+        product_mm = _PRODUCT * _product_mm(sizes_mm, order, sag_mm)
         fits = [
-            _fit_parity(figures, terms[parity], causes, response, data[parity], seen_mm)
-            for parity in (0, 1)
+            _fit_parity(figures, terms[k], causes, response, data[k], seen_mm, product_mm)
+            for k in (0, 1)
         ]
         predicted = np.stack([response @ one.amounts + one.shared_mm for one in fits])
         for parity, of_parity in enumerate(predicted):
@@ -236,9 +244,9 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
 
         # Do the causes and what all sets share explain the waves?
         left = data - predicted
-        rms_mm = float(np.sqrt(np.sum(data**2) / len(figures)))
-        left_mm = float(np.sqrt(np.sum(left**2) / len(figures)))
-        explained = left_mm < max(_UNEXPLAINED * rms_mm, 2 * seen_mm)
+        rms_mm = sizes_mm[order]
+        left_mm = _wave_rms_mm(left)
+        explained = left_mm < max(_UNEXPLAINED * rms_mm, 2 * seen_mm, product_mm)
         likely = _rank_causes(causes, response, data)
         together += _find_causes_together(order, causes, fits[0].covariance)
         for k, cause in enumerate(causes):
@@ -253,6 +261,28 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
             weight = max(one.shared_weight for one in fits)
             shared.append(SharedWaves(order, 1e3 * rms_mm, weight, likely))
     return WaveFit(_widen_shear(waves), tuple(unexplained), tuple(shared), tuple(together), added)
+
+
+def _list_terms(figures: Sequence[FilmFigure], order: int) -> FloatArray:
+    """Cosine and sine terms (2, n, k) of an azimuthal order in n figures, mm."""
+    terms = azimuthal_terms(order)
+    return np.stack([[one.parameters_mm[part] for one in figures] for part in terms])
+
+
+def _wave_rms_mm(terms_mm: FloatArray) -> float:
+    """RMS over disc and figures of waves (2, n, k)."""
+    return float(np.sqrt(np.sum(terms_mm**2) / terms_mm.shape[1]))
+
+
+def _product_mm(sizes_mm: dict[int, float], order: int, sag_mm: float) -> float:
+    """Sum of the products of the waves (RMS by order) that make waves of an order, over the sag."""
+    products_mm2 = [
+        sizes_mm[a] * sizes_mm[b]
+        for a in sizes_mm
+        for b in sizes_mm
+        if a <= b and order in (a + b, b - a)
+    ]
+    return sum(products_mm2) / sag_mm
 
 
 def _widen_shear(waves: list[RingWave]) -> tuple[RingWave, ...]:
@@ -294,6 +324,7 @@ def _fit_parity(
     response: FloatArray,
     data: FloatArray,
     seen_mm: float,
+    product_mm: float,
 ) -> _ParityFit:
     """Fit the cosine or the sine terms of an order.
 
@@ -310,6 +341,8 @@ def _fit_parity(
         The terms, mm.
     seen_mm : float
         Size of a term that no law explains.
+    product_mm : float
+        Size of waves of second order, which grow with the sag.
     """
     noise = shared_covariance(figures, terms) + 1e-14 * np.eye(data.size)
     # A wave's misfit grows in several ways at once: a cause leaves another power of the sag than a
@@ -318,7 +351,7 @@ def _fit_parity(
     mixed: FloatArray = np.mean(misfit_covariances(figures), axis=0)
     spread: FloatArray = np.kron(mixed, np.eye(terms.size))[None].astype(np.float64)
     count = len(causes)
-    of_film = [k for k, cause in enumerate(causes) if cause in _OF_FILM]
+    by_strain = [k for k, cause in enumerate(causes) if cause in _BY_STRAIN]
     by_causes = response.reshape(-1, count)
     by_shared_terms = np.tile(np.eye(terms.size), (len(figures), 1))
     cause_sigmas = np.array([_CAUSE_SIGMAS[cause] for cause in causes])
@@ -327,7 +360,7 @@ def _fit_parity(
     def solve(design: FloatArray, prior_sigmas: FloatArray, least_mm: float) -> Solved:
         """The unknowns of one hypothesis, causes first; least_mm is the least misfit of a term."""
         size_mm = least_mm
-        # Twice: what finite slopes change of an orthotropic film's waves follows from their size.
+        # Twice: what finite slopes change of the waves follows from their size.
         for _ in range(2):
             found = average_over_misfits(
                 design,
@@ -338,19 +371,19 @@ def _fit_parity(
                 prior_sigmas**-2,
                 size_mm,
             )
-            waves_mm = response[..., of_film] @ found.mean[of_film]
+            waves_mm = response[..., by_strain] @ found.mean[by_strain]
             size_mm = float(np.hypot(least_mm, _FOEPPL * np.sqrt(np.mean(waves_mm**2))))
         return found
 
     # The two hypotheses, both with the causes' amounts and the shared terms as unknowns.
-    alone = solve(by_causes, cause_sigmas, seen_mm)
+    alone = solve(by_causes, cause_sigmas, float(np.hypot(seen_mm, product_mm)))
     padded = np.zeros((count + terms.size, count + terms.size))
     padded[:count, :count] = alone.covariance
     without = replace(alone, mean=np.append(alone.mean, np.zeros(terms.size)), covariance=padded)
     with_shared = solve(
         np.hstack([by_causes, by_shared_terms]),
         np.append(cause_sigmas, shared_sigmas),
-        _LEAST_MISFIT_MM,
+        float(np.hypot(_LEAST_MISFIT_MM, product_mm)),
     )
     both = average_models([without, with_shared])
     weight = 1 / (1 + np.exp(np.clip(without.log_evidence - with_shared.log_evidence, -500, 500)))
