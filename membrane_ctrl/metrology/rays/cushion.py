@@ -1,9 +1,22 @@
 """A cushion: a mirror behind a clear film that bulges towards the camera, with gas between them.
 
-A ray that passes the film is refracted into the gas; both faces of the film are parallel, so that
-the film itself only shifts it. The part of n d along a face is the same on both sides (Snell). The
-film also reflects: the camera sees the screen a second time in its outside, and a third time by
-mirror, film and mirror.
+World: z points from the mirror to the camera. The mirror is a bowl; the front film is a bowl upside
+down above it. A surface z = f(x, y) has the normal N = (-f_x, -f_y, 1). A ray is a point p and a
+unit vector d:
+
+    where they meet: z - f(x, y) = 0 at p + t d, by Newton's steps                          (1)
+        t -= (z - f) / (d_z - f_x d_x - f_y d_y)
+    mirror: d' = d - 2 (d N) N / (N N)                                                      (2)
+    Snell, with N N = 1: n' d' = w + sign(a) sqrt(n'^2 - w w) N,  w = n d - a N,  a = n (d N)   (3)
+
+In (3) w is the part of n d along the face, which is the same on both sides. The film is a sheet of
+even thickness T: a ray crosses it within T / |d N| and leaves by a face whose normal is that of the
+place beside, so that a curved film is a weak lens although its faces are parallel.
+
+The film also reflects: the camera sees the screen a second time in its outside, and a third time by
+mirror, film and mirror. With the reflectance of a face R1 = ((n - 1) / (n + 1))^2 both faces have
+
+    R = 2 R1 / (1 + R1)                                                                     (4)
 
 Derivation: section 13 of docs/explanation/metrology.md.
 """
@@ -73,7 +86,7 @@ class Cushion:
 
     @property
     def reflectance(self) -> float:
-        """Of the film's two faces together, at right angles, without interference."""
+        """Of the film's two faces together, at right angles, without interference: (4)."""
         of_face = ((self.film_index - 1) / (self.film_index + 1)) ** 2
         return 2 * of_face / (1 + of_face)
 
@@ -92,21 +105,27 @@ class Cushion:
         z_mm, slope_x, slope_y : (n,) arrays
             World z over the places, and its slopes.
         """
-        raised_mm, tilt_x, tilt_y, saddle_mm, diagonal_mm, lifted_mm = self.errors
+        raised_mm, tilt_x_mrad, tilt_y_mrad, saddle_mm, diagonal_mm, lifted_mm = self.errors
+        x_mm, y_mm = place
+
+        # The bowl upside down: its depth below the film's vertex.
         bowl = Surface.hencky_bowl(self.bulge_mm + raised_mm, self.radius_mm)
+        top_mm = rim_z_mm + self.rim_gap_mm + self.bulge_mm + raised_mm + lifted_mm
+        below_top_mm = bowl.height(x_mm, y_mm)
+        bowl_slope_x, bowl_slope_y = bowl.slopes(x_mm, y_mm)
+
+        # Errors of form: tilts, and two saddles that are turned by 45 degrees against each other.
+        tilt_x = 1e-3 * tilt_x_mrad
+        tilt_y = 1e-3 * tilt_y_mrad
         x, y = place / self.radius_mm
-        height = bowl.height(place[0], place[1])
-        slope_x, slope_y = bowl.slopes(place[0], place[1])
-        top = rim_z_mm + self.rim_gap_mm + self.bulge_mm + raised_mm + lifted_mm
-        # Errors of form: tilts, and two saddles that are turned by 45 degrees.
-        tilted = 1e-3 * (tilt_x * place[0] + tilt_y * place[1])
-        saddle = saddle_mm * (x * x - y * y) + 2 * diagonal_mm * x * y
-        saddle_x = 2 * (saddle_mm * x + diagonal_mm * y) / self.radius_mm
-        saddle_y = 2 * (diagonal_mm * x - saddle_mm * y) / self.radius_mm
+        error_mm = tilt_x * x_mm + tilt_y * y_mm
+        error_mm = error_mm + saddle_mm * (x * x - y * y) + 2 * diagonal_mm * x * y
+        error_slope_x = tilt_x + 2 * (saddle_mm * x + diagonal_mm * y) / self.radius_mm
+        error_slope_y = tilt_y + 2 * (diagonal_mm * x - saddle_mm * y) / self.radius_mm
         return (
-            top - height + tilted + saddle,
-            1e-3 * tilt_x - slope_x + saddle_x,
-            1e-3 * tilt_y - slope_y + saddle_y,
+            top_mm - below_top_mm + error_mm,
+            error_slope_x - bowl_slope_x,
+            error_slope_y - bowl_slope_y,
         )
 
 
@@ -178,9 +197,8 @@ class CushionBench:
         return self._meet_screen(outside, leaving)
 
     def trace_images(self, start: FloatArray, rays: FloatArray) -> FloatArray:
-        """Trace rays to the two further images of the screen, without refraction, which moves
-        them by
-        micrometres.
+        """Trace rays to the two further images of the screen, without refraction, which moves them
+        by micrometres.
 
         Parameters
         ----------
@@ -195,10 +213,11 @@ class CushionBench:
             Screen points, mm: of the image by the film's outside, and of that by mirror, film and
             mirror; NaN where the latter meets the mirror beyond its rim.
         """
-        # By the film's outside.
+        # First image: by the film's outside.
         outside, normal = self._meet_front(start, rays)
         by_outside = self._meet_screen(outside, _reflect(rays, normal))
-        # By the mirror up to the film's inside, down again, and by the mirror a second time.
+        # Second image: by the mirror up to the film's inside, down again, and by the mirror a
+        # second time.
         point = self._meet_mirror(start, rays)
         up = self._reflect_at_mirror(point, rays)
         under, normal = self._meet_front(point, up)
@@ -211,7 +230,7 @@ class CushionBench:
 
     def _meet_mirror(self, start: FloatArray, rays: FloatArray) -> FloatArray:
         """Points (3, n) of the mirror on rays that come down."""
-        # Newton's method on z - vertex_z - h(x, y) = 0, from the plane of the rim.
+        # (1) on z - vertex_z - h(x, y) = 0, from the plane of the rim.
         t = (self._rim_z_mm - start[2]) / rays[2]
         for _ in range(_NEWTON_STEPS):
             x, y, z = start + t * rays
@@ -221,12 +240,13 @@ class CushionBench:
         return np.asarray(start + t * rays)
 
     def _reflect_at_mirror(self, point: FloatArray, rays: FloatArray) -> FloatArray:
+        """Rays after the mirror at points (3, n)."""
         slope_x, slope_y = self.mirror.slopes(point[0], point[1])
         return _reflect(rays, np.stack([-slope_x, -slope_y, np.ones_like(slope_x)]))
 
     def _meet_front(self, start: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Points (3, n) of the front film on rays from either side, and its normals there."""
-        # Newton's method, from a plane half way up the bulge.
+        # (1), from a plane half way up the bulge.
         middle_mm = self._rim_z_mm + self.cushion.rim_gap_mm + self.cushion.bulge_mm / 2
         t = (middle_mm - start[2]) / rays[2]
         for _ in range(_NEWTON_STEPS):
@@ -234,6 +254,8 @@ class CushionBench:
             z, slope_x, slope_y = self.cushion.front_height(self._rim_z_mm, place[:2])
             approach = rays[2] - slope_x * rays[0] - slope_y * rays[1]
             t = t - (place[2] - z) / approach
+
+        # The points, and the normals (-f_x, -f_y, 1) there.
         place = start + t * rays
         _z, slope_x, slope_y = self.cushion.front_height(self._rim_z_mm, place[:2])
         return place, np.stack([-slope_x, -slope_y, np.ones_like(slope_x)])
@@ -241,47 +263,64 @@ class CushionBench:
     def _pass_film(
         self, point: FloatArray, normal: FloatArray, rays: FloatArray, goes_in: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Points and directions behind the film of rays that meet it."""
-        # Snell at the first face.
-        gas = 1 + self.cushion.gas_excess
-        before, behind = gas, 1.0
-        if goes_in:
-            before, behind = 1.0, gas
-        unit = normal / np.linalg.norm(normal, axis=0)
-        in_film = _refract(rays, unit, before, self.cushion.film_index)
-        across = np.sum(in_film * unit, axis=0)
-        path = self.cushion.thickness_mm / np.abs(across)
+        """Points and directions (3, n) behind the film, of rays that meet it.
 
-        # The other face there has the normal of the place beside, by as much as the ray moves
-        # along the film.
-        along_mm = path * (in_film - across * unit)
-        beside = point[:2] + along_mm[:2]
-        _z, slope_x, slope_y = self.cushion.front_height(self._rim_z_mm, beside)
-        other = np.stack([-slope_x, -slope_y, np.ones_like(slope_x)])
-        other /= np.linalg.norm(other, axis=0)
-        leaving = _refract(in_film, other, self.cushion.film_index, behind)
-        return point + path * in_film, leaving
+        Parameters
+        ----------
+        point, normal : (3, n) arrays
+            Where the rays meet the film, and its normals there, of any length.
+        rays : (3, n) array
+            Unit vectors.
+        goes_in : bool
+            From air to gas; otherwise from gas to air.
+        """
+        # 1. Into the film: (3) from the medium before it.
+        gas_index = 1 + self.cushion.gas_excess
+        index_before, index_behind = gas_index, 1.0
+        if goes_in:
+            index_before, index_behind = 1.0, gas_index
+        first_normal = normal / np.linalg.norm(normal, axis=0)
+        in_film = _refract(rays, first_normal, index_before, self.cushion.film_index)
+
+        # 2. Through it: the path is longer than the thickness by 1 / cos of the angle.
+        cosine = np.sum(in_film * first_normal, axis=0)
+        path_mm = self.cushion.thickness_mm / np.abs(cosine)
+
+        # 3. Out of it: the other face has the normal of the place beside, by as much as the ray has
+        # moved along the film.
+        along_film_mm = path_mm * (in_film - cosine * first_normal)
+        beside_mm = point[:2] + along_film_mm[:2]
+        _z, slope_x, slope_y = self.cushion.front_height(self._rim_z_mm, beside_mm)
+        other_normal = np.stack([-slope_x, -slope_y, np.ones_like(slope_x)])
+        other_normal /= np.linalg.norm(other_normal, axis=0)
+        leaving = _refract(in_film, other_normal, self.cushion.film_index, index_behind)
+        return point + path_mm * in_film, leaving
 
     def _meet_screen(self, point: FloatArray, rays: FloatArray) -> FloatArray:
         """s_x and s_y (2, n) where rays cross the plane of the screen."""
-        start = self.screen_axes @ (point - self.screen_origin_mm[:, None])
-        along = self.screen_axes @ rays
-        return np.asarray(start[:2] - start[2] / along[2] * along[:2])
+        # In the screen's axes, the plane is where the third coordinate is 0.
+        start_mm = self.screen_axes @ (point - self.screen_origin_mm[:, None])
+        direction = self.screen_axes @ rays
+        way_mm = -start_mm[2] / direction[2]
+        return np.asarray(start_mm[:2] + way_mm * direction[:2])
 
 
 def _reflect(rays: FloatArray, normal: FloatArray) -> FloatArray:
-    """Rays after a mirror with these normals, of any length."""
-    across = 2 * np.sum(rays * normal, axis=0) / np.sum(normal * normal, axis=0)
-    return np.asarray(rays - across * normal)
+    """Rays after a mirror with these normals, of any length: (2)."""
+    twice = 2 * np.sum(rays * normal, axis=0) / np.sum(normal * normal, axis=0)
+    return np.asarray(rays - twice * normal)
 
 
-def _refract(rays: FloatArray, unit: FloatArray, before: float, behind: float) -> FloatArray:
-    """Unit vectors behind a face with these unit normals: n d along the face stays (Snell)."""
-    wave = before * rays
-    across = np.sum(wave * unit, axis=0)
-    along = wave - across * unit
-    deeper = np.sqrt(behind**2 - np.sum(along * along, axis=0))
-    return np.asarray((along + np.sign(across) * deeper * unit) / behind)
+def _refract(
+    rays: FloatArray, normal: FloatArray, index_before: float, index_behind: float
+) -> FloatArray:
+    """Unit vectors behind a face with these unit normals: (3)."""
+    wave = index_before * rays
+    across_before = np.sum(wave * normal, axis=0)
+    along_face = wave - across_before * normal
+    across_behind = np.sqrt(index_behind**2 - np.sum(along_face * along_face, axis=0))
+    wave_behind = along_face + np.sign(across_before) * across_behind * normal
+    return np.asarray(wave_behind / index_behind)
 
 
 def image_shares(cushion: Cushion, mirror_reflectance: float) -> tuple[float, float]:
