@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -37,6 +38,10 @@ def test_a_fit_is_printed_as_a_table_of_the_configuration() -> None:
         Expansion(18.2, 0.9), None, Expansion(7.4, 0.15), 1500.0, residual_um=0.02, explained=0.99
     )
     text = "\n".join(format_fit(fit))
+    vague = replace(fit, film_per_percent=Expansion(1.1, 8.5))
+    assert "# film_ppm_per_percent: not determined, 1.10 +- 8.50" in format_fit(vague)
+    assert "film_sigma_relative = 0.05" in format_fit(vague)
+    assert not any(line.startswith("film_follows") for line in format_fit(vague))
     assert "film_ppm_per_k = 18.20  # +- 0.90" in text
     assert "# ring_ppm_per_k: its cause has changed too little" in text
     assert "film_sigma_relative = 0.05" in text

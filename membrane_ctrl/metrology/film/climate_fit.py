@@ -34,8 +34,11 @@ _LOG_STEP = 0.01
 # Share by which the spherical term of `climate_figure` is wrong: Foeppl's law against a film with
 # finite rotations
 _LAW_ERROR = 0.02
-# Of the running means of all series; the climate's waves are longer, or equally damped in all
-_SMOOTH_S = 900.0
+# Of the running means of all series, the longest first. Waves of the climate that are as short, as
+# of an air conditioner, would be averaged away: the first that leaves this share of what varies in
+# each cause is used.
+_SMOOTH_S = (900.0, 300.0, 60.0)
+_LEAST_LEFT = 0.5
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,7 @@ def fit_climate(
     good = np.isfinite(spherical_um)
     if good.sum() < 0.5 * good.size:
         raise ValueError("less than half of the record has figures")
-    width = max(1, round(_SMOOTH_S / float(np.median(np.diff(time_s)))))
+    width = _choose_width(list(causes.values()), float(np.median(np.diff(time_s))))
     seen_um = np.interp(time_s, time_s[good], spherical_um[good])
 
     def make_columns(follows_s: float) -> FloatArray:
@@ -200,6 +203,20 @@ def fit_climate(
         float(np.sqrt(misfit)),
         1.0 - misfit / variance if variance > 0 else 0.0,
     )
+
+
+def _choose_width(causes: list[FloatArray], step_s: float) -> int:
+    """Number of values of the running means."""
+    widths = [max(1, round(smooth_s / step_s)) for smooth_s in _SMOOTH_S]
+    for width in widths:
+        left = []
+        for values in causes:
+            noise = float(np.var(np.diff(values))) / 2
+            varies = max(float(np.var(values)) - noise, np.finfo(float).tiny)
+            left.append((float(np.var(_smooth(values, width))) - noise / width) / varies)
+        if min(left) > _LEAST_LEFT:
+            return width
+    return widths[-1]
 
 
 def _follow(values: FloatArray, time_s: FloatArray, lag_s: float) -> FloatArray:

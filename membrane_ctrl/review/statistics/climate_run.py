@@ -14,6 +14,7 @@ from membrane_ctrl.run_files.run import Run, open_run
 
 _SPHERICAL = 11  # Noll index
 _WINDOW_S = 60.0
+_LEAST_KNOWN = 0.5  # largest error of an expansion, over itself, that is worth a key
 _RING_SIGMA = 0.03  # share by which the configured expansion of a metal may be wrong (assumed)
 _SENSORS = ("film_temperature_c", "ring_temperature_c", "humidity_percent")
 _KEYS = {
@@ -99,13 +100,20 @@ def format_fit(fit: ClimateFit) -> list[str]:
         found: Expansion | None = getattr(fit, name)
         if found is None:
             lines.append(f"# {key}: its cause has changed too little")
+        elif found.sigma > _LEAST_KNOWN * abs(found.value):
+            lines.append(f"# {key}: not determined, {found.value:.2f} +- {found.sigma:.2f}")
         else:
             lines.append(f"{key} = {found.value:.2f}  # +- {found.sigma:.2f}")
-    film = [each for each in (fit.film_per_k, fit.film_per_percent) if each is not None]
+    film = [
+        each
+        for each in (fit.film_per_k, fit.film_per_percent)
+        if each is not None and each.sigma <= _LEAST_KNOWN * abs(each.value)
+    ]
     if film:
         share = max(each.sigma / abs(each.value) for each in film)
         lines.append(f"film_sigma_relative = {min(1.0, max(share, 0.01)):.2f}")
-    if np.isfinite(fit.follows_humidity_s):
+    # The time constant is known as far as the expansion is
+    if fit.film_per_percent in film and np.isfinite(fit.follows_humidity_s):
         lines.append(f"film_follows_humidity_s = {fit.follows_humidity_s:.0f}")
     lines.append(
         f"# the climate explains {fit.explained:.1%} of the spherical term's variance; "

@@ -172,6 +172,21 @@ def test_a_night_gives_the_expansions_within_five_per_cent() -> None:
     assert np.sqrt(np.mean(np.square(misses))) < 2.0
 
 
+def test_an_air_conditioner_of_a_quarter_of_an_hour_shows_the_film() -> None:
+    """Its waves are as long as the usual smoothing, which would average them away."""
+    rng = np.random.default_rng(1)
+    time_s = 60.0 * np.arange(300)
+    film_c = 0.5 * np.cos(2 * np.pi * time_s / 900.0)
+    sensitivity = compute_climate_sensitivity(RADIUS_MM, SAG_MM).terms_um[10]
+    spherical_um = 18.5 * sensitivity * film_c + 0.01 * rng.standard_normal(300)
+    none = np.full(300, np.nan)
+    seen_c = 21.0 + film_c + 0.0065 * rng.standard_normal(300)
+    found = fit_climate(time_s, spherical_um, seen_c, none, none, sensitivity)
+    assert found.film_per_k is not None
+    assert found.film_per_k.value == pytest.approx(18.5, rel=0.05)
+    assert abs(found.film_per_k.value - 18.5) < 3 * found.film_per_k.sigma
+
+
 def test_a_cause_that_does_not_change_is_not_fitted() -> None:
     night = _night(1)
     night["humidity_percent"] = np.full(600, np.nan)
