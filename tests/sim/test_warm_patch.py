@@ -8,9 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.sim.climate import FILM_PPM_PER_K, LAMP_K, POISSON_RATIO, Room
+from membrane_ctrl.config.optics import CameraConfig, OpticsConfig
+from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
+from membrane_ctrl.metrology.phase.pattern_sequence import full_sequence
+from membrane_ctrl.sim.climate import (
+    FILM_PPM_PER_K,
+    LAMP_K,
+    POISSON_RATIO,
+    Room,
+    compute_figure_change_per_ppm,
+)
 from membrane_ctrl.sim.figure_changes import climate_change, lamp_change, list_figure_changes
 from membrane_ctrl.sim.film import NOMINAL_SAG_MM, RADIUS_MM
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.truth import Truth
 from membrane_ctrl.sim.warm_patch import Patch, compute_patch_polynomial
 from tests.worlds.second_optics import Material
@@ -66,6 +77,26 @@ def test_a_lamp_changes_the_figure_beside_the_mean_strain() -> None:
     alone = kelvin * FILM_PPM_PER_K * heights_um(compute_patch_polynomial(patch))
     assert whole == pytest.approx(alone, abs=0.05 * np.abs(alone).max())
     assert math.isclose(float(np.array(lamp.poly_um)[0, 0]), 0.0, abs_tol=1e-12)
+
+
+def test_the_simulated_camera_sees_the_climate() -> None:
+    """50e-6 of excess strain are 4.1 µm of spherical aberration in a full cycle."""
+    optics = OpticsConfig(camera=CameraConfig(width_px=306, height_px=256, pixel_um=27.6, bits=12))
+    renderer = OpticsRenderer(optics, typical_film(37.1, 500.0, 1))
+    found = []
+    for excess_ppm in (0.0, 50.0):
+        changes = list_figure_changes(replace(TRUTH, excess_strain_ppm=excess_ppm))
+        frames = [
+            renderer.render_picture(pattern, 0.0, changes=changes)
+            for pattern in full_sequence(optics.pattern)
+        ]
+        cycle = LiveReconstructor(optics, 1)
+        found.append(cycle.measure_full(frames, np.arange(18.0), np.zeros(18)))
+    change_um = found[1].coeffs_um - found[0].coeffs_um
+    expected_um = 50.0 * compute_figure_change_per_ppm()
+    assert change_um[10] == pytest.approx(expected_um[2], abs=0.05)
+    assert change_um[3] == pytest.approx(expected_um[1], abs=0.05)
+    assert found[1].sag_um == pytest.approx(found[0].sag_um, abs=0.1)
 
 
 def test_a_steady_room_changes_nothing() -> None:
