@@ -41,7 +41,6 @@ LAMP_SIGMA_MM = 90.0
 LAMP_PLACE_MM = (150.0, 90.0)
 POISSON_RATIO = 0.38
 _STEP = 2e-5  # of the pre-strain, for the derivative
-ROUND_TERMS = (1, 4, 11, 22)  # Noll indices of `compute_figure_change_per_ppm`
 _THICKNESS_RATIO = 5.0  # of mirror and back film
 
 
@@ -170,20 +169,3 @@ def compute_profile_change_per_ppm() -> FloatArray:
         profile[0] = 0.0
         heights.append(profile / scale)
     return np.asarray(1e3 * NOMINAL_SAG_MM * (heights[0] - heights[1]) / (2 * _STEP) * 1e-6)
-
-
-@cache
-def compute_figure_change_per_ppm() -> FloatArray:
-    """Change of the figure at equal sag for an excess strain of 1e-6: its `ROUND_TERMS` in µm.
-
-    Heights are upward and the vertex is held.
-    """
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    v = (nodes + 1) / 2
-    change_um = np.polynomial.polynomial.polyval(v, compute_profile_change_per_ppm())
-    terms = [
-        math.sqrt(2 * k + 1)
-        * float(np.sum(weights / 2 * change_um * np.polynomial.legendre.Legendre.basis(k)(nodes)))
-        for k in range(4)
-    ]
-    return np.array(terms)

@@ -14,8 +14,9 @@ from membrane_ctrl.metrology.film.climate_figure import compute_climate_sensitiv
 from membrane_ctrl.metrology.film.climate_fit import ClimateFit, Expansion, fit_climate
 from membrane_ctrl.model.events import Maintenance
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.sim.climate import ClimateBlock, Room, compute_figure_change_per_ppm
+from membrane_ctrl.sim.climate import ClimateBlock, Room
 from membrane_ctrl.sim.sensors import FILM_NOISE_K, HUMIDITY_NOISE_PERCENT, RING_NOISE_K
+from tests.worlds.climate_terms import compute_figure_change_per_ppm
 
 MINUTE_S = 60.0
 NIGHT = 14 * 60

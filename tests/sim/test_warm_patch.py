@@ -16,7 +16,6 @@ from membrane_ctrl.sim.climate import (
     LAMP_K,
     POISSON_RATIO,
     Room,
-    compute_figure_change_per_ppm,
 )
 from membrane_ctrl.sim.figure_changes import climate_change, lamp_change, list_figure_changes
 from membrane_ctrl.sim.film import NOMINAL_SAG_MM, RADIUS_MM
@@ -24,6 +23,7 @@ from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.truth import Truth
 from membrane_ctrl.sim.warm_patch import Patch, compute_patch_polynomial
+from tests.worlds.climate_terms import compute_figure_change_per_ppm
 from tests.worlds.second_optics import Material
 from tests.worlds.second_optics.film import FilmSolver, WarmPatch
 

@@ -14,7 +14,7 @@ from scipy.integrate import solve_bvp
 from membrane_ctrl.control.climate import CHANGE_RMS, CHANGE_SPHERICAL
 from membrane_ctrl.metrology.film.climate_figure import compute_climate_sensitivity
 from membrane_ctrl.metrology.film.climate_fit import Expansion, fit_climate
-from membrane_ctrl.sim.climate import ROUND_TERMS, compute_figure_change_per_ppm
+from tests.worlds.climate_terms import ROUND_TERMS, compute_figure_change_per_ppm
 
 RADIUS_MM = 500.0
 SAG_MM = 37.1
