@@ -45,8 +45,9 @@ _CAUSE_SIGMAS: dict[HarmonicCause, float] = {
     "modulus": 0.1,
     "shear": 0.3,
 }
+_OF_FILM = ("modulus", "shear")
 # Causes that strain the film: finite slopes change their waves. A ring that is not flat bends it.
-_BY_STRAIN = ("modulus", "shear", "prestrain", "round")
+_BY_STRAIN = (*_OF_FILM, "prestrain", "round")
 # Standard uncertainty, before any measurement, of a term of a figure that all sets share: that of a
 # lens or a mount.
 _SHARED_SIGMA_MM = 0.3
@@ -351,6 +352,7 @@ def _fit_parity(
     mixed: FloatArray = np.mean(misfit_covariances(figures), axis=0)
     spread: FloatArray = np.kron(mixed, np.eye(terms.size))[None].astype(np.float64)
     count = len(causes)
+    of_film = [k for k, cause in enumerate(causes) if cause in _OF_FILM]
     by_strain = [k for k, cause in enumerate(causes) if cause in _BY_STRAIN]
     by_causes = response.reshape(-1, count)
     by_shared_terms = np.tile(np.eye(terms.size), (len(figures), 1))
@@ -359,21 +361,24 @@ def _fit_parity(
 
     def solve(design: FloatArray, prior_sigmas: FloatArray, least_mm: float) -> Solved:
         """The unknowns of one hypothesis, causes first; least_mm is the least misfit of a term."""
-        size_mm = least_mm
-        # Twice: what finite slopes change of the waves follows from their size.
-        for _ in range(2):
-            found = average_over_misfits(
-                design,
-                data.ravel(),
-                noise,
-                spread,
-                np.zeros(prior_sigmas.size),
-                prior_sigmas**-2,
-                size_mm,
+        nothing = np.zeros(prior_sigmas.size)
+        precision = prior_sigmas**-2
+
+        def average(size_mm: float) -> Solved:
+            return average_over_misfits(
+                design, data.ravel(), noise, spread, nothing, precision, size_mm
             )
-            waves_mm = response[..., by_strain] @ found.mean[by_strain]
-            size_mm = float(np.hypot(least_mm, _FOEPPL * np.sqrt(np.mean(waves_mm**2))))
-        return found
+
+        def widen(found: Solved, chosen: list[int]) -> float:
+            waves_mm = response[..., chosen] @ found.mean[chosen]
+            return float(np.hypot(least_mm, _FOEPPL * np.sqrt(np.mean(waves_mm**2))))
+
+        # What finite slopes change of an orthotropic film's waves follows from their size.
+        found = average(widen(average(least_mm), of_film))
+        # So does what they change of the waves of a clamping. That is in the bars only: a clamping
+        # that explains another cause's waves badly must not become likely by it.
+        size_mm = widen(found, by_strain)
+        return replace(average(size_mm), log_evidence=found.log_evidence)
 
     # The two hypotheses, both with the causes' amounts and the shared terms as unknowns.
     alone = solve(by_causes, cause_sigmas, float(np.hypot(seen_mm, product_mm)))
