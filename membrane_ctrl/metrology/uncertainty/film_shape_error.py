@@ -20,7 +20,9 @@ from membrane_ctrl.model.arrays import FloatArray
 _SAG_WEIGHT = 1e3  # of the sag, relative to one height
 _GRID = 41  # points along the diameter
 # Points of a patch over the usual number, below which its slopes are a selection.
-_LEAST_COUNT = 0.7
+_LEAST_COUNT = 0.3
+_RINGS = 20  # of patches, whose slopes scatter alike
+_TINY = 1e-30  # instead of a division by zero
 # Points of a ring at which the mean of a smooth slope is computed.
 _AZIMUTHS = 24
 _RADII = 4
@@ -144,7 +146,8 @@ def wave_effect(
     # rim of one direction alone.
     usual = float(np.median(patches.count[patches.count > 0]))
     count = np.where(patches.count > _LEAST_COUNT * usual, patches.count, 0.0)
-    weights = np.sqrt(np.tile(count, 2))
+    variance = np.maximum(_variance_by_ring(patches, count), max(slope_variance, _TINY))
+    weights = np.sqrt(np.tile(count / variance, 2))
     left = np.hstack([beyond - absorbed.T @ own for own, beyond in pairs]).T
     wave_left = (left * weights[:, None] / radius_mm)[:, terms_beyond_fit.WAVE]
     seen = patches.slopes.ravel() * weights
@@ -156,8 +159,7 @@ def wave_effect(
 
     # Amplitudes of the waves from the slopes, by least squares with their prior; then the error of
     # the parameters from the amplitudes.
-    mean_square = float(np.sum(seen**2)) / max(2 * np.count_nonzero(count), 1)
-    scatter = max(mean_square, slope_variance)
+    scatter = max(float(np.sum(seen**2)) / max(2 * np.count_nonzero(count), 1), _TINY)
     sigmas_mm = np.array([wave.sigma_mm for wave in terms_beyond_fit.WAVES])
     normal = wave_left.T @ wave_left + scatter * np.diag(1 / sigmas_mm**2)
     amplitudes_of_slopes = np.linalg.solve(normal, wave_left.T)
@@ -167,7 +169,24 @@ def wave_effect(
     # The amplitudes' covariance after these least squares.
     unknown = error_of_waves @ np.linalg.cholesky(scatter * np.linalg.inv(normal))
     effects_mm = np.column_stack([answer @ seen, unknown])
-    return effects_mm, slope_variance * float(np.sum(answer**2))
+    noise_mm2 = slope_variance * float(np.sum(answer**2 / np.tile(variance, 2)))
+    return effects_mm, noise_mm2
+
+
+def _variance_by_ring(patches: residual_patches.Patches, count: FloatArray) -> FloatArray:
+    """Variance of a slope of one point (patches,), by the scatter in the patch's ring: wrinkles are
+    at the rim alone.
+
+    `count` (patches,) are the numbers of points, 0 for patches that are not used.
+    """
+    radius_mm = np.hypot(*patches.places_mm)
+    ring = (radius_mm / max(float(radius_mm.max()), _TINY) * _RINGS).astype(int)
+    ring = np.minimum(ring, _RINGS - 1)
+    squares = count * np.sum(patches.slopes**2, axis=0) / 2
+    of_ring = np.bincount(ring, squares, _RINGS) / np.maximum(
+        np.bincount(ring, count > 0, _RINGS), 1.0
+    )
+    return np.asarray(of_ring[ring])
 
 
 def _absorbed_terms(
