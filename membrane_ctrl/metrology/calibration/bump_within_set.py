@@ -149,4 +149,4 @@ def _solve_turn(sums: FloatArray, of_turned: FloatArray) -> tuple[float, FloatAr
     reduced = normal_equations.eliminate_first(whole, local)
     turned_deg = np.linalg.solve(reduced[:-1, :-1], reduced[:-1, -1])
     least = float(reduced[-1, -1] - reduced[:-1, -1] @ turned_deg)
-    return least, turned_deg
+    return least, np.asarray(turned_deg, float)

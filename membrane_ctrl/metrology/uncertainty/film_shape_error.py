@@ -159,7 +159,8 @@ def wave_effect(
 
     # Amplitudes of the waves from the slopes, by least squares with their prior; then the error of
     # the parameters from the amplitudes.
-    scatter = max(float(np.sum(seen**2)) / max(2 * np.count_nonzero(count), 1), _TINY)
+    used = int(np.count_nonzero(count))
+    scatter = max(float(np.sum(seen**2)) / max(2 * used, 1), _TINY)
     sigmas_mm = np.array([wave.sigma_mm for wave in terms_beyond_fit.WAVES])
     normal = wave_left.T @ wave_left + scatter * np.diag(1 / sigmas_mm**2)
     amplitudes_of_slopes = np.linalg.solve(normal, wave_left.T)

@@ -183,8 +183,8 @@ def test_a_camera_that_was_bumped_is_no_unturned_figure() -> None:
 
 def mixed_set(x: SetPhases, y: SetPhases) -> SetPhases:
     """The x fringes of one set and the y fringes of another, in the bins that both have."""
-    places = [each.row_px * 1e4 + each.column_px for each in (x, y)]
-    _, of_x, of_y = np.intersect1d(*places, return_indices=True)
+    of_x_set, of_y_set = (each.row_px * 1e4 + each.column_px for each in (x, y))
+    _, of_x, of_y = np.intersect1d(of_x_set, of_y_set, return_indices=True)
     return replace(
         x,
         column_px=x.column_px[of_x],

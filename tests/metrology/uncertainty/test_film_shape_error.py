@@ -45,7 +45,7 @@ def measured_patches(is_wrinkled: bool, noise: float) -> tuple[Patches, Array, f
         slopes += 6e-5 * rim * np.cos(6 * np.arctan2(y, x)) * np.stack([x, y])
     normal = sum((of * count) @ of.T for of in basis) / RADIUS_MM**2
     right = sum((of * count) @ slope for of, slope in zip(basis, slopes, strict=True)) / RADIUS_MM
-    inverse = np.linalg.inv(normal)
+    inverse = np.asarray(np.linalg.inv(normal), float)
     taken_mm = inverse @ right
     left = slopes - np.stack([taken_mm @ of for of in basis]) / RADIUS_MM
     similar_mm = AMPLITUDE_MM * _most_similar_surfaces()[:, place]
