@@ -195,7 +195,7 @@ def _origin_text(resolution: str, given: list[dict[str, Any]]) -> str:
     seconds = sum(one["cpu_s"] for one in given) / len(given)
     return (
         f"{len(given)} benches at {size}, {seconds:.1f} s of a core each, "
-        f"commit {', '.join(commits)}.\n"
+        f"seeds {given[0]['seed']} to {given[-1]['seed']}, commit {', '.join(commits)}.\n"
     )
 
 
@@ -332,9 +332,9 @@ sigmas of a hand measurement, half those of a hundredth. About three effects com
 by cause lists them. Two sets a bench, 120 s apart; in between, camera and screen move by what the
 bar of a change allows for (3 µm and 3 µrad, 10 µm along their axes, 1 sigma). With a laser the
 truth is the film at the mean of the sinusoids, without one at the mean of all frames, which the bar
-covers. `make benches` measures up to 500 of them at a
-quarter of the resolution, 6 s of a core each: half an hour on 2 cores. A run can be stopped and
-continues where it was; the numbers below state how many were measured.
+covers. `make benches` measures up to 500 of them at a quarter of the resolution, 6 s of a core
+each: half an hour on 2 cores. A run can be stopped and continues where it was; the numbers below
+state how many were measured. [500 benches at rest](second-world-at-rest.md) have another page.
 
 Tables give the share of the 95 % intervals that contain the truth (goal 93 to 97 %), and bar over
 scatter (1 is sharp), of sets that are `ok` or `degraded`.
