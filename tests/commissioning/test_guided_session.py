@@ -385,3 +385,22 @@ def test_a_session_on_the_emulated_bench_names_its_option(
     assert f"`membrane-ctrl commission {tmp_path} --twin` resumes this session" in person.text
     with pytest.raises(InputError, match="add --twin"):
         CommissioningSession(tmp_path, RealBench(), person.display)
+
+
+def test_a_killed_stage_leaves_its_wider_limit_to_the_next_start(
+    tmp_path: Path, bench: QuickBench
+) -> None:
+    run_stages(tmp_path, bench, Person(), *DESK)
+    context = context_of(tmp_path, bench, Person())
+    files = [tmp_path / "session.json", tmp_path / CONFIGURATION]
+    with context.lend_keys("limits", displacement_min_um=-36_000.0):
+        left = [file.read_bytes() for file in files]
+    # as a power cut leaves them
+    for file, content in zip(files, left, strict=True):
+        file.write_bytes(content)
+    assert load_toml(tmp_path / CONFIGURATION, Config).limits.displacement_min_um == -36_000.0
+    again = Person()
+    run_stages(tmp_path, bench, again, *DESK)
+    assert load_toml(tmp_path / CONFIGURATION, Config).limits.displacement_min_um == -2000.0
+    assert "limits.displacement_min_um" in again.text
+    assert state_of(tmp_path).lent == {}

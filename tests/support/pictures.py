@@ -244,6 +244,8 @@ async def _commission_picture(folder: Path) -> bytes:
         await tab.click("No")
         await wait_for_text(tab, "none is fitted")
         await tab.click("Enter")
+        await wait_for_text(tab, "How does the camera see the mirror?")
+        await click(tab, "choose")
         await wait_for_text(tab, "What drives the pump?")
         await tab.screenshot(target, whole=False)
     return target.read_bytes()

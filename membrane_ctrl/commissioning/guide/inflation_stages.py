@@ -47,25 +47,20 @@ def without_camera(context: StageContext) -> Iterator[None]:
     The controller would also compare laser and camera over steps of many millimetres, for which
     the camera's model of the bowl is not meant.
     """
-    is_enabled = context.config.shape.enabled
-    context.set_keys("shape", enabled=False)
-    try:
+    with context.lend_keys("shape", enabled=False):
         yield
-    finally:
-        context.set_keys("shape", enabled=is_enabled)
 
 
 def inflate_in_steps(context: StageContext) -> None:
     """Fill the mirror in steps, and compare laser and gauge."""
     facts = context.facts
-    limits = context.config.limits
     dialogue = context.dialogue
     sag_um = 1e3 * facts.sag_mm
-    # The depths on the way are below the limit of the finished mirror: it is widened meanwhile.
-    context.set_keys("limits", displacement_min_um=-_HELD_LEAST_SHARE * sag_um)
     points: list[DepthPoint] = []
     try:
         with (
+            # The depths on the way are below the limit of the finished mirror.
+            context.lend_keys("limits", displacement_min_um=-_HELD_LEAST_SHARE * sag_um),
             without_camera(context),
             context.access.start_hold(context.folder, context.config, "inflation") as link,
         ):
@@ -84,8 +79,6 @@ def inflate_in_steps(context: StageContext) -> None:
                 points.append(hold_depth(context, link, setpoint_um))
     except HoldError as error:
         raise StageFailedError(f"the controller ended the inflation: {error}") from None
-    finally:
-        context.set_keys("limits", displacement_min_um=limits.displacement_min_um)
     judge_law(context, points)
 
 

@@ -26,6 +26,7 @@ from membrane_ctrl.commissioning.guide.session_state import (
     TomlTable,
     read_state,
     read_tables,
+    restore_lent_keys,
     write_state,
 )
 from membrane_ctrl.commissioning.guide.stage import (
@@ -96,6 +97,10 @@ class CommissioningSession:
         Raises DeviceError or InputError for files that cannot be written or read.
         """
         self._dialogue.show(_HELP)
+        restored = restore_lent_keys(self._folder, self._state)
+        if restored:
+            names = ", ".join(restored)
+            self._dialogue.show(f"the last start was cut off: {names} are as before its stage")
         self._show_plan()
         index = self._find_first_open()
         try:

@@ -73,6 +73,8 @@ class SessionState(BaseModel):
     answers: dict[str, str] = {}
     records: list[StageRecord] = []
     facts: MirrorFacts | None = None
+    lent: dict[str, float | bool] = {}
+    """Configuration keys that a stage has changed for its own time, with their values before."""
 
     def find_record(self, stage: str) -> StageRecord | None:
         """The record of a stage, if it is finished."""
@@ -133,3 +135,50 @@ def write_tables(folder: Path, tables: TomlTable) -> Config:
     with errors.convert_write_errors(path, errors.DeviceError):
         files.write_text_atomic(path, _HEAD + tomli_w.dumps(tables))
     return config
+
+
+def set_keys(tables: TomlTable, table: str, **keys: Any) -> None:
+    """Set keys of a table, such as `optics.mirror`, that may be missing."""
+    target = tables
+    for name in table.split("."):
+        target = target.setdefault(name, {})
+    target.update(keys)
+
+
+def restore_lent_keys(
+    folder: Path, state: SessionState, names: tuple[str, ...] | None = None
+) -> tuple[str, ...]:
+    """Write back what a stage has changed for its own time.
+
+    A stage does it at its end. What is killed meanwhile leaves it to the next start.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the session.
+    state : SessionState
+    names : tuple of str, optional
+        Of the keys; all by default.
+
+    Returns
+    -------
+    tuple of str
+        The names of the keys that were restored.
+
+    Raises
+    ------
+    InputError, DeviceError
+        A file is damaged or cannot be written.
+    """
+    lent = {name: state.lent[name] for name in names or tuple(state.lent)}
+    if not lent:
+        return ()
+    tables = read_tables(folder)
+    for name, value in lent.items():
+        table, _, key = name.rpartition(".")
+        set_keys(tables, table, **{key: value})
+    write_tables(folder, tables)
+    for name in lent:
+        del state.lent[name]
+    write_state(folder, state)
+    return tuple(lent)

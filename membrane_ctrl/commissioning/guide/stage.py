@@ -1,6 +1,7 @@
 """A stage of a session: what it does, what must be seen, and its checks."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from membrane_ctrl.commissioning.guide.session_state import (
     SessionState,
     TomlTable,
     read_tables,
+    restore_lent_keys,
+    set_keys,
+    write_state,
     write_tables,
 )
 from membrane_ctrl.commissioning.guide.threshold import Threshold
@@ -82,11 +86,21 @@ class StageContext:
     def set_keys(self, table: str, **keys: Any) -> None:
         """Set keys of a table, such as `optics.mirror`, in the configuration file."""
         tables = read_tables(self.folder)
-        target = tables
-        for name in table.split("."):
-            target = target.setdefault(name, {})
-        target.update(keys)
+        set_keys(tables, table, **keys)
         self._write(tables)
+
+    @contextlib.contextmanager
+    def lend_keys(self, table: str, **keys: float | bool) -> Iterator[None]:
+        """Change keys of a table for a time; a killed session restores them at its next start."""
+        present = getattr(self.config, table)
+        names = tuple(f"{table}.{key}" for key in keys)
+        self.state.lent |= {f"{table}.{key}": getattr(present, key) for key in keys}
+        write_state(self.folder, self.state)
+        self.set_keys(table, **keys)
+        try:
+            yield
+        finally:
+            restore_lent_keys(self.folder, self.state, names)
 
     def remove_table(self, parent: str, name: str) -> None:
         """Remove a table below another, such as `front_film` of `optics.mirror`, if it is there."""
