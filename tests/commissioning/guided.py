@@ -29,6 +29,7 @@ PERSON = {
     "interlock2.driver": "none",
     "signature": "Ann",
 }
+_QUESTIONS_MOST = 1000
 SHORT = SessionPlan(settled_s=5.0, hold_s=20.0)
 
 
@@ -60,6 +61,7 @@ class Person:
 
     def read_line(self, key: str, prompt: str) -> str:
         self.asked.append(key)
+        assert len(self.asked) < _QUESTIONS_MOST, f"{key} is asked again and again"
         answer = self._answers.get(key)
         if isinstance(answer, list):
             if answer:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.commissioning.check import DeviceProbe
 from membrane_ctrl.commissioning.guide.bench_access import HandAct, HandMotion
 from membrane_ctrl.commissioning.guide.dialogue import Choice, Dialogue
+from membrane_ctrl.commissioning.guide.good_readings import select_good
 from membrane_ctrl.commissioning.guide.inflation_stages import DepthPoint, judge_law
 from membrane_ctrl.commissioning.guide.mirror_design import PAPER_MIRROR
 from membrane_ctrl.commissioning.guide.real_bench import RealBench
@@ -21,12 +24,15 @@ from membrane_ctrl.commissioning.guide.session_state import (
     SessionState,
     read_state,
 )
-from membrane_ctrl.commissioning.guide.stage import StageContext
+from membrane_ctrl.commissioning.guide.stage import SessionPlan, StageContext, StageFailedError
 from membrane_ctrl.commissioning.guide.text_display import TextDisplay
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import load_toml
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.model.errors import Exit, InputError
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.truth import Truth
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.commissioning.guided import Person, QuickBench, failed_in, run_stages, state_of
 
 DESK = ("mirror", "devices")
@@ -404,3 +410,38 @@ def test_a_killed_stage_leaves_its_wider_limit_to_the_next_start(
     assert load_toml(tmp_path / CONFIGURATION, Config).limits.displacement_min_um == -2000.0
     assert "limits.displacement_min_um" in again.text
     assert state_of(tmp_path).lent == {}
+
+
+class LossyBench(QuickBench):
+    """Every seventh sample of the laser is lost."""
+
+    def _use_bench(self, config: Config) -> VirtualBench:
+        bench = super()._use_bench(config)
+        sample_of = Plant.sample_of
+        plant = bench.plant
+
+        def sample_lossy(truth: Truth) -> BoardSample:
+            sample = sample_of(plant, truth)
+            is_lost = sample.sample_counter % 7 == 0
+            return replace(sample, displacement_quality=1) if is_lost else sample
+
+        plant.sample_of = sample_lossy  # type: ignore[method-assign]
+        return bench
+
+
+def test_lost_samples_of_the_laser_are_no_reason_to_stop(tmp_path: Path) -> None:
+    bench = LossyBench()
+    run_stages(tmp_path, bench, Person(), *DESK)
+    config = load_toml(tmp_path / CONFIGURATION, Config)
+    bench.use_mirror(VirtualBench(Plant(config.twin, config.pump)))
+    person = Person()
+    plan = SessionPlan(settled_s=5.0, leak_s=20.0)
+    run_stages(tmp_path, bench, person, "laser", "inflation", "leak", plan=plan)
+    assert "nan" not in person.text
+    assert "passed: laser's sign" in person.text
+    assert failed_in(tmp_path, person) == []
+
+
+def test_a_laser_that_loses_most_is_named() -> None:
+    with pytest.raises(StageFailedError, match="the laser gave 1 readings in 3 samples"):
+        select_good([math.nan, 1.0, math.nan], "laser")

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from membrane_ctrl.commissioning.guide import thresholds
+from membrane_ctrl.commissioning.guide.good_readings import average_good, select_good
 from membrane_ctrl.commissioning.guide.mirror_design import derive_design
 from membrane_ctrl.commissioning.guide.stage import (
     StageContext,
@@ -27,6 +28,7 @@ from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
 _WHO = "commission"
 _HELD_LEAST_SHARE = 0.99  # of the sag: limits.displacement_min_um while the mirror is filled
 _FULL_SHARE = 0.01  # of the sag: the mirror is at its depth
+_PRESENT_S = 1.0  # a laser may lose some of its readings
 _REPORT_S = 600.0  # between two lines of progress
 _DEPTHS_LEAST = 4  # three unknowns
 _LAW_PA = 2.0  # least squares: a gauge's error is a share of its reading, but not below this
@@ -64,11 +66,7 @@ def inflate_in_steps(context: StageContext) -> None:
             without_camera(context),
             context.access.start_hold(context.folder, context.config, "inflation") as link,
         ):
-            present_um = wait_for_row(link).displacement_um
-            if not np.isfinite(present_um):
-                raise StageFailedError(
-                    "the laser shows nothing: it must see the film from flat to full depth"
-                )
+            present_um = _find_present_um(link)
             for share in context.plan.inflation_shares:
                 setpoint_um = (share - 1.0) * sag_um
                 if setpoint_um < present_um - 0.01 * sag_um:
@@ -80,6 +78,14 @@ def inflate_in_steps(context: StageContext) -> None:
     except HoldError as error:
         raise StageFailedError(f"the controller ended the inflation: {error}") from None
     judge_law(context, points)
+
+
+def _find_present_um(link: HoldLink) -> float:
+    """The laser's newest reading. Raises StageFailedError if it has none for some seconds."""
+    for row in reversed(collect_rows(link, _PRESENT_S)):
+        if np.isfinite(row.displacement_um):
+            return row.displacement_um
+    raise StageFailedError("the laser shows nothing: it must see the film from flat to full depth")
 
 
 def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> DepthPoint:
@@ -98,8 +104,9 @@ def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> Dep
     watch_rows(context, link, is_there, timeout_s)
     # Measure it once it is held.
     rows = collect_rows(link, context.plan.settled_s)
-    sag_mm = context.facts.sag_mm + 1e-3 * float(np.mean([row.displacement_um for row in rows]))
-    pressure_pa = float(np.mean([row.gauge_pressure_pa for row in rows]))
+    displacement_um = average_good([row.displacement_um for row in rows], "laser")
+    sag_mm = context.facts.sag_mm + 1e-3 * displacement_um
+    pressure_pa = average_good([row.gauge_pressure_pa for row in rows], "gauge")
     context.dialogue.show(f"  holding {sag_mm:.2f} mm at {pressure_pa:.1f} Pa")
     return DepthPoint(sag_mm, pressure_pa)
 
@@ -229,8 +236,10 @@ def measure_leak(context: StageContext) -> None:
     if len(rows) < 10:
         raise StageFailedError("the pump did not stay off")
     # The mirror sinks evenly in a minute: the slope of a straight line.
-    times_s = np.array([row.mono_s for row in rows])
-    leak_um_per_s = -float(np.polyfit(times_s, [row.displacement_um for row in rows], 1)[0])
+    select_good([row.displacement_um for row in rows], "laser")
+    seen = [row for row in rows if np.isfinite(row.displacement_um)]
+    times_s = np.array([row.mono_s for row in seen])
+    leak_um_per_s = -float(np.polyfit(times_s, [row.displacement_um for row in seen], 1)[0])
     context.judge(
         "leak at the held depth",
         leak_um_per_s,
@@ -249,7 +258,7 @@ def measure_leak(context: StageContext) -> None:
         thresholds.PUMP_LEAST,
         "fit a smaller pump or a flow controller, or open a bleed (`loop.bleed_fraction`)",
     )
-    estimated = float(np.mean([row.leak_um_per_s for row in held]))
+    estimated = float(np.nanmean([row.leak_um_per_s for row in held]))
     context.note("leak as the controller estimates it", f"{estimated:.2f} µm/s")
     # w0 / (3 T) is the speed: with it the twin leaks as this mirror does.
     time_constant_s = 1e3 * context.facts.sag_mm / (3.0 * max(leak_um_per_s, 1e-6))

@@ -18,6 +18,7 @@ from membrane_ctrl.commissioning.guide.bench_access import (
     HandMotion,
     OpenBench,
 )
+from membrane_ctrl.commissioning.guide.good_readings import average_good, select_good
 from membrane_ctrl.commissioning.guide.mirror_design import derive_design
 from membrane_ctrl.commissioning.guide.session_state import SessionState, TomlTable
 from membrane_ctrl.commissioning.guide.stage import (
@@ -125,7 +126,7 @@ def test_gauge_zero(context: StageContext) -> None:
     """Read the gauge of the vented mirror."""
     context.dialogue.wait("gauge_zero", "Vent the mirror, shut the gas supply")
     readings = _act(context, lambda opened: read_for(opened, _READ_S))
-    gauge_pa = np.array([reading.gauge_pressure_pa for reading in readings])
+    gauge_pa = np.array(select_good([each.gauge_pressure_pa for each in readings], "gauge"))
     context.judge(
         "gauge reading of the vented mirror",
         abs(float(np.mean(gauge_pa))),
@@ -431,9 +432,12 @@ def _act(context: StageContext, action: Action[T]) -> T:
 
 
 def _mean(context: StageContext, name: str) -> float:
-    """The mean of a sensor; NaN if it has no reading."""
+    """The mean of a sensor's readings; NaN if most of them are lost."""
     readings = _act(context, lambda opened: read_for(opened, _READ_S))
-    return float(np.mean([getattr(reading, name) for reading in readings]))
+    try:
+        return average_good([getattr(reading, name) for reading in readings], name)
+    except StageFailedError:
+        return math.nan
 
 
 def _judge_readback(
