@@ -61,11 +61,9 @@ _OFF_REPEATS = 2
 # has jumped. Noise alone does so in a few of ten thousand tests.
 _STEP_CHI2 = 20.0
 _MEDIAN_STEP = 0.954  # median of the difference of two readings, in units of the noise of one
-# All changes of speed are measured from that with everything off: a weak pump behind a noisy laser
-# is found only if that is known. 1 µm of noise at 50 Hz has 0.4 µm/s after the part's measuring
-# time; a noisier laser takes longer, and has this much more time than the part's longest.
-_OFF_SIGMA_MOST_UM_PER_S = 0.4
-_OFF_MORE_S = 2.0
+# All changes of speed are measured from that with everything off. With 1 µm of noise it has
+# 0.4 µm/s after the part's measuring time; a noisier laser takes longer.
+_OFF_SIGMA_MOST_UM_PER_S = 0.6
 # A speed is measured over all readings after a part's waiting time, but at most over so many
 # seconds: noise averages out, and the beginning of a slow response is left behind.
 _VENT_WINDOW_MOST_S = 2.0
@@ -318,7 +316,7 @@ class ActuatorTest:
             memory.off_repeats += 1
             self._begin_part(memory.part)
             return
-        is_last = memory.part_s >= part.longest_s + _OFF_MORE_S - 1e-9
+        is_last = memory.part_s >= part.longest_s - 1e-9
         if speed.sigma_um_per_s > _OFF_SIGMA_MOST_UM_PER_S and not is_last:
             return
         memory.off_um_per_s = speed.um_per_s

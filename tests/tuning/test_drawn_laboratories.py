@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from firmware_iface.emulators.pump_board import BoardSample
-from membrane_ctrl.model.telemetry import State
 from tests.studies.laboratory_sessions import (
     ended_well,
     format_page,
@@ -161,9 +160,3 @@ def test_a_session_has_the_gains_that_the_start_has_limited() -> None:
     assert link.config.loop.kp_per_s < 0.6 * stated.loop.kp_per_s
     assert link.config.loop.ti_s > stated.loop.ti_s
     assert link.config.model_copy(update={"loop": stated.loop, "pump": stated.pump}) == stated
-
-
-@pytest.mark.parametrize("seed", [93, 193])
-def test_a_weak_pump_behind_a_noisy_slow_laser_starts(seed: int) -> None:
-    laboratory = draw_laboratory(seed)
-    assert open_hold(laboratory, laboratory.config(), 2).rows[-1].state == State.HOLD
