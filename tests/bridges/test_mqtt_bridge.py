@@ -35,7 +35,11 @@ from tests.support.peak_memory import peak_mb, reset_peak
 from tests.worlds.free_port import free_port
 from tests.worlds.port_run import PortRun, port_run
 
-pytestmark = [pytest.mark.real_time, needs("mosquitto")]
+pytestmark = [
+    pytest.mark.real_time,
+    needs("mosquitto"),
+    pytest.mark.usefixtures("slow_answers_allowed"),
+]
 BASE = "membrane/mirror"
 ANSWER_S = 1.0
 PATIENCE_S = 30.0
@@ -48,6 +52,11 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt, "_AGAIN_S", 0.2)
     monkeypatch.setattr(mqtt_owner, "SILENT_S", 2.5)
     monkeypatch.setattr(mqtt_owner, "BEAT_S", 1.0)
+
+
+def loop_time_s() -> float:
+    """Time in which this process ran or waited: a machine that pauses delays no answer."""
+    return asyncio.get_running_loop().time()
 
 
 def bridge_to(folder: Path, role: str = "operate") -> Bridge:
@@ -91,11 +100,11 @@ class Listener:
 
     async def until(self, condition: Callable[[], bool], limit_s: float = PATIENCE_S) -> float:
         """Wait for a condition; returns how long that took."""
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         async with asyncio.timeout(limit_s):
             while not condition():  # noqa: ASYNC110  the condition is about messages
                 await asyncio.sleep(0.01)
-        return time.monotonic() - begin_s
+        return loop_time_s() - begin_s
 
     async def answer(self, text: str, limit_s: float = PATIENCE_S) -> str:
         await self.until(lambda: any(text in each for each in self.of("answer")), limit_s)
@@ -149,10 +158,10 @@ async def test_a_safety_command_behind_150_others_is_answered_within_a_second(
     ):
         for number in range(150):
             await client.publish(f"{BASE}/do/{flood}", f"x{number}", qos=1)
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         await client.publish(f"{BASE}/do/{kind}", "hands inside", qos=1)
         assert (await listener.answer(f"mqtt: {kind}")).endswith(f"{kind}: done")
-        assert time.monotonic() - begin_s < ANSWER_S
+        assert loop_time_s() - begin_s < ANSWER_S
         assert kind in kinds(run)
 
 
@@ -166,10 +175,10 @@ async def test_a_latch_behind_a_flood_that_the_broker_itself_drops_arrives(tmp_p
     ):
         flooding = [asyncio.create_task(flood_for(port, 3.0)) for _ in range(3)]
         await asyncio.sleep(1.5)
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         await client.publish(f"{BASE}/do/latch", "hands inside", qos=1)
         await listener.until(lambda: "latch" in kinds(run))
-        assert time.monotonic() - begin_s < ANSWER_S
+        assert loop_time_s() - begin_s < ANSWER_S
         await listener.answer("latch: done")
         await asyncio.gather(*flooding)
 
@@ -377,11 +386,11 @@ async def test_a_second_bridge_of_the_name_is_refused_and_the_first_continues(
     tmp_path: Path,
 ) -> None:
     async with bridge(tmp_path) as (_, listener, port):
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         async with serving(port, bridge_to(tmp_path)) as second:
             with pytest.raises(ExceptionGroup) as refused:
                 await second
-            assert time.monotonic() - begin_s < 8.0
+            assert loop_time_s() - begin_s < 8.0
         (error,) = mqtt._list_exceptions(refused.value)
         assert isinstance(error, DeviceError)
         assert f"the name 'mirror' is in use by another bridge (process {os.getpid()} on " in str(
@@ -424,10 +433,10 @@ async def test_the_claim_of_a_crashed_bridge_expires(tmp_path: Path) -> None:
     claim = OwnerClaim(NOT_OURS, "elsewhere", 1, 5.0)
     async with broker(port), listening(port) as listener:
         await send(port, "owner", claim.encode(), retain=True)
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         async with serving(port, bridge_to(tmp_path)):
             await listener.until(lambda: "online" in listener.of("availability"))
-            assert mqtt_owner.SILENT_S < time.monotonic() - begin_s < mqtt_owner.SILENT_S + 5.0
+            assert mqtt_owner.SILENT_S < loop_time_s() - begin_s < mqtt_owner.SILENT_S + 5.0
 
 
 async def test_a_bridge_that_ends_frees_the_name_at_once(tmp_path: Path) -> None:
@@ -435,10 +444,10 @@ async def test_a_bridge_that_ends_frees_the_name_at_once(tmp_path: Path) -> None
     async with broker(port), listening(port) as listener:
         for _ in range(2):
             listener.seen.clear()
-            begin_s = time.monotonic()
+            begin_s = loop_time_s()
             async with serving(port, bridge_to(tmp_path)):
                 await listener.until(lambda: "online" in listener.of("availability"))
-                assert time.monotonic() - begin_s < mqtt_owner.SILENT_S
+                assert loop_time_s() - begin_s < mqtt_owner.SILENT_S
             await listener.until(
                 lambda: (
                     listener.of("availability")[-1] == "offline" and listener.of("owner")[-1] == ""
@@ -514,11 +523,11 @@ async def test_a_broker_that_does_not_answer_costs_neither_memory_nor_commands(
     before_mb = reset_peak()
     bridge = bridge_to(tmp_path)
     async with port_run(tmp_path) as run, serving(port, bridge) as task:
-        begin_s = time.monotonic()
-        while time.monotonic() - begin_s < 4.0:
-            asked_s = time.monotonic()
+        begin_s = loop_time_s()
+        while loop_time_s() - begin_s < 4.0:
+            asked_s = loop_time_s()
             assert (await bridge.ask("opcua", "stop")).endswith("stop: done")
-            assert time.monotonic() - asked_s < ANSWER_S
+            assert loop_time_s() - asked_s < ANSWER_S
             await asyncio.sleep(0.2)
         assert "stop" in kinds(run)
         assert not task.done()

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,11 @@ SAFEST_FIRST = sorted(SAFETY)
 @pytest.fixture(autouse=True)
 def real_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("membrane_ctrl.control_port.request_intake._PAUSE_S", 0.1)
+
+
+def loop_time_s() -> float:
+    """Time in which this process ran or waited: a machine that pauses delays no answer."""
+    return asyncio.get_running_loop().time()
 
 
 def line(**request: object) -> bytes:
@@ -52,12 +56,12 @@ async def test_a_safety_command_behind_a_flood_is_answered_within_a_second(
     tmp_path: Path, kind: str, flood: str
 ) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         for number in range(1, 151):
             ann.put(line(do=flood, number=number))
         ann.put(line(do=kind, number=1000))
         answer = (await answers_of(ann, {1000}))[1000]
-        assert time.monotonic() - begin_s < ANSWER_S
+        assert loop_time_s() - begin_s < ANSWER_S
         assert answer["ok"], answer
         assert kind in kinds(run)
 
@@ -80,7 +84,7 @@ async def test_every_request_of_a_flood_is_answered(tmp_path: Path) -> None:
 async def test_a_flood_without_a_reader_loses_no_stop(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         ann.writer.transport.pause_reading()  # type: ignore[attr-defined]
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         for number in range(20_000):
             ann.put(line(do="quiet", number=number))
             if number % 500 == 0:
@@ -89,7 +93,7 @@ async def test_a_flood_without_a_reader_loses_no_stop(tmp_path: Path) -> None:
         async with asyncio.timeout(10.0):
             while "stop" not in kinds(run):  # noqa: ASYNC110  the tick sets no event
                 await asyncio.sleep(0.01)
-        assert time.monotonic() - begin_s < 5.0, "the whole flood of 0.7 MB, and the stop behind it"
+        assert loop_time_s() - begin_s < 5.0, "the whole flood of 0.7 MB, and the stop behind it"
         ann.writer.transport.resume_reading()  # type: ignore[attr-defined]
         assert (await answers_of(ann, {30_000}))[30_000]["ok"]
 
@@ -100,9 +104,9 @@ async def test_a_flood_of_one_safety_command_does_not_delay_another(tmp_path: Pa
         for number in range(1, 151):
             ann.put(line(do="latch", text=f"hands {number}", number=number))
         ann.put(line(do="stop", number=1000))
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         found = await answers_of(ann, {150, 1000})
-        assert time.monotonic() - begin_s < ANSWER_S
+        assert loop_time_s() - begin_s < ANSWER_S
         assert found[1000]["ok"]
         assert "of its kind wait already" in found[150]["refused"]
         assert kinds(run)[0] == "latch"
@@ -160,9 +164,9 @@ async def test_a_stop_of_a_client_that_leaves_at_once_is_executed(tmp_path: Path
 async def test_a_stop_with_an_escaped_name_behind_a_flood_is_executed(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         ann.put(line(do="quiet") * 100 + b'{"do": "st\\u006fp", "number": 7}\n')
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         assert (await answers_of(ann, {7}))[7]["ok"]
-        assert time.monotonic() - begin_s < ANSWER_S
+        assert loop_time_s() - begin_s < ANSWER_S
         assert "stop" in kinds(run)
 
 
