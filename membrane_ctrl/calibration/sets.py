@@ -12,7 +12,7 @@ from membrane_ctrl.calibration.set_points import edges_of, phases_of, phases_of_
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry import file, prior_file, set_tables
 from membrane_ctrl.measure.capture_set import CaptureHead, read_head, read_set
-from membrane_ctrl.measure.measurement import Figures
+from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.rays import set_phases
 from membrane_ctrl.metrology.rays.moved_screen import MovedScreen
 from membrane_ctrl.model import errors, terminal
@@ -90,7 +90,7 @@ def read_sets(
     # Sets with the screen in its place come first: those with a moved screen are joined to them.
     ordered = sorted(folders, key=lambda folder: heads[folder].screen_moved is not None)
     for folder in terminal.track_progress(ordered, "sets"):
-        # Its phases.
+        # Its phases, and the rim that it shows.
         head = heads[folder]
         _refuse_turned_artefact(head)
         if head.artefact == "screen":
@@ -100,14 +100,8 @@ def read_sets(
             head = figure.head
             phases = phases_of(folder.name, figure.checked, head.optics)
             phases = replace(phases, artefact=figure.artefact, turned=head.turned)
-            notes += [
-                f"{folder.name}: {head.files[flag.frame]} omitted: {flag.reason}"
-                for flag in figure.checked.flags
-            ]
-            if head.artefact is None and head.turned is None:
-                edges_px = edges_of(figure)
-                if edges_px is not None:
-                    edges.append(edges_px)
+            notes += _list_omitted_frames(folder, figure)
+            edges += _find_edges(figure)
 
         # Its bench, which must be that of the first set.
         bench = head.optics.model_copy(update={"geometry": head.before_move})
@@ -134,16 +128,11 @@ def read_sets(
         )
 
     # The laser reading at the origin.
-    stated_um = sorted({benches[k].geometry.reference_displacement_um or 0.0 for k in films})
-    apart = ""
-    if reference_um is None and len(stated_um) > 1:
-        apart = (
-            f"the sets state reference_displacement_um from {stated_um[0]:.0f} to "
-            f"{stated_um[-1]:.0f} µm; the first set's is used: if the geometry was measured again "
-            "for each set, they are not of one bench"
-        )
     film_sets = [sets[k] for k in films]
     film_benches = [benches[k] for k in films]
+    apart = ""
+    if reference_um is None:
+        apart = _explain_other_references(film_benches)
     reference_um = _reference_um(film_sets, film_benches, reference_um)
     if not any(math.isfinite(phases.displacement_um) for phases in film_sets):
         # Without a laser, the origin is the vertex of the first set.
@@ -151,6 +140,36 @@ def read_sets(
     if not edges:
         notes.append("the rim is not seen in any full set: its size is not used")
     return Bundle(tuple(sets), benches[films[0]], reference_um, tuple(notes), apart, tuple(edges))
+
+
+def _list_omitted_frames(folder: Path, figure: SetFigure) -> list[str]:
+    """Return a note for each frame of a set that is not used."""
+    return [
+        f"{folder.name}: {figure.head.files[flag.frame]} omitted: {flag.reason}"
+        for flag in figure.checked.flags
+    ]
+
+
+def _find_edges(figure: SetFigure) -> list[FloatArray]:
+    """Return the points of the rim in the picture of a set, if it shows the mirror as it usually
+    stands; else nothing.
+    """
+    if figure.head.artefact is not None or figure.head.turned is not None:
+        return []
+    edges_px = edges_of(figure)
+    return [] if edges_px is None else [edges_px]
+
+
+def _explain_other_references(benches: Sequence[OpticsConfig]) -> str:
+    """Return what is wrong if sets state different readings at the origin; empty if they do not."""
+    stated_um = sorted({bench.geometry.reference_displacement_um or 0.0 for bench in benches})
+    if len(stated_um) < 2:
+        return ""
+    return (
+        f"the sets state reference_displacement_um from {stated_um[0]:.0f} to "
+        f"{stated_um[-1]:.0f} µm; the first set's is used: if the geometry was measured again "
+        "for each set, they are not of one bench"
+    )
 
 
 def _refuse_turned_artefact(head: CaptureHead) -> None:

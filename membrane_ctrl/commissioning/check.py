@@ -70,8 +70,26 @@ class DeviceProbe:
 def check_config(config: Config, source: str, as_json: bool) -> int:
     """Check the configuration, probe the devices and report.
 
-    Raises InputError with one line per bad setting; after the report, DeviceError if a device
-    cannot be used.
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+    source : str
+        Its file, for messages.
+    as_json : bool
+        Print the report as JSON.
+
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    InputError
+        With one line per bad setting.
+    DeviceError
+        After the report: a device cannot be used.
     """
     findings = dict.fromkeys(require_sound(config, source))  # before touching any device
     if config.devices is not None:
@@ -335,11 +353,21 @@ def _measure_samples_hz(
 
 
 async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> DeviceProbe:
-    """Probe the board without writing, also while another program controls it.
+    """Probe the board without writing, also while another program controls it. Claim and watchdog
+    are unaffected.
 
-    Claim and watchdog are unaffected.
+    Parameters
+    ----------
+    board : PumpBoard
+        Not yet connected.
+    name : str
+        For the report.
+    laser : bool
+        Whether the bench must have one.
 
-    `laser`: whether the bench must have one.
+    Returns
+    -------
+    DeviceProbe
     """
     try:
         identity = await board.identify()
@@ -517,10 +545,28 @@ def _time_exposures(optics: optical_bench.OpticalBench) -> tuple[float, float, f
 
 
 def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
-    """`conformance`: test a board and report; exits with REJECTED if it fails.
+    """Test a board, print the findings; the command `conformance`.
 
-    Raises InputError for a bad URL, DeviceError if the board is locked, does not answer, or another
-    program uses it.
+    Parameters
+    ----------
+    url : str
+        Of the board.
+    unit_id : int
+        Modbus unit.
+    as_json : bool
+        Print them as JSON.
+
+    Returns
+    -------
+    int
+        The exit code, REJECTED if the board fails.
+
+    Raises
+    ------
+    InputError
+        The URL is wrong.
+    DeviceError
+        The board is locked, does not answer, or another program uses it.
     """
     try:
         with device_claim.claim_devices(device_names.modbus_names(url, unit_id)):

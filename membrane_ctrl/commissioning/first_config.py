@@ -29,11 +29,27 @@ _TWIN = "tcp://127.0.0.1:{port}"
 
 
 def write_first_config(path: Path, twin: bool, ask: bool) -> int:
-    """Write the file: for the twin, from answers, or, without a terminal, for the twin with what is
-    connected.
+    """Write a first configuration: for the twin, from answers, or, without a terminal, for the twin
+    with what is connected.
 
-    Raises InputError for a file that exists or cannot be written, and for answers that contradict
-    each other.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    twin : bool
+        For the twin.
+    ask : bool
+        There is a terminal.
+
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    InputError
+        The file exists or cannot be written, or answers contradict each other.
     """
     if path.exists() or path.is_symlink():
         raise errors.InputError(

@@ -96,11 +96,27 @@ ROLES_OF_DRIVERS = (*roles.ROLES, *_OPTICS)
 
 
 def write_package(name: str, role: str, folder: Path) -> int:
-    """Write the folder `<name>-driver` below another one, never over an existing one, and print
-    what to do next.
+    """Write the package of a new driver below a folder, never over an existing one, and print what
+    to do next.
 
-    Raises InputError for a name that is taken or is none, an unknown role, and a folder that cannot
-    be written.
+    Parameters
+    ----------
+    name : str
+        Of the driver; the package's folder is `<name>-driver`.
+    role : str
+        That it fills.
+    folder : Path
+        In which the package is written.
+
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    InputError
+        The name is taken or is none, the role is unknown, or the folder cannot be written.
     """
     _require_free(name)
     if role not in ROLES_OF_DRIVERS:

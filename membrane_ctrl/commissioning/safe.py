@@ -34,12 +34,31 @@ _LAPSE_S = 1.0  # beyond a watchdog period the board will not stop the pump any 
 
 
 def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: bool = True) -> int:
-    """Stop the pump of a configuration from `source`; leave the vent as it is.
+    """Stop the pump of a configuration; leave the vent as it is.
 
-    With `latch`, the board latches its stop and the devices are locked: nothing runs the pump until
-    a person removes the lock. Without it, a program that has the devices keeps running.
+    Parameters
+    ----------
+    config : Config
+        With the devices.
+    source : str
+        Its file, for messages.
+    logs_dir : Path or None
+        Folder of the runs.
+    latch : bool
+        The board latches its stop and the devices are locked: nothing runs the pump until a person
+        removes the lock. Without it, a program that has the devices keeps running.
 
-    Raises InputError without devices, DeviceError if the pump could not be stopped or locked.
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    InputError
+        There are no devices.
+    DeviceError
+        The pump could not be stopped or locked.
     """
     if config.devices is None:
         raise InputError(f"{source}: devices: missing; nothing to make safe")

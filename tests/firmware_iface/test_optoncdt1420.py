@@ -23,6 +23,7 @@ from firmware_iface.emulators.optoncdt1420 import NO_PEAK, encode_three_bytes
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import Optoncdt1420Config
+from tests.support.memory_bench import run_on_bench
 from tests.support.virtual_time import run_virtual, stand_still
 from tests.worlds.faulty_devices import MemoryWire, Optoncdt1420Emulator
 
@@ -44,14 +45,7 @@ class Bench:
 
 
 def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], **settings: Any) -> None:
-    async def opened() -> None:
-        bench = Bench(**settings)
-        await bench.driver.open()
-        await test(bench)
-        await bench.driver.close()
-        assert asyncio.all_tasks() == {asyncio.current_task()}
-
-    run_virtual(opened())
+    run_on_bench(lambda: Bench(**settings), test)
 
 
 def measurement(raw: int, counter: int) -> bytes:

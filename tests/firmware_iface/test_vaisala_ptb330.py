@@ -15,6 +15,7 @@ from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import VaisalaPtb330Config
+from tests.support.memory_bench import run_on_bench
 from tests.support.virtual_time import run_virtual
 from tests.worlds.faulty_devices import MemoryWire, SerialFaults, VaisalaPtb330Emulator
 
@@ -34,14 +35,7 @@ class Bench:
 
 
 def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], **emulator: Any) -> None:
-    async def opened() -> None:
-        bench = Bench(**emulator)
-        await bench.driver.open()
-        await test(bench)
-        await bench.driver.close()
-        assert asyncio.all_tasks() == {asyncio.current_task()}
-
-    run_virtual(opened())
+    run_on_bench(lambda: Bench(**emulator), test)
 
 
 def test_frames() -> None:

@@ -13,6 +13,7 @@ from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import VentusConfig
+from tests.support.memory_bench import run_on_bench
 from tests.support.virtual_time import run_virtual
 from tests.worlds.faulty_devices import MemoryWire, SerialFaults, VentusEmulator
 
@@ -28,14 +29,7 @@ class Bench:
 
 
 def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], **settings: Any) -> None:
-    async def opened() -> None:
-        bench = Bench(**settings)
-        await bench.driver.open()
-        await test(bench)
-        await bench.driver.close()
-        assert asyncio.all_tasks() == {asyncio.current_task()}
-
-    run_virtual(opened())
+    run_on_bench(lambda: Bench(**settings), test)
 
 
 def test_frames() -> None:

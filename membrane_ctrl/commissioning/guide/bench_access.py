@@ -91,7 +91,24 @@ class BenchAccess(Protocol):
     def act(self, config: Config, action: Action[T]) -> T:
         """Open the bench, do something with it, and leave it with the pump off.
 
-        Raises DeviceError if it does not open, LinkError if it fails meanwhile.
+        Parameters
+        ----------
+        config : Config
+            With the devices.
+        action : Action[T]
+            Gets the opened bench.
+
+        Returns
+        -------
+        T
+            What the action returns.
+
+        Raises
+        ------
+        DeviceError
+            The bench does not open.
+        LinkError
+            It fails meanwhile.
         """
         ...
 
@@ -104,8 +121,26 @@ class BenchAccess(Protocol):
     ) -> AbstractContextManager[HoldLink]:
         """Start the controller in standby; it is stopped at the end of the block.
 
-        An emulated bench measures figures from rendered frames only if `by_frames`: they cost
-        seconds of processor time. Raises DeviceError if it does not start.
+        Parameters
+        ----------
+        folder : Path
+            Of the session.
+        config : Config
+            The configuration of the hold.
+        name : str
+            Of the run.
+        by_frames : bool
+            Measure figures from rendered frames; an emulated bench does so only if this is set,
+            because they cost seconds of processor time.
+
+        Returns
+        -------
+        AbstractContextManager[HoldLink]
+
+        Raises
+        ------
+        DeviceError
+            It does not start.
         """
         ...
 
@@ -116,7 +151,22 @@ class BenchAccess(Protocol):
     def run_tuning(
         self, folder: Path, config: Config, command: str, show: Callable[[str], None]
     ) -> int:
-        """Run `tune run` or `tune pump` on the hold that runs, or on the twin, and show what it
-        prints; returns its exit code.
+        """Run `tune` on the hold that runs, or on the twin.
+
+        Parameters
+        ----------
+        folder : Path
+            Of the session.
+        config : Config
+            The configuration of the hold.
+        command : str
+            `run` or `pump`.
+        show : callable
+            Receives each printed line.
+
+        Returns
+        -------
+        int
+            The exit code.
         """
         ...

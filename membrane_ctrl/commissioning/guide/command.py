@@ -32,9 +32,26 @@ _BEGIN_MOST = 1000  # characters of the line that names a session
 def commission_bench(
     folder: Path, make_virtual_hold: MakeHold | None = None, as_messages: bool = False
 ) -> int:
-    """Run or resume the session of a folder, on the emulated bench if its hold is given.
+    """Run or resume the session of a folder.
 
-    Raises InputError or DeviceError.
+    Parameters
+    ----------
+    folder : Path
+        Of the session; is made.
+    make_virtual_hold : MakeHold or None
+        Makes the hold of the emulated bench; None for the configured devices.
+    as_messages : bool
+        Exchange messages with a program instead of a terminal.
+
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    InputError, DeviceError
+        The folder cannot be used, or the session failed.
     """
     if not as_messages:
         return _run_session(folder, TextDisplay(read_terminal_line, print_line), make_virtual_hold)

@@ -158,7 +158,19 @@ class Dialogue:
             self.display.show_line(line)
 
     def ask_text(self, key: str, question: str, default: str = "", is_needed: bool = False) -> str:
-        """Ask for a text; an empty answer is the default, or asked again if one is needed."""
+        """Ask for a text.
+
+        Parameters
+        ----------
+        key : str
+            Under which the answer is kept.
+        question : str
+            For the person.
+        default : str
+            What an empty answer stands for.
+        is_needed : bool
+            An empty answer without a default is asked again.
+        """
 
         def parse(text: str) -> str:
             if is_needed and not text:
@@ -171,7 +183,21 @@ class Dialogue:
     def ask_number(
         self, key: str, question: str, default: float, low: float, high: float, unit: str = ""
     ) -> float:
-        """Ask for a number within limits."""
+        """Ask for a number until it is within limits.
+
+        Parameters
+        ----------
+        key : str
+            Under which the answer is kept.
+        question : str
+            For the person.
+        default : float
+            What an empty answer stands for.
+        low, high : float
+            The limits.
+        unit : str
+            Of the number.
+        """
 
         def parse(text: str) -> float:
             if _THOUSANDS.fullmatch(text):
@@ -198,7 +224,24 @@ class Dialogue:
     def ask_choice(
         self, key: str, question: str, choices: Sequence[Choice], default: str = ""
     ) -> str:
-        """Ask for one of a numbered list; returns its name. A number or a name is accepted."""
+        """Ask for one of a numbered list; a number or a name is accepted.
+
+        Parameters
+        ----------
+        key : str
+            Under which the answer is kept.
+        question : str
+            For the person.
+        choices : sequence of Choice
+            The list.
+        default : str
+            Name that an empty answer stands for.
+
+        Returns
+        -------
+        str
+            The name of the choice.
+        """
         names = [choice.name for choice in choices]
 
         def parse(text: str) -> str:

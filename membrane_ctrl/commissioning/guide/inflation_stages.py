@@ -89,7 +89,17 @@ def _find_present_um(link: HoldLink) -> float:
 
 
 def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> DepthPoint:
-    """Hold a depth for a while, and measure it."""
+    """Move the held mirror to a depth, hold it there for a while, and measure it.
+
+    Parameters
+    ----------
+    context : StageContext
+        Of the stage.
+    link : HoldLink
+        Of the hold.
+    setpoint_um : float
+        The depth, as displacement.
+    """
     # Move there.
     link.send_command(Command("setpoint", _WHO, value=setpoint_um))
     if wait_for_row(link).state == State.STANDBY:
@@ -145,7 +155,29 @@ def watch_rows(
     is_done: Callable[[TelemetryRow], bool],
     timeout_s: float,
 ) -> TelemetryRow:
-    """Follow the hold until a row is as wanted. Raises StageFailedError on a fault or time-out."""
+    """Follow the hold until a row is as wanted.
+
+    Parameters
+    ----------
+    context : StageContext
+        Of the stage; shows the progress.
+    link : HoldLink
+        Of the hold.
+    is_done : callable
+        Whether a row is as wanted.
+    timeout_s : float
+        Longest time.
+
+    Returns
+    -------
+    TelemetryRow
+        That row.
+
+    Raises
+    ------
+    StageFailedError
+        A fault, or the time is over.
+    """
     began_s = shown_s = None
     while True:
         for row in read_sound_news(link).rows:
@@ -175,6 +207,13 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
     """Compare laser and gauge by the film's law, p = p0 + a w + c w^3.
 
     The linear term is the tension that the film has been clamped with; it cannot be negative.
+
+    Parameters
+    ----------
+    context : StageContext
+        Of the stage; records the check.
+    points : list of DepthPoint
+        Depths with their pressures; four at least.
     """
     if len(points) < _DEPTHS_LEAST:
         context.leave_out(

@@ -71,6 +71,19 @@ def write_report(
     """Write `report.html` and `report.pdf`; returns whether the bench is accepted.
 
     Raises DeviceError if they cannot be written.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the session.
+    stages : sequence of CommissioningStage
+        All stages, in their order.
+    state : SessionState
+        What the session has recorded.
+    tables : TomlTable
+        The configuration.
+    signed_by : str
+        Name of the person.
     """
     reasons = find_reasons(stages, state, tables)
     page = _make_page(folder, stages, state, reasons, signed_by)

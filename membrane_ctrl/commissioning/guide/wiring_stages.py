@@ -85,8 +85,29 @@ async def run_outputs(
 ) -> list[roles.BenchReading]:
     """Keep pump and vent commanded, then switch the pump off.
 
-    Raises StageFailedError, with the pump off and the vent open, if the pressure rises or one of
-    the interlocks opens.
+    Parameters
+    ----------
+    opened : OpenBench
+        The bench.
+    command : BenchCommand
+        Of pump and vent.
+    duration_s : float
+        For so long.
+    gauge_most_pa : float
+        Highest pressure.
+    interlocks : tuple of InterlockDriver
+        Must stay closed meanwhile.
+
+    Returns
+    -------
+    list of BenchReading
+        The readings meanwhile.
+
+    Raises
+    ------
+    StageFailedError
+        The pressure rises beyond it, or one of the interlocks opens; the pump is then off and the
+        vent open.
     """
     readings: list[roles.BenchReading] = []
     if interlocks:

@@ -313,18 +313,7 @@ def _fit_round(
         predicted_mm = round_terms_mm(bowls, reach) + finite_mm
         return np.append(predicted_mm.ravel(), x[3:][is_gauged] + x[2])
 
-    # Their covariances: of noise and geometry, of the gauge, and of a misfit of size 1.
-    offset = gauge.offset_pa / pressure_pa[is_gauged]
-    reading_noise = (gauge.noise_pa / pressure_pa[is_gauged]) ** 2
-    of_gauge = np.outer(offset, offset) + gauge.scale**2 + np.diag(reading_noise)
-    split = len(terms)
-    noise = np.zeros((target.size, target.size))
-    noise[:split, :split] = shared_covariance(figures, ROUND)
-    noise[split:, split:] = of_gauge
-    misfits = np.zeros((GROWTHS.size, *noise.shape))
-    of_terms = np.diag(_FREEDOM**2)
-    for misfit, of_figures in zip(misfits, misfit_covariances(figures), strict=True):
-        misfit[:split, :split] = np.kron(of_figures, of_terms)
+    noise, misfits = _assemble_covariances(figures, gauge, pressure_pa[is_gauged])
 
     # The prior, and the start: Hencky's film at each sag.
     known = np.append([0.0, POISSON, _LOG_STIFFNESS], np.zeros(count))
@@ -370,6 +359,32 @@ def _fit_round(
         found.append(solved)
     whole = average_models(found)
     return whole.mean, whole.covariance[:3, :3], whole.size_mm
+
+
+def _assemble_covariances(
+    figures: Sequence[FilmFigure], gauge: Gauge, gauged_pa: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariance (data, data) of the data by their noise, and those (growths, data, data) by a
+    misfit of size 1 of each growth.
+
+    Data are the round terms and the excess of each figure, and the logarithm of each gauged load.
+    """
+    # A gauge has an offset and a scale, which all its readings share, and noise.
+    offset = gauge.offset_pa / gauged_pa
+    reading_noise = (gauge.noise_pa / gauged_pa) ** 2
+    of_gauge = np.outer(offset, offset) + gauge.scale**2 + np.diag(reading_noise)
+
+    # Terms and loads have independent errors; a misfit is one of the terms.
+    split = len(figures) * len(ROUND)
+    size = split + gauged_pa.size
+    noise = np.zeros((size, size))
+    noise[:split, :split] = shared_covariance(figures, ROUND)
+    noise[split:, split:] = of_gauge
+    misfits = np.zeros((GROWTHS.size, size, size))
+    of_terms = np.diag(_FREEDOM**2)
+    for misfit, of_figures in zip(misfits, misfit_covariances(figures), strict=True):
+        misfit[:split, :split] = np.kron(of_figures, of_terms)
+    return noise, misfits
 
 
 def _limit_step(x: FloatArray, step: FloatArray) -> float:
