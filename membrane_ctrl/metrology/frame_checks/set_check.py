@@ -89,6 +89,11 @@ def check_set(
     if not is_one_surface(found):
         found = put_exchanged_back(stack, binned, optics, anchor) or found
     _require_stated_orientation(optics, stack, found.phase_rad, binned.bin_px)
+    if any(flag.defect.is_found_by_prediction for flag in found.flags):
+        # A wrong orientation also predicts frames wrongly: without these, the harmonics of a
+        # response leave waves that hide it.
+        phase_rad = _phases_alone(stack, binned, optics, anchor)
+        _require_stated_orientation(optics, stack, phase_rad, binned.bin_px)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Sets whose slopes belong to no surface: their contrast shows no blur."""
+"""Sets whose slopes belong to no surface: what is named as the cause, and what is not."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from membrane_ctrl.measure.measurement import measure_set
 from tests.studies.second_benches import FOLDING_LENS, draw_bench
 from tests.studies.second_world_errors import measured_errors
 from tests.worlds.second_optics import Bench, Mirror, Stated, World
@@ -34,3 +35,11 @@ def test_a_lens_that_folds_and_contradicts_the_frames_makes_the_figure_unusable(
     assert found.worst_sigmas > 3
     assert found.verdict == "rejected"
     assert found.reason.startswith("camera.distortion: the lens model folds")
+
+
+def test_turned_pictures_are_named_where_a_frame_was_blamed_for_them(tmp_path: Path) -> None:
+    """Without that frame the harmonics of a gamma hid the orientation: the set was `degraded`."""
+    draw_bench(500, 0.125).world.write_set(tmp_path, 0.0)
+    measurement = measure_set(tmp_path)
+    assert measurement.verdict == "rejected"
+    assert "the pictures are rotated by 180 degrees" in measurement.reason
