@@ -672,6 +672,7 @@ class CentreFilter:
 
     def _make_estimate(self, now_s: float) -> CentreEstimate:
         x, row = self.memory.x, self._find_centre_row(now_s)
+        # The centre drifts by the leak, and by gas that warms towards the air.
         drift = float(x[_LEAK])
         if self._gas_follows_air_s > 0:
             gain = self._warmth_gain * (1.0 + x[_WARMTH_ERROR])

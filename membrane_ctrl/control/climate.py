@@ -163,15 +163,18 @@ class Climate:
         memory, config = self.memory, self._config
         if math.isnan(memory.film.value.value) and math.isnan(memory.moisture.value.value):
             return ClimateStrain()
+        # Strains by heat and by water since the lock.
         by_heat_ppm = config.film_ppm_per_k * memory.film.change
         by_water_ppm = config.film_ppm_per_percent * memory.moisture.change
         ring_ppm = config.ring_ppm_per_k * memory.ring.change
+        # Temperatures may have wandered where no sensor shows them.
         film_k = _wander(_WANDER_K, memory.film.unseen_s)
         if not memory.has_film_sensor:
             film_k = math.hypot(film_k, _FILM_AS_AIR_K)
         ring_k = _wander(_WANDER_K, memory.ring.unseen_s)
         if not memory.sees_ring:
             ring_k = math.hypot(ring_k, _RING_AS_AIR_K)
+        # Independent errors: of the expansions, of unseen changes, of the start.
         parts = (
             config.film_sigma_relative * by_heat_ppm,
             config.film_sigma_relative * by_water_ppm,

@@ -190,6 +190,8 @@ class HeldOffset:
             return given.distrust
         if not given.settled:
             return make_reason(ShapeCode.NOT_SETTLED, "the mirror does not rest at its setpoint")
+        # A figure from before the mirror settled does not count; without a new one for long, the
+        # loop waits.
         usable = figure is not None and figure.time_s >= memory.settled_since_s
         if not usable:
             waits_since_s = max(memory.seen_s, memory.settled_since_s)
@@ -201,6 +203,7 @@ class HeldOffset:
         finite = np.isfinite(figure.coeffs_um).all() and np.isfinite(figure.covariance_um2).all()
         if not finite:
             return make_reason(ShapeCode.NOT_FINITE, "the terms of the figure are not finite")
+        # A jump beyond the drift so far is none of the mirror.
         if memory.state != HeldState.WAITING:
             jump_um = self._find_offset_change(figure) - memory.drift.drift_at(
                 figure.time_s, self._time_constant_s

@@ -144,12 +144,14 @@ def unpack_estimate(data: bytes) -> ShapeEstimate:
     except RecursionError:
         raise ValueError("shape estimate: not one flat JSON object") from None
     _require_valid(head)
+    # Coefficients as doubles, then the upper half of the covariance as singles.
     if len(arrays) != _COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE:
         raise ValueError(f"shape estimate: {len(arrays)} bytes of arrays do not fit its first line")
     coeffs_um = np.frombuffer(arrays, dtype="<f8", count=ZERNIKE_TERMS)
     values = np.frombuffer(arrays, dtype="<f4", offset=_COEFFS_BYTES)
     if np.isinf(coeffs_um).any() or np.isinf(values).any():
         raise ValueError("shape estimate: infinite coefficient or covariance")
+    # The covariance is symmetric.
     covariance = np.empty((ZERNIKE_TERMS, ZERNIKE_TERMS))
     rows, columns = _UPPER
     covariance[rows, columns] = covariance[columns, rows] = values

@@ -222,6 +222,7 @@ class OpenWindows(StateNode):
         tuple of float and dict of str to (rows,) array
             The level's window in s, and its finished rows.
         """
+        # Ticks become rows of the finest level; those of the last window wait.
         is_over = new is None
         ticks = self.ticks
         if new is not None:

@@ -135,6 +135,7 @@ class Plant:
     def truth(self) -> Truth:
         """The true state."""
         i = self._index
+        # Depth by the pressure, and its change per amount of gas, by which flows become speeds.
         gas, ambient_pa = self._gas, self._ambient_pa[i]
         gauge_pa = gas.gauge_pressure_pa
         sag_mm = self._sag[i] * gas.root_pa

@@ -42,6 +42,7 @@ def advise_number(solution: Solution, index: int) -> Advice | None:
         Number of the set whose sag is considered.
     """
     # The sag's sigma with each free parameter known better.
+    # Each number in turn, as if it were known better: the covariance follows without new residuals.
     sums = np.sum([each.eliminate_surface() for each in solution.equations], axis=0)
     sigmas = solution.problem.sigmas
     advice = []

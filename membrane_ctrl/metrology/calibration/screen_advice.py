@@ -69,6 +69,7 @@ def advise_screen_sets(solution: Solution, index: int) -> tuple[ScreenAdvice, ..
         The most useful first.
     """
     problem = solution.problem
+    # What has not been taken yet.
     half_mm = np.max(
         [np.abs(problem.sets[k].screen_mm).max(axis=1) for k in problem.film_sets], axis=0
     )
@@ -148,6 +149,7 @@ def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Sol
     """The solution with the film of one set seen again, the screen moved along a rail, and by how
     far.
     """
+    # The screen a rail's length away, known as well as a rail allows.
     film = solution.problem.sets[index]
     present = solution.equations[index]
     known = MovedScreen((0.0, 0.0, _RAIL_MM), RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0)
@@ -155,6 +157,7 @@ def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Sol
     state = replace(solution.states[index], moved_screens=(move,))
     there = foreseen_set(solution, film.add_screen_place(film, known), state, half_mm)
     again = there.subset(there.select_screen(1))
+    # The equations of this set with the points of both places.
     all_weights = np.append(present.robust.weights, np.ones(again.sigma_mm.size))
     robust = replace(present.robust, weights=all_weights)
     linear = list(solution.equations)

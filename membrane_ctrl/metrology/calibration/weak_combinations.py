@@ -118,6 +118,7 @@ def _describe_combination(
     whose numbers are `free` (k,).
     """
     # The effect of one sigma on the surface; the laser's scale has none.
+    # The change of the surface, as heights over the disc, with and without its plane.
     is_optical = free < bench_poses.OPTICAL
     response = surface_response(solution, index)[:, free[is_optical]]
     change_mm = response @ amounts[is_optical]

@@ -317,12 +317,15 @@ def _name_pattern(
     """
     k = flag.frame
     own = evidence[k]
+    # A frame that repeats another one is stale.
     identical = earlier.get(k)
     if identical is None:
         identical = next((late for late, early in earlier.items() if early == k), None)
     if identical is not None:
         reason = f"stale: the same picture as {stack.patterns[identical].name}"
         return Flag(k, FrameDefect.STALE, reason, flag.severity)
+    # Else it may show the picture of another frame; if that one shows this picture, they are
+    # swapped.
     if own.shows == k:
         return flag
     name = stack.patterns[own.shows].name

@@ -330,6 +330,7 @@ def _judge_white_and_black(
     axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArray
 ) -> list[SeriesFlag]:
     """Flags of white and black, which must enclose all that the fringes show."""
+    # Brightest and darkest tenth of the fringes at each pixel, against white and black.
     frames = np.concatenate([axis.frames.reshape(-1, black.size) for axis in axes])
     margin = _BEYOND_MARGIN * np.ptp(np.percentile(frames, [5, 95]))
     typical_high, typical_low = np.percentile(frames, [90, 10], axis=0)

@@ -101,6 +101,7 @@ def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
     distortion: tuple[float, ...] = ()
     if lens.any():
         distortion = tuple(float(k) for k in lens)
+    # Poses, lens and bow replace the stated ones; the focal length changes by its logarithm.
     bow_per_mm = stated.face.bow_per_mm + bow_mm / BOW_RADIUS_MM**2
     geometry = replace(
         stated,

@@ -72,6 +72,7 @@ def read_minutes(run: Run) -> dict[str, FloatArray]:
     """Minute means of the spherical term and of the climate's sensors, as `fit_climate` takes
     them.
     """
+    # The spherical term of each usable figure.
     shapes = run.shapes()
     ok = np.asarray(shapes.verdict) != "rejected"
     shape_s = np.asarray(shapes.time_s)[ok]
@@ -79,6 +80,7 @@ def read_minutes(run: Run) -> dict[str, FloatArray]:
     names = [f"mean_{name}" for name in _SENSORS]
     level = run.level(_WINDOW_S, names=names)
     time_s = np.asarray(level["time_s"])
+    # Means of the figures of each minute.
     minute = np.searchsorted(time_s, shape_s, side="right") - 1
     counts = np.bincount(np.clip(minute, 0, None), minlength=time_s.size)[: time_s.size]
     sums = np.bincount(np.clip(minute, 0, None), spherical_um, time_s.size)[: time_s.size]

@@ -137,6 +137,7 @@ def _image_last(
     """The image by one cycle, and the deviations of Strehl ratio and radius by its noise."""
     mirror = config.optics.mirror
     aperture_mm = mirror.analysis_radius_mm
+    # A grid over the aperture.
     axis_mm = (np.arange(_CELLS) + 0.5) * 2 * aperture_mm / _CELLS - aperture_mm
     x, y = np.meshgrid(axis_mm, axis_mm)
     outside = np.hypot(x, y) > aperture_mm
@@ -155,6 +156,7 @@ def _image_last(
     covariance_um2 = _find_covariance(shapes, place)
     if np.isnan(covariance_um2).any():
         return found, math.nan, math.nan
+    # The deviations, by images of figures drawn from the covariance.
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(coeffs_um, covariance_um2, _DRAWS, check_valid="ignore")
     images = [image(cast(FloatArray, draw)) for draw in draws]

@@ -174,6 +174,7 @@ class PartReader:
         """Bytes to which a column chunk unpacks. Raises ValueError if it is damaged,
         or too large.
         """
+        # The bytes of the chunk, with the checksum of the manifest.
         start, size = chunk_span(chunk)
         if start < 0 or size < 0 or start + size > self._size_bytes:
             raise ValueError(f"column {chunk.path_in_schema} is cut off")
@@ -181,6 +182,7 @@ class PartReader:
         expected = self._expected_crc32(number, place)
         if expected is not None and zlib.crc32(data) != expected:
             raise ValueError(f"column {chunk.path_in_schema} is damaged")
+        # What they unpack to, by the headers of their pages.
         found = page_headers.measure_chunk(data)
         kind = self.schema.field(chunk.path_in_schema.partition(".")[0]).type
         most_values = rows * (kind.list_size if isinstance(kind, pa.FixedSizeListType) else 1)
