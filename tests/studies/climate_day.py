@@ -40,8 +40,8 @@ from tests.worlds.changing_film import best_sphere_focus_mm, hencky_profile, rad
 TERM_SIGMA_UM = 0.01
 FIGURE_EVERY_S = 60.0
 JUDGE_EVERY_S = 300.0
-# Moisture that changes twice a day moves the film by 119 µm against the gauge within an hour, to which
-# creep and noise are added: more than the default limit, which is made for one wave a day
+# Moisture that changes twice a day moves the film by 119 µm against the gauge within an hour, and
+# creep and noise add to it: more than the default limit, which is made for one wave a day
 GAUGE_DRIFT_UM = 300.0
 SETTLED_S = 600.0  # from the start until the reference is complete
 _STEP = 2e-5  # of the strain, for the derivative of the profile
