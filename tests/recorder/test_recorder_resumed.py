@@ -264,9 +264,16 @@ def test_a_state_above_the_size_limit_is_refused(
 
 
 @pytest.mark.parametrize(
-    "left", [None, b"", b"no state", b"\x80\x04N.", b"[]", b"[" * 10_000, b"{}", b"null"]
+    ("left", "rows_kept", "partial", "ticks"),
+    [
+        (None, 75, True, 100),
+        (None, 3000, False, 100),
+        *(
+            (left, 3000, False, 100)
+            for left in (b"", b"no state", b"\x80\x04N.", b"[]", b"[" * 10_000, b"{}", b"null")
+        ),
+    ],
 )
-@pytest.mark.parametrize(("rows_kept", "partial", "ticks"), [(3000, False, 100), (75, True, 100)])
 def test_without_a_handover_the_statistics_begin_with_the_ring_and_are_marked_partial(
     tmp_path: Path, stack: ExitStack, left: bytes | None, rows_kept: int, partial: bool, ticks: int
 ) -> None:
