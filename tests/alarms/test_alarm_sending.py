@@ -57,9 +57,9 @@ def test_a_service_that_hangs_delays_no_other_and_is_not_asked_again(
         assert send_to_all(services, "t", "b", "warning")
         assert (hanging.calls, good.calls) == (1, count)
     assert not send_to_all(services[:1], "t", "b", "warning")
-    assert time.monotonic() - began_s < 5.0
+    assert time.monotonic() - began_s < 30.0  # without the limit it would hang
     release.set()
-    deadline_s = time.monotonic() + 5.0
+    deadline_s = time.monotonic() + 30.0
     while not send_to_all(services[:1], "t", "b", "warning"):
         assert time.monotonic() < deadline_s
     assert hanging.calls >= 2, "it is asked again once it has returned"

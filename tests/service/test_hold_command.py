@@ -21,6 +21,13 @@ from membrane_ctrl.service.send_limits import SendLimits
 from tests.bridges.test_bridges import bridge_with, seen_hold
 from tests.worlds.port_run import port_run
 
+PATIENCE_S = 30.0  # a machine that runs the tests may pause for seconds
+
+
+def loop_time_s() -> float:
+    """Time in which this process ran or waited."""
+    return asyncio.get_running_loop().time()
+
 
 def limits(seconds: float, refusal: str = "") -> SendLimits:
     return SendLimits(time.monotonic() + seconds, lambda: refusal)
@@ -42,26 +49,26 @@ async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) 
         frozen.bind(str(path))
         frozen.listen(8)
         bridge = bridge_with("operate", dataclasses.replace(seen_hold(), name="the-run"), path)
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         assert "hold refused: not obeyed within 2 s" in await bridge.ask("mqtt", "hold")
-        assert time.monotonic() - begin_s < 2.5
-        begin_s = time.monotonic()
+        assert loop_time_s() - begin_s < 2.5
+        begin_s = loop_time_s()
         assert "latch: no answer from the hold within 0.9 s; still being sent" in await bridge.ask(
             "mqtt", "latch"
         )
-        assert time.monotonic() - begin_s < 1.0
+        assert loop_time_s() - begin_s < 1.0
         waiting, _ = frozen.accept()  # the hold continues
         waiting.sendall(
             b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n'
         )
-        waiting.settimeout(1.0)
+        waiting.settimeout(PATIENCE_S)
         assert waiting.recv(1000) == b"", "the hold command is not sent any more"
         waiting.close()
         latching, _ = frozen.accept()
         latching.sendall(
             b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n'
         )
-        latching.settimeout(5.0)
+        latching.settimeout(PATIENCE_S)
         assert b'"do": "latch"' in await asyncio.to_thread(latching.recv, 1000)
         latching.close()
         await bridge.close()
@@ -106,6 +113,6 @@ async def test_a_command_is_not_sent_after_its_deadline_or_another_decision(tmp_
 async def test_no_hold_is_answered_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bridge = bridge_with("operate", None, tmp_path / "control.sock")
     for name in ("hold", "latch"):
-        begin_s = time.monotonic()
+        begin_s = loop_time_s()
         assert "no hold is listening" in await bridge.ask("mqtt", name)
-        assert time.monotonic() - begin_s < command_lanes.SAFETY_ANSWER_S
+        assert loop_time_s() - begin_s < command_lanes.SAFETY_ANSWER_S
