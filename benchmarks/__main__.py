@@ -31,6 +31,7 @@ BENCHMARKS = {
     "live_cycle": "benchmarks.metrology",
     "tracking": "benchmarks.metrology",
     "measure_full": "benchmarks.metrology",
+    "measure_command": "benchmarks.metrology",
     "monte_carlo": "benchmarks.metrology",
     "acquisition": "benchmarks.metrology",
     "tracking_live": "benchmarks.metrology",

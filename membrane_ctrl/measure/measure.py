@@ -11,7 +11,7 @@ import numpy as np
 
 from membrane_ctrl.config import sight
 from membrane_ctrl.geometry.file import read_geometry
-from membrane_ctrl.measure import figure_report, figure_results, results
+from membrane_ctrl.measure import figure_results, results
 from membrane_ctrl.measure.measurement import Measurement, measure_set
 from membrane_ctrl.measure.sofast_command import check_sofast_file
 from membrane_ctrl.metrology.figure.radial_profile import RadialProfile, radial_profile
@@ -171,6 +171,8 @@ def _write_files(
             outcome.figure,
         )
     if options.report:
+        from membrane_ctrl.measure import figure_report
+
         figure_report.write_report(target, str(options.folder), lines, result, drawn)
     if options.rerun:
         from membrane_ctrl.measure.rerun_recording import log_measurement

@@ -5,8 +5,6 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from membrane_ctrl.geometry.file import GeometryFile
 from membrane_ctrl.geometry.run_geometry import require_plausible
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchor_head, read_set
@@ -111,8 +109,12 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
             error.saturated_fraction,
         )
 
-    # The figure from every pixel, and its verdict.
+    # The figure from every pixel, and its verdict. After the pixels' phases no frames are needed:
+    # they are large.
     pixels = measure_pixels(optics, checked)
+    head = capture.head
+    del capture
+    checked = replace(checked, stack=checked.stack.drop_frames())
     middle = time.perf_counter()
     full = reconstruct_full(optics, checked, pixels)
     end = time.perf_counter()
@@ -125,13 +127,8 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
         verdict, reason = "degraded", "; ".join(reasons)
     timing = {"load": loaded - begin, "phase": middle - loaded, "reconstruct": end - middle}
 
-    # What follows needs no frames: they are large.
-    stack = checked.stack
-    no_frames = np.empty((len(stack.patterns), 0, 0), stack.frames.dtype)
-    checked = replace(checked, stack=replace(stack, frames=no_frames))
-    return Measurement(
-        capture.head, verdict, reason, checked.flags, checked, full, stack.mean_reading_um, timing
-    )
+    mean_um = checked.stack.mean_reading_um
+    return Measurement(head, verdict, reason, checked.flags, checked, full, mean_um, timing)
 
 
 def read_anchor(

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from membrane_ctrl.measure.figure_results import ENERGY_SHARES, MeasuredFigure
 from membrane_ctrl.measure.measurement import Measurement
@@ -63,6 +65,21 @@ def draw_measurement(
     list of Path
         The files.
     """
+    # A title in a fixed place: matplotlib measures all labels of an axis twice to find a free one.
+    with rc_context({"axes.titley": 1.0}):
+        drawn = _draw_pictures(measurement, light, profile, outline, bars, figure)
+        return [write_picture(out / f"{name}.png", picture) for name, picture in drawn.items()]
+
+
+def _draw_pictures(
+    measurement: Measurement,
+    light: FloatArray,
+    profile: radial_profile.RadialProfile | None,
+    outline: rim_outline.Outline | None,
+    bars: ErrorBars | None,
+    figure: MeasuredFigure | None,
+) -> dict[str, Figure]:
+    """All pictures by their names."""
     drawn = {"frames": _draw_frames(measurement)}
     full = measurement.full
     if full is not None and profile is not None:
@@ -84,7 +101,7 @@ def draw_measurement(
             star = _draw_star(figure)
             if star is not None:
                 drawn["star"] = star
-    return [write_picture(out / f"{name}.png", picture) for name, picture in drawn.items()]
+    return drawn
 
 
 def new_sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
@@ -105,10 +122,12 @@ def new_sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> t
 
 
 def _plain_powers(*axes: Any) -> None:
-    """Label logarithmic axes like 1e-06: mathematical type takes a tenth of a second a picture."""
+    """Label logarithmic axes like 1e-06, without ticks between: mathematical type takes a tenth of
+    a second a picture, and each tick as long as a label.
+    """
     for axis in axes:
         axis.set_major_formatter("{x:.0e}")
-        axis.set_minor_formatter("")
+        axis.set_minor_locator(NullLocator())
 
 
 def _draw_figure(found: MeasuredFigure) -> Figure:

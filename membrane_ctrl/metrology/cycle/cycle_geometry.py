@@ -105,7 +105,7 @@ class CycleGeometry:
         return GeometryStatement.from_evidence(self._known_by, self._source, rim, slopes)
 
     def _make_bench(self, tracer: Tracer, state: TrackedPoints, surface: Surface) -> TrialBench:
-        places_px = self._places_px[:, state.index]
+        places_px = np.take(self._places_px, state.index, axis=1)
         exact = np.zeros((2, state.index.size))
         return TrialBench.from_points(
             self._optics, tracer, surface, state.points, places_px, exact, _BENCH_POINTS
@@ -113,7 +113,7 @@ class CycleGeometry:
 
     def _measure_curl_urad(self, tracer: Tracer, state: TrackedPoints, surface: Surface) -> float:
         """Slopes without a surface that the fit of some points leaves."""
-        places_px = self._places_px[:, state.index]
+        places_px = np.take(self._places_px, state.index, axis=1)
         some = spread_evenly(places_px, self._optics.camera.width_px, _SLOPE_POINTS)
         points = state.points.subset(some)
         field = tracer.slope_field(points, surface)

@@ -133,7 +133,7 @@ class CycleMotion:
         """
         # The bins that both cycles have, and by how much their screen points changed.
         place = np.minimum(np.searchsorted(self.index, index), self.index.size - 1)
-        changed_mm = changed_mm - self.changed_mm[:, place]
+        changed_mm = changed_mm - np.take(self.changed_mm, place, axis=1)
         known = np.isfinite(changed_mm).all(axis=0) & (self.index[place] == index)
         place = place[known]
 

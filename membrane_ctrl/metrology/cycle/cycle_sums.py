@@ -121,8 +121,11 @@ class CycleSums:
 
     def take_means(self, index: IntArray) -> Singles:
         """Means (frames, n) of some bins in all frames of a full cycle."""
+        # in single precision, which holds every sum exactly
+        means = np.empty((self._slots.count, index.size), np.float32)
         sums = self._binner.sums[: self._slots.count].reshape(self._slots.count, -1)
-        means = np.take(sums, index, axis=1).astype(np.float32)
+        for of_frame, sums_of_frame in zip(means, sums, strict=True):
+            of_frame[:] = np.take(sums_of_frame, index)
         means /= np.float32(self._bin_px**2)
         return means
 

@@ -197,7 +197,7 @@ class LiveReconstructor:
             return make_rejected_cycle("full", times, readings, cause or str(error))
 
         # The figure, without light of previous pictures.
-        places_px = np.stack([self._grid.column_px, self._grid.row_px])[:, state.index]
+        places_px = np.stack([self._grid.column_px[state.index], self._grid.row_px[state.index]])
         self._sums.remove_lag_of_full(state.index, places_px, state.accepted[:, 0])
         self._watch.begin(state, self._sums.lag)
         self._statement = None
@@ -383,25 +383,29 @@ class LiveReconstructor:
         if self._geometry.cushion is not None:
             return film_image.NO_FILM_IMAGE
         light = images[self._slots.white].astype(float) - images[self._slots.black]
-        bright = float(np.percentile(light, _BRIGHTEST_PERCENTILE))
+        bright = float(np.percentile(light[::_EVERY], _BRIGHTEST_PERCENTILE))
         seen = np.flatnonzero(usable & (light > full_decoder.CONTRAST_SHARE * bright))
 
         # Where their rays cross the plane half way down the bowl, inside the analysed part.
         mirror = self._optics.mirror
         pinhole_mm = self._geometry.pinhole_mm
-        rays = self._grid.rays[:, self._near[seen]]
+        rays = np.take(self._grid.rays, self._near[seen], axis=1)
         t = (mirror.sag_mm / 2 - pinhole_mm[2]) / rays[2]
         position_mm = pinhole_mm[:2, None] + t * rays[:2]
-        inside = np.hypot(*position_mm) < mirror.analysis_radius_mm
+        inside = np.square(position_mm).sum(axis=0) < mirror.analysis_radius_mm**2
         seen = seen[inside]
+        position_mm = np.compress(inside, position_mm, axis=1)
 
-        # Amplitude of the fringes, mean of both axes.
-        swing = np.zeros(seen.size)
-        for slots, weights in zip(self._slots.sinusoids, self._weights, strict=True):
-            _, cosine, sine = weights @ images[slots][:, seen]
-            swing += np.hypot(cosine, sine) / 2
+        def compute_swing() -> FloatArray:
+            """Amplitude of the fringes, mean of both axes."""
+            swing = np.zeros(seen.size)
+            for slots, weights in zip(self._slots.sinusoids, self._weights, strict=True):
+                _, cosine, sine = weights @ np.take(images[slots], seen, axis=1)
+                swing += np.hypot(cosine, sine) / 2
+            return swing
+
         return film_image.find_film_image(
-            self._sums.shape, self._near[seen], position_mm[:, inside], light[seen], swing
+            self._sums.shape, self._near[seen], position_mm, light[seen], compute_swing
         )
 
     def _track_phases(self, state: tracked_points.TrackedPoints, readings: FloatArray) -> None:

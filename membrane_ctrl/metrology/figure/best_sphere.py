@@ -10,6 +10,7 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
+from membrane_ctrl.metrology.numerics.vectors import column_blocks
 from membrane_ctrl.model.arrays import FloatArray
 
 _SPHERE_POINTS = 20_000  # enough to come close; the last step takes all
@@ -43,16 +44,18 @@ class Sphere:
         """Deviation (n,) in mm of points (3, n), and the unit normals (3,
         n) of the sphere there.
         """
-        # q, q n and q^2 of each point; then s, the share of the radius at which the point is. The
-        # deviation is (1 - s) / c, written so that a plane, c = 0, needs no limit.
-        q = points_mm - np.array([[0.0], [0.0], [self.vertex_mm]])
-        along = self.normal @ q
-        square = np.einsum("in,in->n", q, q)
+        deviation_mm = np.empty(points_mm.shape[1])
+        normals = np.empty_like(points_mm)
         c = self.curvature_per_mm
-        s = np.sqrt(1 - 2 * c * along + c * c * square)
-
-        deviation_mm = (2 * along - c * square) / (1 + s)
-        normals = (self.normal[:, None] - c * q) / s
+        for block in column_blocks(points_mm.shape[1]):
+            # q, q n and q^2 of each point; then s, the share of the radius at which the point is.
+            # The deviation is (1 - s) / c, written so that a plane, c = 0, needs no limit.
+            q = points_mm[:, block] - np.array([[0.0], [0.0], [self.vertex_mm]])
+            along = self.normal @ q
+            square = np.einsum("in,in->n", q, q)
+            s = np.sqrt(1 - 2 * c * along + c * c * square)
+            deviation_mm[block] = (2 * along - c * square) / (1 + s)
+            normals[:, block] = (self.normal[:, None] - c * q) / s
         return deviation_mm, normals
 
     def sag_mm(self, radius_mm: float) -> float:
@@ -108,7 +111,20 @@ def _fit_paraboloid(points_mm: FloatArray, columns: FloatArray) -> Sphere:
 
 
 def _sphere_step(sphere: Sphere, points_mm: FloatArray, columns: FloatArray) -> FloatArray:
-    """Gauss-Newton step (4,) of vertex, tilts and curvature.
+    """Gauss-Newton step (4,) of vertex, tilts and curvature."""
+    normal = np.zeros((4, 4))
+    right = np.zeros(4)
+    for block in column_blocks(points_mm.shape[1]):
+        deviation, rows = _sphere_derivatives(sphere, points_mm[:, block])
+        rows *= columns[:, None]
+        normal += rows @ rows.T
+        right -= rows @ deviation
+    step = np.linalg.lstsq(normal, right, rcond=1e-13)[0]
+    return np.asarray(columns * step)
+
+
+def _sphere_derivatives(sphere: Sphere, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Deviation (n,) of points, and its derivatives (4, n) by vertex, tilts and curvature.
 
     From (1 - c d)^2 = s^2, the derivatives of d need no division by c.
     """
@@ -133,6 +149,5 @@ def _sphere_step(sphere: Sphere, points_mm: FloatArray, columns: FloatArray) -> 
     by_tilt_y = normal_by_y[0] * x + normal_by_y[1] * y + normal_by_y[2] * z
     by_curvature = (deviation * deviation - square) / 2
     rows = np.stack([by_vertex, by_tilt_x, by_tilt_y, by_curvature])
-    rows *= columns[:, None] / s
-    step = np.linalg.lstsq(rows @ rows.T, -rows @ deviation, rcond=1e-13)[0]
-    return np.asarray(columns * step)
+    rows /= s
+    return deviation, rows

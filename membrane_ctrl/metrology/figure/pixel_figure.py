@@ -3,6 +3,7 @@ residual.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -133,16 +134,21 @@ class FullResult:
         ]
         return np.square(sigma_mm)
 
+    @cached_property
+    def _fit_on_grid(self) -> FloatArray:
+        """Height and slopes (3, m, m) of the fit on `grid.axis_mm`."""
+        return self.surface.on_grid(self.grid.axis_mm)
+
     def height_mm(self) -> FloatArray:
         """Height above the vertex (m, m) on `grid.axis_mm`: the fit plus its residual; NaN where
         not measured.
         """
-        return np.asarray(self.surface.on_grid(self.grid.axis_mm)[0] + self.residual_mm)
+        return np.asarray(self._fit_on_grid[0] + self.residual_mm)
 
     def map(self) -> SurfaceMap:
         """The height with the slopes that were measured, as means over the cells."""
         grid = self.grid
-        height, slope_x, slope_y = self.surface.on_grid(grid.axis_mm)
+        height, slope_x, slope_y = self._fit_on_grid
         height = height + self.residual_mm
         return SurfaceMap(grid.axis_mm, height, slope_x + grid.slope_x, slope_y + grid.slope_y)
 
@@ -197,32 +203,40 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     points = _follow_rays(checked, column, row)
     del row, column
 
-    # Their phases, in the period of their bin: screen points.
+    # Their phases, in the period of their bin: screen points. Here, and below, an array is freed
+    # before the next one is made: these are the largest of a measurement.
     film = FilmMotion.from_set(checked)
-    x_phases, y_phases = _phases_of_axes(optics, checked, film, points, index, in_bin)
-    phase_rad = np.stack([x_phases.phase_rad, y_phases.phase_rad])
-    points.screen_mm[:] = screen_scale.screen_mm(phase_rad, optics.pattern)
+    sensitivity_rad_per_um = _sensitivity_rad_per_um(optics, checked, film, points)
+    swing_adu = np.full(index.size, np.inf, np.float32)
+    keep = np.ones(index.size, bool)
+    for axis in range(2):
+        motion_um = film.motion_um[axis] if film.is_worth_correcting else None
+        phases = _axis_phases(checked, axis, index, in_bin, sensitivity_rad_per_um[axis], motion_um)
+        points.screen_mm[axis] = screen_scale.screen_mm(phases.phase_rad, optics.pattern)
+        np.minimum(swing_adu, phases.swing_adu, out=swing_adu)
+        keep &= ~phases.saturated
+        del phases
+    del sensitivity_rad_per_um
 
     # Without pixels beyond the analysed radius, with a clipped frame or with too weak fringes.
-    x_mm, y_mm = checked.tracer.position_mm(points)
-    keep = x_mm**2 + y_mm**2 <= optics.mirror.analysis_radius_mm**2
-    keep &= ~(x_phases.saturated | y_phases.saturated)
-    swing_adu = np.minimum(x_phases.swing_adu, y_phases.swing_adu)
     keep &= swing_adu > full_decoder.FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
+    del in_bin
+    for part, some in points.parts(_PART):
+        x_mm, y_mm = checked.tracer.position_mm(some)
+        keep[part] &= x_mm**2 + y_mm**2 <= optics.mirror.analysis_radius_mm**2
 
     # Without the reflections of a front film, and pixels that show their edges.
     reflections = None
     if checked.tracer.geometry.cushion is not None:
         reflections, lost = _remove_reflections(optics, checked, points, keep)
         keep &= ~lost
-    index = index[keep]
-    swing_adu = swing_adu[keep]
+    place = np.flatnonzero(keep)
+    index = index[place]
+    swing_adu = swing_adu[place]
+    points.keep(place)
     noise_adu = pixel_noise.estimate_pixel_noise_adu(checked.stack, checked.view.used, index)
-
-    # The copies of the points take the most memory of a measurement: free what is not needed.
-    del x_phases, y_phases, phase_rad, x_mm, y_mm, in_bin
     moved = film.is_worth_correcting
-    return PixelPoints(index, points.subset(keep), swing_adu, noise_adu, moved, reflections)
+    return PixelPoints(index, points, swing_adu, noise_adu, moved, reflections)
 
 
 def _remove_reflections(
@@ -290,44 +304,19 @@ def _follow_rays(checked: Checked, column: IntArray, row: IntArray) -> ray_traci
     return points
 
 
-def _phases_of_axes(
-    optics: OpticsConfig,
-    checked: Checked,
-    film: FilmMotion,
-    points: ray_tracing.Points,
-    index: IntArray,
-    in_bin: IntArray,
-) -> tuple[PixelPhases, PixelPhases]:
-    """Phases of x and of y at some pixels, corrected for the film's motion if it is worth it.
+def _sensitivity_rad_per_um(
+    optics: OpticsConfig, checked: Checked, film: FilmMotion, points: ray_tracing.Points
+) -> FloatArray:
+    """Change of the phases (2, n) per µm of the film's motion; 0 if it is not worth correcting.
 
     Section 7 of docs/explanation/metrology.md.
-
-    Parameters
-    ----------
-    optics : OpticsConfig
-        The bench.
-    checked : Checked
-        The set.
-    film : FilmMotion
-        Motion of the film between its frames.
-    points : Points
-        The pixels on the surface.
-    index, in_bin : (n,) int arrays
-        Their numbers, and the bins that they are in.
     """
-    motion_um: tuple[FloatArray | None, FloatArray | None] = (None, None)
-    sensitivity_rad_per_um = np.zeros((2, index.size))
-    if film.is_worth_correcting:
-        motion_um = film.motion_um
-        sensitivity_mm_per_um = film_motion.sensitivity_mm_per_um(
-            checked.tracer, points, checked.state.surface
-        )
-        sensitivity_rad_per_um = sensitivity_mm_per_um / screen_scale.mm_per_rad(optics.pattern)
-    x_phases, y_phases = (
-        _axis_phases(checked, k, index, in_bin, sensitivity_rad_per_um[k], motion_um[k])
-        for k in range(2)
+    if not film.is_worth_correcting:
+        return np.zeros((2, points.t_mm.size))
+    sensitivity_mm_per_um = film_motion.sensitivity_mm_per_um(
+        checked.tracer, points, checked.state.surface
     )
-    return x_phases, y_phases
+    return np.asarray(sensitivity_mm_per_um / screen_scale.mm_per_rad(optics.pattern))
 
 
 def _trace_pixel_rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
@@ -443,8 +432,10 @@ def reconstruct_full(
 
     # Weights by the residual to that surface, then the fit.
     tracer.intersect(points, rough.surface, newton=2)
-    _, residual = _slope_residual(tracer, points, rough.surface)
-    points.weights[:] = tukey_weights(residual)
+    residual = np.empty(points.t_mm.size)
+    for part, some in points.parts(_PART):
+        _, residual[part] = _slope_residual(tracer, some, rough.surface)
+    points.weights = tukey_weights(residual)
     normal = NormalMatrix.from_points(tracer, points)
     fit = surface_fit.fit_surface(
         tracer, points, rough.surface, normal=normal, tolerance_mm=tolerance_mm
@@ -452,10 +443,13 @@ def reconstruct_full(
 
     # What the terms leave, in cells, integrated.
     tracer.intersect(points, fit.surface)
-    field, residual = _slope_residual(tracer, points, fit.surface)
-    is_film = (residual < _NO_SLOPE).astype(float)
-    grid = zonal_map.residual_grid(field, is_film, radius_mm)
-    fit_grid = zonal_map.residual_grid(field, points.weights, radius_mm)
+    cells_of_film = zonal_map.CellSums(points.t_mm.size, radius_mm)
+    cells_of_fit = zonal_map.CellSums(points.t_mm.size, radius_mm)
+    for _, some in points.parts(_PART):
+        field, residual = _slope_residual(tracer, some, fit.surface)
+        cells_of_film.add_pixels(field, (residual < _NO_SLOPE).astype(float))
+        cells_of_fit.add_pixels(field, some.weights)
+    grid = cells_of_film.mean_residual()
     return FullResult(
         fit=replace(fit, changes_mm=(*rough.changes_mm, *fit.changes_mm)),
         index=pixels.index,
@@ -463,7 +457,7 @@ def reconstruct_full(
         swing_adu=pixels.swing_adu,
         noise_adu=pixels.noise_adu,
         grid=grid,
-        fit_grid=fit_grid,
+        fit_grid=cells_of_fit.mean_residual(),
         residual_mm=zonal_map.integrate_residual(grid),
         quality=set_quality(optics, checked, fit, float(np.median(pixels.swing_adu))),
         moved=pixels.moved,

@@ -16,6 +16,7 @@ import numpy as np
 from membrane_ctrl.metrology.figure import best_sphere, star_image
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.numerics import grid_fit, zernike
+from membrane_ctrl.metrology.numerics.vectors import vector_lengths
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 _FRINGE = [zernike.fringe_set_orders(j) for j in range(1, zernike.FRINGE_TERMS + 1)]
@@ -124,24 +125,27 @@ class FigureOf:
         mask = self._mask
         points = seen.points()
 
-        # Deviation from the best sphere, its rotationally invariant part, and its smooth part.
+        # Deviation from the best sphere, and normals of the surface against those of the sphere.
         sphere = best_sphere.best_sphere(points, near)
         deviation_mm, sphere_normals = sphere.deviation(points)
         deviation_um = 1e3 * (deviation_mm - deviation_mm.mean())
+        normals = np.stack([-seen.slope_x[mask], -seen.slope_y[mask], np.ones(points.shape[1])])
+        normals /= vector_lengths(normals)
+        angle_rms = _compute_rms(vector_lengths(normals - sphere_normals))
+        del sphere_normals
+
+        # The spot, and the image of a star.
+        focus_mm, spot_mm = _compute_spot(sphere, points, normals)
+        del normals
+        spot_50_mm, spot_80_mm, spot_95_mm = np.quantile(spot_mm, ENERGY_SHARES)
+        strehl, path_rms_um = star_image.find_strehl(points, self.wavelength_um)
+        del points
+
+        # Rotationally invariant and smooth part of the deviation.
         rotational_um = self._rings.round_part(deviation_um)
         deviation_map_um = _place_values(deviation_um, mask)
         smooth_map_um = self._pvr.values(self._pvr.coefficients(deviation_map_um))
         smooth_um = smooth_map_um[mask]
-
-        # Normals of the surface, against those of the sphere, and the spot that they give.
-        slopes = np.stack([seen.slope_x[mask], seen.slope_y[mask]])
-        normals = np.stack([*-slopes, np.ones(slopes.shape[1])])
-        normals /= np.linalg.norm(normals, axis=0)
-        angle_rad = np.linalg.norm(normals - sphere_normals, axis=0)
-        focus_mm, spot_mm = _compute_spot(sphere, points, normals)
-        spot_50_mm, spot_80_mm, spot_95_mm = np.quantile(spot_mm, ENERGY_SHARES)
-
-        strehl, path_rms_um = star_image.find_strehl(points, self.wavelength_um)
 
         radius_mm = np.nan
         if sphere.curvature_per_mm != 0:
@@ -157,7 +161,7 @@ class FigureOf:
             pvr_um=float(np.ptp(smooth_um)) + 3 * _compute_rms(deviation_um - smooth_um),
             rotational_pv_um=float(np.ptp(rotational_um)),
             asymmetry_rms_um=_compute_rms(deviation_um - rotational_um),
-            slope_rms_urad=1e6 * _compute_rms(angle_rad),
+            slope_rms_urad=1e6 * angle_rms,
             best_focus_mm=focus_mm,
             spot_rms_mm=_compute_rms(spot_mm),
             spot_50_mm=float(spot_50_mm),

@@ -17,10 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from membrane_ctrl.metrology.numerics.vectors import column_blocks, vector_lengths
 from membrane_ctrl.model.arrays import FloatArray
 
 _PADDING = 4  # of the aperture: samples of the image at a quarter of wavelength over aperture
-_NEWTON_STEPS = 6
+_FEW_POINTS = 20_000  # enough to come close to the focus; the last steps take all
+_FIRST_STEPS, _LAST_STEPS = 4, 2  # Gauss-Newton's, with few points and with all
 _ENERGY_SHARES = (0.5, 0.8)
 _CURVE_POINTS = 2000  # of a curve of the energy: enough for a picture
 # Neighbouring cells whose paths differ by more than half a wavelength do not show what lies between
@@ -131,28 +133,57 @@ def find_paths(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     ValueError
         A mirror without a focus in front of it.
     """
-    x, y, z = points_mm
     # Start: the focus of the paraboloid through the points, whose axis is turned to z
-    scale_mm = float(np.sqrt(np.mean(x * x + y * y)))
-    u, v = x / scale_mm, y / scale_mm
-    columns = np.stack((np.ones_like(x), u, v, u * u + v * v))
-    found = np.linalg.solve(columns @ columns.T, columns @ z)
+    x, y, z = points_mm
+    scale_mm = float(np.sqrt(np.mean(np.square(points_mm[:2])) * 2))
+    normal = np.zeros((4, 4))
+    right = np.zeros(4)
+    for block in column_blocks(x.size):
+        u, v = points_mm[:2, block] / scale_mm
+        columns = np.stack((np.ones_like(u), u, v, u * u + v * v))
+        normal += columns @ columns.T
+        right += columns @ z[block]
+    found = np.linalg.solve(normal, right)
     tilt_x, tilt_y, curvature = found[1:] / (scale_mm, scale_mm, scale_mm**2)
     if curvature <= 0:
         raise ValueError("the mirror has no focus in front of it")
-    z = z - tilt_x * x - tilt_y * y
-    points_mm = np.stack((x, y, z))
+    turned_mm = np.stack((x, y, z - tilt_x * x - tilt_y * y))
+
+    # The focus, and the paths to it
     focus = np.array([0.0, 0.0, 1 / (4 * curvature)])
-    for _ in range(_NEWTON_STEPS):
-        towards = focus[:, None] - points_mm
-        distance = np.linalg.norm(towards, axis=0)
-        path = distance - z
-        # Both without their means, as the mean path is free
-        gradient = towards / distance
-        gradient -= gradient.mean(axis=1, keepdims=True)
-        focus = focus - np.linalg.solve(gradient @ gradient.T, gradient @ (path - path.mean()))
-    path = np.linalg.norm(focus[:, None] - points_mm, axis=0) - z
+    some_mm = turned_mm[:, :: max(1, x.size // _FEW_POINTS)]
+    for cloud_mm in [some_mm] * _FIRST_STEPS + [turned_mm] * _LAST_STEPS:
+        focus = focus + _focus_step(cloud_mm, focus)
+    path = np.empty(x.size)
+    for block in column_blocks(x.size):
+        towards = focus[:, None] - turned_mm[:, block]
+        path[block] = vector_lengths(towards) - turned_mm[2, block]
     return focus, path
+
+
+def _focus_step(points_mm: FloatArray, focus_mm: FloatArray) -> FloatArray:
+    """Gauss-Newton step (3,) of the focus towards the least variance of the paths."""
+    # Sums of the gradients of the paths, of the paths less that of the vertex, and of products
+    count = points_mm.shape[1]
+    of_gradient = np.zeros(3)
+    of_path = 0.0
+    normal = np.zeros((3, 3))
+    right = np.zeros(3)
+    for block in column_blocks(count):
+        towards = focus_mm[:, None] - points_mm[:, block]
+        distance = vector_lengths(towards)
+        path = distance - points_mm[2, block] - focus_mm[2]
+        gradient = towards / distance
+        of_gradient += gradient.sum(axis=1)
+        of_path += float(path.sum())
+        normal += gradient @ gradient.T
+        right += gradient @ path
+
+    # Both about their means, as the mean path is free
+    mean = of_gradient / count
+    normal -= count * np.outer(mean, mean)
+    right -= mean * of_path
+    return -np.asarray(np.linalg.solve(normal, right))
 
 
 def find_strehl(points_mm: FloatArray, wavelength_um: float) -> tuple[float, float]:

@@ -29,6 +29,7 @@ _DARKEST = 0.2  # least light of a row over its mean
 _CLEAR_STEPS = 20.0
 _FEWEST_BINS = 1_000
 _ENOUGH_BINS = 15_000  # more only cost time
+_SEARCHED_BINS = 60_000  # of all bins: among these are enough that see the fringes
 _LEAST_SWING_PERCENTILE = 95  # the swing that `CONTRAST_SHARE` refers to
 _HARMONICS = (2, 3, 4)  # of the fringes: the response of panel and camera
 _TURNS = 3  # of a fit; the last one changes the largest bands by a thousandth
@@ -64,7 +65,8 @@ class _Steps:
         self._row = index // columns
         self._rows = np.arange(rows)
         self._shifts_rad = stack.shifts_rad(frames)
-        self._seen = binned.means[frames].reshape(len(frames), -1)[:, index]
+        means = binned.means[frames].reshape(len(frames), -1)
+        self._seen = np.take(means, index, axis=1)
         self._design = stack.design(frames)
         self._inverse = np.linalg.pinv(stack.design(frames))
         self.unexplained = 0.0
@@ -308,12 +310,12 @@ def _add_frequency(rad_per_row: FloatArray, power: FloatArray, rows: IntArray) -
 
 def _with_fringes(binned: Binned, axes: list[list[int]]) -> IntArray:
     """Bins (n,), enough of those in which both axes swing and nothing is saturated."""
-    of_axes = [np.ptp(binned.means[frames], axis=0) for frames in axes]
-    swing = np.minimum(*of_axes)
-    stride = max(1, swing.size // _ENOUGH_BINS)
-    some = swing.ravel()[::stride]
-    least_swing = CONTRAST_SHARE * np.percentile(some, _LEAST_SWING_PERCENTILE)
-    saturated = binned.saturated[[*axes[0], *axes[1]]].any(axis=0)
-    usable = (swing > least_swing) & ~saturated
-    every = max(1, np.count_nonzero(usable) // _ENOUGH_BINS)
-    return np.flatnonzero(usable)[::every]
+    count = len(binned.means)
+    stride = max(1, binned.means[0].size // _SEARCHED_BINS)
+    means = binned.means.reshape(count, -1)[:, ::stride]
+    swing = np.minimum(*[np.ptp(means[frames], axis=0) for frames in axes])
+    least_swing = CONTRAST_SHARE * np.percentile(swing, _LEAST_SWING_PERCENTILE)
+    clipped = binned.saturated.reshape(count, -1)[:, ::stride]
+    is_saturated = clipped[[*axes[0], *axes[1]]].any(axis=0)
+    usable: IntArray = stride * np.flatnonzero((swing > least_swing) & ~is_saturated)
+    return usable[:: max(1, usable.size // _ENOUGH_BINS)]

@@ -8,16 +8,20 @@ of the fringes shows the same patch, but a lamp as well.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
 import cv2
 import numpy as np
+from numpy.polynomial.polynomial import polyvander
 
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _DEGREE = 4  # of the smooth light of the mirror
-_FITTED_BINS = 6000  # that determine it
+# Exponents of x and y of its monomials
+_POWERS = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+_FITTED_BINS = 6000  # that determine it, and the scatter about it
 _ROUNDS = 4  # of its fit, each without the bins that are brighter
 _LEAST_SHARE = 0.02  # of the light
 _CLEAR_SIGMAS = 6.0
@@ -94,7 +98,7 @@ def find_film_image(
     index: IntArray,
     position_mm: FloatArray,
     light: FloatArray,
-    swing: FloatArray,
+    compute_swing: Callable[[], FloatArray],
     evidence: ImageEvidence = ImageEvidence.WHITE_AND_BLACK,
 ) -> FilmImage:
     """Search the bins of the mirror for a part that shows the screen a second time.
@@ -109,8 +113,8 @@ def find_film_image(
         Where they are on it.
     light : (n,) array
         Light of a white screen less that of a black one, or the mean light of the fringes.
-    swing : (n,) array
-        Amplitude of the fringes.
+    compute_swing : function
+        Returns the amplitude (n,) of the fringes; called only if a part is brighter.
     evidence : ImageEvidence
         Which of both the light is.
 
@@ -122,17 +126,22 @@ def find_film_image(
     if index.size < _LEAST_BINS / _LARGEST_PART or not np.median(light) > 0:
         return NO_FILM_IMAGE
 
-    # Light and swing over a smooth change that the brighter bins do not determine.
-    columns = _smooth_columns(position_mm)
-    usual = np.ones(index.size, bool)
-    excess = np.zeros(index.size)
+    # A smooth change of the light over the mirror, which some of the bins determine: in each round
+    # those that were not far off it in the last one.
+    scale_mm = float(np.abs(position_mm).max())
+    some = np.arange(0, index.size, max(1, index.size // _FITTED_BINS))
+    columns = _smooth_columns(position_mm[:, some] / scale_mm)
+    usual = np.ones(some.size, bool)
+    smooth = np.zeros(len(_POWERS))
     sigma = math.inf
     for _ in range(_ROUNDS):
-        excess = _excess_over_smooth(light, columns, usual)
-        sigma = _MAD_SIGMAS * float(np.median(np.abs(excess[usual])))
-        usual = np.abs(excess) < max(_LEAST_SHARE / 2, 3 * sigma)
+        smooth = _fit_smooth(light[some], columns, usual)
+        excess_of_some = light[some] / (smooth @ columns) - 1
+        sigma = _MAD_SIGMAS * float(np.median(np.abs(excess_of_some[usual])))
+        usual = np.abs(excess_of_some) < max(_LEAST_SHARE / 2, 3 * sigma)
         if np.mean(usual) < 1 - _LARGEST_PART:
             return nothing
+    excess = light / _evaluate_smooth(smooth, position_mm / scale_mm) - 1
 
     # Noisy bins are averaged over squares.
     side = 1
@@ -142,11 +151,11 @@ def find_film_image(
     bright = excess > max(_LEAST_SHARE, _CLEAR_SIGMAS * sigma / side)
 
     # The largest connected patch of brighter bins.
+    if not bright.any():
+        return nothing
     picture = np.zeros(shape, np.uint8)
     picture.reshape(-1)[index[bright]] = 1
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(picture, connectivity=4)
-    if count < 2:
-        return nothing
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(picture, connectivity=4)
     largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
     patch = parts == largest
     inside = patch.reshape(-1)[index]
@@ -162,7 +171,9 @@ def find_film_image(
         within = inside
     if not around.any() or np.median(excess[around]) > _STEEP * np.median(excess[within]):
         return nothing
-    swing_excess = _excess_over_smooth(swing, columns, usual)
+    swing = compute_swing()
+    smooth = _fit_smooth(swing[some], columns, usual)
+    swing_excess = swing / _evaluate_smooth(smooth, position_mm / scale_mm) - 1
     swing_excess = _average_bins(shape, index, swing_excess, side)
     if float(np.mean(swing_excess[inside])) > _SWING_SHARE * share:
         return nothing
@@ -177,27 +188,34 @@ def find_film_image(
     )
 
 
-def _smooth_columns(position_mm: FloatArray) -> FloatArray:
-    """Polynomials (n, k) of the place on the mirror."""
-    x, y = position_mm / float(np.abs(position_mm).max())
-    columns = []
-    power_x = np.ones_like(x)
-    for i in range(_DEGREE + 1):
-        monomial = power_x
-        for _ in range(_DEGREE + 1 - i):
-            columns.append(monomial)
-            monomial = monomial * y
-        power_x = power_x * x
-    return np.stack(columns, axis=1)
+def _smooth_columns(place: FloatArray) -> FloatArray:
+    """Monomials (k, m) of places (2, m) within the unit square."""
+    of_x, of_y = polyvander(place, _DEGREE)
+    return np.stack([of_x[:, i] * of_y[:, j] for i, j in _POWERS])
 
 
-def _excess_over_smooth(values: FloatArray, columns: FloatArray, usual: BoolArray) -> FloatArray:
-    """Values (n,) over the smooth change through some of the usual ones, less 1."""
-    place = np.flatnonzero(usual)
-    some = place[:: max(1, place.size // _FITTED_BINS)]
-    known = columns[some]
-    solved = np.linalg.solve(known.T @ known, known.T @ values[some])
-    return np.asarray(values / (columns @ solved) - 1)
+def _fit_smooth(values: FloatArray, columns: FloatArray, usual: BoolArray) -> FloatArray:
+    """Amplitudes (k,) of the monomials (k, m) through the usual ones of the values (m,)."""
+    known = columns[:, usual]
+    return np.asarray(np.linalg.solve(known @ known.T, known @ values[usual]))
+
+
+def _evaluate_smooth(amplitudes: FloatArray, place: FloatArray) -> FloatArray:
+    """The polynomial of these amplitudes at places (2, n)."""
+    table = np.zeros((_DEGREE + 1, _DEGREE + 1))
+    for (i, j), amplitude in zip(_POWERS, amplitudes, strict=True):
+        table[i, j] = amplitude
+    # Horner's scheme, in x of polynomials in y, each no longer than the total degree allows.
+    x, y = place
+    value = np.zeros(x.size)
+    for i in range(_DEGREE, -1, -1):
+        of_y = np.full(x.size, table[i, _DEGREE - i])
+        for j in range(_DEGREE - i - 1, -1, -1):
+            of_y *= y
+            of_y += table[i, j]
+        value *= x
+        value += of_y
+    return value
 
 
 def _average_bins(

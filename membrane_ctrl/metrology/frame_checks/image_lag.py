@@ -30,6 +30,7 @@ _HARMONICS = range(2, 7)  # of a sinusoid: the response of panel and camera
 # Least power of the change from the previous frame that the frame's own pattern does not explain,
 # over the whole power of that change.
 _LEAST_DETERMINED = 0.05
+_REGULAR = 1e-12  # of the length of a column
 _LEAST_BINS = 300  # of one frame
 _LIVE_BINS = 2500  # of a live cycle: a share is known to 2e-4
 # Errors of the shares that no frame shows: relative to the share, because sinusoids change between
@@ -124,8 +125,10 @@ def estimate_image_lag(
         `ImageLag.unknown()` if no frame shows both shares, or only with an uncertainty above 3 %.
     """
     scene = scene.thin_to()
-    means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
-    clipped = binned.saturated.reshape(len(stack.patterns), -1)[:, scene.index]
+    means = np.take(binned.means.reshape(len(stack.patterns), -1), scene.index, axis=1).astype(
+        float
+    )
+    clipped = np.take(binned.saturated.reshape(len(stack.patterns), -1), scene.index, axis=1)
     smooth = scene.smooth_columns()
 
     # The shares that each frame shows.
@@ -404,12 +407,16 @@ def _fit_previous(
     """
     if np.count_nonzero(usable) < _LEAST_BINS:
         return None, None
-    columns, seen = columns[:, usable], seen[usable]
+    columns = np.compress(usable, columns, axis=1)
+    seen = seen[usable]
 
     # The frame's own pattern alone. Normal equations: the columns have length 1 and are far from
-    # dependent.
-    columns = columns / np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), 1e-30)
-    solve = np.linalg.pinv(columns @ columns.T) @ columns
+    # dependent; where one is empty, the small diagonal leaves it out.
+    lengths = np.sqrt(np.einsum("pn,pn->p", columns, columns))
+    columns = columns / np.maximum(lengths, 1e-30)[:, None]
+    normal = columns @ columns.T
+    normal[np.diag_indices_from(normal)] += _REGULAR
+    solve = np.linalg.inv(normal) @ columns
     own = (solve @ seen) @ columns
 
     # The change from the previous frame, where this frame is brighter, and where it is darker; each

@@ -8,6 +8,7 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.frame_checks import film_image, light_response, second_reflection
 from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, Checked
 from membrane_ctrl.metrology.frame_checks.sampled_bins import SampledBins
+from membrane_ctrl.model.arrays import FloatArray
 
 
 def measure_light_path(
@@ -83,12 +84,17 @@ def _find_film_image(
     position_mm = geometry.pinhole_mm[:2, None] + t * rays[:2]
     on_film = np.hypot(*position_mm) < optics.mirror.analysis_radius_mm
     index = index[on_film]
-    swing = checked.view.swing_adu.mean(axis=0)
+    swing_adu = checked.view.swing_adu
+
+    def compute_swing() -> FloatArray:
+        """Amplitude of the fringes, mean of both axes."""
+        return np.asarray(swing_adu.mean(axis=0).reshape(-1)[index])
+
     return film_image.find_film_image(
         (light.shape[0], light.shape[1]),
         index,
         position_mm[:, on_film],
         light.reshape(-1)[index],
-        swing.reshape(-1)[index],
+        compute_swing,
         evidence,
     )

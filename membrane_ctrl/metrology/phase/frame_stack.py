@@ -122,6 +122,11 @@ class FrameStack:
         before = tuple(new_place[self.frame_before(taken)] for taken in order)
         return replace(self, frames=self.frames[order], light=None, gain=gain, before=before)
 
+    def drop_frames(self) -> "FrameStack":
+        """The set without its pictures, which take the most memory."""
+        no_frames = np.empty((len(self.patterns), 0, 0), self.frames.dtype)
+        return replace(self, frames=no_frames)
+
     @property
     def readings_um(self) -> FloatArray:
         """Laser readings of the sinusoids, x and then y."""

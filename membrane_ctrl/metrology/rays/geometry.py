@@ -13,6 +13,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import GeometryConfig, MirrorConfig, OpticsConfig
 from membrane_ctrl.config.sight import compute_poses
+from membrane_ctrl.metrology.numerics.vectors import vector_lengths
 from membrane_ctrl.metrology.rays.cushion import Cushion
 from membrane_ctrl.metrology.rays.gas_lens import GasLens, trace_gas_lens
 from membrane_ctrl.metrology.rays.lens_distortion import distort_points, undistort_points
@@ -104,7 +105,7 @@ class Geometry:
         if any(self.distortion):
             x, y = undistort_points(x, y, self.distortion)
         camera = np.stack([x, y, np.ones_like(x)])
-        camera /= np.linalg.norm(camera, axis=0)
+        camera /= vector_lengths(camera)
         return np.asarray(np.tensordot(self.rotation.T, camera, axes=1))
 
     @property

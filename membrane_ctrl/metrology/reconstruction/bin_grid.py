@@ -54,7 +54,7 @@ class BinGrid:
 
     def solid_angle(self, index: IntArray) -> FloatArray:
         """Solid angle of bins: (side / focal length)^2 cos^3 of the angle to the axis."""
-        cosine = self._geometry.rotation[2] @ self.rays[:, index]
+        cosine = self._geometry.rotation[2] @ np.take(self.rays, index, axis=1)
         return np.asarray((self._bin_px / self._geometry.focal_px) ** 2 * cosine**3)
 
     def averaging_bias_mm(
@@ -86,7 +86,7 @@ class BinGrid:
         total = np.zeros_like(centre)
         for around in self._around:
             moved = Points(
-                np.ascontiguousarray(around[:, index]), centre, points.weights, points.t_mm.copy()
+                np.take(around, index, axis=1), centre, points.weights, points.t_mm.copy()
             )
             tracer.intersect(moved, surface, newton=3)
             total += tracer.predict_screen(moved, surface)

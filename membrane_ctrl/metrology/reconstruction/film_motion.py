@@ -21,6 +21,8 @@ from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
 
+_ROUNDING = 1e-12  # of the largest weight
+
 
 def combine_steps(
     weights: FloatArray, shifts_rad: FloatArray, bin_px: int, motion_um: FloatArray | None = None
@@ -42,7 +44,9 @@ def combine_steps(
     -------
     StepCombination
     """
-    _, cosine, sine = weights / bin_px**2
+    # A weight that is 0 but for rounding is 0, and costs no time.
+    is_rounding = np.abs(weights) < _ROUNDING * np.abs(weights).max()
+    _, cosine, sine = np.where(is_rounding, 0.0, weights) / bin_px**2
     if motion_um is None:
         return phase_change.StepCombination(cosine, sine)
     # turn_n and mirror_n for n = 1 and 2. The phasors are per pixel: the bin's area cancels.

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from membrane_ctrl.metrology.numerics.compiled import compile_kernel
-from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.metrology.reconstruction.masked_laplacian import MaskedLaplacian
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -80,6 +79,37 @@ def _scatter_samples(field, weights, first_mm, step_mm, sums, start, stop):  # t
         sums[2, i, j] += w * (field[3, p] - field[5, p])
 
 
+class CellSums:
+    """Sums of the residual over cells, to which pixels are added in parts.
+
+    Parameters
+    ----------
+    pixels : int
+        Number of pixels in all: they fill a disc, pi / 4 of the square's cells. The cells are as
+        fine as it allows, at most `_CELLS_A_SIDE` a side.
+    radius_mm : float
+        Radius of the analysis: half the grid's side.
+    """
+
+    def __init__(self, pixels: int, radius_mm: float) -> None:
+        filled_side = int(math.sqrt(4 / math.pi * max(pixels, 1) / _PIXELS_A_CELL))
+        half = max(min(_CELLS_A_SIDE, filled_side) // 2, 2)
+        self._axis_mm: FloatArray = radius_mm / half * np.arange(-half, half + 1, dtype=np.float64)
+        self._sums = np.zeros((3, self._axis_mm.size, self._axis_mm.size))
+
+    def add_pixels(self, field: FloatArray, weights: FloatArray) -> None:
+        """Add pixels; arguments as of `residual_grid`."""
+        step_mm = self._axis_mm[1] - self._axis_mm[0]
+        count = field.shape[1]
+        _scatter_samples(field, weights, self._axis_mm[0], step_mm, self._sums, 0, count)
+
+    def mean_residual(self) -> ResidualGrid:
+        """Means over the cells."""
+        count, x, y = self._sums
+        safe = np.where(count > 0, count, 1.0)
+        return ResidualGrid(self._axis_mm, x / safe, y / safe, count)
+
+
 def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> ResidualGrid:
     """Average the residual in cells.
 
@@ -95,25 +125,10 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
     Returns
     -------
     ResidualGrid
-        As fine as the number of pixels allows, at most `_CELLS_A_SIDE` cells a side.
     """
-    # The pixels fill a disc: pi / 4 of the square's cells.
-    pixels = max(field.shape[1], 1)
-    filled_side = int(math.sqrt(4 / math.pi * pixels / _PIXELS_A_CELL))
-    half = max(min(_CELLS_A_SIDE, filled_side) // 2, 2)
-    axis: FloatArray = radius_mm / half * np.arange(-half, half + 1, dtype=np.float64)
-
-    def run(start: int, stop: int) -> FloatArray:
-        sums = np.zeros((3, axis.size, axis.size))
-        _scatter_samples(field, weights, axis[0], axis[1] - axis[0], sums, start, stop)
-        return sums
-
-    sums, *others = split_over_threads(run, field.shape[1])
-    for other in others:  # in place: here a measurement takes the most memory
-        sums += other
-    count, x, y = sums
-    safe = np.where(count > 0, count, 1.0)
-    return ResidualGrid(axis, x / safe, y / safe, count)
+    cells = CellSums(field.shape[1], radius_mm)
+    cells.add_pixels(field, weights)
+    return cells.mean_residual()
 
 
 def integrate_residual(grid: ResidualGrid) -> FloatArray:

@@ -358,7 +358,7 @@ class ErrorWatch:
         if lag is None:
             lag = ImageLag.unknown()
         self._lag = lag
-        places_px = self._places_px[:, state.index]
+        places_px = np.take(self._places_px, state.index, axis=1)
         chosen = trial_bench.spread_evenly(places_px, self._optics.camera.width_px, POINTS)
         self._examined = np.flatnonzero(chosen)
 
@@ -377,7 +377,7 @@ class ErrorWatch:
         if film_motion.is_worth_correcting(cycle.readings_um, self._laser_noise_um):
             about_mean_um = cycle.readings_um - np.mean(cycle.readings_um)
             corrected_um = np.reshape(about_mean_um, corrected_um.shape)
-        means = np.stack([sums[:, bins] for sums in cycle.sums]) / self._bin_px**2
+        means = np.stack([np.take(sums, bins, axis=1) for sums in cycle.sums]) / self._bin_px**2
         seen = estimate_frame_errors(
             means,
             self._shifts_rad,
@@ -444,7 +444,7 @@ class ErrorWatch:
         state = cycle.state
         fit = cycle.fit
         swings = state.fresh[:, 4]
-        places_px = self._places_px[:, state.index]
+        places_px = np.take(self._places_px, state.index, axis=1)
 
         # Slopes that the fit leaves, as patches, and as a film that is not Hencky's.
         field = tracer.slope_field(state.points, fit.surface)
@@ -462,7 +462,7 @@ class ErrorWatch:
 
         # Light over the amplitude of the fringes, and blur of the image.
         levels = [
-            weights[0] @ sums[:, state.index]
+            weights[0] @ np.take(sums, state.index, axis=1)
             for weights, sums in zip(self._weights, cycle.sums, strict=True)
         ]
         light = np.stack(levels) / self._bin_px**2 / swings

@@ -11,6 +11,11 @@ SHAPE = (128, 153)
 MM = 7.0  # of a bin on the mirror
 
 
+def not_needed() -> np.ndarray:
+    """The swing of fringes in which nothing is brighter."""
+    raise AssertionError("the swing is not needed")
+
+
 def find(
     light_excess: float, swing_excess: float, blur: bool = False, noise: float = 1.0
 ) -> FilmImage:
@@ -27,7 +32,7 @@ def find(
     smooth = 1000 * (1 - 0.2 * x + 0.1 * y - 0.15 * (x**2 + y**2))
     light = smooth * (1 + light_excess * patch) + rng.normal(0, noise, x.size)
     swing = smooth / 2 * (1 + swing_excess * patch) + rng.normal(0, noise, x.size)
-    return find_film_image(SHAPE, index, position_mm, light, swing)
+    return find_film_image(SHAPE, index, position_mm, light, lambda: swing)
 
 
 def test_a_patch_of_added_light_is_named_with_place_and_share() -> None:
@@ -52,3 +57,11 @@ def test_noise_of_the_bins_does_not_hide_a_patch() -> None:
 def test_other_light_is_none(light: float, swing: float, blur: bool) -> None:
     assert not find(light, swing, blur).is_found
     assert find(light, swing, blur).describe() == ""
+
+
+def test_the_fringes_are_not_asked_where_no_part_is_brighter() -> None:
+    row, column = np.indices(SHAPE).reshape(2, -1)
+    position_mm = MM * np.stack([column - 76.0, 63.5 - row])
+    index = np.flatnonzero(np.hypot(*position_mm) < 440)
+    light = 1000 - 0.3 * position_mm[0, index]
+    assert not find_film_image(SHAPE, index, position_mm[:, index], light, not_needed).is_found

@@ -7,6 +7,7 @@ import pytest
 
 from membrane_ctrl.metrology.reconstruction.masked_laplacian import MaskedLaplacian
 from membrane_ctrl.metrology.reconstruction.zonal_map import (
+    CellSums,
     ResidualGrid,
     integrate_residual,
     residual_grid,
@@ -66,6 +67,19 @@ def test_pixels_are_averaged_in_their_cell_and_weights_count() -> None:
     assert grid.slope_x[cell] == pytest.approx(3.5e-6)
     assert np.sum(grid.count) == 5
     assert abs(Y.min()) == 100.0
+
+
+def test_pixels_may_come_in_parts() -> None:
+    rng = np.random.default_rng(4)
+    field = rng.uniform(-90, 90, (6, 3000))
+    weights = rng.uniform(0, 1, 3000)
+    whole = residual_grid(field, weights, 100.0)
+    cells = CellSums(3000, 100.0)
+    for part in (slice(0, 1300), slice(1300, 3000)):
+        cells.add_pixels(field[:, part], weights[part])
+    again = cells.mean_residual()
+    assert np.allclose(again.slope_x, whole.slope_x, rtol=1e-12, atol=0)
+    assert np.allclose(again.count, whole.count, rtol=1e-12, atol=0)
 
 
 def test_the_solver_meets_its_tolerance() -> None:
