@@ -76,7 +76,7 @@ class WatchedPlant(Plant):
     Attributes
     ----------
     pump_given, vent_given : float
-        Drive of the pump's motor and of the valve, whoever sent it.
+        Drive of the pump's motor and of the valve, by any sender.
     """
 
     def __init__(

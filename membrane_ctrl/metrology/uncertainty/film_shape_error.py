@@ -21,7 +21,7 @@ _SAG_WEIGHT = 1e3  # of the sag, relative to one height
 _GRID = 41  # points along the diameter
 # Points of a patch over the usual number, below which its slopes are a selection.
 _LEAST_COUNT = 0.3
-_RINGS = 20  # of patches, whose slopes scatter alike
+_RINGS = 20  # of patches, whose slopes scatter equally
 _TINY = 1e-30  # instead of a division by zero
 # Points of a ring at which the mean of a smooth slope is computed.
 _AZIMUTHS = 24
