@@ -235,7 +235,7 @@ _INVARIANTS = (
     "same tick.",
     "- A safe level is left only from HOLD_FLOW; it always has a cause; the first cause stays.",
     "- A harmless event trips nothing, and the mirror ends at its setpoint.",
-    "- Without ticks the board stops the pump within its watchdog period, also while another client reads.",
+    "- Without ticks the board stops the pump within its watchdog period, also while others read.",
     "- A stop ends. If the pump does not obey, the stop does not succeed, and opens the vent.",
     "- Every event can be recorded.",
 )
