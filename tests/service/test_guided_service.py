@@ -134,7 +134,9 @@ def listener(tmp_path: Path) -> Iterator[Path]:
                     connection, _ = waiting.accept()
                     with connection:
                         processes.append(
-                            subprocess.Popen(words, stdin=connection, stdout=connection)
+                            subprocess.Popen(
+                                words, stdin=connection.fileno(), stdout=connection.fileno()
+                            )
                         )
 
         threading.Thread(target=serve, daemon=True).start()

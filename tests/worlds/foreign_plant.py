@@ -21,8 +21,7 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 STEP_S = 0.01
 _SAG_UM, _PRESSURE_PA, _AMBIENT_PA, _AIR_K = 37_100.0, 600.0, 98_400.0, 295.0
-_TENSION = 0.4 * _PRESSURE_PA / _SAG_UM
-_STRETCH = 0.6 * _PRESSURE_PA / _SAG_UM**3
+_TENSION_SHARE = 0.4  # of the pressure at the working point
 _WEATHER_S, _WEATHER_STEP_S = 7200.0, 0.05
 
 Curve = Callable[[float], float]  # share of the full flow against the command
@@ -125,7 +124,10 @@ class ForeignPlant:
         gusts: bool = False,
         laser_um: float = 1.0,
         barometer: bool = True,
+        tension_share: float = _TENSION_SHARE,
     ) -> None:
+        self._tension = tension_share * _PRESSURE_PA / _SAG_UM
+        self._stretch = (1.0 - tension_share) * _PRESSURE_PA / _SAG_UM**3
         self.pump, self._leak_um_per_s, self._laser_um = pump, leak_um_per_s, laser_um
         self._barometer = barometer
         weather_rng, self._rng = np.random.default_rng(seed).spawn(2)
@@ -155,9 +157,9 @@ class ForeignPlant:
         """
         sag = np.full_like(self._ambient, _SAG_UM)
         for _ in range(4):
-            total = self._ambient + sag * (_TENSION + _STRETCH * sag**2)
+            total = self._ambient + sag * (self._tension + self._stretch * sag**2)
             sag -= (total * sag - self._gas * self._air) / (
-                total + (_TENSION + 3 * _STRETCH * sag**2) * sag
+                total + (self._tension + 3 * self._stretch * sag**2) * sag
             )
         return sag - _SAG_UM
 
@@ -215,14 +217,13 @@ class ForeignPlant:
         )
 
     def _gauge(self) -> float:
-        return self._sag_um * (_TENSION + _STRETCH * self._sag_um**2)
+        return self._sag_um * (self._tension + self._stretch * self._sag_um**2)
 
     def _pressure(self, i: int) -> float:
         return float(self._ambient[i]) + self._gauge()
 
-    @staticmethod
-    def _stiffness(sag_um: float) -> float:
-        return _TENSION + 3 * _STRETCH * sag_um**2
+    def _stiffness(self, sag_um: float) -> float:
+        return self._tension + 3 * self._stretch * sag_um**2
 
 
 def _weather(
