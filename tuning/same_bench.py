@@ -41,7 +41,10 @@ def continue_on_hold(folder: SessionFolder, link: HoldLink) -> SessionFolder:
         Pump, loop or present gains are not those that its data are for.
     """
     where = f"the hold {link.name}"
-    require_same_bench(where, link.config, folder)
+    # The same twin has the devices of a configuration that is practised on it.
+    if link.name != folder.head.source:
+        require_same_devices(where, link.config, folder)
+    _require_same_settings(where, link.config, folder)
     known = [folder.head.before]
     if folder.is_done("design"):  # its own gains may be on trial
         known.append(gains_file.load_gains(folder.file_path("gains.toml")).loop)
@@ -87,6 +90,10 @@ def require_same_bench(path: Path | str, config: schema.Config, folder: SessionF
         A key differs that is neither a gain nor independent of the gains.
     """
     require_same_devices(path, config, folder)
+    _require_same_settings(path, config, folder)
+
+
+def _require_same_settings(path: Path | str, config: schema.Config, folder: SessionFolder) -> None:
     tuned = folder.config
     for section in ("pump", "loop"):
         here, there = getattr(config, section), getattr(tuned, section)

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig, LoopConfig
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions import folder, progress
@@ -237,6 +237,21 @@ def test_a_session_continues_with_a_later_hold_of_the_same_bench(
         )
         return
     with pytest.raises(InputError, match=refused):
+        same_bench.continue_on_hold(opened, link)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("hold", "continues"), [("twin", True), ("a-run", False)])
+def test_a_session_on_the_twin_of_a_bench_continues_there_only(
+    tmp_path: Path, hold: str, continues: bool
+) -> None:
+    """A guided session that is practised on the emulated bench tunes twice, with `[devices]`."""
+    config = Config(loop=RUNNING, devices=DevicesConfig(board="tcp://192.0.2.1"))
+    opened = folder.create_session(tmp_path, "s", "eve", "twin", config, RUNNING)
+    link = SimpleNamespace(config=config, name=hold)
+    if continues:
+        same_bench.continue_on_hold(opened, link)  # type: ignore[arg-type]
+        return
+    with pytest.raises(InputError, match="tuned the simulated bench"):
         same_bench.continue_on_hold(opened, link)  # type: ignore[arg-type]
 
 
