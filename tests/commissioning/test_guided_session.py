@@ -10,8 +10,10 @@ import pytest
 
 from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.commissioning.check import DeviceProbe
+from membrane_ctrl.commissioning.guide import emulated_bench
 from membrane_ctrl.commissioning.guide.bench_access import HandAct, HandMotion
 from membrane_ctrl.commissioning.guide.dialogue import Choice, Dialogue
+from membrane_ctrl.commissioning.guide.emulated_bench import EmulatedBench
 from membrane_ctrl.commissioning.guide.good_readings import select_good
 from membrane_ctrl.commissioning.guide.inflation_stages import DepthPoint, judge_law
 from membrane_ctrl.commissioning.guide.mirror_design import PAPER_MIRROR
@@ -29,6 +31,7 @@ from membrane_ctrl.commissioning.guide.text_display import TextDisplay
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import load_toml
 from membrane_ctrl.controller.cross_check import cross_check
+from membrane_ctrl.hold.virtual_hold import VirtualHold
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.truth import Truth
@@ -445,3 +448,21 @@ def test_lost_samples_of_the_laser_are_no_reason_to_stop(tmp_path: Path) -> None
 def test_a_laser_that_loses_most_is_named() -> None:
     with pytest.raises(StageFailedError, match="the laser gave 1 readings in 3 samples"):
         select_good([math.nan, 1.0, math.nan], "laser")
+
+
+def test_each_tuning_of_the_emulated_bench_begins_with_the_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`tune run` continues a session that it finds, and refuses one of another pump's curve."""
+    started: list[list[str]] = []
+
+    def note_program(words: list[str], show: object) -> int:
+        started.append(words)
+        return 0
+
+    monkeypatch.setattr(emulated_bench, "run_shown", note_program)
+    bench = EmulatedBench(VirtualHold)
+    for command in ("pump", "run"):
+        assert bench.run_tuning(tmp_path, Config(), command, print) == 0
+    logs = [words[words.index("--logs") + 1] for words in started]
+    assert len(set(logs)) == 2

@@ -196,7 +196,9 @@ class EmulatedBench:
     ) -> int:
         """Run `tune` on a twin of its own; its gains are not saved."""
         configuration = str(folder / CONFIGURATION)
-        logs = str(folder / "logs")
+        # Its own folder: `tune run` would continue the session of `tune pump`, whose curve the
+        # configuration has not.
+        logs = str(folder / "logs" / command)
         arguments = [*OWN_PROGRAM, "tune", command, "--twin"]
         arguments += ["--config", configuration, "--logs", logs, "--yes"]
         return run_shown(arguments, show)
