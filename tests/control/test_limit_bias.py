@@ -31,6 +31,18 @@ def test_a_start_far_from_the_setpoint_hardly_moves_the_aim() -> None:
     assert 0.0 < bias.offset_um < 0.02
 
 
+def test_a_pump_that_cannot_hold_the_mirror_winds_the_aim_no_further_than_a_mean_error() -> None:
+    bias = LimitBias()
+    for _ in range(6000):
+        bias.step(50.0, True, 0.1)
+    assert bias.offset_um == pytest.approx(2.0)
+    seconds = 0
+    while bias.offset_um > 0.2:  # the pump holds again: the mirror stands at the aim
+        bias.step(-bias.offset_um, False, 1.0)
+        seconds += 1
+    assert seconds < 120
+
+
 def test_the_aim_returns_when_the_pump_is_in_its_range_again() -> None:
     bias = LimitBias(offset_um=-0.8, share=0.5)
     for _ in range(9000):
