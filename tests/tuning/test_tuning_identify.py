@@ -106,16 +106,6 @@ def test_only_a_strong_pump_beside_which_something_swings_is_mapped(
     assert any("coloured" in reason for reason in found.reasons)
 
 
-def test_a_blinking_laser_is_refused() -> None:
-    whole = record(TRUTH)
-    reading = whole.displacement_um.copy()
-    reading[::20] = np.nan
-    blinking = replace(whole, displacement_um=reading)
-    found = judge_fit(blinking, identify_plant(blinking))
-    assert found.verdict == "refused"
-    assert "laser" in found.reasons[0]
-
-
 def test_too_little_excitation_is_refused_with_the_experiment_that_helps() -> None:
     whole = record(TRUTH, samples=400, laser_um=4.0, walk_um2_per_s=0.5)
     found = judge_fit(whole, identify_plant(whole))

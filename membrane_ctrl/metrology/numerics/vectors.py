@@ -38,7 +38,7 @@ def vector_lengths(vectors: FloatArray) -> FloatArray:
     (n,) array
         As `np.linalg.norm(vectors, axis=0)`, in half of its time.
     """
-    square = np.square(vectors[0])
+    square = np.asarray(np.square(vectors[0]))  # one vector alone, too
     for component in vectors[1:]:
         square += np.square(component)
     return np.asarray(np.sqrt(square, out=square))
