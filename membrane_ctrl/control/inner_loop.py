@@ -1,10 +1,9 @@
-"""The inner loop: holds the laser reading at the setpoint with the pump's flow. Pure: no I/O, no
-clock.
+"""The inner loop: holds the centre (the laser's reading, or the estimate) at the setpoint with the
+pump's flow. Pure: no I/O, no clock.
 
-Order of a tick: setpoint ramp and trim -> measurement filter -> P, I, D -> feed-forward -> limits
--> back-calculation
--> pump curve. The measurement filter stands before the limits: noise that meets a one-sided limit
-becomes a bias.
+Order of a tick on the laser: setpoint ramp and trim -> measurement filter -> P, I, D ->
+feed-forward -> limits -> back-calculation -> pump curve. The measurement filter stands before the
+limits: noise that meets a one-sided limit becomes a bias.
 """
 
 import math
@@ -90,9 +89,9 @@ class InnerLoopState(StateNode):
     kept_output: LoopOutput | None = None
     kept_s: float = 0.0
     follows_estimate: bool = False  # the last automatic tick did
-    # Where the loop on the estimate aims, less the setpoint: not 0 just after a hand-over
+    # Added to the aim of the loop on the estimate after a hand-over; decays in 0.5 s
     aim_offset_um: float = 0.0
-    # Where it aims, less the setpoint, while the pump is often at a limit
+    # Added to that aim against the mean error of a pump that stands at a limit
     limit_bias: LimitBias = field(default_factory=LimitBias)
 
 

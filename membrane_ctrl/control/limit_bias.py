@@ -1,4 +1,4 @@
-"""Removes the mean error of a loop whose pump often stands at its limit. Pure.
+"""Reduces the mean error of a loop whose pump often stands at its limit. Pure.
 
 The pump only adds gas. Where the leak is small for the weather, the wanted flow is often below 0:
 what lifts the mirror is removed slowly, by the leak, and what lowers it at once, by the pump. A
@@ -19,10 +19,11 @@ from membrane_ctrl.model.state_tree import StateNode
 _SHARE_S = 60.0  # T_w
 _OFFSET_S = 20.0  # T_o: slow against any loop
 _MEMORY_S = 300.0  # T_m: the weather of half an hour ago is another one
-# A larger error counts as this much: it is that of a start or of a door, no mean one
+# Larger errors, of a start or a door, are passing ones: they count as this much
 _ERROR_MOST_UM = 1.0
-# More than the mean error of any drawn bench (0.8 µm). A pump that cannot hold the mirror at all
-# winds the aim no further, so that it returns without a lasting error once it can.
+# More than the mean error of any of the benchmark's random benches (0.8 µm). A pump that cannot
+# hold the mirror at all winds the aim no further, so that it returns without a lasting error once
+# it can.
 _OFFSET_MOST_UM = 2.0
 
 

@@ -284,7 +284,10 @@ def _describe_shared(waves: ring_waves.SharedWaves) -> str:
     if waves.weight > _SURELY_SHARED:
         return text + f"the same at all sags: not the film's; of {elsewhere}"
     causes = " or ".join(_CAUSES[cause] for cause in waves.likely[:2])
-    return text + f"of no sure cause: the same at all sags ({elsewhere}), or {causes}"
+    return text + (
+        f"of no sure cause: a figure that all sets share ({elsewhere}), by a probability of "
+        f"{waves.weight:.0%}, or {causes}"
+    )
 
 
 def _describe_together(pair: ring_waves.CausesTogether) -> str:

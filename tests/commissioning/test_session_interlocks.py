@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -19,7 +20,7 @@ from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.live_hold import News
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.commissioning.guided import Person, QuickBench, run_stages
+from tests.commissioning.guided import SHORT, Person, QuickBench, run_stages
 
 DESK = ("mirror", "devices")
 BOARD = {"driver": "board_input", "input": "0"}
@@ -72,6 +73,53 @@ def test_a_circuit_that_opens_during_a_hold(
     assert STATED in stopped
     assert "Do: follow the interlock's text, close its circuit" in stopped
     assert bench.bench.board.pump_fraction == 0.0
+
+
+class WaitingHold(VirtualHold):
+    """A hold that goes on while a person thinks about a question."""
+
+    present: ClassVar[WaitingHold | None] = None
+    unread: News | None = None
+
+    def let_time_pass(self) -> None:
+        self.unread = super().read_news()
+
+    def read_news(self) -> News:
+        WaitingHold.present = self
+        if self.unread is None:
+            return super().read_news()
+        unread, self.unread = self.unread, None
+        return unread
+
+
+class ThinkingPerson(Person):
+    """Lets a second pass before the second step of the inflation, in which a circuit opens."""
+
+    def __init__(self, bench: QuickBench) -> None:
+        super().__init__()
+        self._bench = bench
+
+    def read_line(self, key: str, prompt: str) -> str:
+        steps = [asked for asked in self.asked if asked.startswith("fill_")]
+        if key.startswith("fill_") and steps and WaitingHold.present is not None:
+            self._bench.move_hand(HandMotion(HandAct.OPEN_CIRCUIT, "emergency_stop"))
+            WaitingHold.present.let_time_pass()
+            WaitingHold.present = None
+        return super().read_line(key, prompt)
+
+
+def test_a_circuit_that_opens_while_a_question_is_open_is_named(tmp_path: Path) -> None:
+    """Not the command that the fault refuses."""
+    bench = QuickBench(WaitingHold)
+    run_stages(tmp_path, bench, person_with(BOARD), *DESK)
+    use_filled_mirror(tmp_path, bench)
+    WaitingHold.present = None
+    person = ThinkingPerson(bench)
+    plan = replace(SHORT, inflation_shares=(1.0, 1.0005))
+    assert run_stages(tmp_path, bench, person, "inflation", plan=plan) == Exit.INTERRUPTED
+    (stopped,) = [line for line in person.shown if line.startswith("  stopped safely:")]
+    assert STATED in stopped
+    assert "refused" not in stopped
 
 
 class OpeningBench(QuickBench):

@@ -100,6 +100,9 @@ def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> Dep
     setpoint_um : float
         The depth, as displacement.
     """
+    # The hold may have ended by a fault while a question was open: that is the cause to name, not
+    # the refused command.
+    read_sound_news(link)
     # Move there.
     link.send_command(Command("setpoint", _WHO, value=setpoint_um))
     if wait_for_row(link).state == State.STANDBY:
@@ -133,10 +136,13 @@ def acknowledge_fault(context: StageContext, link: HoldLink) -> None:
 
 
 def read_sound_news(link: HoldLink) -> News:
-    """The news of the hold. Raises StageFailedError, with cause and remedy, on a fault."""
+    """Read ticks and events of the hold. Raises StageFailedError, with cause and remedy, if there
+    is a fault among them.
+    """
     news = link.read_news()
     for event in news.events:
         if isinstance(event, events.Fault):
+            # The stage's hold ends before a person reads this.
             raise StageFailedError(f"the controller ended it: {event.sentence}; the pump is off")
     return news
 

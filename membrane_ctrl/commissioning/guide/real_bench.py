@@ -182,11 +182,17 @@ def _wait_for_socket(process: "subprocess.Popen[bytes]", socket: Path, log: Path
 def _end_process(process: "subprocess.Popen[bytes]") -> None:
     """End the hold as Ctrl-C does, and wait until it has stopped safely.
 
-    A Ctrl-C of the terminal has reached it already: then it only needs time.
+    A Ctrl-C of the terminal has reached it already: then it only needs time. Raises DeviceError if
+    it does not end.
     """
     with contextlib.suppress(subprocess.TimeoutExpired):
         if isinstance(sys.exc_info()[1], KeyboardInterrupt):
             process.wait(_OWN_END_S)
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
-    process.wait(_ENDS_S)
+    try:
+        process.wait(_ENDS_S)
+    except subprocess.TimeoutExpired:
+        raise DeviceError(
+            f"the hold has not ended within {_ENDS_S:g} s: run `membrane-ctrl safe`, then end it"
+        ) from None
