@@ -31,9 +31,16 @@ image)
     make_wheel
     make_base "$out/base.tar"
     cp Containerfile "$out/"
-    builder=$(command -v podman || command -v docker || command -v buildah)
+    # podman or docker if it answers: a client without its daemon builds nothing
+    builder=buildah
+    for each in podman docker; do
+        if "$each" info >/dev/null 2>&1; then
+            builder=$each
+            break
+        fi
+    done
     case $builder in
-    */buildah)
+    buildah)
         export BUILDAH_ISOLATION="${BUILDAH_ISOLATION:-chroot}"
         buildah build --tag membrane-ctrl --file "$out/Containerfile" "$out"
         container=$(buildah from membrane-ctrl)
