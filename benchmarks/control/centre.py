@@ -75,8 +75,8 @@ def peak_sensitivity(case: str, slower: float = 1.0) -> tuple[float, float]:
     """Largest share of a sine in the readings that remains in centre and sine, and its frequency in
     Hz.
 
-    Two runs in the same noise, with the sine and without; the true pump is `slower` by a factor
-    than told.
+    Two runs in the same noise, with the sine and without; the true pump is slower by a factor of
+    `slower` than its configuration.
     """
     pump = {
         "pump_delay_s": slower * TwinConfig().pump_delay_s,

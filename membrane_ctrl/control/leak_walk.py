@@ -10,8 +10,9 @@ weighted by their probabilities.
 
 A hypothesis needs neither pump nor weather, because it does not hold centre and leak themselves,
 but their differences d_c and d_l from those of the main filter: what moves the centre moves both
-alike. With nu the innovation of the main filter, K_c and K_l its gains on centre and leak, k_c and
-k_l the gains of the hypothesis, r the variance of the reading, and P the hypothesis's covariance:
+by the same amount. With nu the innovation of the main filter, K_c and K_l its gains on centre and
+leak, k_c and k_l the gains of the hypothesis, r the variance of the reading, and P the covariance
+of the hypothesis:
 
     predict   d_c <- d_c - d_l dt          P <- F P F^T + Q,   F = [1 -dt; 0 1]                 (1)
     correct   n = nu - d_c                 the innovation of the hypothesis
@@ -156,7 +157,7 @@ class LeakWalk(StateNode):
         gains: tuple[float, float],
         dt_s: float,
     ) -> None:
-        """Correct the hypotheses by a reading of the centre, and weight them anew.
+        """Correct the hypotheses by a reading of the centre, and update their weights.
 
         Parameters
         ----------

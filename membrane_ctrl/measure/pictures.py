@@ -176,8 +176,8 @@ def _draw_star(found: MeasuredFigure) -> Figure | None:
     """Draw the image of a distant point at the stated wavelength, and its energy by radius.
 
     None without a real focus. Where the cells do not resolve the differences of the paths, the
-    point spread function is not that of the mirror: the picture says so, and shows where the rays
-    meet the focal plane.
+    point spread function is not that of the mirror: the picture states this, and shows where the
+    rays meet the focal plane.
     """
     if not found.figure.numbers.best_focus_mm > 0:
         return None

@@ -76,7 +76,7 @@ def test_a_circuit_that_opens_during_a_hold(
 
 
 class WaitingHold(VirtualHold):
-    """A hold that goes on while a person thinks about a question."""
+    """A hold that continues while a question is open."""
 
     present: ClassVar[WaitingHold | None] = None
     unread: News | None = None
