@@ -52,8 +52,14 @@ def require_optics(devices: DevicesConfig) -> None:
 
 
 def report_problem(devices: DevicesConfig, control: Connection) -> None:
-    """Load the drivers, check their settings, and send the problem or an empty text: target of a
-    child process.
+    """Load the drivers of camera and screen and check their settings; target of a child process.
+
+    Parameters
+    ----------
+    devices : DevicesConfig
+        Tables `camera` and `screen`; one that is not configured is not checked.
+    control : Connection
+        Receives the text of the first problem, or an empty text.
     """
     tables = (
         (devices.camera, "devices.camera", drivers.CAMERAS),

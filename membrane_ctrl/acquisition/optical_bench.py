@@ -160,7 +160,20 @@ def _make_screen(config: Config, section: Any, clock: CycleClock, *library: Any)
 
 
 def make_raster(config: Config, screen: ScreenSection) -> display_patterns.ScreenRaster:
-    """The screen's pixels and the pattern region. Raises LinkError if the region does not fit."""
+    """Make the raster of a screen: its pixels, and the region in which the pattern is shown.
+
+    Parameters
+    ----------
+    config : Config
+        For the number of periods and their length in mm.
+    screen : ScreenSection
+        For the pixels, their pitch in mm, and the pattern's centre.
+
+    Raises
+    ------
+    LinkError
+        The pattern does not fit on the screen.
+    """
     pattern = config.optics.pattern
     try:
         return display_patterns.ScreenRaster(

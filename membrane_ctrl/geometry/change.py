@@ -12,7 +12,18 @@ _NAMED_MOST = 4
 
 
 def describe_change(before: OpticsConfig, now: OpticsConfig) -> str:
-    """The numbers that differ, with both values; empty if none does."""
+    """List the numbers of the geometry that differ, the first few with both values.
+
+    Parameters
+    ----------
+    before, now : OpticsConfig
+        The optics of two runs.
+
+    Returns
+    -------
+    str
+        Such as `geometry.a_mm from 2400 to 2401`; empty if none differs.
+    """
     old = dict(_list_leaves("", list_numbers(before)))
     new = dict(_list_leaves("", list_numbers(now)))
     names = [name for name in {**new, **old} if old.get(name) != new.get(name)]

@@ -30,7 +30,20 @@ class LensTable(Section):
     distortion: Distortion = ()
 
     def apply_to_camera(self, camera: CameraConfig, where: Path) -> CameraConfig:
-        """The camera with this lens. Raises InputError, naming the file, for a different camera."""
+        """Return the camera with this calibrated lens.
+
+        Parameters
+        ----------
+        camera : CameraConfig
+            The camera of the frames.
+        where : Path
+            The geometry's file, for the message.
+
+        Raises
+        ------
+        InputError
+            Number or pitch of the pixels differ: the lens was calibrated on another camera.
+        """
         for key in ("width_px", "height_px", "pixel_um"):
             if getattr(self, key) != getattr(camera, key):
                 raise errors.InputError(

@@ -65,7 +65,20 @@ def read_configured_geometry(config: Config) -> RunGeometry:
 
 
 def read_run_geometry(run_dir: Path | None, config: Config) -> RunGeometry:
-    """The geometry in use of a started run, from its folder."""
+    """Read the geometry that a started run uses from its folder.
+
+    Parameters
+    ----------
+    run_dir : Path or None
+        The run's folder; None, or a folder without a copy: the configuration's own geometry.
+    config : Config
+        The run's configuration.
+
+    Raises
+    ------
+    InputError
+        The copy cannot be used.
+    """
     return _read_if_present(None if run_dir is None else run_dir / GEOMETRY_COPY, config)
 
 
@@ -82,8 +95,21 @@ def _read_if_present(path: Path | None, config: Config) -> RunGeometry:
 
 
 def require_plausible(optics: OpticsConfig, where: Path, depth_known: bool = True) -> None:
-    """Raises InputError for a geometry from `where` with which less than half of the mirror can be
-    measured.
+    """Refuse a geometry with which less than half of the mirror can be measured.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The optics with this geometry.
+    where : Path
+        Its file, for the message.
+    depth_known : bool
+        Whether the film's depth is stated. Unless it is, any depth that the film can have counts.
+
+    Raises
+    ------
+    InputError
+        Names the table and the key that are most probably wrong, and the remedy.
     """
     found = sight.find_doubt(optics, depth_known)
     if found is not None and found.hopeless:

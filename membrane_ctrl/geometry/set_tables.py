@@ -34,7 +34,25 @@ class ArtefactTable(Section):
     vertex_sigma_mm: _Length = 1.0
 
     def make_artefact(self, radius_mm: float, path: Path) -> Artefact | Literal["screen"]:
-        """The surface, over its disc, or the screen itself. Raises InputError."""
+        """Make the artefact that the set shows instead of the film.
+
+        Parameters
+        ----------
+        radius_mm : float
+            Radius of the disc over which it is seen: `mirror.radius_mm`.
+        path : Path
+            The set's `capture.toml`, for the message.
+
+        Returns
+        -------
+        Artefact or "screen"
+            Its curvature in 1/mm, 0 for a flat; `"screen"` if the camera sees the screen itself.
+
+        Raises
+        ------
+        InputError
+            A key is missing, or does not belong to the form.
+        """
         # The screen itself.
         if self.form == "screen":
             if len(self.model_fields_set) > 1:

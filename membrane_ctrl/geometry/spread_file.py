@@ -47,13 +47,30 @@ def read_spread(path: Path) -> GeometrySpread | None:
 
 
 def geometry_spread(optics: schema.OpticsConfig, file: Path | None) -> tuple[GeometrySpread, str]:
-    """How well poses, lens and screen are known, and the source of that.
+    """Return how well poses, lens and screen are known, and by what.
 
     The file's covariance, else the geometry's own sigmas of a, b and alpha, else those of the
     paper's instruments. What these do not name has the sigma of `[geometry.sigmas]`; of the poses,
     only where no file has a covariance.
 
-    Raises InputError if the file's covariance is for the other form.
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The optics with the geometry in use.
+    file : Path or None
+        File of that geometry; None: the geometry is stated without a file.
+
+    Returns
+    -------
+    spread : GeometrySpread
+        Covariance of the bench parameters.
+    source : str
+        Where it is from, for people.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or its covariance is for the other form of the geometry.
     """
     geometry, given = optics.geometry, None if file is None else read_spread(file)
     others = stated_sigmas(optics)
@@ -71,7 +88,18 @@ def geometry_spread(optics: schema.OpticsConfig, file: Path | None) -> tuple[Geo
 
 
 def find_known_by(optics: schema.OpticsConfig, file: Path | None) -> KnownBy:
-    """What `geometry_spread` of the same arguments rests on. Raises InputError."""
+    """Return what `geometry_spread` of the same arguments rests on.
+
+    Parameters
+    ----------
+    optics, file : as in `geometry_spread`
+        -
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
+    """
     if file is not None and read_spread(file) is not None:
         return KnownBy.CALIBRATION
     if stated_spread(optics.geometry) is None:

@@ -421,7 +421,22 @@ def _find_sensor_bits(head: CaptureHead, frames: Image, path: Path) -> int:
 
 
 def require_inside(name: str, folder: Path, path: Path) -> None:
-    """Raise InputError for a frame that is not the set's own: a set may come from anywhere."""
+    """Refuse a file name that leads out of the set's folder: a set may come from anywhere.
+
+    Parameters
+    ----------
+    name : str
+        As the set states it, relative to its folder.
+    folder : Path
+        The set. Symbolic links on the way are followed before the comparison.
+    path : Path
+        Its `capture.toml`, for the message.
+
+    Raises
+    ------
+    InputError
+        The name is empty, absolute, has a `..`, or leads elsewhere by a link.
+    """
     try:
         inside = bool(name) and (folder / name).resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):  # a NUL, too long a name, circular links

@@ -112,8 +112,22 @@ def measured_figure(
 def figure_table(
     measurement: Measurement, found: MeasuredFigure, bars: ErrorBars
 ) -> dict[str, Any]:
-    """The block `figure`: every number with 1 sigma from noise and from the geometry
-    (docs/reference/figure.md).
+    """Make the block `figure` of `result.json` (docs/reference/figure.md).
+
+    Parameters
+    ----------
+    measurement : Measurement
+        For the radius of the terms and the cells of the map.
+    found : MeasuredFigure
+        The figure of this measurement.
+    bars : ErrorBars
+        Covariances of the terms, and the source of the geometry's spread.
+
+    Returns
+    -------
+    dict
+        Each number with 1 sigma from noise and from the geometry. A number that the surface does
+        not have stands in `not_given`, with the reason.
     """
     numbers = {
         name: make_quantity(
@@ -216,8 +230,20 @@ def _zernike_tables(
 
 
 def write_figure_maps(path: Path, found: MeasuredFigure) -> None:
-    """Write the deviation from the best sphere, its spectrum, and the encircled energy. Raises
-    OSError.
+    """Write the deviation from the best sphere, its spectrum, and the encircled energy.
+
+    Parameters
+    ----------
+    path : Path
+        The `.npz`, replaced. Maps are (rows, columns) in µm over `y_mm` and `x_mm`, NaN outside;
+        the spectrum has the density in µm² mm² for each spatial frequency in 1/mm.
+    found : MeasuredFigure
+        The figure.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
     """
     write_arrays(
         path,
@@ -268,7 +294,16 @@ def figure_lines(found: MeasuredFigure) -> list[str]:
 
 
 def with_bar(value: float, sigma: float) -> str:
-    """A number with its 1 sigma, to two digits of that; without one, the number states that."""
+    """Format a number with its 1 sigma, both to the second digit of the sigma.
+
+    Parameters
+    ----------
+    value : float
+        The number, in any unit.
+    sigma : float
+        In the same unit. 0 or less: the number is exact, and no error bar is added; NaN or
+        infinite: unknown, which the text states.
+    """
     if not math.isfinite(sigma):
         return f"{value:.4g} (no error bar)"
     if sigma <= 0:

@@ -181,10 +181,17 @@ def _write_files(
 
 
 def name_lens_fold(measurement: Measurement, reason: str, explains: bool) -> str:
-    """The reason of a verdict, with a lens model that folds within the picture.
+    """Return the reason of a verdict, with a lens model that folds within the picture.
 
-    If the frames contradict the geometry, such a model explains it (`explains`); otherwise it is
-    only mentioned.
+    Parameters
+    ----------
+    measurement : Measurement
+        For the stated lens.
+    reason : str
+        Reason of the verdict; empty if there is none, which stays empty.
+    explains : bool
+        Whether the frames contradict the geometry. Such a lens model is then named as the cause,
+        in front of the reason; otherwise it is mentioned behind it.
     """
     doubt = sight.find_lens_doubt(measurement.head.optics)
     if doubt is None or not reason:

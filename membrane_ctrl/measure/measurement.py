@@ -134,7 +134,27 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
 def read_anchor(
     folder: str | Path, geometry: GeometryFile | None = None
 ) -> tuple[CaptureHead, Anchor]:
-    """Read the reference of fringes sets. Raises InputError if it gives no figure."""
+    """Read and check the reference of a set of fringes alone.
+
+    Parameters
+    ----------
+    folder : str or Path
+        The reference, a set with Gray code or with several frequencies.
+    geometry : GeometryFile or None
+        Replaces the reference's own geometry.
+
+    Returns
+    -------
+    head : CaptureHead
+        Of the reference.
+    anchor : Anchor
+        Its phases, from which the fringe orders of the other set follow.
+
+    Raises
+    ------
+    InputError
+        It is no valid set, has fringes alone, or gives no figure.
+    """
     capture = read_set(folder, geometry)
     if capture.head.kind == "fringes":
         where = capture.head.folder / "capture.toml"

@@ -105,8 +105,20 @@ def _draw_pictures(
 
 
 def new_sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
-    """A figure of so many inches and its axes, with fixed margins: fitted ones double the time of a
-    picture.
+    """Make a figure and its axes with fixed margins: fitted ones double the time of a picture.
+
+    Parameters
+    ----------
+    width, height : float
+        Inches, margins included.
+    rows, columns : int
+        Number of axes.
+
+    Returns
+    -------
+    figure : Figure
+    axes : Axes or array of Axes
+        As `Figure.subplots` returns them: one, (columns,), (rows,) or (rows, columns).
     """
     figure = Figure(figsize=(width, height))
     axes = figure.subplots(rows, columns)

@@ -16,7 +16,24 @@ def pdf_pages(
     tables: Mapping[str, PageTable],
     pictures: Sequence[PagePicture],
 ) -> bytes:
-    """Pages of text, then two pictures on each."""
+    """Make the pages of a report: text and tables first, then two pictures a page.
+
+    Parameters
+    ----------
+    title : str
+        First line.
+    lines : sequence of str
+        Text below the title; long lines are wrapped.
+    tables : mapping of str to PageTable
+        Tables by heading.
+    pictures : sequence of PagePicture
+        PNG images.
+
+    Returns
+    -------
+    bytes
+        A PDF file of pages in A4.
+    """
     from matplotlib import figure, image
     from matplotlib.backends.backend_pdf import PdfPages
 

@@ -22,8 +22,27 @@ if TYPE_CHECKING:  # half a second to load, and most measurements make no record
 def open_recording(
     path: Path, application: str, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """Write a Rerun recording to a file `path` (.rrd), overwriting it. Raises OSError if that
-    fails.
+    """Write a Rerun recording within a `with` block.
+
+    The file appears whole at the end of the block, or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        The file (.rrd), replaced if it exists.
+    application : str
+        Application id: recordings of one id share a blueprint in the viewer.
+    blueprint : rrb.Blueprint or None
+        Views with which the file opens; None: those that the viewer chooses.
+
+    Yields
+    ------
+    rr.RecordingStream
+
+    Raises
+    ------
+    OSError
+        The file cannot be written, e.g. because the disk is full.
     """
     import rerun as rr
 
@@ -44,7 +63,17 @@ def open_recording(
 
 
 def log_pictures(recording: rr.RecordingStream, entity: str, pictures: Sequence[Path]) -> None:
-    """Log every picture below an entity, by file name."""
+    """Log pictures as static images, each at `entity` and its file's name without ending.
+
+    Parameters
+    ----------
+    recording : rr.RecordingStream
+        An open recording.
+    entity : str
+        Path of the entity above the pictures.
+    pictures : sequence of Path
+        Image files, such as PNG.
+    """
     import rerun as rr
 
     for picture in pictures:
@@ -52,8 +81,21 @@ def log_pictures(recording: rr.RecordingStream, entity: str, pictures: Sequence[
 
 
 def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Path]) -> None:
-    """Write maps, coefficients, verdict and pictures as a recording `path` (.rrd).
-    Raises OSError.
+    """Write maps, coefficients, verdict and pictures of a measurement as a Rerun recording.
+
+    Parameters
+    ----------
+    path : Path
+        The file (.rrd), replaced if it exists.
+    measurement : Measurement
+        Without a figure, only verdict and pictures are logged. Maps are shown with +y upwards.
+    pictures : sequence of Path
+        PNG files.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
     """
     import rerun as rr
 

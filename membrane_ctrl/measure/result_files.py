@@ -24,7 +24,22 @@ _ARRAYS_BYTES = 100_000_000
 
 
 def write_json(path: Path, table: dict[str, Any]) -> None:
-    """Write strict JSON: no NaN."""
+    """Write a table as strict JSON, with a line feed at its end.
+
+    Parameters
+    ----------
+    path : Path
+        The file, replaced as a whole.
+    table : dict
+        Plain data; a number that does not exist is None, not NaN.
+
+    Raises
+    ------
+    ValueError
+        A number is NaN or infinite.
+    OSError
+        The file cannot be written.
+    """
     write_text_atomic(path, json.dumps(table, indent=1, allow_nan=False) + "\n")
 
 
@@ -89,7 +104,27 @@ def _read_array(archive: zipfile.ZipFile, name: str, most: int) -> FloatArray:
 
 
 def write_picture(path: Path, figure: Figure, dpi: int = 110) -> Path:
-    """Write a figure as PNG; returns its path. Raises OSError."""
+    """Write a figure as PNG.
+
+    Parameters
+    ----------
+    path : Path
+        The file, replaced as a whole.
+    figure : Figure
+        Of any backend.
+    dpi : int
+        Pixels per inch.
+
+    Returns
+    -------
+    Path
+        `path`.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     picture = io.BytesIO()

@@ -180,9 +180,21 @@ def apply_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measuremen
 def result_table(
     measurement: Measurement, bars: ErrorBars | None, figure: dict[str, Any] | None
 ) -> dict[str, Any]:
-    """The content of `result.json` (schema membrane-result/1); numbers that do not exist are null.
+    """Make the content of `result.json` (schema membrane-result/1).
 
-    `figure` is its block of that name (`figure_results.figure_table`).
+    Parameters
+    ----------
+    measurement : Measurement
+        A rejected one gives the same keys with null.
+    bars : ErrorBars or None
+        None: no figure; uncertainty and knowledge of the geometry are null, the budget is empty.
+    figure : dict or None
+        The block `figure` (`figure_results.figure_table`); None: null.
+
+    Returns
+    -------
+    dict
+        Plain data; numbers that do not exist are None.
     """
     full = measurement.full
     optics = measurement.head.optics
@@ -378,7 +390,24 @@ def write_result(
     details: dict[str, Any],
     bars: ErrorBars | None,
 ) -> None:
-    """Write `result.json`, `details.json` and, with a usable figure, two maps. Raises OSError."""
+    """Write `result.json`, `details.json` and, with a usable figure, two maps.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the results; made if it does not exist.
+    measurement : Measurement
+        Its height becomes `height.npz`, in mm, unless it is rejected.
+    result, details : dict
+        Content of the two JSON files (`result_table`, `details_table`).
+    bars : ErrorBars or None
+        Their maps of 1 sigma become `sigma.npz`, in µm; None: no such file.
+
+    Raises
+    ------
+    OSError
+        A file cannot be written.
+    """
     make_folder(out)
     write_json(out / "result.json", result)
     write_json(out / "details.json", details)

@@ -21,8 +21,24 @@ _LEAST_PIXELS = 200  # fewer cannot judge a frame
 
 
 def check_sofast_file(path: Path, as_json: bool) -> int:
-    """Check the frames and report. Returns the exit code; raises InputError if it is not a SOFAST
-    file.
+    """Check the frames of a SOFAST measurement and print the verdict.
+
+    Parameters
+    ----------
+    path : Path
+        The HDF5 file.
+    as_json : bool
+        Print one object (schema membrane-frames/1) instead of lines of text.
+
+    Returns
+    -------
+    int
+        `Exit.REJECTED` if the frames are unusable, else `Exit.DONE`.
+
+    Raises
+    ------
+    InputError
+        It is not a SOFAST file, h5py is not installed, or hardly a pixel sees fringes.
     """
     try:
         measurement = read_sofast_file(path)

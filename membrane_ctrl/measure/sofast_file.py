@@ -93,7 +93,25 @@ def open_hdf5(path: Path) -> Any:
 
 
 def read_item(file: Any, name: str) -> Any:
-    """A data set of the file itself; refuses links to other files and implausible sizes."""
+    """Read one data set of the file itself.
+
+    Parameters
+    ----------
+    file : h5py.File
+        An open file; untrusted.
+    name : str
+        Path of the data set within the file, as `group/name`.
+
+    Returns
+    -------
+    numpy array or scalar
+        As h5py reads it.
+
+    Raises
+    ------
+    ValueError
+        It is missing, damaged, too large, or a link: links could lead to other files.
+    """
     import h5py
 
     try:
@@ -127,6 +145,23 @@ def read_item(file: Any, name: str) -> Any:
 
 
 def read_floats(file: Any, name: str) -> FloatArray:
+    """Read one data set as 64-bit floats.
+
+    Parameters
+    ----------
+    file, name : as in `read_item`
+        -
+
+    Returns
+    -------
+    array of float
+        In the data set's own shape and unit.
+
+    Raises
+    ------
+    ValueError
+        As `read_item`; also if it holds no numbers.
+    """
     try:
         return np.asarray(read_item(file, name), float)
     except TypeError:

@@ -142,14 +142,37 @@ class StabilityRun:
         self._stated = stated
 
     def skip_set(self, name: str, reason: str) -> None:
-        """Count a bad set."""
+        """Count a set without a figure, and give it a row of the series.
+
+        Parameters
+        ----------
+        name : str
+            The set's folder.
+        reason : str
+            Why it has no figure; the first few are listed in the result.
+        """
         self._bad_count += 1
         if len(self._bad) < _LISTED_BAD:
             self._bad.append({"set": name, "reason": reason})
         self._series.writerow((name, "rejected", reason))
 
     def add(self, name: str, number: int, one: measurement.SetFigure) -> None:
-        """Add a set; `number` is its place in the run, which seeds its noise."""
+        """Add the figure of a set: its uncertainty, its row, and the pairs that end with it.
+
+        Parameters
+        ----------
+        name : str
+            The set's folder.
+        number : int
+            Place of the set in the run, from 0; it seeds the noise of its trials.
+        one : SetFigure
+            The figure. Sets are added in the order of the run.
+
+        Raises
+        ------
+        InputError
+            The spread of the geometry is too wide for the trials' fits to converge.
+        """
         grid = self._grid_for(one)
         spread = self._spread_for(one)
         surface = one.figure.fit.surface
@@ -404,8 +427,20 @@ def stability_command(options: StabilityOptions) -> int:
 
 
 def set_folders(run: Path, out: Path) -> list[Path]:
-    """The sets of a run, sorted by name, without results of earlier analyses. Raises InputError if
-    there are none.
+    """List the capture sets of a run, sorted by name.
+
+    Parameters
+    ----------
+    run : Path
+        Folder of the sets.
+    out : Path
+        Folder of this analysis, which is no set; nor is a folder with the results of an earlier
+        one.
+
+    Raises
+    ------
+    InputError
+        There is no such folder, it is itself a set, or it holds none.
     """
     if not run.is_dir():
         raise errors.InputError(f"{run}: no such run of sets")

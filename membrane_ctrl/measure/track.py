@@ -118,7 +118,31 @@ class Track:
 def track_command(
     folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool
 ) -> int:
-    """Track a set, write the result and report it. Returns the exit code; raises CommandError."""
+    """Track a set of crossed patterns, write `track.npz` and print the result.
+
+    Parameters
+    ----------
+    folder : Path
+        The set.
+    geometry : Path or None
+        Geometry file that replaces the set's own; None: that of the set.
+    out : Path or None
+        Folder of the results; None: `result` in the set's folder.
+    as_json : bool
+        Print the table as one line of JSON instead of text.
+    pictures : bool
+        Write the picture and the Rerun recording, too.
+
+    Returns
+    -------
+    int
+        `Exit.REJECTED` if no frame has a usable figure, else `Exit.DONE`.
+
+    Raises
+    ------
+    CommandError
+        The set or its reference is invalid, or the result cannot be written.
+    """
     begin_s = time.perf_counter()
     given = None
     if geometry is not None:

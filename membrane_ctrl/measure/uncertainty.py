@@ -50,13 +50,34 @@ def run_everywhere(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> FloatArray:
-    """Parameters (trials, sets, parameters) in mm as `monte_carlo.run_trials`, with a progress bar
-    on a terminal.
+    """Run Monte Carlo trials in this process, on its cores, or on a Dask cluster.
 
-    `workers` is the number of processes, by default according to the work; `scheduler` the address
-    of a Dask scheduler to use instead, e.g. tcp://host:8786. Raises InputError if Dask is not
-    installed or the spread is too wide for the fit to converge; DeviceError if the scheduler does
-    not answer.
+    The numbers are the same to twelve digits. A terminal shows a progress bar.
+
+    Parameters
+    ----------
+    benches : sequence of TrialBench
+        The sets; all of one trial share its geometry.
+    spread : GeometrySpread
+        Covariance of poses, lens and screen.
+    seed, trials : int
+        Seed, and number of trials.
+    workers : int or None
+        Number of processes; None: one for little work, else one for each core.
+    scheduler : str or None
+        Address of a Dask scheduler to use instead, such as tcp://host:8786.
+
+    Returns
+    -------
+    (trials, sets, parameters) array
+        Parameters of the surface, mm, as `monte_carlo.run_trials`.
+
+    Raises
+    ------
+    InputError
+        Dask is not installed, or the spread is too wide for the fit to converge.
+    DeviceError
+        The scheduler does not answer.
     """
     batches = [range(first, min(first + _BATCH, trials)) for first in range(0, trials, _BATCH)]
     job = partial(monte_carlo.run_trials, benches, spread, seed)

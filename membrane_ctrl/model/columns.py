@@ -213,7 +213,15 @@ class TelemetryColumn:
         return self.entity.startswith("/truth/")
 
     def format_value(self, value: float | None, sign: bool = False) -> str:
-        """Return a value with its decimals, with `sign` also a plus; a dash for a missing value."""
+        """Return a value with the column's decimals, without unit.
+
+        Parameters
+        ----------
+        value : float or None
+            In the column's unit; None, NaN and infinity give a dash.
+        sign : bool
+            Whether a positive value has a plus.
+        """
         if value is None or not math.isfinite(value):
             return MISSING
         plus = "+" if sign else ""
@@ -233,12 +241,19 @@ def declare_column(
     aggregation: Aggregation | None = None,
     published: bool = False,
 ) -> Any:
-    """Return a dataclass field whose metadata is a row of the table. Parameters: see
-    `TelemetryColumn`.
+    """Return a dataclass field whose metadata is a row of the table of columns.
 
-    A value that nothing sets is missing: NaN. Unless they are given, a quantity has two decimals,
-    and overview levels keep the last value of a code, and minimum, mean and maximum of a published
-    column.
+    A value that nothing sets is missing: NaN.
+
+    Parameters
+    ----------
+    label, description, plot, entity, colour, width, kind, published
+        As the attributes of `TelemetryColumn`.
+    decimals : int or None
+        None: two for a quantity, none for counts and codes.
+    aggregation : Aggregation or None
+        None: overview levels keep the last value of a code, and minimum, mean and maximum of a
+        published column.
     """
     if decimals is None:
         decimals = 2 if kind is Kind.QUANTITY else 0
@@ -708,5 +723,11 @@ def plot_title(plot: Plot, detail: str = "") -> str:
 
 
 def title_with_unit(title: str, detail: str, unit: str) -> str:
-    """Return a title, a detail and a unit with commas between them; any of them may be empty."""
+    """Return a title, a detail and a unit with commas between them.
+
+    Parameters
+    ----------
+    title, detail, unit : str
+        Any of them may be empty, and is then left out.
+    """
     return ", ".join(part for part in (title, detail, unit) if part)

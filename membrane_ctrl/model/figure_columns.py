@@ -205,5 +205,13 @@ def figure_columns_of(plot: Plot) -> tuple[TelemetryColumn, ...]:
 
 
 def figure_plot_title(plot: Plot, detail: str = "") -> str:
-    """Return the title of a plot of figures with its unit, as `columns.plot_title`."""
+    """Return the title of a plot of figures with its unit, as `columns.plot_title`.
+
+    Parameters
+    ----------
+    plot : Plot
+        A plot with at least one column of figures; the first one has the unit.
+    detail : str
+        Put between title and unit, unless it is empty.
+    """
     return title_with_unit(plot.title, detail, figure_columns_of(plot)[0].unit)

@@ -18,7 +18,15 @@ _LINE = re.compile(re.escape(_COMMENT) + r"([0-9a-f]{8})\n")
 
 
 def dumps_checked(table: dict[str, Any], indent: int | None = None) -> str:
-    """JSON text of an object, with its checksum."""
+    """Return the JSON text of an object, with its checksum as the last member `crc32`.
+
+    Parameters
+    ----------
+    table : dict
+        Plain data, as `plain_json.dumps` accepts it.
+    indent : int or None
+        Spaces for each level; None: one line.
+    """
     plain = json.loads(dumps(table))
     return dumps({**plain, KEY: _table_crc(plain)}, indent)
 

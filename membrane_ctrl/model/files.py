@@ -164,7 +164,20 @@ def write_text_atomic(path: Path, text: str) -> None:
 
 
 def write_bytes_atomic(path: Path, data: bytes) -> None:
-    """As `write_text_atomic`, with bytes."""
+    """Write bytes beside a file, sync them, and move them into place atomically.
+
+    Parameters
+    ----------
+    path : Path
+        The file; a link of this name is replaced, not its target.
+    data : bytes
+        The whole content.
+
+    Raises
+    ------
+    OSError
+        It cannot be written; the former file stays.
+    """
     with folder_handle(path.parent) as folder:
         part = f".{path.name}.part"
         try:
@@ -217,7 +230,20 @@ def append_text(path: Path, text: str) -> None:
 
 
 def move_file(source: Path, target: Path) -> None:
-    """Replace a file, or a link but not its target, by another file. Raises OSError."""
+    """Replace a file by another file, atomically.
+
+    Parameters
+    ----------
+    source : Path
+        The file to move, on the same file system.
+    target : Path
+        Its new name; a link of this name is replaced, not its target.
+
+    Raises
+    ------
+    OSError
+        It cannot be moved; both files stay.
+    """
     with folder_handle(source.parent) as from_folder, folder_handle(target.parent) as folder:
         try:
             os.replace(source.name, target.name, src_dir_fd=from_folder, dst_dir_fd=folder)
@@ -242,8 +268,24 @@ def make_folder(path: Path) -> Path:
 
 @contextlib.contextmanager
 def scratch_folder(folder: Path, prefix: str) -> Iterator[Path]:
-    """A private temporary folder within a folder, for programs that write by name.
-    Raises OSError.
+    """Make a private temporary folder within a folder, for programs that write by name.
+
+    Parameters
+    ----------
+    folder : Path
+        Existing folder, so that `move_file` from there stays on one file system.
+    prefix : str
+        With which the temporary folder's name begins.
+
+    Yields
+    ------
+    Path
+        The temporary folder, which is deleted with its content at the end of the block.
+
+    Raises
+    ------
+    OSError
+        It cannot be made.
     """
     with folder_handle(folder), tempfile.TemporaryDirectory(prefix=prefix, dir=folder) as scratch:
         yield Path(scratch)

@@ -84,7 +84,15 @@ class NoticeChanges(NamedTuple):
 
 
 def apply_changes(standing: Notices, changes: NoticeChanges) -> Notices:
-    """Return the notices that stand after an event."""
+    """Return the notices that are open after an event.
+
+    Parameters
+    ----------
+    standing : mapping of NoticeKey to Notice
+        Those before the event, oldest first; not changed.
+    changes : NoticeChanges
+        What the event closes, and then opens. A notice that is opened again keeps its place.
+    """
     if not changes.closed and not changes.opened:
         return standing
     closed = frozenset(changes.closed)

@@ -21,12 +21,37 @@ def find_missing_page_library() -> str | None:
 
 
 def describe_missing(user: str, name: str, extra: str) -> str:
-    """What needs a library that is missing, and how to install it, in one line."""
+    """Describe in one line what needs a library that is missing, and how to install it.
+
+    Parameters
+    ----------
+    user : str
+        What needs it, such as `--format h5`.
+    name : str
+        The library, such as `h5py`.
+    extra : str
+        The extra of this package that requires it.
+    """
     return f"{user} needs {name}: pip install 'membrane-ctrl[{extra}]'"
 
 
 def require_installed(name: str, extra: str, user: str) -> None:
-    """Raise InputError, with how to install it, if a library is missing; does not import it."""
+    """Refuse to begin without a library, which is not imported yet.
+
+    Parameters
+    ----------
+    name : str
+        The library, such as `h5py`.
+    extra : str
+        The extra of this package that requires it.
+    user : str
+        What needs it, such as `--format h5`.
+
+    Raises
+    ------
+    InputError
+        It is not installed; the message states how to install it.
+    """
     if not is_installed(name):
         raise errors.InputError(describe_missing(user, name, extra))
 

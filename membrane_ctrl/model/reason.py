@@ -66,8 +66,17 @@ class Reason(StateNode):
 
 
 def make_reason(code: str, text: str, *details: object) -> Reason:
-    """Return a reason whose code is followed by details that make it another one, such as who
-    asked.
+    """Return a reason whose code has details.
+
+    Parameters
+    ----------
+    code : str
+        What decides, such as the name of a refusal.
+    text : str
+        For people, with numbers.
+    *details : object
+        What makes it another reason although the code is the same, such as who asked: joined to
+        the code by points.
     """
     return Reason(".".join(map(str, (code, *details))), text)
 

@@ -168,7 +168,15 @@ class RunStatus:
 
 
 def gains_words(loop: Mapping[str, Any], trial_left_s: float | None) -> str:
-    """Gains for a person, with the countdown of a trial."""
+    """Return the gains of the loop for a person, with the time that is left of a trial.
+
+    Parameters
+    ----------
+    loop : mapping
+        With `kp_per_s` in 1/s, `ti_s` and `td_s` in s.
+    trial_left_s : float or None
+        Until the gains are reverted; None or NaN: they are not on trial.
+    """
     on_trial = trial_left_s is not None and math.isfinite(trial_left_s)
     trial = ""
     if on_trial:

@@ -86,8 +86,12 @@ class TelemetryRow(ColumnValues):
         return f"{column.format_value(getattr(self, name), sign):>{width}} {column.unit}".rstrip()
 
     def format_labelled(self, name: str, sign: bool = False, width: int = 0) -> str:
-        """Return a value with label and unit, `error +0.25 µm`;
-        parameters as those of `format_quantity`.
+        """Return a value with label and unit: `error +0.25 µm`.
+
+        Parameters
+        ----------
+        name, sign, width : as in `format_quantity`
+            -
         """
         return f"{COLUMNS[name].short_label} {self.format_quantity(name, sign, width)}"
 
@@ -112,7 +116,20 @@ def unpack_rows(messages: Sequence[bytes]) -> Rows:
 
 
 def get_column(rows: Rows, name: str) -> FloatArray:
-    """One field of all rows, (n,)."""
+    """Return one column of all rows.
+
+    Parameters
+    ----------
+    rows : (n, fields) array
+        As `unpack_rows` returns them.
+    name : str
+        Field of `TelemetryRow`.
+
+    Returns
+    -------
+    (n,) array
+        A view, in the column's unit; NaN where the value is missing.
+    """
     return rows[:, COLUMN[name]]
 
 

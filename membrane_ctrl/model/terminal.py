@@ -53,8 +53,16 @@ def only_text() -> Iterator[None]:
 
 
 def table_console(stderr: bool = False, width: int | None = None) -> Console:
-    """A Rich console for tables that passes Rich's own colours, but no control characters in the
-    cells.
+    """Make a Rich console for tables whose cells may hold texts from anywhere.
+
+    It passes Rich's own colours, but no control characters in the cells, and reads no markup.
+
+    Parameters
+    ----------
+    stderr : bool
+        Print on stderr instead of stdout.
+    width : int or None
+        Columns; None: those of the terminal.
     """
     from rich.console import Console
 
@@ -65,7 +73,15 @@ def table_console(stderr: bool = False, width: int | None = None) -> Console:
 
 
 def live_line(text: str, end: str = "") -> None:
-    """Replace the last line of stderr, a terminal, by a text."""
+    """Replace the last line of stderr, which must be a terminal.
+
+    Parameters
+    ----------
+    text : str
+        One line; line ends become spaces, control characters are escaped.
+    end : str
+        Written after the text; a line feed makes the line stay.
+    """
     # `_Text` would escape what moves the cursor
     stream = getattr(sys.stderr, "rich_proxied_file", sys.stderr)
     stream.write(f"\r\033[K{one_line(text)}{end}")
@@ -73,7 +89,17 @@ def live_line(text: str, end: str = "") -> None:
 
 
 def track_progress(items: Iterable[_T], what: str, total: int | None = None) -> Iterable[_T]:
-    """Yield the items, with a progress bar on stderr if that is a terminal."""
+    """Yield items, with a progress bar on stderr if that is a terminal.
+
+    Parameters
+    ----------
+    items : iterable
+        Yielded unchanged.
+    what : str
+        Title of the bar, such as `sets`.
+    total : int or None
+        Number of items; None: their length, or a bar without an end if they have none.
+    """
     from rich.progress import track
 
     rich, on = table_console(stderr=True), sys.stderr.isatty()

@@ -64,7 +64,15 @@ class PartResult:
 
 
 def judge_within(value: float, low: float, high: float) -> Agreement:
-    """REPRODUCED if a value lies between two bounds, else DIFFERS."""
+    """Return REPRODUCED if a value lies between two bounds, which count as inside, else DIFFERS.
+
+    Parameters
+    ----------
+    value : float
+        The number computed here; NaN differs.
+    low, high : float
+        Bounds of the paper's number, in the same unit.
+    """
     return Agreement.REPRODUCED if low <= value <= high else Agreement.DIFFERS
 
 

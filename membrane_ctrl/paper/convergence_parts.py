@@ -32,7 +32,15 @@ _ROUNDING_MM = 1e-12
 
 
 def make_seen_points(bench: MeasuredBench, count: int = _POINTS) -> SeenPoints:
-    """What about `count` of the set's bins see, one in so many."""
+    """Thin out the bins of a set: more points than `count` only cost time.
+
+    Parameters
+    ----------
+    bench : MeasuredBench
+        The set.
+    count : int
+        About how many bins to keep, evenly over the mirror.
+    """
     points = bench.checked.state.points
     every = max(1, points.t_mm.size // count)
     return SeenPoints(points.rays[:, ::every], points.screen_mm[:, ::every])
@@ -41,7 +49,19 @@ def make_seen_points(bench: MeasuredBench, count: int = _POINTS) -> SeenPoints:
 def solve_by_paper(
     bench: MeasuredBench, start: StartShape, iterations: int, count: int = _POINTS
 ) -> ReferenceSolution:
-    """The paper's own iteration on the bins of the set."""
+    """Solve the paper's own iteration (its section 2.4) on bins of the set.
+
+    Parameters
+    ----------
+    bench : MeasuredBench
+        The set, and a, b and alpha of its geometry.
+    start : StartShape
+        h^(0).
+    iterations : int
+        Number of iterations; there is no other end.
+    count : int
+        About how many bins to use.
+    """
     mirror = bench.optics.mirror
     return reconstruct(
         bench.geometry,

@@ -192,7 +192,20 @@ def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
 
 
 def run_trials(inputs: TrialInputs, numbers: Sequence[int]) -> FloatArray:
-    """Coefficients (trials, readings, terms) of the trials with these numbers, mm."""
+    """Solve trials, each with one draw of the errors, in every reading of the paper.
+
+    Parameters
+    ----------
+    inputs : TrialInputs
+        What all trials share.
+    numbers : sequence of int
+        Numbers of the trials: each seeds its own errors, so that batches can run anywhere.
+
+    Returns
+    -------
+    (trials, readings, terms) array
+        Coefficients of `PolynomialSurface`, mm; the readings in the order of `AngleReading`.
+    """
     trials = [_draw(inputs, number) for number in numbers]
     return np.array(
         [[_solve_trial(inputs, trial, reading) for reading in AngleReading] for trial in trials]

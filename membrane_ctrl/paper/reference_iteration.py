@@ -160,7 +160,15 @@ def make_slope_matrices(
 
 
 def make_parabola(depth_mm: float, radius_mm: float) -> StartShape:
-    """The paper's starting shape: a paraboloid with this depth at the radius."""
+    """Make the paper's starting shape: a paraboloid with its vertex at the origin.
+
+    Parameters
+    ----------
+    depth_mm : float
+        Height at the radius.
+    radius_mm : float
+        Radius of the mirror.
+    """
     bend = depth_mm / radius_mm**2
     return StartShape(
         lambda x, y: bend * (x**2 + y**2), lambda x, y: (2.0 * bend * x, 2.0 * bend * y)
@@ -168,7 +176,15 @@ def make_parabola(depth_mm: float, radius_mm: float) -> StartShape:
 
 
 def make_cone(depth_mm: float, radius_mm: float) -> StartShape:
-    """A cone with its tip at the vertex."""
+    """Make a cone with its tip at the vertex; the slope at the tip is 0.
+
+    Parameters
+    ----------
+    depth_mm : float
+        Height at the radius.
+    radius_mm : float
+        Radius of the mirror.
+    """
     slope = depth_mm / radius_mm
 
     def slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -179,7 +195,15 @@ def make_cone(depth_mm: float, radius_mm: float) -> StartShape:
 
 
 def make_v_fold(depth_mm: float, radius_mm: float) -> StartShape:
-    """Two planes that meet in the y axis."""
+    """Make two planes that meet in the y axis.
+
+    Parameters
+    ----------
+    depth_mm : float
+        Height at the radius, on the x axis.
+    radius_mm : float
+        Radius of the mirror.
+    """
     slope = depth_mm / radius_mm
     return StartShape(lambda x, _: slope * np.abs(x), lambda x, y: (slope * np.sign(x), 0.0 * y))
 

@@ -204,8 +204,22 @@ class _Path:
 
 
 def compute_projection_correction(rays: Reflection, axis: int) -> FloatArray:
-    """delta theta (n,) of equation 14, rad; `axis` 0 projects onto the xz plane, 1 onto the yz
-    plane.
+    """Compute delta theta of equation 14.
+
+    Incident and reflected ray make the same angle with the normal. Projected onto a plane that the
+    rays are skew to, they do not: delta theta is the difference.
+
+    Parameters
+    ----------
+    rays : Reflection
+        Unit vectors at n points of the last surface.
+    axis : int
+        0 projects onto the xz plane, 1 onto the yz plane.
+
+    Returns
+    -------
+    (n,) array
+        Angle of the arriving ray less that of the leaving one, rad.
     """
     in_plane = [axis, 2]
     normal = rays.normal[:, in_plane]

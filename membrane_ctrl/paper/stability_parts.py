@@ -72,7 +72,23 @@ class SetSeries:
 
 
 def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> SetSeries:
-    """One full set, and fringes sets after it, each computed from its frames."""
+    """Simulate one full set and fringes sets after it, each measured from its own frames.
+
+    Parameters
+    ----------
+    bench : PaperBench
+        Bench and film; its seed draws the film's motion and the laser's noise.
+    sets : int
+        Number of sets, the full one included.
+    air_um : float
+        Amplitude of the seeing: how far moving air shifts what the camera sees, in µm of the
+        simulated disturbance `seeing_um`; 0: still air.
+
+    Returns
+    -------
+    SetSeries
+        Without the rejected sets, which it counts.
+    """
     # The bench: frames of the film as it moves, read by the laser with its noise.
     renderer = OpticsRenderer(
         bench.optics,

@@ -62,7 +62,20 @@ class PartFolder:
         return PartResult(stored.comparisons, stored.numbers, pictures, stored.timing_s)
 
     def write_part(self, part: PaperPart, result: PartResult) -> None:
-        """Store a finished part, its table last. Raises OSError."""
+        """Store a finished part: pictures first, so that a table is never without them.
+
+        Parameters
+        ----------
+        part : PaperPart
+            Which part.
+        result : PartResult
+            What it computed.
+
+        Raises
+        ------
+        OSError
+            A file cannot be written.
+        """
         for number, png in enumerate(result.pictures.values()):
             files.write_bytes_atomic(self._picture(part, number), png)
         table = {

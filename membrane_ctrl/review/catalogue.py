@@ -90,7 +90,25 @@ class Filter:
 
 
 def list_entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]:
-    """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
+    """List the runs of a folder, oldest first.
+
+    Parameters
+    ----------
+    logs_dir : Path
+        Folder of the runs.
+    wanted : Filter or None
+        Criteria of the runs to list; None: all.
+
+    Returns
+    -------
+    list of RunEntry
+        A run that cannot be read has an entry whose `exit` gives the reason.
+
+    Raises
+    ------
+    InputError
+        There is no such folder.
+    """
     require_folder(logs_dir)
     found = [_entry_or_why(folder) for folder in list_run_folders(logs_dir)]
     return [item for item in found if wanted is None or wanted.accepts_entry(item)]

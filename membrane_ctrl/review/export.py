@@ -227,7 +227,31 @@ def _write_hdf5(
 def export_command(
     run: Path, form: str, out: Path | None, streams: list[str], start: str | None, end: str | None
 ) -> int:
-    """Write a run for other programs and report where."""
+    """Write a run for other programs and print the files, with notes on missing parts.
+
+    Parameters
+    ----------
+    run : Path
+        A run's folder, its name or a part of it, or `last`.
+    form : str
+        One of `FORMATS`.
+    out : Path or None
+        Folder of the files; None: `export` in the run's folder.
+    streams : list of str
+        As in `export_run`; empty: everything.
+    start, end : str or None
+        Times as a person writes them (`run_times.moment_s`); None: unlimited.
+
+    Returns
+    -------
+    int
+        0, the exit code.
+
+    Raises
+    ------
+    InputError, DeviceError
+        As `export_run`.
+    """
     opened = open_run(catalogue.resolve_run(run))
     folder = out.resolve() if out else opened.folder / "export"
     files = export_run(opened, form, folder, streams, *part_s(opened.origin_utc, start, end))

@@ -23,7 +23,15 @@ def format_span(seconds: float) -> str:
 
 
 def format_number(value: float | None, digits: int = 3) -> str:
-    """A number to the given digits; a dash for none."""
+    """Format a number to its significant digits, without an exponent for large ones.
+
+    Parameters
+    ----------
+    value : float or None
+        None, NaN and infinity give a dash.
+    digits : int
+        Significant digits; a number with more digits before the point is rounded to an integer.
+    """
     if value is None or not math.isfinite(value):
         return "–"
     if abs(value) < 10**digits:
@@ -32,7 +40,15 @@ def format_number(value: float | None, digits: int = 3) -> str:
 
 
 def format_signed(value: float, digits: int = 3) -> str:
-    """A number with its sign, to the given digits and without an exponent above 1."""
+    """Format a finite number with its sign, without an exponent for large ones.
+
+    Parameters
+    ----------
+    value : float
+        The number.
+    digits : int
+        Significant digits; a number with more digits before the point is rounded to an integer.
+    """
     if abs(value) < 10**digits:
         return f"{value:+.{digits}g}"
     return f"{value:+.0f}"

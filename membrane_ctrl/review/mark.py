@@ -12,7 +12,25 @@ from membrane_ctrl.run_files.run import open_run
 
 
 def mark_command(words: Sequence[str], at: str | None) -> int:
-    """Add a mark to a run's timeline; the words are the run and the text."""
+    """Add a mark to a run's timeline.
+
+    Parameters
+    ----------
+    words : sequence of str
+        Of the command line: the run (its folder, its name or a part of it, or `last`) and the text.
+    at : str or None
+        Time as a person writes it (`run_times.moment_s`), within the run.
+
+    Returns
+    -------
+    int
+        0, the exit code.
+
+    Raises
+    ------
+    InputError
+        Words or time are missing, the text is empty, or the time is outside the run.
+    """
     if len(words) != 2 or at is None:
         raise errors.InputError(
             "review mark: write `review mark RUN TEXT --at 03:12` (TEXT in quotes)"

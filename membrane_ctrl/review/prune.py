@@ -12,8 +12,28 @@ from membrane_ctrl.run_files import retention
 def to_prune(
     logs_dir: Path, now_utc: datetime, keep_days: float | None, keep_gb: float | None
 ) -> list[tuple[retention.OldRun, str]]:
-    """The runs that the recorder's retention rule (`retention`) would delete, and why; oldest
-    first.
+    """List the runs that the recorder's retention rule (`retention`) would delete.
+
+    Parameters
+    ----------
+    logs_dir : Path
+        Folder of the runs.
+    now_utc : datetime
+        From which the age counts.
+    keep_days : float or None
+        Largest age of a run; None: no limit.
+    keep_gb : float or None
+        Disk space of all runs, in 1e9 bytes; None: no limit.
+
+    Returns
+    -------
+    list of (OldRun, str)
+        Oldest first, each with the reason.
+
+    Raises
+    ------
+    InputError
+        There is no such folder, or neither limit.
     """
     require_folder(logs_dir)
     if keep_days is None and keep_gb is None:

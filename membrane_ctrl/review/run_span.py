@@ -17,6 +17,14 @@ def end_s(run: Run) -> float:
 
 
 def make_outside_error(run: Run, wanted: str) -> errors.InputError:
-    """The error for a time outside a run."""
+    """Make the error for a time outside a run.
+
+    Parameters
+    ----------
+    run : Run
+        Its first and last minute are named.
+    wanted : str
+        The time as it was given, with its option, such as `--at 03:12`.
+    """
     went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(end_s(run)):%Y-%m-%d %H:%M} UTC"
     return errors.InputError(f"{wanted}: not in the run, which lasted from {went}")

@@ -21,7 +21,30 @@ from membrane_ctrl.run_files.run import open_run
 def list_command(
     logs: Sequence[Path], wanted: catalogue.Filter, since: str | None, until: str | None, json: bool
 ) -> int:
-    """Print the table of the folders' runs that pass a filter, oldest first."""
+    """Print the table of runs, oldest first.
+
+    Parameters
+    ----------
+    logs : sequence of Path
+        Folders of runs.
+    wanted : Filter
+        Criteria of the runs to list; its times are replaced by `since` and `until`.
+    since, until : str or None
+        A run starts at or after the first and before the second: dates or times in ISO 8601, in UTC
+        unless they state a zone; None: unlimited.
+    json : bool
+        Print a list of objects instead of a table.
+
+    Returns
+    -------
+    int
+        0, the exit code.
+
+    Raises
+    ------
+    InputError
+        A folder does not exist, or a text is no date.
+    """
     wanted = replace(wanted, since_utc=_parse_day(since), until_utc=_parse_day(until))
     folders = {folder.resolve(): folder for folder in logs}  # each once
     found = [
@@ -36,7 +59,27 @@ def list_command(
 
 
 def show_command(run: Path, logs: Path, json: bool) -> int:
-    """Print one run: its line of the catalogue, its states and faults, its missing parts."""
+    """Print one run: its line of the catalogue, its states and faults, its missing parts.
+
+    Parameters
+    ----------
+    run : Path
+        A run's folder, its name or a part of it, or `last`.
+    logs : Path
+        Folder of the runs, below which a name is searched.
+    json : bool
+        Print one object instead of lines of text.
+
+    Returns
+    -------
+    int
+        0, the exit code.
+
+    Raises
+    ------
+    InputError
+        No run, or more than one, matches.
+    """
     opened = open_run(catalogue.resolve_run(run, logs))
     opened.read_all_parts()
     entry = catalogue.read_entry(opened.folder)
@@ -77,7 +120,31 @@ def show_command(run: Path, logs: Path, json: bool) -> int:
 def prune_command(
     logs: Path, keep_days: float | None, keep_gb: float | None, delete: bool, json: bool
 ) -> int:
-    """List the runs that the retention rule would delete; delete them only with `delete`."""
+    """List the runs that the retention rule would delete, or delete them.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder of the runs.
+    keep_days : float or None
+        Largest age of a run; None: no limit.
+    keep_gb : float or None
+        Disk space of all runs, in 1e9 bytes; None: no limit.
+    delete : bool
+        Delete them; a run that cannot be deleted is named on stderr.
+    json : bool
+        Print one object instead of lines of text.
+
+    Returns
+    -------
+    int
+        `Exit.DEVICE_FAILED` if a run could not be deleted, else 0.
+
+    Raises
+    ------
+    InputError
+        There is no such folder, or neither limit.
+    """
     expired = prune.to_prune(logs, datetime.now(UTC), keep_days, keep_gb)
     stay = prune.prune_runs([run for run, _ in expired]) if delete else {}
     expired = [(run, why) for run, why in expired if run.folder not in stay]

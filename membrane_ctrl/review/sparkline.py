@@ -10,7 +10,20 @@ _POINTS = 80  # of a run's small line
 
 
 def render_sparkline(values: Sequence[float] | Column, width: int = 160, height: int = 28) -> str:
-    """A small SVG line; gaps where values are missing."""
+    """Draw a small line of a series as SVG, scaled to its own range.
+
+    Parameters
+    ----------
+    values : (n,) array or sequence
+        Evenly spaced; values that are not finite leave gaps. More than 80 are averaged to 80.
+    width, height : int
+        Pixels.
+
+    Returns
+    -------
+    str
+        An element `svg`; empty with fewer than two finite values.
+    """
     y = np.asarray(values, dtype=np.float64)
     if y.size > _POINTS:
         y = np.array([part.mean() for part in np.array_split(y, _POINTS)])

@@ -174,7 +174,13 @@ class LiveBench:
         return self._sample
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
-        """Drive pump and vent."""
+        """Drive pump and vent until the next command.
+
+        Parameters
+        ----------
+        pump_fraction, vent_fraction : float
+            Share of the full drive, and of the full opening, 0 to 1.
+        """
         self._plant.actuate(pump_fraction, vent_fraction)
 
     def catch_up(self) -> None:

@@ -334,7 +334,18 @@ class MapDevice:
             self._apply_output(found, set_output)
 
     def read(self, address: int, count: int) -> list[int]:
-        """Words. Raises RegisterRefusal."""
+        """Return words of consecutive registers: outputs as last written, sensors as they read now.
+
+        Parameters
+        ----------
+        address, count : int
+            First register, and number of registers.
+
+        Raises
+        ------
+        RegisterRefusal
+            A register does not exist.
+        """
         words = {**self._constants, **self._written}
         for found, value in self._sensors.items():
             words.update(enumerate(found.encode(value()), found.address))
@@ -344,7 +355,20 @@ class MapDevice:
             raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_ADDRESS) from None
 
     def write(self, address: int, words: Sequence[int]) -> None:
-        """All or nothing. Raises RegisterRefusal."""
+        """Write words to consecutive output registers, all or none, and drive the outputs.
+
+        Parameters
+        ----------
+        address : int
+            First register.
+        words : sequence of int
+            Raw words.
+
+        Raises
+        ------
+        RegisterRefusal
+            A register is no output, or a word is outside `raw_limits`.
+        """
         places = range(address, address + len(words))
         if not all(at in self._written for at in places):
             raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_ADDRESS)
@@ -361,7 +385,20 @@ class MapDevice:
 
 
 def respond_to_input(pdu: bytes, table: modbus_pdu.RegisterTable) -> bytes:
-    """`respond`, and "read input registers" (function 4) answered from the same registers."""
+    """Answer a request as `modbus_pdu.answer_request`, and function 4 from the same registers.
+
+    Parameters
+    ----------
+    pdu : bytes
+        The request, from the function code on; function 4 reads input registers.
+    table : RegisterTable
+        The registers, which this device offers as holding and as input registers.
+
+    Returns
+    -------
+    bytes
+        The reply's PDU, or an exception's.
+    """
     if pdu[0] != _READ_INPUT:
         return modbus_pdu.answer_request(pdu, table)
     reply = modbus_pdu.answer_request(bytes([modbus_pdu.READ_HOLDING]) + pdu[1:], table)

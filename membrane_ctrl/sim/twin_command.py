@@ -12,8 +12,24 @@ _STOPS = {signal.SIGINT, signal.SIGTERM}
 
 
 def serve_twin(config: Config, speed: float) -> int:
-    """Serve until SIGINT or SIGTERM; print the address on stderr. Raises DeviceError, e.g. for a
-    busy port.
+    """Serve the simulated bench until SIGINT or SIGTERM; print its address on stderr.
+
+    Parameters
+    ----------
+    config : Config
+        Tables `twin` and `pump`.
+    speed : float
+        Seconds of the plant for each second of the clock.
+
+    Returns
+    -------
+    int
+        `Exit.INTERRUPTED` after SIGINT, `Exit.DONE` after SIGTERM.
+
+    Raises
+    ------
+    DeviceError
+        The bench does not start, e.g. because the port is taken.
     """
     with contextlib.ExitStack() as stack:
         start_bench(

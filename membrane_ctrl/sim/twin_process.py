@@ -17,8 +17,24 @@ _READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
 
 
 def start_bench(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
-    """Start the bench process, which the stack ends, and wait until it listens; print where. Raises
-    DeviceError.
+    """Start the bench's process, wait until it listens, and print its address.
+
+    Parameters
+    ----------
+    spec : BenchSpec
+        Its plant, clock and port.
+    stack : ExitStack
+        Ends the process when it closes.
+
+    Returns
+    -------
+    BenchReport
+        Where the bench listens.
+
+    Raises
+    ------
+    DeviceError
+        It does not start in time, or the port is taken.
     """
     terminal.print_progress(f"starting the twin: waiting until it listens, at most {_READY_S:g} s")
     ours, theirs = event_pipe.make_pipe()
@@ -39,8 +55,15 @@ def start_bench(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
 
 
 def bench_spec(config: Config, clock: RunClock) -> BenchSpec:
-    """The bench of a configuration; the default port may be another twin's, a configured one is
-    meant.
+    """Return what the bench's process needs of a configuration.
+
+    Parameters
+    ----------
+    config : Config
+        Tables `twin` and `pump`. If the default port is taken, another twin may have it, and a free
+        one serves; a port that the configuration states is required.
+    clock : RunClock
+        The run's clock, on which the plant runs.
     """
     twin = config.twin
     return BenchSpec(
@@ -59,10 +82,25 @@ class TwinProcess:
     def start_twin(
         cls, config: Config, clock: RunClock, stack: contextlib.ExitStack, lab: bool = False
     ) -> "TwinProcess":
-        """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for
-        a busy port.
+        """Start the twin and wait until it listens.
 
-        With `lab` it answers as the configured instruments, else as the pump board.
+        Parameters
+        ----------
+        config : Config
+            The run's configuration.
+        clock : RunClock
+            The run's clock, on which the plant runs.
+        stack : ExitStack
+            Ends the twin when it closes.
+        lab : bool
+            Whether the twin answers as the configured instruments instead of the pump board.
+
+        Raises
+        ------
+        DeviceError
+            It does not start, e.g. because the port is taken.
+        InputError
+            More interlocks are configured than the pump board has inputs.
         """
         if len(config.interlocks) > settings.BOARD_INPUTS and not lab:
             raise errors.InputError(

@@ -177,6 +177,18 @@ class MemoryLink:
         self.connected = True
 
     async def read_holding(self, address: int, count: int) -> list[int]:
+        """Read registers of the board, as `ModbusLink.read_holding`.
+
+        Parameters
+        ----------
+        address, count : int
+            First register, and number of registers.
+
+        Raises
+        ------
+        LinkError
+            The board refuses; while a scenario cuts the link, there is no answer.
+        """
         self._begin()
         with _raise_refusals(self.name):
             words = self._bench.board.read(address, count)
@@ -184,12 +196,40 @@ class MemoryLink:
         return words
 
     async def read_input(self, address: int, count: int) -> list[int]:
+        """Read input registers: the board has the same ones as `read_holding`.
+
+        Parameters
+        ----------
+        address, count : as in `read_holding`
+            -
+        """
         return await self.read_holding(address, count)
 
     async def write_register(self, address: int, word: int) -> None:
+        """Write one register, as `write_registers`.
+
+        Parameters
+        ----------
+        address, word : int
+            Register, and its 16 bits.
+        """
         await self.write_registers(address, [word])
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
+        """Write registers of the board, and drive pump and vent as the board then does.
+
+        Parameters
+        ----------
+        address : int
+            First register.
+        words : sequence of int
+            16 bits for each register.
+
+        Raises
+        ------
+        LinkError
+            As `read_holding`.
+        """
         self._begin()
         with _raise_refusals(self.name):
             self._bench.board.write(address, words)

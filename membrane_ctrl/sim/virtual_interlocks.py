@@ -47,7 +47,15 @@ class VirtualInterlocks:
         return inputs
 
     def open_mask(self, board_word: int, now_s: float) -> int:
-        """`BenchReading.interlocks_open` by the board's inputs and the polled devices."""
+        """Return `BenchReading.interlocks_open`: a bit for each interlock, 1 if it is open.
+
+        Parameters
+        ----------
+        board_word : int
+            The board's inputs, 1 for a closed circuit, as `board_word` makes them.
+        now_s : float
+            Virtual time, from which the age of a polled device's last answer counts.
+        """
         found = 0
         for bit, interlock in enumerate(self._configured):
             if isinstance(interlock, BoardInputConfig):

@@ -45,7 +45,18 @@ class Patch:
     sigma_mm: float
 
     def profile(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Warming at places of the unit disc, 1 in the middle of the patch."""
+        """Return the warming at places of the film, relative to the middle of the patch.
+
+        Parameters
+        ----------
+        x, y : (n,) array
+            Places on the unit disc: in units of the film's radius, from its centre.
+
+        Returns
+        -------
+        (n,) array
+            0 to 1.
+        """
         square_mm2 = (RADIUS_MM * x - self.x_mm) ** 2 + (RADIUS_MM * y - self.y_mm) ** 2
         return np.asarray(np.exp(-square_mm2 / (2 * self.sigma_mm**2)))
 

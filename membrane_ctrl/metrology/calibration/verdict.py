@@ -322,7 +322,20 @@ def _judge_camera(solution: Solution) -> list[Cause]:
 
 
 def describe_bump_within(problem: Problem, bump: BumpWithinSet) -> CalibrationFinding:
-    """Return the finding on a camera that was bumped in the middle of a set."""
+    """Return the finding on a camera that was bumped in the middle of a set.
+
+    Parameters
+    ----------
+    problem : Problem
+        The sets, for the name.
+    bump : BumpWithinSet
+        Number of the set, and yaw, pitch and roll of its y frames about its x frames in degrees.
+
+    Returns
+    -------
+    CalibrationFinding
+        It spoils the calibration; the set is to be repeated.
+    """
     yaw, pitch, roll = bump.turned_deg
     description = (
         f"the camera moved while {problem.sets[bump.index].name} was taken, between its x and its "

@@ -188,7 +188,20 @@ def _find_swapped_pair(
 
 
 def exchange_order(count: int, a: int, b: int) -> list[int]:
-    """Return the order of `count` frames with the frames `a` and `b` exchanged."""
+    """Return the order of frames in which two of them are exchanged.
+
+    Parameters
+    ----------
+    count : int
+        Number of frames.
+    a, b : int
+        Numbers of the two, from 0.
+
+    Returns
+    -------
+    list of int
+        For each place, the number of the frame that stands there.
+    """
     order = list(range(count))
     order[a] = b
     order[b] = a

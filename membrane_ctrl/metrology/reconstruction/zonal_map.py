@@ -98,7 +98,16 @@ class CellSums:
         self._sums = np.zeros((3, self._axis_mm.size, self._axis_mm.size))
 
     def add_pixels(self, field: FloatArray, weights: FloatArray) -> None:
-        """Add pixels; arguments as of `residual_grid`."""
+        """Add pixels to the sums of their cells.
+
+        Parameters
+        ----------
+        field : (6, n) array
+            Rows of `Tracer.slope_field`: x and y in mm, measured slopes, fitted slopes. Pixels
+            beyond the grid are ignored.
+        weights : (n,) array
+            0 leaves a pixel out.
+        """
         step_mm = self._axis_mm[1] - self._axis_mm[0]
         count = field.shape[1]
         _scatter_samples(field, weights, self._axis_mm[0], step_mm, self._sums, 0, count)

@@ -103,7 +103,19 @@ class LiveTracker:
     ) -> ShapeEstimate:
         """Measure the figure of a full cycle, which becomes the reference of the frames after it.
 
-        Parameters and result as those of `LiveReconstructor.measure_full`.
+        Parameters
+        ----------
+        frames : sequence of (H, W) arrays
+            One for each pattern of a full cycle, in their order; of the camera's depth.
+        time_s : (n,) array
+            Middle of each exposure.
+        displacement_um : (n,) array
+            The laser's reading then; NaN if missing.
+
+        Returns
+        -------
+        ShapeEstimate
+            Rejected, too, if its bins can be no reference for the frames after it.
         """
         estimate = self._cycles.measure_full(frames, time_s, displacement_um)
         self._tracker = None

@@ -27,7 +27,31 @@ def report_command(
     end: str | None,
     json: bool,
 ) -> int:
-    """Write `report.html` and `report.json`; see `membrane-ctrl report --help`."""
+    """Write `report.html` and `report.json` of a run, and print its main figures.
+
+    Parameters
+    ----------
+    run : Path
+        A run's folder, its name or a part of it, or `last`.
+    out : Path or None
+        Folder of the report; None: `report` in the run's folder.
+    compare_with : Path or None
+        Another run, given as `run` is, to list the differences from.
+    start, end : str or None
+        Part of the run, as a person writes times (`run_times.moment_s`); None: unlimited.
+    json : bool
+        Print the content of `report.json` instead.
+
+    Returns
+    -------
+    int
+        0, the exit code.
+
+    Raises
+    ------
+    CommandError
+        A run cannot be read or has no data in this part, or the report cannot be written.
+    """
     began_s = time.monotonic()
     opened = open_run(catalogue.resolve_run(run))
     analysis = analyse_run(opened, *part_s(opened.origin_utc, start, end))
@@ -66,7 +90,22 @@ def report_command(
 
 
 def write_report(folder: Path, text: str, page: str) -> None:
-    """Write a report's JSON and its page into a folder, which is made. Raises OSError."""
+    """Write a report into a folder, which is made if it does not exist.
+
+    Parameters
+    ----------
+    folder : Path
+        Of `report.json` and `report.html`; both are replaced.
+    text : str
+        JSON, without a line feed at its end.
+    page : str
+        The whole HTML page.
+
+    Raises
+    ------
+    OSError
+        A file cannot be written.
+    """
     files.make_folder(folder)
     files.write_text_atomic(folder / "report.json", text + "\n")
     files.write_text_atomic(folder / "report.html", page)

@@ -128,7 +128,25 @@ def make_picture(
     width_in: float = WIDTH_IN,
     **subplots: Any,
 ) -> Iterator[tuple[Figure, Any]]:
-    """A figure in the report's style and its axes, as `Figure.subplots` gives them."""
+    """Make a figure in the report's style within a `with` block.
+
+    The style holds only within the block: render the figure there, too.
+
+    Parameters
+    ----------
+    rows, columns : int
+        Number of axes.
+    height_in, width_in : float
+        Inches, all axes and titles included.
+    **subplots
+        Passed to `Figure.subplots`.
+
+    Yields
+    ------
+    figure : Figure
+    axes : Axes or array of Axes
+        As `Figure.subplots` returns them.
+    """
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
         yield figure, figure.subplots(rows, columns, **subplots)
@@ -150,7 +168,15 @@ def render_svg(figure: Figure) -> Markup:
 
 
 def draw_panel(draw: Callable[[Figure, Any], None], height_in: float) -> Markup:
-    """One panel as SVG; `draw` fills its axes."""
+    """Draw one panel as SVG; two or three of them stand side by side on a page.
+
+    Parameters
+    ----------
+    draw : callable
+        Called with the figure and its axes, which it fills.
+    height_in : float
+        Inches; the width is `PANEL_IN`.
+    """
     with make_picture(1, 1, height_in, PANEL_IN) as (figure, axes):
         draw(figure, axes)
         return render_svg(figure)
@@ -196,7 +222,22 @@ def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> 
 
 
 def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
-    """Times in a unit that suits the span, and the unit."""
+    """Convert times to a unit that suits the length of an axis.
+
+    Parameters
+    ----------
+    time_s : (n,) array or float
+        Seconds.
+    span_s : float
+        Length of the whole axis in seconds, which selects the unit.
+
+    Returns
+    -------
+    time : array
+        The times in that unit.
+    unit : str
+        `d`, `h`, `min` or `s`.
+    """
     for unit_s, least, name in ((86400.0, 3, "d"), (3600.0, 3, "h"), (60.0, 5, "min")):
         if span_s >= least * unit_s:
             return np.asarray(time_s) / unit_s, name
@@ -402,7 +443,21 @@ def _add_legend(plot: Any) -> None:
 
 
 def pump_history(history: Sequence[PumpSeen], change_max: float) -> Markup:
-    """The pump against the newest run's curve over the runs of the bench, and the leak of each."""
+    """Draw the pump's flow over the runs of a bench, and the leak of each.
+
+    Parameters
+    ----------
+    history : sequence of PumpSeen
+        Oldest first; not empty.
+    change_max : float
+        `pump.change_max`: the dashed limits are this share above and below the first run that has
+        the newest run's curve.
+
+    Returns
+    -------
+    Markup
+        Two panels as SVG.
+    """
     first = next(seen for seen in history if seen.same_curve)
     days = [seen.started_utc for seen in history]
 

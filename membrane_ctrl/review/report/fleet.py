@@ -96,8 +96,19 @@ class RunReport:
 
 
 def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
-    """Analyse one run, or the same part of each. A run that cannot be reported gives its reason,
-    whatever it is.
+    """Analyse one run of a fleet; a job of the worker pool.
+
+    Parameters
+    ----------
+    start, end : str or None
+        Part of the run, as a person writes times (`run_times.moment_s`); None: unlimited.
+    folder : Path
+        The run.
+
+    Returns
+    -------
+    RunReport
+        If the run cannot be reported, for whatever reason, its entry has only `problem`.
     """
     try:
         run = open_run(folder)

@@ -36,8 +36,19 @@ class PumpSeen:
 
 
 def explain_pump_change(history: Sequence[PumpSeen], change_max: float) -> str:
-    """Words for a certain change beyond the limit since the first run on the present curve; empty
-    without one.
+    """Describe how the pump has changed since the first run that has the newest run's curve.
+
+    Parameters
+    ----------
+    history : sequence of PumpSeen
+        Oldest first, as `pump_history` returns them.
+    change_max : float
+        `pump.change_max`, the share of the flow up to which a change is normal.
+
+    Returns
+    -------
+    str
+        A sentence, if the change exceeds `change_max` and 3 sigma of the two runs; else empty.
     """
     if not history:
         return ""

@@ -32,7 +32,7 @@ class FittedSlope:
 
 
 def fit_slope(time_s: Column, values: Column) -> FittedSlope:
-    """Slope of values against time.
+    """Fit the slope of values against time, with an interval for correlated samples.
 
     The variance of the ordinary slope is multiplied by the integrated autocorrelation time of the
     residuals, g = 1 + 2 sum r_k, summed while the sums of neighbouring pairs stay positive and fall
@@ -42,7 +42,17 @@ def fit_slope(time_s: Column, values: Column) -> FittedSlope:
     the round before. An interval of 95 % then covers 94 to 97 % of long records, and 90 % of those
     of six correlation times.
 
-    `time_s` (n,) is equally spaced except for gaps; values that are not finite are ignored.
+    Parameters
+    ----------
+    time_s : (n,) array
+        Equally spaced except for gaps.
+    values : (n,) array
+        In any unit; values that are not finite are ignored.
+
+    Returns
+    -------
+    FittedSlope
+        In the values' unit per hour; NaN with fewer than 5 finite values.
     """
     finite = np.isfinite(values)
     hours = time_s[finite] / 3600.0

@@ -30,7 +30,35 @@ def film_run_command(
     pictures: bool,
     as_json: bool,
 ) -> int:
-    """Read the runs, fit the creep, write `creep.json` and its picture. Raises CommandError."""
+    """Fit the creep of a film to its runs, write `creep.json` and print the result.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        Runs with figures and a pressure gauge; the first has the mirror's radius.
+    prestrain : float
+        Strain of the flat film, m/m.
+    poisson : float
+        Poisson's ratio of the film.
+    out : Path or None
+        Folder of the results; None: `film` in the last run's folder.
+    pictures : bool
+        Draw the stiffness over time, too.
+    as_json : bool
+        Print the table as one line of JSON instead of text.
+
+    Returns
+    -------
+    int
+        0, the exit code.
+
+    Raises
+    ------
+    RejectedError
+        A run has no figures or no gauge, or the readings are too few for a law of creep.
+    CommandError
+        A run cannot be read, or the result cannot be written.
+    """
     runs = [open_run(folder) for folder in folders]
     radius_mm = runs[0].config.optics.mirror.radius_mm
     time_s, sag_mm, pressure_pa = (

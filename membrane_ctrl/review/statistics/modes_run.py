@@ -88,8 +88,30 @@ class SeenMode:
 
 
 def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pictures: bool) -> int:
-    """Search the frames for vibrations, write `modes.json` and pictures, report. Raises
-    CommandError.
+    """Search tracked frames for vibrations, write `modes.json` and print the modes.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        Results of `track`, or runs with tracked frames.
+    out : Path or None
+        Folder of the results; None: `modes` in the last folder.
+    as_json : bool
+        Print the table as one line of JSON instead of text.
+    pictures : bool
+        Draw the modes and write a recording, too.
+
+    Returns
+    -------
+    int
+        0, the exit code.
+
+    Raises
+    ------
+    RejectedError
+        No folder has enough frames at a steady rate.
+    CommandError
+        A folder cannot be read, or the result cannot be written.
     """
     # Search some minutes of each run by themselves: lines come and go.
     times: list[float] = []

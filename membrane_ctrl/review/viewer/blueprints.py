@@ -45,7 +45,15 @@ class ReviewBlueprint:
     config: Config
 
     def make_blueprint(self, tab: str = "overview", tabs: Sequence[str] = TABS) -> rrb.Blueprint:
-        """The blueprint, with some of `TABS`, `tab` selected."""
+        """Make the blueprint of the tabs.
+
+        Parameters
+        ----------
+        tab : str
+            The tab that is selected; one of `tabs`.
+        tabs : sequence of str
+            Some of `TABS`, in the order shown.
+        """
         makers = {
             "overview": self._make_overview,
             "loop": self._make_loop_tab,

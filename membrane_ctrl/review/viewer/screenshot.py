@@ -30,10 +30,26 @@ _TRY_AGAIN = "try again when the machine is less busy"
 
 
 def take_screenshot(source: Path | str, at: CursorTime | None = None) -> bytes:
-    """PNG of a recording as it opens, at a moment or its end, or of a server's page.
+    """Take a picture of the viewer.
 
-    Raises RuntimeError if the viewer does not start (no Vulkan driver), does not answer in time, or
-    its picture keeps changing.
+    Parameters
+    ----------
+    source : Path or str
+        A recording, or the URL of a server's page.
+    at : CursorTime or None
+        Where the time cursor of a recording is put; None: at its end. A server's page keeps the
+        cursor of its own.
+
+    Returns
+    -------
+    bytes
+        PNG.
+
+    Raises
+    ------
+    RuntimeError
+        The viewer does not start (no Vulkan driver), does not answer in time, or its picture keeps
+        changing.
     """
     with _start_headless_viewer() as viewer:
         try:

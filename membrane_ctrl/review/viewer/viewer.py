@@ -42,6 +42,15 @@ class CursorTime:
 
 
 def place_cursor(client: ViewerClient, at: CursorTime) -> None:
+    """Stop a viewer's time cursor at a time.
+
+    Parameters
+    ----------
+    client : ViewerClient
+        Connection to a viewer that has opened its recordings.
+    at : CursorTime
+        Timeline and time.
+    """
     if at.timeline == "utc":
         client.set_time(at.timeline, timestamp=np.datetime64(at.nanos, "ns"), play_state="paused")
     else:
@@ -104,6 +113,17 @@ def put_cursor(
 
     A viewer that does not answer in time is left unchanged: its plots show the requested part
     anyway.
+
+    Parameters
+    ----------
+    process : Popen
+        The viewer; if it ends, the attempt ends.
+    port : int
+        On which it listens at 127.0.0.1.
+    at : CursorTime
+        Timeline and time.
+    most_s : float
+        How long to try, s.
     """
     until_s = time.monotonic() + most_s
     while time.monotonic() < until_s and process.poll() is None:
@@ -169,7 +189,26 @@ def serve_source(
 def show_live_run(run: Run, web: bool, port: int = 0) -> int:
     """Show a run in progress, made from its tables, without affecting the run.
 
-    The view is sent to a separate server, to which the viewer (or, with `web`, a browser) connects.
+    The view is sent to a separate server, to which the viewer connects.
+
+    Parameters
+    ----------
+    run : Run
+        The run; its tables are read again as they grow.
+    web : bool
+        Serve a page for a browser on this machine instead of opening a viewer.
+    port : int
+        Of that page; 0 for a free one.
+
+    Returns
+    -------
+    int
+        0, the exit code, after the viewer was closed or Ctrl-C.
+
+    Raises
+    ------
+    DeviceError
+        There is no screen, or the viewer or its server does not start.
     """
     data_port, port = free_port(), port or free_port()
     if web:
@@ -235,6 +274,15 @@ def _find_host(bind: str) -> str:
 
 
 def make_proxy_url(host: str, port: int) -> str:
+    """Return the address at which a viewer's server offers its recordings.
+
+    Parameters
+    ----------
+    host : str
+        Name or address of the server's machine.
+    port : int
+        Its data port (gRPC).
+    """
     return f"rerun+http://{host}:{port}/proxy"
 
 

@@ -580,7 +580,15 @@ class TwinScreen:
         self.shown = pattern
 
     def show_picture(self, levels: Levels, raster: ScreenRaster) -> None:
-        """Show the pixels that an emulated display has got."""
+        """Show the pixels that an emulated display has received.
+
+        Parameters
+        ----------
+        levels : (height, width) uint8 array
+            What each pixel shows, 0 to 255.
+        raster : ScreenRaster
+            Place of the pixels on the screen.
+        """
         self.shown = PanelPicture(levels, raster)
 
     def close(self) -> None:

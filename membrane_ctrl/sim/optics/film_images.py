@@ -79,7 +79,21 @@ def light_of_pattern(shown: Pattern, config: PatternConfig, light: Light) -> Scr
 
 
 def light_of_panel(panel: PanelPicture, light: Light) -> ScreenLight:
-    """Light of the nearest pixel of a panel."""
+    """Return the light of a panel's pixels; a place has that of the nearest one.
+
+    Parameters
+    ----------
+    panel : PanelPicture
+        What the panel shows, and where its pixels are.
+    light : Light
+        Gamma of the panel, and the light of a black screen.
+
+    Returns
+    -------
+    ScreenLight
+        A function of places (s_x, s_y) in mm from the low edges of the pattern's region; 0 beside
+        the panel.
+    """
     pixels = panel.light_of_pixels(light)
     low_column, low_row, pitch_mm = panel.places
 

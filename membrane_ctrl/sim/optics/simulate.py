@@ -206,8 +206,19 @@ class _Exposure:
 
 
 def simulate_set(folder: str | Path, spec: SimulationSpec) -> None:
-    """Write one capture set and its truth. Raises OSError if the folder or a file cannot be
-    written.
+    """Simulate one capture set and write its frames, its description and the truth.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of the set; made if it does not exist.
+    spec : SimulationSpec
+        Bench, film, disturbances and seed.
+
+    Raises
+    ------
+    OSError
+        The folder or a file cannot be written.
     """
     _write_set(Path(folder), spec, _make_renderer(spec))
 
