@@ -64,7 +64,7 @@ class _Departure:
     ----------
     radius_mm : (points,) array
         Where the profiles are known.
-    seen_mm : (n, points) array
+    from_hencky_mm : (n, points) array
         Profiles less those of the paper's film without pre-strain.
     left_mm : (n, points) array
         What the fitted law leaves of the profiles.
@@ -73,14 +73,14 @@ class _Departure:
     """
 
     radius_mm: FloatArray
-    seen_mm: FloatArray
+    from_hencky_mm: FloatArray
     left_mm: FloatArray
     sigma_mm: FloatArray
 
     @property
-    def seen_um(self) -> float:
-        """RMS of `seen_mm` over the area."""
-        return self._rms_um(self.seen_mm)
+    def from_hencky_um(self) -> float:
+        """RMS of `from_hencky_mm` over the area."""
+        return self._rms_um(self.from_hencky_mm)
 
     @property
     def left_um(self) -> float:
@@ -96,7 +96,7 @@ class _Departure:
     def contradicts(self) -> bool:
         """Whether the law leaves most of the departure, beyond doubt."""
         is_significant = self.left_um > _SURELY_LEFT * self.sigma_um
-        return is_significant and self.left_um > _UNLIKE_LAW * self.seen_um
+        return is_significant and self.left_um > _UNLIKE_LAW * self.from_hencky_um
 
     def _rms_um(self, profiles_mm: FloatArray) -> float:
         share = self.radius_mm / np.sum(self.radius_mm)
@@ -181,7 +181,7 @@ def _compute_departure(
     radius_mm = np.linspace(0.0, reach_mm, _PROFILE_POINTS)
     rho = radius_mm / disc_mm
     paper = FilmLaw(0.0, _POISSON, _STIFFNESS_N_PER_M, disc_mm)
-    seen_mm = []
+    from_hencky_mm = []
     left_mm = []
     for figure, left in zip(figures, fit.left_mm, strict=True):
         # Hencky's bowl of the same pressure, or of the same sag if no gauge was read.
@@ -190,10 +190,10 @@ def _compute_departure(
         else:
             hencky = paper.with_sag(figure.sag_mm)
         measured_mm = _profile_mm(figure.parameters_mm, disc_mm, radius_mm)
-        seen_mm.append(measured_mm - hencky.height_mm(rho))
+        from_hencky_mm.append(measured_mm - hencky.height_mm(rho))
         left_mm.append(_profile_mm(left, disc_mm, radius_mm))
     sigma_mm = np.array([_profile_sigma_mm(figure, fit, rho) for figure in figures])
-    return _Departure(radius_mm, np.array(seen_mm), np.array(left_mm), sigma_mm)
+    return _Departure(radius_mm, np.array(from_hencky_mm), np.array(left_mm), sigma_mm)
 
 
 def _profile_sigma_mm(
@@ -365,7 +365,7 @@ def _make_fit_table(
     law = fit.law
     strain, poisson, relative = fit.sigmas
     gauged = any(np.isfinite(figure.pressure_pa) for figure in figures)
-    edge = [float(profile[-1]) for profile in departure.seen_mm]
+    edge = [float(profile[-1]) for profile in departure.from_hencky_mm]
 
     # Without a pressure the stiffness has no meaning; the paper's then serves for the pre-strain
     # that would explain its edge.
@@ -404,11 +404,11 @@ def _make_fit_table(
                 "sigmas": wave.sigmas.tolist(),
             }
             for wave in fit.waves
-            if wave.seen
+            if wave.is_sure
         ],
         "misfit_um": fit.misfit_um,
         "departure": {
-            "rms_um": departure.seen_um,
+            "rms_um": departure.from_hencky_um,
             "left_um": departure.left_um,
             "left_sigma_um": departure.sigma_um,
         },
@@ -494,7 +494,9 @@ def _draw_fit(
     # Departures from Hencky's film, and what the law leaves of them.
     drawing = Figure(figsize=(13, 4.2), layout="constrained")
     seen, left, both = drawing.subplots(1, 3)
-    for figure, profile, rest in zip(figures, departure.seen_mm, departure.left_mm, strict=True):
+    for figure, profile, rest in zip(
+        figures, departure.from_hencky_mm, departure.left_mm, strict=True
+    ):
         seen.plot(departure.radius_mm, profile, label=f"{figure.name}, {figure.sag_mm:.1f} mm")
         left.plot(departure.radius_mm, 1e3 * rest)
     seen.set(title="less Hencky's film of the paper", xlabel="radius (mm)", ylabel="mm")

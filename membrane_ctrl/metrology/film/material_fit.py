@@ -165,16 +165,16 @@ def fit_film(
     # Size of the misfit, from the terms that the law does not determine.
     sags_mm = np.array([[figure.sag_mm] for figure in figures])
     typical_bowls = FilmLaw(0.0, POISSON, 1.0, radius_mm).with_sag(sags_mm)
-    seen_mm = max(unexplained_term_mm(figures, typical_bowls, reach), _LEAST_MM)
+    misfit_mm = max(unexplained_term_mm(figures, typical_bowls, reach), _LEAST_MM)
 
     # The film by the round terms, then the waves of its ring.
     unknowns, covariance, size_mm = _fit_round_of_any_misfit(
-        figures, radius_mm, reach, gauge, seen_mm
+        figures, radius_mm, reach, gauge, misfit_mm
     )
     prestrain, poisson, log_stiffness = unknowns[:3]
     law = FilmLaw(float(prestrain), float(poisson), float(np.exp(log_stiffness)), radius_mm)
     bowls = law.under_load(np.exp(unknowns[3:, None]))
-    of_waves = fit_waves(figures, bowls, reach, seen_mm)
+    of_waves = fit_waves(figures, bowls, reach, misfit_mm)
 
     # What both leave of the figures.
     predicted_mm = of_waves.added_mm
@@ -247,7 +247,7 @@ def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]
 
 
 def _fit_round_of_any_misfit(
-    figures: Sequence[FilmFigure], radius_mm: float, reach: float, gauge: Gauge, seen_mm: float
+    figures: Sequence[FilmFigure], radius_mm: float, reach: float, gauge: Gauge, misfit_mm: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """As `_fit_round`; a misfit far above that of the terms without a law is tried, too.
 
@@ -257,7 +257,7 @@ def _fit_round_of_any_misfit(
     refused: ValueError | None = None
     for times in _TIMES_EXPECTED:
         try:
-            return _fit_round(figures, radius_mm, reach, gauge, times * seen_mm)
+            return _fit_round(figures, radius_mm, reach, gauge, times * misfit_mm)
         except ValueError as error:
             refused = refused or error
     assert refused is not None
@@ -265,7 +265,7 @@ def _fit_round_of_any_misfit(
 
 
 def _fit_round(
-    figures: Sequence[FilmFigure], radius_mm: float, reach: float, gauge: Gauge, seen_mm: float
+    figures: Sequence[FilmFigure], radius_mm: float, reach: float, gauge: Gauge, misfit_mm: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """Fit the law to the round terms of n figures, by Gauss-Newton.
 
@@ -277,7 +277,7 @@ def _fit_round(
         As those of `fit_film`.
     reach : float
         Radius of the fitted area over that of the ring.
-    seen_mm : float
+    misfit_mm : float
         Size of the misfit in other terms.
 
     Returns
@@ -292,7 +292,7 @@ def _fit_round(
     count = len(figures)
     sags_mm = np.array([figure.sag_mm for figure in figures])
     sag_mm = float(np.mean(sags_mm))
-    seen_mm = max(seen_mm, _NEGLECTED * sag_mm**3 / radius_mm**2)
+    misfit_mm = max(misfit_mm, _NEGLECTED * sag_mm**3 / radius_mm**2)
 
     # The data. The gauge's pressure times the radius is the load times the stiffness.
     pressure_pa = np.array([figure.pressure_pa for figure in figures])
@@ -334,7 +334,7 @@ def _fit_round(
             slopes = _numerical_slopes(predict, x)
             rest = target - predict(x)
             solved = average_over_misfits(
-                slopes, rest, noise, tried_misfits, known - x, precision, seen_mm
+                slopes, rest, noise, tried_misfits, known - x, precision, misfit_mm
             )
             # Near the solution a step is far below its error; before, it is limited.
             sigmas = np.sqrt(np.diag(solved.covariance)[:3])

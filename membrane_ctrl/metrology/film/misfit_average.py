@@ -135,7 +135,7 @@ def average_over_misfits(
     misfits: FloatArray,
     known: FloatArray,
     precision: FloatArray,
-    seen_mm: float,
+    misfit_mm: float,
 ) -> Solved:
     """Average the unknowns over the misfit's size and over the ways in which it grows.
 
@@ -147,12 +147,12 @@ def average_over_misfits(
         As those of `solve_linear`.
     misfits : (growths, m, m) array
         Covariances of a misfit of size 1.
-    seen_mm : float
+    misfit_mm : float
         Size of the misfit in the terms that the law does not determine.
     """
     found = []
-    for size_mm in seen_mm * _SIZES:
-        log_prior = -float(np.log1p((np.log(size_mm / seen_mm) / _LOG_WIDTH) ** 2))
+    for size_mm in misfit_mm * _SIZES:
+        log_prior = -float(np.log1p((np.log(size_mm / misfit_mm) / _LOG_WIDTH) ** 2))
         for misfit in misfits:
             covariance = noise + size_mm**2 * misfit
             solved = solve_linear(design, residual, covariance, known, precision)

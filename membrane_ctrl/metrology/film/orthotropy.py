@@ -146,7 +146,7 @@ def _find_axes(moduli: RingWave, shear: RingWave) -> _Axes:
 
     # The moduli differ: two waves cos 2 (theta - direction), whose phase is twice the direction.
     # The four waves are split into the part along the same axes and the part across.
-    if moduli.seen:
+    if moduli.is_sure:
         direction_rad = _find_phase(moduli) / 2 % np.pi
         turn = 4 * direction_rad
         cosine, sine = shear.amounts
@@ -162,7 +162,7 @@ def _find_axes(moduli: RingWave, shear: RingWave) -> _Axes:
 
     # Equal moduli, another shear: two pairs of axes, 45 degrees apart, with opposite signs of s.
     # Those of the larger modulus are taken, along which the shear is soft (s below 0).
-    if shear.seen:
+    if shear.is_sure:
         direction_rad = (_find_phase(shear) + np.pi) / 4 % (np.pi / 2)
         return _Axes(
             direction_rad,

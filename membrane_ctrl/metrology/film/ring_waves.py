@@ -63,7 +63,7 @@ _SECOND_ORDER = 2.0
 # beside unequal moduli) leave 1.4 to 1.7 of the square as four waves.
 _PRODUCT = 2.0
 _UNEXPLAINED = 0.1  # share of an order's waves: if more is left, there is another cause
-_LEAST_SEEN_MM = 2e-3  # least RMS of an order's terms that is stated
+_LEAST_STATED_MM = 2e-3  # least RMS of an order's terms that is stated
 _TOGETHER = 0.95  # correlation of two causes that the sets determine only together
 _FIRST_FREE_ORDER = 4  # orders from here on show how large terms without a cause are
 
@@ -91,8 +91,8 @@ class RingWave:
     explained: bool
 
     @property
-    def seen(self) -> bool:
-        """Whether it is there beyond doubt."""
+    def is_sure(self) -> bool:
+        """Whether the cause is there beyond doubt."""
         return self.explained and bool(np.any(np.abs(self.amounts) > SURE_SIGMAS * self.sigmas))
 
 
@@ -204,7 +204,9 @@ def azimuthal_terms(order: int) -> IntArray:
     return np.array([found[0], found[1]])
 
 
-def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm: float) -> WaveFit:
+def fit_waves(
+    figures: Sequence[FilmFigure], bowls: Bowl, reach: float, misfit_mm: float
+) -> WaveFit:
     """Causes of the waves in the figures.
 
     Parameters
@@ -215,7 +217,7 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
         The film of the law in each of them, (n, 1).
     reach : float
         Radius of the analysed disc in radii of the ring.
-    seen_mm : float
+    misfit_mm : float
         Size of a term that no law explains.
 
     Returns
@@ -236,7 +238,7 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
         data = _list_terms(figures, order)
         product_mm = _PRODUCT * _product_mm(sizes_mm, order, sag_mm)
         fits = [
-            _fit_parity(figures, terms[k], causes, response, data[k], seen_mm, product_mm)
+            _fit_parity(figures, terms[k], causes, response, data[k], misfit_mm, product_mm)
             for k in (0, 1)
         ]
         predicted = np.stack([response @ one.amounts + one.shared_mm for one in fits])
@@ -247,18 +249,18 @@ def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm:
         left = data - predicted
         rms_mm = sizes_mm[order]
         left_mm = _wave_rms_mm(left)
-        explained = left_mm < max(_UNEXPLAINED * rms_mm, 2 * seen_mm, product_mm)
+        explained = left_mm < max(_UNEXPLAINED * rms_mm, 2 * misfit_mm, product_mm)
         likely = _rank_causes(causes, response, data)
         together += _find_causes_together(order, causes, fits[0].covariance)
         for k, cause in enumerate(causes):
             amounts = np.array([one.amounts[k] for one in fits])
             sigmas = np.sqrt([one.covariance[k, k] for one in fits])
             waves.append(RingWave(cause, order, amounts, sigmas, explained))
-        if rms_mm < _LEAST_SEEN_MM:
+        if rms_mm < _LEAST_STATED_MM:
             continue
         if not explained:
             unexplained.append(UnexplainedWaves(order, 1e3 * rms_mm, 1e3 * left_mm, likely))
-        elif not any(wave.seen for wave in waves[-len(causes) :]):
+        elif not any(wave.is_sure for wave in waves[-len(causes) :]):
             weight = max(one.shared_weight for one in fits)
             shared.append(SharedWaves(order, 1e3 * rms_mm, weight, likely))
     return WaveFit(_widen_shear(waves), tuple(unexplained), tuple(shared), tuple(together), added)
@@ -324,7 +326,7 @@ def _fit_parity(
     causes: Sequence[HarmonicCause],
     response: FloatArray,
     data: FloatArray,
-    seen_mm: float,
+    misfit_mm: float,
     product_mm: float,
 ) -> _ParityFit:
     """Fit the cosine or the sine terms of an order.
@@ -340,7 +342,7 @@ def _fit_parity(
         Terms of one unit of each cause, mm.
     data : (n, k) array
         The terms, mm.
-    seen_mm : float
+    misfit_mm : float
         Size of a term that no law explains.
     product_mm : float
         Size of waves of second order, which grow with the sag.
@@ -381,7 +383,7 @@ def _fit_parity(
         return replace(average(size_mm), log_evidence=found.log_evidence)
 
     # The two hypotheses, both with the causes' amounts and the shared terms as unknowns.
-    alone = solve(by_causes, cause_sigmas, float(np.hypot(seen_mm, product_mm)))
+    alone = solve(by_causes, cause_sigmas, float(np.hypot(misfit_mm, product_mm)))
     padded = np.zeros((count + terms.size, count + terms.size))
     padded[:count, :count] = alone.covariance
     without = replace(alone, mean=np.append(alone.mean, np.zeros(terms.size)), covariance=padded)

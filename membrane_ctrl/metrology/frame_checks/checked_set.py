@@ -107,11 +107,12 @@ class Checked:
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
-        """Verdict from the frames alone: "ok", or "degraded" with the reason."""
+        """Verdict from the frames alone: "ok", or "degraded" with all reasons."""
+        flagged = ""
         if self.flags:
-            reason = f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data"
-            return "degraded", reason
+            flagged = f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data"
         doubts = (
+            flagged,
             band_removal.describe_bands(self.stack.gain),
             image_lag.describe_image_lag(self.lag),
             second_reflection.describe_second_reflection(self.second),

@@ -108,7 +108,7 @@ def test_a_film_of_the_law_is_found_to_the_noise() -> None:
     assert stiffness < 6e-3
     assert np.abs(_z(fit, world)).max() < 3.5
     assert fit.misfit_um < 2.0  # a micrometre is what the law neglects
-    assert not any(wave.seen for wave in fit.waves)
+    assert not any(wave.is_sure for wave in fit.waves)
 
 
 def test_without_a_gauge_the_stiffness_is_unknown_and_the_rest_is_not() -> None:
@@ -160,7 +160,7 @@ def test_a_ring_that_is_not_flat_is_distinguished_from_an_uneven_strain() -> Non
     waves = {(wave.cause, wave.order): wave for wave in _fit(figures).waves}
     for cause, true in (("flat", 0.3), ("prestrain", 4e-5)):
         wave = waves[cause, 2]
-        assert wave.seen
+        assert wave.is_sure
         assert wave.amounts == pytest.approx([true, 0.0], abs=0.05 * true)
     assert abs(waves["round", 2].amounts[0]) < 0.05
 
@@ -250,7 +250,7 @@ def test_an_orthotropic_film_is_named_with_its_direction_beside_an_uneven_ring()
     material = Material(0.88, 0.33, None, direction_rad=0.6, prestrain=(1e-4, 1e-4, 0.0))
     ring = Ring({2: (4e-4, 1e-4), 3: (1e-4, 0.0)})
     fit = _fit(_second_world_figures(Mirror(37.0, material=material, ring=ring)))
-    seen = {(wave.cause, wave.order): wave for wave in fit.waves if wave.seen}
+    seen = {(wave.cause, wave.order): wave for wave in fit.waves if wave.is_sure}
     assert set(seen) == {("modulus", 2), ("flat", 2), ("flat", 3)}
     apart = 0.12 / 0.94  # of the mean modulus
     modulus = seen["modulus", 2]
@@ -291,14 +291,14 @@ def test_an_isotropic_film_in_an_oval_ring_has_no_stiff_direction() -> None:
     material = Material(1.0, 0.36, None, prestrain=(4e-4, 4e-4, 0.0))
     ring = Ring({}, {2: (2.8e-4, 1.1e-4)})
     fit = _fit(_second_world_figures(Mirror(37.0, material=material, ring=ring)))
-    assert not any(wave.seen for wave in fit.waves if wave.cause in ("modulus", "shear"))
+    assert not any(wave.is_sure for wave in fit.waves if wave.cause in ("modulus", "shear"))
 
 
 def test_an_isotropic_film_has_no_stiff_direction() -> None:
     """E1 / E2 is 1 within a bar of half a percent, and no cause is stated that is not there."""
     material = Material(1.0, 0.35, None, prestrain=(5e-4, 5e-4, 0.0))
     fit = _fit(_second_world_figures(Mirror(37.0, material=material)))
-    assert not any(wave.seen for wave in fit.waves)
+    assert not any(wave.is_sure for wave in fit.waves)
     film = fit.orthotropy
     assert film is not None
     assert not film.has_direction
@@ -319,7 +319,7 @@ def test_waves_that_all_sets_share_have_no_cause_in_the_film(size_mm: float) -> 
     shared_mm[3:5] = 0.8 * size_mm, -0.6 * size_mm
     figures = [replace(one, parameters_mm=one.parameters_mm + shared_mm) for one in figures]
     fit = _fit(figures)
-    seen = {wave.cause for wave in fit.waves if wave.seen}
+    seen = {wave.cause for wave in fit.waves if wave.is_sure}
     if size_mm < 0.01:  # within what the law neglects, a ring out of flat has the same waves
         assert seen <= {"flat"}
         return
@@ -342,7 +342,7 @@ def test_a_stiff_direction_is_found_beside_waves_that_all_sets_share() -> None:
     (modulus,) = (wave for wave in fit.waves if wave.cause == "modulus")
     true = np.array([apart * np.cos(1.2), apart * np.sin(1.2)])
     assert np.all(np.abs(modulus.amounts - true) < 3 * modulus.sigmas)
-    seen = {wave.cause for wave in fit.waves if wave.seen}
+    seen = {wave.cause for wave in fit.waves if wave.is_sure}
     assert seen <= {"modulus"}
 
 
@@ -354,7 +354,7 @@ def test_waves_without_a_known_cause_are_reported_as_unknown() -> None:
         parameters[22] += 0.03 * (figure.sag_mm / 36) ** 4  # Noll 24: two waves, radial order 6
         figures.append(replace(figure, parameters_mm=parameters))
     fit = _fit(figures)
-    assert not any(wave.seen for wave in fit.waves if wave.order == 2)
+    assert not any(wave.is_sure for wave in fit.waves if wave.order == 2)
     (unknown,) = fit.unexplained
     assert unknown.order == 2
     assert unknown.left_um > 10

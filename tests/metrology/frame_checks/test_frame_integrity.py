@@ -5,12 +5,14 @@ alarm.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
+from membrane_ctrl.metrology.frame_checks.film_image import FilmImage, ImageEvidence
 from membrane_ctrl.metrology.frame_checks.frame_inspection import find_identical_frames
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.rays.surface import Surface
@@ -57,6 +59,22 @@ def test_a_stale_frame_is_reported_and_left_out(kind: str, frame: str) -> None:
     assert "stale" in reasons[0]
     assert wrong is not None
     assert wrong < 0.05
+
+
+@pytest.mark.parametrize(
+    "kind", ["stale", pytest.param("flicker", marks=pytest.mark.campaign), "swapped"]
+)
+def test_a_flagged_frame_neither_hides_nor_makes_another_doubt(kind: str) -> None:
+    checked = check_set(faulty_set(kind, "x_gray_1", 4, 1.0), bench())
+    verdict, reason = checked.verdict
+    assert verdict == "degraded"
+    assert "flagged" in reason
+    assert ";" not in reason.partition("; the figure excludes")[2]
+    with_image = replace(checked, image=FilmImage(0.04, ImageEvidence.WHITE_AND_BLACK, 1, 2, 3, 4))
+    verdict, reason = with_image.verdict
+    assert verdict == "degraded"
+    assert "flagged" in reason
+    assert "a second reflection of the screen at x +1 mm" in reason
 
 
 @pytest.mark.parametrize("frame", ["x_sin_2", pytest.param("y_sin_1", marks=pytest.mark.campaign)])
