@@ -50,12 +50,10 @@ class Bridge:
         self._answer = ""
         self._safety_answered_s = -math.inf
         self._lanes = CommandLanes(feed.ask, self._report_late)
-        self.late_listeners: list[
-            Callable[[str], None]
-        ] = []  # get the late outcomes of safety commands
-        self.opening = (
-            asyncio.Lock()
-        )  # one bridge after the other: a server blocks the event loop while it opens
+        # they get the late outcomes of safety commands
+        self.late_listeners: list[Callable[[str], None]] = []
+        # one bridge after the other: a server blocks the event loop while it opens
+        self.opening = asyncio.Lock()
 
     def values(self) -> dict[str, Value]:
         """The values of `TABLE` now."""
@@ -79,7 +77,28 @@ class Bridge:
     async def ask(
         self, by: str, name: str, given: Any = "", role: Role | None = None, who: str = ""
     ) -> str:
-        """Send a command, as `submit`, and wait for what became of it."""
+        """Send a command, as `submit`, and wait for its outcome.
+
+        Parameters
+        ----------
+        by : str
+            The bridge: `mqtt`, `opcua` or `epics`; recorded with the command.
+        name : str
+            A key of `COMMANDS`, such as `setpoint`.
+        given : object
+            Its number (in the unit of the command's button, such as µm) or text, as the client
+            sent it: a number, str, or bytes in UTF-8. Ignored by a command that takes neither.
+        role : str or None
+            Role of the client; None is the role of `[bridges]`.
+        who : str
+            Name of a client that has logged in; empty if the bridge does not know it.
+
+        Returns
+        -------
+        str
+            One line for people, with the time in UTC. A refusal is returned, too: nothing is
+            raised.
+        """
         return await self.submit(by, name, given, role, who)
 
     def submit(
@@ -96,14 +115,16 @@ class Bridge:
         given : object
             Its number or text, as the client sent it.
         role, who : str
-            Role and name of the client, where the bridge has them; the configured role limits
-            both.
+            Role and name of the client, where the bridge has them. A client can do no more than
+            the role of `[bridges]` allows.
 
         Returns
         -------
         Future of str
-            What became of it, in one line.
+            The outcome in one line; already done if the command was refused here.
         """
+        # A command that the bridge itself refuses gets a future that is done, so that refused and
+        # sent commands are answered in the same way below.
         try:
             asked = self._request(by, name, given, role or self.settings.role, who)
         except ValueError as error:
@@ -124,7 +145,7 @@ class Bridge:
         return answer
 
     async def close(self) -> None:
-        """End what is under way."""
+        """End the lanes; safety commands under way get the rest of their time."""
         await self._lanes.close()
 
     def _note_outcome(self, by: str, name: str, outcome: Outcome) -> str:
@@ -134,7 +155,10 @@ class Bridge:
         answer = f"{time.strftime('%H:%M:%S', time.gmtime())} UTC, {by}: {outcome.text}"
         safety = is_safety_command(name)
         now_s = time.monotonic()
-        if safety or now_s - self._safety_answered_s > _SAFETY_SHOWN_S or outcome.done:
+        # An ordinary refusal waits until the safety command's answer has been visible for a while;
+        # a command that the hold obeyed is always shown, because it changed something.
+        safety_answer_is_old = now_s - self._safety_answered_s > _SAFETY_SHOWN_S
+        if safety or safety_answer_is_old or outcome.done:
             self._answer = answer
         if safety:
             self._safety_answered_s = now_s
@@ -146,7 +170,9 @@ class Bridge:
             listener(answer)
 
     def _request(self, by: str, name: str, given: Any, role: Role, who: str) -> dict[str, Any]:
-        """The request of a command. Raises ValueError with what is wrong, in one line."""
+        """The request of a command, for the control port. Raises ValueError: one line that states
+        the fault.
+        """
         action = COMMANDS.get(name)
         if action is None:
             raise ValueError("no such command")
@@ -174,9 +200,8 @@ class Bridge:
         text = str(given)
         if is_safety_command(name):
             return _remove_unprintable(text)
-        if (
-            len(text.encode("utf-8", "replace")) > TEXT_BYTES
-        ):  # the port would drop a client that sends too much
+        # the port would drop a client that sends too much
+        if len(text.encode("utf-8", "replace")) > TEXT_BYTES:
             raise ValueError(f"{name} refused: longer than {TEXT_BYTES} bytes")
         return text
 
@@ -185,6 +210,7 @@ def _number_text(action: ActionButton, given: Any) -> str:
     """A number in the notation of `request`. Raises ValueError for whatever is not exactly one
     finite number.
     """
+    # One byte more than allowed is enough to refuse a payload by its length.
     if isinstance(given, bytes):
         given = _decode_payload(given[: TEXT_BYTES + 1], str(action.do))
     if isinstance(given, str):
@@ -194,6 +220,7 @@ def _number_text(action: ActionButton, given: Any) -> str:
             given = parse_number(given)
         except ValueError as error:
             raise ValueError(f"{action.label}: enter a number in {action.unit}: {error}") from None
+    # Python counts True as a number; a client that sends it means something else.
     if isinstance(given, bool) or not isinstance(given, float | int):
         raise ValueError(f"{action.label}: enter a number in {action.unit}")
     try:

@@ -127,7 +127,7 @@ class CommandLanes:
         kind = str(request["do"])
         self._refuse_waiting(kind)
         asyncio.get_running_loop().call_later(SAFETY_ANSWER_S, _answer_provisionally, outcome, kind)
-        # The same command may already wait: one execution answers both.
+        # The same command with the same text may already wait: sending it once answers both.
         for waiting in self._safety.waiting_of(kind):
             if waiting.request.get("text") == request.get("text"):
                 if len(waiting.outcomes) < _SHARED_MOST:
@@ -163,7 +163,9 @@ class CommandLanes:
             waiting.answer(await self._send_on_thread(waiting.request, limits))
 
     def _make_overtaken_check(self, kind: str) -> Callable[[], str]:
-        """A function that returns whether a safety command has come since now."""
+        """A function that returns why a command must not be sent any more: a safety command has
+        come since now; else an empty text.
+        """
         count = self._safety_count
 
         def refusal() -> str:
@@ -181,8 +183,8 @@ class CommandLanes:
             waiting.answer(outcome)
 
     async def _send_on_thread(self, request: Message, limits: SendLimits) -> Outcome:
-        """Send on a thread of its own, which ends with the process: a hold that hangs must not
-        delay the exit.
+        """Send on a new thread that ends with the process: a hold that hangs must not delay the
+        exit.
         """
         loop = asyncio.get_running_loop()
         outcome: asyncio.Future[Outcome] = loop.create_future()
@@ -198,7 +200,7 @@ class CommandLanes:
                 result = Outcome.failed(
                     str(request["do"]), f"not sent: {type(error).__name__}: {error}"
                 )
-            with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+            with contextlib.suppress(RuntimeError):  # the loop is closed, no sender waits
                 loop.call_soon_threadsafe(set_outcome, result)
 
         threading.Thread(target=send, name="bridge command", daemon=True).start()

@@ -32,9 +32,23 @@ _DIGITS = 4
 
 
 async def serve(config: EpicsConfig, bridge: Bridge) -> None:
-    """Serve until cancelled. Raises DeviceError if the address is taken, or another server has
-    these records.
+    """Serve until cancelled.
+
+    Parameters
+    ----------
+    config : EpicsConfig
+        Address and ports to listen on.
+    bridge : Bridge
+        The values that become records, and the commands that become records `do:COMMAND`. Its
+        `opening` is held for the seconds in which the IOC starts.
+
+    Raises
+    ------
+    DeviceError
+        The address is taken, or another server has these records.
     """
+    # The lock of this machine keeps two bridges of one name apart; the search below finds other
+    # servers.
     with device_claim.claim_devices([f"EPICS records {bridge.settings.name}:*"]):
         await _serve_records(config, bridge)
 
@@ -51,31 +65,33 @@ async def _serve_records(config: EpicsConfig, bridge: Bridge) -> None:
     from softioc import alarm
 
     while True:
-        live = bridge.live
+        # A value that is missing keeps the record's last number and becomes INVALID: by COMM if
+        # the hold does not answer, by UDF if the hold has no such value now.
+        missing_status = alarm.COMM_ALARM
+        if bridge.live:
+            missing_status = alarm.UDF_ALARM
         for name, value in bridge.values().items():
             record = records[name]
             if value is not None:
                 record.set(_shorten_text(value))
             else:
-                record.set_alarm(
-                    alarm.INVALID_ALARM, alarm.COMM_ALARM if not live else alarm.UDF_ALARM
-                )
+                record.set_alarm(alarm.INVALID_ALARM, missing_status)
         await asyncio.sleep(bridge.settings.period_s)
 
 
 def _start_ioc(config: EpicsConfig, bridge: Bridge) -> dict[str, Any]:
     """Start the IOC, which takes seconds; returns the records of the published values."""
     _require_free(config)
-    addresses = {"EPICS_CAS_INTF_ADDR_LIST": config.host, "EPICS_PVAS_INTF_ADDR_LIST": config.host}
-    addresses |= {
-        "EPICS_CAS_BEACON_ADDR_LIST": config.host,
-        "EPICS_CAS_AUTO_BEACON_ADDR_LIST": "NO",
-    }
-    addresses |= {
-        "EPICS_PVAS_BEACON_ADDR_LIST": config.host,
-        "EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO",
-    }
-    os.environ.update(addresses)
+    # EPICS reads addresses and ports from the environment only, for Channel Access (CAS) and
+    # PV Access (PVAS): where to listen, and no beacons to networks that nobody configured.
+    for protocol in ("CAS", "PVAS"):
+        os.environ.update(
+            {
+                f"EPICS_{protocol}_INTF_ADDR_LIST": config.host,
+                f"EPICS_{protocol}_BEACON_ADDR_LIST": config.host,
+                f"EPICS_{protocol}_AUTO_BEACON_ADDR_LIST": "NO",
+            }
+        )
     os.environ.update(
         EPICS_CA_SERVER_PORT=str(config.ca_port), EPICS_PVAS_SERVER_PORT=str(config.pva_port)
     )
@@ -86,6 +102,7 @@ def _start_ioc(config: EpicsConfig, bridge: Bridge) -> dict[str, Any]:
     for do, action in bridge.commands.items():
         _make_command_record(builder, bridge, do, action, records["answer"])
     builder.LoadDatabase()
+    # The rules of access must be set before iocInit, which reads their file; then the file may go.
     with tempfile.TemporaryDirectory() as folder:
         rules = Path(folder) / "rules.acf"
         files.write_text_atomic(rules, _RULES)
@@ -95,7 +112,9 @@ def _start_ioc(config: EpicsConfig, bridge: Bridge) -> dict[str, Any]:
 
 
 def _require_free(config: EpicsConfig) -> None:
-    """EPICS would take another port instead, where no client looks. Raises DeviceError."""
+    """Refuse ports that are in use: EPICS would listen on another one, where no client searches.
+    Raises DeviceError.
+    """
     for port in (config.ca_port, config.pva_port):
         try:
             socket.create_server((config.host, port)).close()

@@ -27,7 +27,20 @@ _DEFAULT_PORT = 5064
 
 
 def require_unserved(record: str, ca_port: int) -> None:
-    """Search for a record. Raises DeviceError if a server has it."""
+    """Search for a record where its clients would.
+
+    Parameters
+    ----------
+    record : str
+        Full name, such as `bench2:state`; ASCII.
+    ca_port : int
+        UDP port of Channel Access that this bridge will use; the standard's 5064 is searched, too.
+
+    Raises
+    ------
+    DeviceError
+        A server has the record.
+    """
     server = find_server(record, _search_addresses(ca_port))
     if server:
         raise errors.DeviceError(
@@ -37,8 +50,20 @@ def require_unserved(record: str, ca_port: int) -> None:
 
 
 def find_server(record: str, addresses: list[tuple[str, int]]) -> str:
-    """Search for a record at these addresses for half a second; returns its server's address, or an
-    empty text.
+    """Search for a record for half a second; datagrams may be lost, so every address is asked every
+    0.1 s.
+
+    Parameters
+    ----------
+    record : str
+        Full name; ASCII.
+    addresses : list of (str, int)
+        Host or broadcast address, and UDP port. One that cannot be reached is left out.
+
+    Returns
+    -------
+    str
+        Address of the first server that replies; empty if none does.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as searching:
         searching.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -46,11 +71,10 @@ def find_server(record: str, addresses: list[tuple[str, int]]) -> str:
         end_s = time.monotonic() + _SEARCH_S
         while time.monotonic() < end_s:
             for address in addresses:
-                with suppress(
-                    OSError
-                ):  # no route, no such host: nobody there is found by clients either
+                # no route, no such host: clients find no server there either
+                with suppress(OSError):
                     searching.sendto(_search_message(record), address)
-            with suppress(OSError):
+            with suppress(OSError):  # no reply within `_REPEAT_S`
                 reply, (host, _) = searching.recvfrom(_DATAGRAM_BYTES)
                 if _has_search_reply(reply):
                     return str(host)
@@ -74,6 +98,8 @@ def _search_addresses(ca_port: int) -> list[tuple[str, int]]:
 
 
 def _search_message(record: str) -> bytes:
+    """A datagram with two messages: the version of the protocol, and the search for one record."""
+    # The payload is the name with its terminator, padded to a multiple of eight bytes.
     name = record.encode("ascii") + b"\0"
     name += b"\0" * (-len(name) % 8)
     version = _HEADER.pack(_VERSION, 0, 0, _MINOR_VERSION, 0, 0)
@@ -84,6 +110,8 @@ def _search_message(record: str) -> bytes:
 
 def _has_search_reply(reply: bytes) -> bool:
     """Whether a datagram holds the reply of a server that has the record."""
+    # A datagram may hold several messages one after the other; only a server that has the record
+    # replies to a search.
     place = 0
     while place + _HEADER.size <= len(reply):
         command, payload_bytes, *_ = _HEADER.unpack_from(reply, place)

@@ -53,13 +53,29 @@ _UNSUPPORTED_VERSION = (1, 132)  # reason codes of MQTT 3.1.1 and 5
 async def serve(config: MqttConfig, bridge: Bridge) -> None:
     """Publish until cancelled; connect again whenever the broker returns.
 
-    Raises InputError for a wrong file, DeviceError if another bridge has the name at this broker.
+    Parameters
+    ----------
+    config : MqttConfig
+        The broker, and how to log in to it.
+    bridge : Bridge
+        The values to publish, and where commands go.
+
+    Raises
+    ------
+    InputError
+        A file of password or certificate authority cannot be used.
+    DeviceError
+        Another bridge has the name at this broker.
     """
     broker = Broker(config, bridge.settings.name)
     ownership = NameOwnership(broker.claim, f"{broker.where}: the name {bridge.settings.name!r}")
     printed = False
+    # Wait until the other bridges are open: they block the event loop, and a connection would time
+    # out meanwhile.
     async with bridge.opening:
-        pass  # a connection would time out meanwhile
+        pass
+    # Each round is one connection until it fails. A failure is printed once, and again only after
+    # a connection that has worked.
     while True:
         began_s = time.monotonic()
         connection = asyncio.create_task(
@@ -121,6 +137,16 @@ class Broker:
 
         Its identifier stays the same for this process: at a reconnection the broker ends the former
         connection.
+
+        Parameters
+        ----------
+        purpose : str
+            Last word of the identifier, different for each connection of this process: `safety`
+            or `values`.
+        handle : callable
+            Gets each message as it arrives, in the event loop; it must not block.
+        will : aiomqtt.Will or None
+            What the broker publishes if the connection breaks; None for nothing.
         """
         inbox = Inbox(handle)
 
@@ -159,18 +185,18 @@ class Broker:
 
 
 def _read(file: str | None) -> str | None:
+    if file is None:
+        return None
     try:
-        if file is None:
-            return None
         return files.read_text(Path(file), follow=True).strip()
     except (OSError, ValueError) as error:
         raise errors.InputError(f"bridges.mqtt.password_file: {error}") from None
 
 
 def _make_tls_context(config: MqttConfig) -> ssl.SSLContext | None:
+    if config.ca_file is None:
+        return None
     try:
-        if config.ca_file is None:
-            return None
         return ssl.create_default_context(cafile=config.ca_file)
     except OSError as error:
         raise errors.InputError(f"bridges.mqtt.ca_file: {config.ca_file}: {error}") from None
@@ -179,7 +205,12 @@ def _make_tls_context(config: MqttConfig) -> ssl.SSLContext | None:
 async def _serve_connection(
     broker: Broker, config: MqttConfig, bridge: Bridge, ownership: NameOwnership
 ) -> None:
-    """Connect, claim the name, publish and obey until a connection fails."""
+    """Connect, claim the name, publish and obey until a connection fails.
+
+    The order is part of the protection: no command is subscribed before the name is owned, so two
+    bridges of one name never act on the same command; the safety commands are subscribed before the
+    connection of all others opens.
+    """
     base = broker.base
     owner_topic = f"{base}/owner"
 
@@ -193,6 +224,7 @@ async def _serve_connection(
         if str(message.topic) == owner_topic:
             ownership.receive(_get_payload_bytes(message), message.retain)
             return
+        # A retained message is refused below and therefore must not hold up other commands.
         if not message.retain:
             barrier.raise_for(_command_name(message))
         _handle_command(message, bridge, safety_reports)
@@ -217,8 +249,9 @@ async def _serve_connection(
         try:
             await _publish_and_obey(broker, config, bridge, barrier)
         except asyncio.CancelledError:
-            # The program ends, unless it was another task that failed: the name is free for the
-            # next bridge.
+            # Either the program ends, or another task of the group failed. Only at the end of the
+            # program the claim is withdrawn, so that the next bridge need not wait for silence;
+            # after a failure this process connects again and needs its claim.
             failed = any(task.done() for task in (watching, keeping, *others))
             keeping.cancel()
             if not failed:
@@ -239,9 +272,7 @@ async def _wait_for_disconnect(client: aiomqtt.Client) -> None:
 async def _publish_and_obey(
     broker: Broker, config: MqttConfig, bridge: Bridge, barrier: OrderBarrier
 ) -> None:
-    """Publish the values, and obey the commands that are no safety commands, on a connection of
-    their own.
-    """
+    """Publish the values, and obey all commands but the safety commands, on a second connection."""
     base = broker.base
 
     async def publish_answer(answer: str) -> None:
@@ -255,6 +286,8 @@ async def _publish_and_obey(
             barrier.receive(_get_payload_bytes(message))
         elif is_safety_command(name):
             return  # it also comes on the other connection
+        # This command may have been published before a safety command that was faster on the other
+        # connection.
         elif barrier.newest and name not in MOVES_NOTHING:
             reports.add_refusal(f"{name} refused: {overtaken(barrier.newest)}")
         else:
@@ -278,7 +311,8 @@ async def _publish_and_obey(
                 tasks.create_task(_wait_for_disconnect(client))
                 tasks.create_task(_publish(client, bridge, base, availability))
                 tasks.create_task(reports.run())
-        except asyncio.CancelledError:  # a clean goodbye suppresses the last will
+        # After an orderly disconnection the broker publishes no will: publish `offline` here.
+        except asyncio.CancelledError:
             with suppress(aiomqtt.MqttError, TimeoutError):
                 async with asyncio.timeout(_LEAVES_S):
                     await client.publish(f"{base}/availability", "offline", qos=1, retain=True)
@@ -315,6 +349,8 @@ async def _publish(
     client: aiomqtt.Client, bridge: Bridge, base: str, availability: Availability
 ) -> None:
     """Publish the values every period, and the availability when it changes or is wrong."""
+    # The loop runs at least every `_LOOK_S`, so that a lost hold is shown before the next values
+    # are due when their period is long.
     next_s = time.monotonic()
     while True:
         now = "online" if bridge.live else "offline"
@@ -333,7 +369,7 @@ async def _publish(
 
 
 def _handle_command(message: aiomqtt.Message, bridge: Bridge, reports: Reports) -> None:
-    """Hand a command on, or refuse it; the answer is reported in either case."""
+    """Submit a command, or refuse it; the answer is reported in either case."""
     name = _command_name(message)
     if message.retain:  # an old command, delivered again at each connection
         reports.add_refusal(f"{name} refused: a retained message is no command")
@@ -356,8 +392,19 @@ def _get_payload_bytes(message: aiomqtt.Message) -> bytes:
 
 
 def discovery(bridge: Bridge, base: str) -> dict[str, Any]:
-    """The device with its entities, as Home Assistant takes it (device discovery, 2024.11 and
-    later).
+    """The device with its entities for Home Assistant (device discovery, 2024.11 and later).
+
+    Parameters
+    ----------
+    bridge : Bridge
+        Its published values become sensors, its allowed commands buttons, numbers and texts.
+    base : str
+        Topic under which values and commands are: `membrane/NAME`, without a slash at the end.
+
+    Returns
+    -------
+    dict
+        The payload of the discovery topic, to be sent as JSON.
     """
     name = bridge.settings.name
     found = {each.name: _describe_sensor(each, name) for each in TABLE}

@@ -37,6 +37,7 @@ class OrderBarrier:
 
     def receive(self, payload: bytes) -> None:
         """Note a marker that has come back."""
+        # Anyone may publish on this topic: a number above the last one sent counts as that one.
         instance, _, number = payload[:64].decode("ascii", "replace").partition(" ")
         if instance == self._instance and number.isascii() and number.isdecimal():
             self._returned = max(self._returned, min(int(number), self._sent))
@@ -52,6 +53,8 @@ class OrderBarrier:
 
     async def run(self, publish: PublishMarker) -> None:
         """Publish markers until cancelled."""
+        # The newest marker lies behind all older ones: if it is back, so are they, and a lost one
+        # needs no repetition of its own.
         while True:
             await self._raised.wait()
             self._raised.clear()

@@ -12,7 +12,7 @@ class CancellableClient(aiomqtt.Client):
     """Raises a cancellation that arrives in the moment in which the broker confirms a call.
 
     aiomqtt awaits confirmations with `asyncio.wait_for`, which loses such a cancellation in Python
-    3.11 (https://github.com/python/cpython/issues/86296): the task would go on, and nothing would
+    3.11 (https://github.com/python/cpython/issues/86296): the task would continue and nothing would
     end it.
     """
 

@@ -73,24 +73,37 @@ class OwnerClaim:
 
 
 def parse_claim(payload: bytes) -> OwnerClaim | None:
-    """The claim in a message; None for anything else, which anybody may have published."""
+    """The claim in a message; None for anything else, because any client can publish there."""
     if len(payload) > _CLAIM_BYTES:
         return None
-    with suppress(ValueError, TypeError, RecursionError):
+    try:
         claim = OwnerClaim(**json.loads(payload))
-        since_s = claim.since_s
-        owned = since_s is None or (
-            type(since_s) in (int, float) and math.isfinite(since_s) and since_s >= 0.0
-        )
-        if (
-            owned
-            and _INSTANCE.fullmatch(claim.instance)
-            and type(claim.pid) is int
-            and len(claim.host) <= _HOST_LENGTH
-            and claim.host.isprintable()
-        ):
-            return claim
-    return None
+    except (ValueError, TypeError, RecursionError):
+        return None
+    if not _is_owned_since(claim.since_s):
+        return None
+    # The dataclass checks no types: JSON may have put anything into its fields.
+    if not isinstance(claim.instance, str) or not _INSTANCE.fullmatch(claim.instance):
+        return None
+    if type(claim.pid) is not int:
+        return None
+    if not isinstance(claim.host, str) or not claim.host.isprintable():
+        return None
+    if len(claim.host) > _HOST_LENGTH:
+        return None
+    return claim
+
+
+def _is_owned_since(since_s: object) -> bool:
+    """Whether this is a time since which a claim may own a name; None is: not yet."""
+    if since_s is None:
+        return True
+    if isinstance(since_s, bool) or not isinstance(since_s, int | float):
+        return False
+    try:
+        return math.isfinite(since_s) and since_s >= 0.0
+    except OverflowError:  # an integer that no float holds
+        return False
 
 
 class NameOwnership:
@@ -113,7 +126,16 @@ class NameOwnership:
         self._heard = asyncio.Event()
 
     def receive(self, payload: bytes, retained: bool) -> None:
-        """Note a message of the owner's topic."""
+        """Note a message of the owner's topic.
+
+        Parameters
+        ----------
+        payload : bytes
+            A claim as JSON; empty if an owner has ended; anything else is ignored.
+        retained : bool
+            Whether the broker delivered it from its memory: then its owner may be gone. A message
+            that is not retained shows an owner that is alive.
+        """
         if not payload:  # a former owner has ended
             self._released = True
             self._heard.set()
@@ -131,17 +153,23 @@ class NameOwnership:
         """Become the owner; call it after each connection. Raises DeviceError if another bridge has
         the name.
         """
+        # Wait for the retained claim, then publish this one, not retained: a live owner answers it
+        # at once with its own.
         await asyncio.sleep(_RETAINED_S)
         await publish(self.claim.encode(), False)
         deadline_s = time.monotonic() + self._listening_s()
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             if self._released:
-                # Others may also have waited for that.
+                # The owner has ended, so there is no need to wait for its silence. Other bridges
+                # may also have waited for that: settle with them who follows.
                 self._released = False
                 deadline_s = min(deadline_s, time.monotonic() + SETTLE_S)
+            # A rival that ranks behind must see this claim, so that it ends.
             if await self._rival_heard(min(left_s, SETTLE_S)):
                 await publish(self.claim.encode(), False)
                 await asyncio.sleep(_BETWEEN_ANSWERS_S)
+        # No live claim ranks before this one. A reconnecting owner keeps its earlier time, and so
+        # its rank.
         if self.claim.since_s is None:
             self.claim = replace(self.claim, since_s=time.time())
         await publish(self.claim.encode(), True)

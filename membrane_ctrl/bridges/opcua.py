@@ -35,8 +35,19 @@ _ENCRYPTED = [
 async def serve(config: OpcuaConfig, bridge: Bridge) -> None:
     """Serve until cancelled.
 
-    Raises InputError for a bad file of users, certificate or key, DeviceError if the address is
-    taken.
+    Parameters
+    ----------
+    config : OpcuaConfig
+        Address, users and certificate.
+    bridge : Bridge
+        The values that become variables, and the commands that become methods.
+
+    Raises
+    ------
+    InputError
+        A file of users, certificate or key cannot be used.
+    DeviceError
+        The address is taken.
     """
     where = f"opc.tcp://{config.host}:{config.port}/membrane_ctrl"
     users = _read_users(config)
@@ -48,9 +59,8 @@ async def serve(config: OpcuaConfig, bridge: Bridge) -> None:
         await _secure(server, config, bridge.settings.name)
         space = await server.register_namespace(f"urn:membrane-ctrl:{bridge.settings.name}")
         nodes = await _make_nodes(server, space, bridge, users)
-        await _show(
-            server, nodes, bridge
-        )  # nobody may see the zeros that the variables were made with
+        # the variables were made with zeros, which no client may see
+        await _show(server, nodes, bridge)
         try:
             await server.start()
         except OSError as error:

@@ -39,9 +39,8 @@ _MESSAGE_BYTES_MAX = 1 << 20
 _PASSWORD_LENGTH = 256
 _VERIFYING_MOST = 8  # log-ins that wait for the hash of another
 
-caller: contextvars.ContextVar[str] = contextvars.ContextVar(
-    "caller", default=""
-)  # name of a method's client
+# name of the client whose method call this task answers
+caller: contextvars.ContextVar[str] = contextvars.ContextVar("caller", default="")
 
 
 class AnonymousClients:
@@ -54,7 +53,13 @@ class AnonymousClients:
         return User(UserRole.User)
 
     async def verify(self, name: str, password: str, address: str) -> None:
-        """There is nothing to verify."""
+        """Do nothing: a password means nothing here.
+
+        Parameters
+        ----------
+        name, password, address : str
+            As for `NamedClients.verify`; ignored.
+        """
 
 
 class NamedClients:
@@ -68,11 +73,11 @@ class NamedClients:
 
     def __init__(self, users: dict[str, KnownUser]) -> None:
         self._users = users
+        # its password is verified for a name that does not exist, so that both take the same time
         self._nobody = known_user("nobody", "read", secrets.token_hex(8))
         self._secret = secrets.token_bytes(32)
-        self._verified: dict[
-            str, bytes
-        ] = {}  # a digest of name and password of each user who has logged in
+        # a digest of name and password of each user who has logged in, keyed with `_secret`
+        self._verified: dict[str, bytes] = {}
         self._turns = Turns(time.monotonic)
         self._one_at_a_time = asyncio.Lock()
         self._verifying = 0
@@ -82,9 +87,18 @@ class NamedClients:
 
         A password that was right before takes no time, so guesses of others cannot keep its owner
         out.
+
+        Parameters
+        ----------
+        name, password : str
+            As the client sent them.
+        address : str
+            IP address of the client, which limits its attempts per second (`Turns`).
         """
+        # Known at once, or refused without the hash: longer than any password is.
         if self._is_verified(name, password) or len(password) > _PASSWORD_LENGTH:
             return
+        # A flood of guesses may neither queue without limit nor occupy the threads.
         if self._verifying >= _VERIFYING_MOST or not self._turns.take(address):
             return
         self._verifying += 1
@@ -102,7 +116,22 @@ class NamedClients:
         password: str | None = None,
         certificate: object = None,
     ) -> User | None:
-        """Return the user of a session; None if the password was not verified."""
+        """Return the user of a session (called by asyncua, after `verify`).
+
+        Parameters
+        ----------
+        iserver : object
+            Not used; asyncua passes its server.
+        username, password : str or None
+            None for a client that sent none.
+        certificate : object
+            Not used: certificates encrypt here, and identify no user.
+
+        Returns
+        -------
+        User or None
+            None if the password was not verified, which asyncua answers with a refusal.
+        """
         if username is None or password is None or not self._is_verified(username, password):
             return None
         return User(UserRole.User, username)
@@ -175,6 +204,8 @@ class _BridgeProcessor(UaProcessor):  # type: ignore[misc]  # asyncua has no typ
         self._calls: set[asyncio.Task[None]] = set()
 
     async def process_message(self, seqhdr: Any, body: Buffer) -> Any:
+        # A call becomes a task and counts as processed at once, so that the next message of this
+        # connection is read meanwhile.
         kind = nodeid_from_binary(body.copy())
         if kind == _CALL:
             task = asyncio.create_task(self._process_call(seqhdr, body), name="opcua call")
@@ -192,9 +223,7 @@ class _BridgeProcessor(UaProcessor):  # type: ignore[misc]  # asyncua has no typ
             self._transport.close()
 
     async def _verify_password(self, body: Buffer) -> None:
-        """Verify the password of an ActivateSession message; whatever is wrong with it is for
-        asyncua to refuse.
-        """
+        """Verify the password of an ActivateSession message; asyncua refuses a malformed one."""
         with suppress(Exception):
             nodeid_from_binary(body)
             struct_from_binary(ua.RequestHeader, body)
