@@ -318,7 +318,7 @@ def _make_figures_table(
         ("gas", _format_gas(view, row)),
         ("", Text()),
         *_make_shape_items(view.shape, row),
-        *([("holds", Text(view.held_scalar))] if view.held_scalar else []),
+        *([("scalar", Text(view.held_scalar))] if view.held_scalar else []),
         ("", Text()),
         ("lateness", _format_lateness(view, row)),
         ("faults", _format_faults(view)),
@@ -351,7 +351,7 @@ def _format_error(view: ConsoleView, config: Config) -> Text:
 
 
 def _format_held(held: HeldError) -> Text:
-    """The figures with which the run will end."""
+    """How well the run has held until now: the figures of its closing report."""
     if not held.seconds:
         return Text("not for one second yet", style="dim")
     return Text.assemble(f"{held.name}, 1 s means: ", (held.figures_text, "bold"))

@@ -39,7 +39,7 @@ class HeldState(IntEnum):
     OFF = 0  # switched off by a person, or the vertex is held
     WAITING = 1  # the reference is not complete
     TRACKING = 2
-    VERTEX = 3  # without a usable figure: the vertex is held at the last offset
+    KEPT = 3  # without a usable figure: the centre is held at the last offset
     EXPIRED = 4  # the same, for longer than the last offset is worth
 
 
@@ -111,13 +111,15 @@ class HeldOffset:
     Parameters
     ----------
     shape : ShapeConfig
-        Memory of the tracker, rate of the offset, age up to which a figure is used, largest jump.
+        Time constant of the tracker, rate of the offset, age up to which a figure is used, largest
+        jump.
     limits : HeldLimits
     weights : HeldWeights
     reference_um : (terms,) array, optional
         Terms of a stored figure that the setpoint 0 stands for; else the first figures of the run
         are the reference at the setpoint of that moment.
     memory : HeldOffsetMemory, optional
+        What an earlier controller remembered, from its snapshot; else the offset begins at 0.
     """
 
     def __init__(
@@ -136,8 +138,8 @@ class HeldOffset:
         self._time_constant_s = shape.time_constant_s
         self.memory = memory or HeldOffsetMemory()
 
-    def set_memory(self, time_constant_s: float) -> None:
-        """Set the tracker's memory; the offset does not jump."""
+    def set_time_constant(self, time_constant_s: float) -> None:
+        """Set over how long the tracker averages the figures, s; the offset does not jump."""
         self._time_constant_s = time_constant_s
 
     @property
@@ -214,10 +216,10 @@ class HeldOffset:
         return NO_REASON
 
     def _keep_offset(self, reason: Reason, now_s: float) -> None:
-        """Hold the vertex at the last offset for a reason."""
+        """Hold the centre at the last offset for a reason."""
         memory = self.memory
         if memory.state != HeldState.WAITING:
-            memory.state = HeldState.VERTEX
+            memory.state = HeldState.KEPT
             if now_s - memory.seen_s > self._limits.keep_s:
                 memory.state = HeldState.EXPIRED
         memory.reason = reason

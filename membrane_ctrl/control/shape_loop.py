@@ -96,8 +96,8 @@ class ShapeLoop:
         """Whether it is switched on."""
         return self.memory.state != telemetry.ShapeState.OFF
 
-    def set_memory(self, time_constant_s: float) -> None:
-        """Set the tracker's memory; the trim does not jump."""
+    def set_time_constant(self, time_constant_s: float) -> None:
+        """Set over how long the tracker averages the figures, s; the trim does not jump."""
         self._time_constant_s = time_constant_s
 
     def switch(self, on: bool, now_s: float) -> None:

@@ -194,8 +194,19 @@ def check_greeting(message: Message) -> Message:
 
 
 def check(message: Message, model: type[BaseModel]) -> Message:
-    """Return a decoded message if it fits a model. Raises AnswerError naming the first field that
-    does not.
+    """Return a decoded message, unchanged, if it fits a model.
+
+    Parameters
+    ----------
+    message : Message
+        From a peer that may be no hold: any JSON object.
+    model : type of BaseModel
+        Fields that it does not name are allowed: a newer hold may send more.
+
+    Raises
+    ------
+    AnswerError
+        Names the first field that does not fit.
     """
     try:
         model.model_validate(message)

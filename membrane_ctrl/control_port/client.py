@@ -114,6 +114,8 @@ class PortClient:
         """Send a request (`protocol.Request`) and return its answer. Raises DeviceError if none
         comes in time.
         """
+        # Answers carry the number of their request: one that came too late for an earlier request
+        # is passed over
         self._number += 1
         until_s = time.monotonic() + self._patience_s
         try:

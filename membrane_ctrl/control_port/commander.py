@@ -123,7 +123,15 @@ class Commander:
         return ended
 
     def release(self, who: str, connection: str = "") -> None:
-        """Release command, if this client has it."""
+        """Release command, if this client has it; else nothing happens.
+
+        Parameters
+        ----------
+        who : str
+            The client's name.
+        connection : str
+            The id of its connection: a session of command belongs to that, and not to the name.
+        """
         if self.session is not None:
             self.end_session(connection)
         elif self._holder == who:

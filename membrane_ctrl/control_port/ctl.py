@@ -146,8 +146,24 @@ def fleet(file: Path) -> dict[str, Where]:
 
 
 def fleet_status(file: Path, as_json: bool) -> int:
-    """Ask all holds of a fleet file at once, and print a line of each; `DEVICE_FAILED` if one does
-    not answer.
+    """Ask all holds of a fleet file at once, and print a line of each.
+
+    Parameters
+    ----------
+    file : Path
+        The fleet file.
+    as_json : bool
+        Print one JSON object instead: the status of each hold by its name, or its `problem`.
+
+    Returns
+    -------
+    int
+        `Exit.DEVICE_FAILED` if one does not answer in time, else `Exit.DONE`.
+
+    Raises
+    ------
+    InputError
+        The file is wrong.
     """
     places = fleet(file)
     with ThreadPoolExecutor(len(places)) as pool:

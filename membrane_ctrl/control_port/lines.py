@@ -57,6 +57,7 @@ class LineReader:
         OSError
             The connection failed.
         """
+        # Each byte is searched once, and no more is kept than the longest line has
         searched = 0
         while (end := self._unread.find(b"\n", searched)) < 0:
             searched = len(self._unread)

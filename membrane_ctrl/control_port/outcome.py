@@ -25,12 +25,28 @@ class Outcome:
 
     @classmethod
     def failed(cls, command: str, reason: str) -> "Outcome":
-        """The outcome of a command that did not reach the hold, or got no answer."""
+        """The outcome of a command that did not reach the hold, or got no answer.
+
+        Parameters
+        ----------
+        command : str
+            Its name, as people read it.
+        reason : str
+            Why, within a sentence. The hold may still have obeyed.
+        """
         return cls(command, f"{command}: {reason}")
 
     @classmethod
     def refused(cls, command: str, reason: str) -> "Outcome":
-        """The outcome of a command that was refused."""
+        """The outcome of a command that was refused: it has changed nothing.
+
+        Parameters
+        ----------
+        command : str
+            Its name, as people read it.
+        reason : str
+            Why, within a sentence.
+        """
         return cls(command, f"{command} refused: {reason}")
 
     @classmethod
@@ -40,7 +56,16 @@ class Outcome:
 
     @classmethod
     def from_answer(cls, command: str, answer: Mapping[str, Any]) -> "Outcome":
-        """The outcome by the hold's answer."""
+        """The outcome by the hold's answer.
+
+        Parameters
+        ----------
+        command : str
+            Its name, as people read it.
+        answer : mapping
+            `ok`; `refused` with the reason if not; `problem` if a lock counts, but is not on the
+            disk.
+        """
         if not answer.get("ok"):
             return cls.refused(command, str(answer.get("refused")))
         if answer.get("problem"):

@@ -24,7 +24,19 @@ class Refusals:
         self.count = 0
 
     def record(self, who: str, command: str, reason: str, why: str = "") -> None:
-        """Count a refusal, and record it if the rate allows."""
+        """Count a refusal, and record it if the rate allows.
+
+        Parameters
+        ----------
+        who : str
+            The sender, or the peer of the connection.
+        command : str
+            Empty if the request could not be read.
+        reason : str
+            Why it was refused, within a sentence.
+        why : str
+            The sender's own reason for the request.
+        """
         self.count += 1
         now_s = self._now()
         self._tokens = min(_REFUSAL_BURST, self._tokens + _REFUSALS_PER_S * (now_s - self._since_s))

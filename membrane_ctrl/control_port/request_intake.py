@@ -145,7 +145,11 @@ class RequestIntake:
                     await asyncio.sleep(_TURN_S)
 
     def _accept_some(self, lines: deque[bytes]) -> None:
-        """Accept lines until the turn's share of parsing is used."""
+        """Accept lines until the turn's share of parsing is used.
+
+        While the queue is full, only a line that could hold a safety command is parsed: a search
+        for a few words costs far less than JSON.
+        """
         parsed = 0
         while lines and parsed < _PARSED_MOST:
             line = lines.popleft()

@@ -70,9 +70,9 @@ def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
         return Sender(peer.who, peer.role, account=peer.who, session=peer.session)
     role = min(peer.role, on_behalf.role, key=_RANK.__getitem__)
     from_person = on_behalf.via != "bridge"
-    if (
-        not peer.is_own_user
-    ):  # anybody could state this: it proves no login, and the peer sends it for somebody else
+    # Any program could state this. Only the hold's own user is trusted with a name: its service has
+    # verified the login. From others it lowers the role, and proves nothing
+    if not peer.is_own_user:
         return Sender(peer.who, role, session=peer.session, from_person=from_person)
     who = f"{on_behalf.via}:{on_behalf.account or on_behalf.name}"
     account = who if from_person and on_behalf.account else ""
@@ -82,12 +82,28 @@ def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
 
 
 def role_includes(role: str, needed: Role) -> bool:
-    """Whether a role includes the needed one; an unknown role is `read`."""
+    """Whether a role includes the needed one.
+
+    Parameters
+    ----------
+    role : str
+        May come from another program: an unknown role counts as `read`.
+    needed : Role
+        `tune` includes `operate`, which includes `read`.
+    """
     return _RANK.get(role, 0) >= _RANK[needed]
 
 
 def explain_missing_role(sender: Peer | Sender, do: RequestName) -> str:
-    """Why the sender's role forbids this request; empty if it does not."""
+    """Why the sender's role forbids a request; empty if it does not.
+
+    Parameters
+    ----------
+    sender : Peer or Sender
+        Who is behind the connection, with the lower role of the two if it sends for another.
+    do : RequestName
+        A command of `controller.commands.TABLE`, or a request of the port itself.
+    """
     needed = TABLE[do].role if do in TABLE else _ERRANDS[do]
     if role_includes(sender.role, needed):
         return ""

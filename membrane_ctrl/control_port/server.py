@@ -82,6 +82,8 @@ class Port:
 
     def handle_tick(self, outputs: tick.TickOutputs) -> None:
         """Note a tick's outputs, and answer the clients whose commands it took."""
+        # 1. The status, and the events for those who watch. A lock's word is known only now: it
+        #    belongs to the answer of the request that set it
         self._status = self._status.after_row(outputs.row)
         for event in outputs.events:
             self._status = self._status.after_event(event, outputs.row.mono_s)
@@ -96,6 +98,8 @@ class Port:
                 }
             for session in self._sessions:
                 session.event(event)
+        # 2. The answers: `_await_outcome` continues after this tick. One whose client has given up
+        #    is no longer there
         for number, refusal in outputs.answers:
             future = self._waiting.get(number)
             if future is not None and not future.done():
@@ -321,6 +325,8 @@ class Port:
         """The command of a request. Raises InputError for invalid
         gains or an invalid experiment.
         """
+        # All of it is checked here, so that the tick gets only values that may be: a refusal costs
+        # it nothing
         kind = next(kind for kind in commands.TABLE if kind == request.do)
         loop = None if request.loop is None else self._new_loop(request.loop)
         experiment = None
@@ -375,6 +381,7 @@ class Port:
         """Why the tick refused the command; empty if it executed it."""
         if self._over:
             return _OVER
+        # Waits before the command is queued, so that the very next tick finds who waits for it
         future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._waiting[command.number] = future
         self._hooks.queue_command(command)

@@ -39,7 +39,18 @@ class PortSession:
         self._watch: asyncio.Task[None] | None = None
 
     async def run(self, greeting: dict[str, Any], answer: Answer, refused: Refused) -> None:
-        """Answer requests until the peer disconnects."""
+        """Answer requests until the peer disconnects; in the event loop of the ticks.
+
+        Parameters
+        ----------
+        greeting : dict
+            First message to the peer: version, run, its name and role, the commander, the run's
+            clock.
+        answer : async callable
+            Executes a request of this session and returns its answer.
+        refused : callable
+            Records a refusal: who, command (empty for the connection itself), reason.
+        """
         try:
             self._connection.send(greeting)
             await self._serve_requests(answer, refused)

@@ -46,8 +46,14 @@ def fault_line(status: Mapping[str, Any]) -> str:
 
 
 def notice_lines(status: Mapping[str, Any], topic: str | None = None) -> list[str]:
-    """Return the sentences of a status's notices on neither faults nor locks, of one topic or of
-    all.
+    """Return the sentences of a status's notices on neither faults nor locks.
+
+    Parameters
+    ----------
+    status : mapping
+        As the port answers it.
+    topic : str, optional
+        Only those of this topic, such as `maintenance`; None: all.
     """
     return [
         str(each["text"]) for each in status.get("notices", ()) if topic in (None, each["topic"])

@@ -107,8 +107,8 @@ class Controller:
         self._shape = shape_loop.ShapeLoop(
             config.shape, sag_sensitivity, memory.shape, self._held.rim_weights
         )
-        self._shape.set_memory(self._gains.present.shape_time_constant_s)
-        self._held.set_memory(self._gains.present.shape_time_constant_s)
+        self._shape.set_time_constant(self._gains.present.shape_time_constant_s)
+        self._held.set_time_constant(self._gains.present.shape_time_constant_s)
         # A dead time and lag that the actuator test has identified replace the configured ones
         estimator = apply_response(config.estimator, memory.context.pump_response)
         self._context = TickContext(
@@ -177,79 +177,45 @@ class Controller:
         return self._config.model_copy(update={"loop": gains.loop, "pump": gains.pump})
 
     def tick(self, inputs: TickInputs) -> TickOutputs:
-        """Run one tick. Never raises: an exception in a handler
-        becomes a fault in the next tick.
+        """Run one tick.
+
+        Never raises: an exception in a state's handler, or in a part that may fail, becomes the
+        fault `tick_error` in the next tick.
+
+        Parameters
+        ----------
+        inputs : TickInputs
+            Reading, figure and commands of the tick, and its time (`RunClock`, s). Called 50 times
+            a second by the supervisor, in its event loop; a replay calls it with recorded inputs.
+
+        Returns
+        -------
+        TickOutputs
+            The command for pump and vent, the telemetry row, and what happened.
         """
         context = self._context
         events: list[Event] = []
+        # 1. Time, interlocks and commands
         self._begin_tick(inputs, events)
+        # 2. What do the sensors show? The loop's last output is the one of the tick before
         last = context.output or inner_loop.LoopOutput()
-        # nothing follows a setpoint in a pause
-        judged = self.state in state_sets.MOVING and not context.paused
-        error_um = last.error_um if judged else math.nan
-        context.observer.observe_inputs(inputs, self._may_follow_optics())
-        consistency = self._consistency
-        events += consistency.compare_sensors(
-            inputs,
-            self.state,
-            context.dt_s,
-            hold_status.hold_status(
-                context, last, self._estimation.held_by_optics, self._may_follow_optics()
-            ),
-        )
-        stand = context.standstill
-        stand.observe_reading(
-            inputs.now_s, inputs.reading, context.observer.commanded, inputs.link_up
-        )
-        observation = replace(
-            context.observer.make_observation(inputs, error_um),
-            tick_error=self.memory.tick_error,
-            overdue=context.overdue,
-            unfit=context.unfit,
-            laser_fault_text=consistency.laser_fault_text,
-            runs_on=stand.runs_on,
-            inflow=stand.inflow,
-            locked=describe_locks(context.locks, _LOCKS_SHOWN),
-            laser_gauge_apart=consistency.laser_gauge_apart,
-            gas_excess=consistency.gas_excess,
-            held_by_optics=self._estimation.held_by_optics or context.observer.optics_replace_laser,
-            displacement_valid=self._displacement_suffices(),
-            unseen_film=self._explain_unseen_film(),
-            open_interlocks=context.interlocks.judged_mask,
-            interlock_level=context.interlocks.safe_level,
-            interlock_words=context.interlocks.describe_open(context.interlocks.judged_mask),
-        )
-        if not self._config.by_optics:
-            advances = observation.advance_age_s <= self._config.limits.stale_s
-            events += self._sample_rate.step(
-                inputs.now_s,
-                answered=inputs.reading is not None and advances,
-                fresh=observation.advance_age_s == 0.0,
-            )
-        events += self._climate.step(inputs.reading, self.state, context.dt_s)
-        verdict = self._safety.judge(self.state, observation)
-        if self._config.states.observe:  # the program that drives the pump protects the mirror
-            verdict = safety.Verdict(None)
-        self._apply_verdict(verdict, events)
-        self._consider_resuming(observation)
+        observation = self._observe(inputs, last, events)
+        # 3. The safety table judges before anything decides about the pump
+        self._judge_safety(observation, events)
+        # 4. The loop's setpoint and process value
         shape = self._step_shape(inputs, events)
-        events += self._estimation.step(inputs, self.state, context, last, shape.state, consistency)
-        if (estimate := self._estimation.estimate) is not None:
-            shape = replace(shape, trim_um=estimate.mount_um)
-        self._step_held(events)
-        context.laser_doubted = bool(consistency.laser_fault_text)
-        is_held = self.state in (State.SETTLE, State.HOLD) or self._config.states.observe
-        context.estimate = estimate if is_held else None
-        if self._config.estimator.process_value == "auto":
-            self._choose_process_value(last, events)
-        if math.isnan(self.memory.state_since_s):  # the verdict has just changed the state
+        shape = self._choose_loop_inputs(inputs, last, shape, events)
+        # 5. The state's handler commands the pump. The verdict, too, may have changed the state
+        if math.isnan(self.memory.state_since_s):
             self.memory.state_since_s = inputs.now_s
             context.state_age_s = 0.0
         self._run_state(events)
+        # 6. What this tick has found out about the pump counts from the next one
         self._use_pump(events)
         self._use_response(events)
         if context.loop.learned and self.state == State.HOLD:
             events += self._consistency.report_pump_curve(context.loop)
+        # 7. The record
         command = BenchCommand(context.pump_fraction, context.vent_fraction)
         context.observer.note_command(command)
         context.last_pump_fraction = context.pump_fraction
@@ -273,6 +239,87 @@ class Controller:
             answers=tuple(self._answers),
             clear_mask=self._clear_mask,
         )
+
+    def _observe(
+        self, inputs: TickInputs, last: inner_loop.LoopOutput, events: list[Event]
+    ) -> Observation:
+        """Collect what the safety table judges: the readings, and what the parts found in them."""
+        context, consistency, stand = self._context, self._consistency, self._context.standstill
+        # The displacement first: all that follows compares with it
+        context.observer.observe_inputs(inputs, self._may_follow_optics())
+        # Sensors against each other; a faulty one is known in the tick that shows it
+        status = hold_status.hold_status(
+            context, last, self._estimation.held_by_optics, self._may_follow_optics()
+        )
+        events += consistency.compare_sensors(inputs, self.state, context.dt_s, status)
+        # The pump against what was commanded
+        stand.observe_reading(
+            inputs.now_s, inputs.reading, context.observer.commanded, inputs.link_up
+        )
+        # In a pause nothing follows a setpoint: there is no error to judge
+        follows_setpoint = self.state in state_sets.MOVING and not context.paused
+        error_um = last.error_um if follows_setpoint else math.nan
+        observation = replace(
+            context.observer.make_observation(inputs, error_um),
+            tick_error=self.memory.tick_error,
+            overdue=context.overdue,
+            unfit=context.unfit,
+            laser_fault_text=consistency.laser_fault_text,
+            runs_on=stand.runs_on,
+            inflow=stand.inflow,
+            locked=describe_locks(context.locks, _LOCKS_SHOWN),
+            laser_gauge_apart=consistency.laser_gauge_apart,
+            gas_excess=consistency.gas_excess,
+            held_by_optics=self._estimation.held_by_optics or context.observer.optics_replace_laser,
+            displacement_valid=self._displacement_suffices(),
+            unseen_film=self._explain_unseen_film(),
+            open_interlocks=context.interlocks.judged_mask,
+            interlock_level=context.interlocks.safe_level,
+            interlock_words=context.interlocks.describe_open(context.interlocks.judged_mask),
+        )
+        # Notices only; no rule follows from these two
+        if not self._config.by_optics:
+            advances = observation.advance_age_s <= self._config.limits.stale_s
+            events += self._sample_rate.step(
+                inputs.now_s,
+                answered=inputs.reading is not None and advances,
+                fresh=observation.advance_age_s == 0.0,
+            )
+        events += self._climate.step(inputs.reading, self.state, context.dt_s)
+        return observation
+
+    def _judge_safety(self, observation: Observation, events: list[Event]) -> None:
+        """Compare the observation with the limits, and enter the safe level that follows."""
+        verdict = self._safety.judge(self.state, observation)
+        if self._config.states.observe:  # the program that drives the pump protects the mirror
+            verdict = safety.Verdict(None)
+        self._apply_verdict(verdict, events)
+        self._consider_resuming(observation)
+
+    def _choose_loop_inputs(
+        self,
+        inputs: TickInputs,
+        last: inner_loop.LoopOutput,
+        shape: shape_loop.ShapeOutput,
+        events: list[Event],
+    ) -> shape_loop.ShapeOutput:
+        """Estimate the centre, move the setpoint for the held scalar, and choose what the loop
+        follows; returns the shape loop's output with the trim that is in use.
+        """
+        context, consistency = self._context, self._consistency
+        # While the centre is estimated, the trim is the estimated drift of the laser's mount
+        events += self._estimation.step(inputs, self.state, context, last, shape.state, consistency)
+        estimate = self._estimation.estimate
+        if estimate is not None:
+            shape = replace(shape, trim_um=estimate.mount_um)
+        self._step_held(events)
+        context.laser_doubted = bool(consistency.laser_fault_text)
+        # Only a mirror near its setpoint is held by the estimate: elsewhere the loop has the laser
+        is_held = self.state in (State.SETTLE, State.HOLD) or self._config.states.observe
+        context.estimate = estimate if is_held else None
+        if self._config.estimator.process_value == "auto":
+            self._choose_process_value(last, events)
+        return shape
 
     def _choose_process_value(self, last: inner_loop.LoopOutput, events: list[Event]) -> None:
         """Let the loop follow laser or estimate; after an error the estimate."""
@@ -495,8 +542,8 @@ class Controller:
         self._estimation.set_gains(loop)
         self._process_value.set_loop(loop, pump, self._estimator)
         self._consistency.set_gains(loop, pump)
-        self._shape.set_memory(self._gains.present.shape_time_constant_s)
-        self._held.set_memory(self._gains.present.shape_time_constant_s)
+        self._shape.set_time_constant(self._gains.present.shape_time_constant_s)
+        self._held.set_time_constant(self._gains.present.shape_time_constant_s)
         self._step_setpoint()
 
     def _step_setpoint(self) -> None:
@@ -596,7 +643,12 @@ class Controller:
         return shape
 
     def _step_held(self, events: list[Event]) -> None:
-        """Move the centre so that the held scalar stays; after an error the offset stays."""
+        """Move the centre so that the held scalar stays.
+
+        After an error the offset is that of the tick before, until `tick_error` latches a fault in
+        the next tick. The offset counts only while the loop moves the mirror: otherwise it is 0 in
+        the context, and the memory of `HeldOffset` keeps it for the next hold.
+        """
         context = self._context
         try:
             events += self._held.step(

@@ -58,10 +58,10 @@ class HeldScalar:
             memory,
         )
 
-    def set_memory(self, time_constant_s: float) -> None:
-        """Set the tracker's memory, as that of the shape loop."""
+    def set_time_constant(self, time_constant_s: float) -> None:
+        """Set over how long the figures are averaged, s: as in the shape loop, also on trial."""
         if self._offset is not None:
-            self._offset.set_memory(time_constant_s)
+            self._offset.set_time_constant(time_constant_s)
 
     def step(
         self, context: TickContext, state: State, shape_on: bool, distrust: Reason

@@ -11,7 +11,8 @@ _SENTENCES = {
     "off": "{name} is not followed",
     "waiting": "{name} waits for its reference",
     "tracking": "{name} is held",
-    "vertex": "{name} is not followed: the centre rests at the last offset",
+    "kept": "{name} is not followed: the centre rests at the last offset",
+    "vertex": "{name} is not followed: the centre rests at the last offset",  # of older holds
     "expired": "{name} is not known any more",
 }
 

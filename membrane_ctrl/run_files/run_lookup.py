@@ -1,10 +1,20 @@
 """Finds the folder of a run, given a path to it or into it."""
 
+import re
 from pathlib import Path
 
-from membrane_ctrl.model import (
-    errors,
-)
+from membrane_ctrl.model import errors
+
+_RUN_NAME = re.compile(r"\d{8}T\d{6}Z-.+")
+
+
+def is_run_name(name: str) -> bool:
+    """Whether a name is one that `create_run_folder` gives: the start in UTC, then a name.
+
+    The newest run of a folder is the last such name. A copy under another name, such as `3-copy`,
+    would hide it.
+    """
+    return _RUN_NAME.fullmatch(name) is not None
 
 
 def find_folder(path: Path) -> Path:

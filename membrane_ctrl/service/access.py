@@ -34,7 +34,17 @@ ACTIONS = (
 
 
 def is_action_allowed(user: WebUser, port_role: str, action: ActionButton) -> bool:
-    """Whether the viewer's role and that of this process at the port both allow it."""
+    """Whether the viewer's role and that of this process at the port both allow an action.
+
+    Parameters
+    ----------
+    user : WebUser
+        The viewer; the role is of the account, the link or the token.
+    port_role : str
+        Role that the hold's port has granted this process; empty before it has: as `read`.
+    action : ActionButton
+        States the role that it needs.
+    """
     return role_includes(user.role, action.role) and role_includes(port_role, action.role)
 
 
@@ -62,8 +72,28 @@ def on_behalf(user: WebUser, session: str) -> dict[str, str]:
 
 
 def request(action: ActionButton, why: str, given: str, take_over: bool = False) -> dict[str, Any]:
-    """The request to send, for the reason `why`. Raises ValueError with what is wrong with the
-    input.
+    """The request to send.
+
+    Parameters
+    ----------
+    action : ActionButton
+        The command, and which input it asks for.
+    why : str
+        Who asks, for the records of the run.
+    given : str
+        The input as typed; not read if the command asks for none.
+    take_over : bool
+        Take command from the session that has it.
+
+    Returns
+    -------
+    dict
+        A request of the control port (docs/reference/control-port.md), without `on_behalf`.
+
+    Raises
+    ------
+    ValueError
+        What is wrong with the input, in a sentence for the viewer.
     """
     asked: dict[str, Any] = {"do": action.do, "why": why, "take_over": take_over}
     if action.asks == "number":

@@ -52,7 +52,22 @@ class KnownUser:
 
 
 def known_user(name: str, role: str, password: str) -> KnownUser:
-    """A new user. Raises InputError for a name, role or password that cannot be."""
+    """A new user, with the hash of a password; takes 50 ms of a core.
+
+    Parameters
+    ----------
+    name : str
+        1 to 32 printable characters without a colon, which separates the fields of the file.
+    role : str
+        `read`, `operate` or `tune`.
+    password : str
+        At least 8 characters; not kept.
+
+    Raises
+    ------
+    InputError
+        For a name, role or password that cannot be.
+    """
     require_name(name, role)
     if len(password) < 8:
         raise errors.InputError("password: at least 8 characters")
@@ -60,7 +75,16 @@ def known_user(name: str, role: str, password: str) -> KnownUser:
 
 
 def require_name(name: str, role: str) -> None:
-    """Raise InputError for a name or role that no account can have."""
+    """Raise InputError for a name or role that no account or token can have.
+
+    Parameters
+    ----------
+    name : str
+        Must have 1 to 32 printable characters without a colon, which separates the fields of the
+        files of users and tokens.
+    role : str
+        Must be `read`, `operate` or `tune`.
+    """
     if not name.isprintable() or not name or ":" in name or len(name) > 32:
         raise errors.InputError(f"user {name!r}: 1 to 32 printable characters without a colon")
     if role not in get_args(Role):
@@ -68,7 +92,21 @@ def require_name(name: str, role: str) -> None:
 
 
 def known_users(text: str, source: str) -> dict[str, KnownUser]:
-    """Users by name, from the text of a users file. Raises InputError with the wrong line."""
+    """Users by name, from the text of a users file.
+
+    Parameters
+    ----------
+    text : str
+        Lines `NAME:ROLE:HASH`; empty lines and comments (`#`) do not count. Of two lines with one
+        name the last counts.
+    source : str
+        The file, for the message.
+
+    Raises
+    ------
+    InputError
+        With the number of the wrong line.
+    """
     found = {}
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.startswith("#"):
@@ -135,15 +173,40 @@ class Accounts:
         return WebUser(_LINK_NAME, self.link_role) if fits else None
 
     def guess_of(self, name: str, source: str, device: str) -> Guess:
-        """Return who guesses; a device counts only if its cookie is of this account."""
+        """Return who guesses a password; a device counts only if its cookie is of this account.
+
+        Parameters
+        ----------
+        name : str
+            The account, as typed.
+        source : str
+            Network address of the client, behind the trusted proxies.
+        device : str
+            Value of the device cookie; empty if there is none. May be forged: it is a signed
+            number.
+        """
         known = self.users.get(name)
         if known is not None and _is_device_of(known, device):
             return Guess(name, source, device)
         return Guess(name, source)
 
     def evaluate(self, guess: Guess, password: str, admission: Admission) -> WebUser | None:
-        """Compare the password of an admitted guess; slow. Returns None if it is wrong or the
-        account is unknown.
+        """Compare the password of an admitted guess; takes 50 ms of a core, so it runs on a pool.
+
+        Parameters
+        ----------
+        guess : Guess
+            Of `guess_of`.
+        password : str
+            As typed.
+        admission : Admission
+            Of the throttle: the guess has been counted already. A right password returns what it
+            took.
+
+        Returns
+        -------
+        WebUser or None
+            None for a wrong password and for an unknown account, after the same time.
         """
         known = self.users.get(guess.account)
         if known is None:
@@ -155,7 +218,21 @@ class Accounts:
         return WebUser(known.name, known.role, has_login=True)
 
     def device_cookie(self, user: WebUser, device: str) -> str | None:
-        """The header that remembers a device after a login by name; None if it is known."""
+        """The header that remembers a device after a login by name.
+
+        Parameters
+        ----------
+        user : WebUser
+            Who has logged in.
+        device : str
+            The device's cookie until now; empty if it has none.
+
+        Returns
+        -------
+        str or None
+            Value of `Set-Cookie`; None if the device is known already, or for the link, which has
+            no account.
+        """
         known = self.users.get(user.name)
         if known is None or _is_device_of(known, device):
             return None

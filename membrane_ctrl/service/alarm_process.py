@@ -109,7 +109,16 @@ class FolderAlarms:
 def alarm_process_main(spec: AlarmProcessSpec, line: Connection) -> None:
     """Send alarms and heartbeats until the service ends.
 
-    Target of a `spawn`ed process; over `line` come messages that the service works.
+    Target of a `spawn`ed process.
+
+    Parameters
+    ----------
+    spec : AlarmProcessSpec
+        Folders and heartbeat; pickled by `multiprocessing`, so plain data.
+    line : Connection
+        Both ways: the service writes `SERVICE_WORKS` while it works, this process reports `Alive`.
+        Silence of the service for 30 s stops the heartbeats, so that whoever waits for them
+        notices.
     """
     child.leave_at_stop()
     heartbeat = make_heartbeat(spec.heartbeat)
@@ -123,6 +132,9 @@ def alarm_process_main(spec: AlarmProcessSpec, line: Connection) -> None:
             now_s = time.monotonic()
             if _has_message(line):
                 service_s = now_s
+            # `Alive` only while every folder's thread works: the service replaces this process
+            # otherwise. The heartbeat needs the service, too: its silence is the alarm of last
+            # resort, sent by the program that expects it
             if is_working(folders, now_s):
                 report(child_events.Alive(_IDLE_S))
                 if now_s - service_s < _SERVICE_SILENT_S:
@@ -131,7 +143,15 @@ def alarm_process_main(spec: AlarmProcessSpec, line: Connection) -> None:
 
 
 def is_working(folders: Sequence[FolderAlarms], now_s: float) -> bool:
-    """Whether all folders are looked after."""
+    """Whether all folders are looked after.
+
+    Parameters
+    ----------
+    folders : sequence of FolderAlarms
+        Each steps on its own thread, and notes the end of every step.
+    now_s : float
+        Monotonic time.
+    """
     return all(now_s - each.worked_s < _STUCK_S for each in folders)
 
 

@@ -339,7 +339,15 @@ def _add_streams(api: FastAPI, feeds: Mapping[str, HoldFeed]) -> None:
 
 
 def describe_state(hold: str, seen: HoldSeen) -> StateAnswer:
-    """Return what is known of a hold."""
+    """Return what is known of a hold.
+
+    Parameters
+    ----------
+    hold : str
+        Its name on the page; empty if the service follows one hold only.
+    seen : HoldSeen
+        What its feed has kept. Of a silent hold the old status is left out: it may be wrong by now.
+    """
     silent = seen.silent
     status = {} if silent else seen.status
     row = status.get("row") or {}

@@ -18,6 +18,7 @@ from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.event_log import LoggedEvent
 from membrane_ctrl.run_files.run import Run, open_run
+from membrane_ctrl.run_files.run_lookup import is_run_name
 from membrane_ctrl.run_files.table_store.reader import TableReader
 from membrane_ctrl.service.event_lines import SHOWN_MOST, format_event
 
@@ -206,7 +207,7 @@ def find_newest_run(logs: Path) -> Path | None:
     """Return the newest folder of a run in a folder of runs, by its name; None without one."""
     with suppress(OSError):
         for folder in sorted(logs.iterdir(), reverse=True):
-            if folder.name[:1].isdigit() and (folder / "events.jsonl").exists():
+            if is_run_name(folder.name) and (folder / "events.jsonl").exists():
                 return folder
     return None
 
@@ -214,6 +215,7 @@ def find_newest_run(logs: Path) -> Path | None:
 def _judge_end(
     exit_word: str | None, fault: events.Fault | None, stop: events.CommandTaken | None
 ) -> EndKind:
+    # From no record to a regular end. A fault is judged before the exit that it causes.
     if exit_word is None:
         return EndKind.NO_RECORD
     if exit_word in run_events.ENDS_WITHOUT_CONTROL:

@@ -164,7 +164,17 @@ class HoldFeed:
         return signal_values(self.seen)
 
     def ask(self, request: Message, limits: SendLimits = NO_LIMITS) -> Outcome:
-        """Send a request on a connection of its own; returns what became of it."""
+        """Send a request on a connection of its own; returns what became of it.
+
+        Waits for the hold's answer: called on a pool, never in the event loop of the page.
+
+        Parameters
+        ----------
+        request : Message
+            A request of the control port: `do`, and what the command needs.
+        limits : SendLimits
+            Until when it may be sent, and what else refuses it; by default nothing does.
+        """
         what = str(request["do"]).replace("_", " ")
         try:
             answer = self.ask_hold(request, limits)
@@ -173,8 +183,17 @@ class HoldFeed:
         return Outcome.from_answer(what, answer)
 
     def ask_hold(self, request: Message, limits: SendLimits = NO_LIMITS) -> Message:
-        """Send a request on a connection of its own; returns the hold's answer. Raises DeviceError
-        without an answer.
+        """Send a request on a connection of its own; returns the hold's answer.
+
+        Parameters
+        ----------
+        request, limits
+            As for `ask`.
+
+        Raises
+        ------
+        DeviceError
+            There is no answer, or another run listens than the one that was followed.
         """
         return ask_hold(self._where, self.seen.name, request, limits)
 
@@ -218,12 +237,14 @@ class HoldFeed:
         if folder is None:
             return
         with suppress(OSError, ValueError, errors.CommandError):
+            # A run takes seconds to read: again only if a file has grown or the summary has come
             size = (folder / "events.jsonl").stat().st_size
             read = folder, size, (folder / "summary.json").exists()
             is_final = self.seen.ended is not None and self.seen.ended.folder == folder
             if read == self._files_read and is_final:
                 return
             ended = read_ended_run(folder)
+            # Just after the control process has gone, its recorder may still write the end
             if ended.kind is EndKind.NO_RECORD and not _is_over(ended):
                 return
             self._files_read = read
@@ -232,14 +253,18 @@ class HoldFeed:
             self.seen = replace(self.seen, ended=ended, events=ended.events)
 
     def _watch(self, client: PortClient) -> None:
+        # 1. Another run than the last one begins with an empty page
         greeting = client.greeting
         if greeting["run"] != self.seen.name or self.seen.ended is not None:
             self.seen = HoldSeen(str(greeting["run"]))
             self._events.clear()
         self.marks.clear()  # those made without contact are in the runs' logs only
         self.met_s = time.time()
+        # 2. The rings before the file of the events: an event that comes meanwhile is in both, and
+        #    `RunEventsReader` drops the second
         rings = self._rings()
         self._log = self._open_log(rings.get("events"))
+        # 3. The port sends a status every period; ten without one mean that the hold hangs
         client.patience(10 * PERIOD_S)
         answer = client.ask(do="watch", period_s=PERIOD_S)
         if not answer.get("ok"):
@@ -275,11 +300,13 @@ class HoldFeed:
     def _take_message(
         self, streamed: Message, greeting: Message, rings: dict[str, ring.RingReader]
     ) -> None:
+        # Events from the run's files and ring if they are here: complete, and with their times
         if self._log is not None:
             for line in self._log.read_new():
                 self._note_event(line)
         elif "event" in streamed:
             self._note_event(streamed["event"])
+        # Each status is also the moment to read the rings: viewers see all three of one time
         if "status" in streamed:
             self.seen = replace(
                 self.seen,
@@ -312,6 +339,7 @@ class HoldFeed:
             return
         rows = telemetry.unpack_rows(reader.drain())
         if len(rows):
+            # Ticks have the hold's own clock: the newest is of now, the others are as much older
             ticks = telemetry.get_columns(rows)
             at_s = utc_s + ticks["mono_s"] - ticks["mono_s"][-1]
             for place, tick_s in enumerate(at_s):
@@ -439,6 +467,7 @@ def _of_feed(feed: HoldFeed, signal: str, begin_s: float) -> Series:
 
 def _of_runs(logs: Path, signal: str, begin_s: float, end_s: float, span_s: float) -> list[Series]:
     """The signal in each run of the folder that reaches into the span, oldest first."""
+    # The finest stored level whose rows are not many more than the points that will be shown
     window_s = next((w for w in (1.0, 10.0) if span_s / w <= 4 * _POINTS_MAX), 60.0)
     names = [f"{kind}_{signal}" for kind in ("min", "mean", "max")]
     found = []

@@ -67,15 +67,19 @@ class FollowedRun:
     def step(self) -> None:
         """Take what is new, and send what is due."""
         self._look_for_control()  # before the rings: it has written its last message first
+        # 1. What is new. Only the newest row's time is needed to date the alarms of a run whose
+        #    start is known to a second only
         events = [json.dumps(line).encode() for line in self._events.read_new()]
         rows = _drain(self._rings.get("telemetry"))
         if rows:
             self._seconds.note_tick(telemetry.TelemetryRow.unpack(rows[-1]).mono_s)
+        # 2. A run that is over has no news, but an alarm may have to be repeated or escalated
         is_over = self._alarms.has_ended or self._is_gone
         if not is_over or events:
             self._alarms.process_news(rows, events)
         else:
             self._alarms.send_due()
+        # 3. No control process and no event of its end, twice in a row: it was killed
         if self._looks_without_control < _LOOKS_WITHOUT_CONTROL or self._alarms.has_ended:
             return
         if not self._is_gone:

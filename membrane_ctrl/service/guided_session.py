@@ -220,6 +220,7 @@ class GuidedSession:
         """
         if len(text) > _ANSWER_MOST:
             raise errors.InputError(f"longer than {_ANSWER_MOST} characters")
+        # Two viewers may answer at once: the lock and the number give each question one answer
         with self._lock:
             waiting = self._seen.question
             if waiting is None or waiting.number != number or self._link is None:
@@ -245,12 +246,12 @@ class GuidedSession:
         self._thread.shutdown()
 
     def _follow(self, link: SessionLink, name: str, folder: Path) -> None:
-        """Take the messages of a session until it ends."""
+        """Take the messages of a session until it ends; on a thread of its own."""
         with suppress(OSError):
             for line in link.source:
                 try:
                     message = MESSAGES.validate_json(line)
-                except ValidationError:
+                except ValidationError:  # of a newer program, or a line that a library prints
                     continue
                 with self._lock:
                     self._take_message(message)

@@ -88,10 +88,13 @@ async def _stop_and_start(
     """Stop the hold if one runs, wait for its end, and begin the start; returns why it was not
     started. Raises InputError, PoolFullError.
     """
+    # 1. Stop, if a hold runs; a refused stop leaves it running
     if not starter.can_start():
         stopped = await pool_of_command("stop").run(feed.ask, stop)
         if not stopped.done:
             return stopped.text
+    # 2. An accepted stop is not the end: the pump must be seen off, and the recording is closed.
+    #    The next hold could not claim the devices before
     give_up_s = time.monotonic() + _ENDS_S
     while not starter.can_start():
         if time.monotonic() > give_up_s:

@@ -260,13 +260,39 @@ class HoldStarter:
 
 
 def options_file(logs: Path, name: str) -> Path:
-    """Return the file from which a unit takes its options at one start."""
+    """Return the file from which a unit of systemd takes the options of its next start.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder of the runs, which the service may write.
+    name : str
+        Name of the configuration, which is the unit's instance.
+    """
     return logs / f".start-{name}.env"
 
 
 def find_name_of_run(run: str, names: Sequence[str]) -> str | None:
-    """Return the configuration of a run that the service has started, which has its name."""
-    return next((name for name in names if run.endswith(f"-{name}")), None)
+    """Return the configuration of a run that the service has started, which has its name.
+
+    Parameters
+    ----------
+    run : str
+        Name of the run folder: `20261121T012345Z-lab`, or `...-lab-2` for the second run that began
+        in that second; empty if there was none yet.
+    names : sequence of str
+        Names of the configurations.
+
+    Returns
+    -------
+    str or None
+        None for a run that was started by hand under another name.
+    """
+    of_run = run.partition("-")[2]
+    if of_run in names:
+        return of_run
+    first, _, number = of_run.rpartition("-")
+    return first if number.isdecimal() and first in names else None
 
 
 def is_configuration_name(name: str) -> bool:

@@ -21,7 +21,17 @@ class IdleEnd:
     used_s: float
 
     def note_use(self, now_s: float, viewers: int, holding: bool) -> None:
-        """Note how many viewers there are, and whether a hold runs."""
+        """Note how many viewers there are, and whether a hold runs.
+
+        Parameters
+        ----------
+        now_s : float
+            Time by the clock of `used_s`, which is the caller's.
+        viewers : int
+            Open pages.
+        holding : bool
+            Whether a hold runs in a folder of the service: it is never left without its page.
+        """
         if viewers > 0 or holding:
             self.used_s = now_s
 

@@ -205,7 +205,8 @@ class LoginMiddleware:
             return
         given = parse_qs(body.decode("utf-8", "replace"))
         name, password = (given.get(key, [""])[0] for key in ("name", "password"))
-        # Too many guesses wait, those of a known device least.
+        # Beyond its budget a guess is refused before the slow comparison. The answer comes late, so
+        # that a client that tries again at once does not occupy the event loop.
         guess = self._accounts.guess_of(name, self._source(scope), device)
         admission = self._accounts.throttle.admit(guess)
         if not admission.granted:
@@ -294,8 +295,16 @@ def with_login(
     tokens: TokenBook | None = None,
     guard: ConnectionGuard | None = None,
 ) -> ASGIApp:
-    """Return an application that only those who are let in can reach; parameters as for
-    `LoginMiddleware`, and the key with which sessions are signed.
+    """Return an application that only those who are let in can reach.
+
+    Parameters
+    ----------
+    app : ASGIApp
+        The page and the API.
+    accounts, address, tokens, guard
+        As for `LoginMiddleware`.
+    session_key : str
+        Key with which the cookies of sessions are signed; a new one ends all sessions.
     """
     return SessionMiddleware(
         LoginMiddleware(app, accounts, address, tokens, guard),
@@ -310,6 +319,7 @@ def with_login(
 
 def malformation(scope: Scope) -> Refusal | None:
     """Return what is wrong with the form of a request; None if nothing is."""
+    # Of two such headers a proxy may check one, and we the other
     names = [name for name, _ in scope["headers"]]
     if names.count(b"host") > 1 or names.count(b"origin") > 1:
         return Refusal(HTTPStatus.BAD_REQUEST, "a header that must be unique is repeated")

@@ -51,11 +51,27 @@ class Budgets:
         return max(0.0, 1.0 - self._filled(key, now_s)) * self.refill_s
 
     def take(self, key: tuple[str, ...], now_s: float) -> None:
-        """Take a token."""
+        """Take a token; a bucket may owe one, because the caller decides.
+
+        Parameters
+        ----------
+        key : tuple of str
+            What the budget is of, such as address and account.
+        now_s : float
+            Monotonic time.
+        """
         self._set(key, self._filled(key, now_s) - 1.0, now_s)
 
     def give_back(self, key: tuple[str, ...], now_s: float) -> None:
-        """Return a token that was taken."""
+        """Return a token that was taken; never beyond the full budget.
+
+        Parameters
+        ----------
+        key : tuple of str
+            What the budget is of, such as address and account.
+        now_s : float
+            Monotonic time.
+        """
         self._set(key, min(self._filled(key, now_s) + 1.0, self.burst), now_s)
 
     def forget(self, key: tuple[str, ...]) -> None:
@@ -130,7 +146,15 @@ class LoginThrottle:
                 budget.give_back(key, now_s)
 
     def note_success(self, guess: Guess, admission: Admission) -> None:
-        """Restore the budget of a client that gave the right password."""
+        """Restore the budget of a client that gave the right password.
+
+        Parameters
+        ----------
+        guess : Guess
+            The right one. Its device, and its address for this account, have the full budget again.
+        admission : Admission
+            What the guess took, also from the budgets that it shares with others; it is returned.
+        """
         self.withdraw(admission)
         with self._lock:
             self._device.forget((guess.device,))
@@ -139,8 +163,12 @@ class LoginThrottle:
 
     def _needed(self, guess: Guess, now_s: float) -> tuple[tuple[Budgets, tuple[str, ...]], ...]:
         """Return the budgets in which a guess counts."""
+        # A device of the owner has a budget that no stranger can use up
         if guess.device:
             return ((self._device, (guess.device,)),)
+        # The others: a few guesses an address at one account, some more at all accounts together.
+        # An attack from many addresses meets the account's budget, from which the first two tries
+        # of an address are exempt
         both = (guess.source, guess.account)
         exempt = self._first_tries.wait_s(both, now_s) == 0.0
         shared = (self._first_tries, both) if exempt else (self._account, (guess.account,))

@@ -10,6 +10,7 @@ from membrane_ctrl.alarms.sent_log import LOG_NAME
 from membrane_ctrl.config.alarms import AlarmsConfig
 from membrane_ctrl.processes import published_rings
 from membrane_ctrl.run_files.run_config import read_config
+from membrane_ctrl.run_files.run_lookup import is_run_name
 
 _NEWS_AGE_MAX_S = 86_400.0  # an older end is no news
 _RINGS = "rings.json"
@@ -19,7 +20,7 @@ def find_published_run(logs: Path) -> Path | None:
     """Return the newest run of a folder that has published its rings; None without one."""
     with suppress(OSError):
         for folder in sorted(logs.iterdir(), reverse=True):
-            if folder.name[:1].isdigit() and (folder / _RINGS).exists():
+            if is_run_name(folder.name) and (folder / _RINGS).exists():
                 return folder
     return None
 

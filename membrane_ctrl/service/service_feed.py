@@ -45,8 +45,23 @@ class ServiceFeed(HoldFeed):
         return values
 
     def ask_hold(self, request: Message, limits: SendLimits = NO_LIMITS) -> Message:
-        """Send a request; returns the hold's answer. Raises DeviceError without an answer,
-        InputError if the other service refuses it.
+        """Send a request through the other service; returns the hold's answer.
+
+        Parameters
+        ----------
+        request : Message
+            A request of the control port; `on_behalf` names the viewer, for the reason in the
+            records.
+        limits : SendLimits
+            Judged here, and passed on as a time limit for the other service. Safety commands have
+            none.
+
+        Raises
+        ------
+        DeviceError
+            There is no answer.
+        InputError
+            The other service refuses it: the token's role is too low, or the request is wrong.
         """
         viewer = request.get("on_behalf", {}).get("name", "")
         request = request | {"viewer": viewer}

@@ -59,6 +59,15 @@ def read_tokens(path: Path) -> list[ProgramToken]:
 def add_token(path: Path, name: str, role: str) -> str:
     """Add a token to a file and return it; it is shown only once.
 
+    Parameters
+    ----------
+    path : Path
+        File of the tokens (`tokens_file`), which has their hashes; made if it is missing.
+    name : str
+        Name of the program, for the records of the runs.
+    role : str
+        `read`, `operate` or `tune`: the most that the program may do.
+
     Raises
     ------
     InputError
@@ -76,7 +85,22 @@ def add_token(path: Path, name: str, role: str) -> str:
 
 
 def revoke_token(path: Path, name: str) -> None:
-    """Remove the token of a name. Raises InputError if there is none, else as `add_token`."""
+    """Remove the token of a name: the next request with it is refused.
+
+    Parameters
+    ----------
+    path : Path
+        File of the tokens (`tokens_file`).
+    name : str
+        As it was added.
+
+    Raises
+    ------
+    InputError
+        There is no token of the name.
+    DeviceError
+        The file cannot be read or written.
+    """
     tokens = read_tokens(path)
     kept = [each for each in tokens if each.name != name]
     if len(kept) == len(tokens):

@@ -31,7 +31,19 @@ class GivenAnswer:
 
 
 def explain_input(action: ActionButton, text: str, allowed: AllowedRange | None) -> str:
-    """Why an input is refused before it is sent; empty if it is not."""
+    """Why an input is refused before it is sent; empty if it is not.
+
+    The hold judges again: its limits may have changed since the page read its configuration.
+
+    Parameters
+    ----------
+    action : ActionButton
+        The command; `asks` states whether it needs a number, a text or nothing.
+    text : str
+        As the viewer has typed it; a number has a decimal point (`parse_number`).
+    allowed : AllowedRange or None
+        None if the hold's configuration is not known here: then any number passes.
+    """
     if action.asks != "number":
         return "enter a text" if action.do == "mark" and not text.strip() else ""
     try:
@@ -44,9 +56,19 @@ def explain_input(action: ActionButton, text: str, allowed: AllowedRange | None)
 async def ask_for_confirmation(
     action: ActionButton, status: Mapping[str, Any], config: Config | None
 ) -> GivenAnswer | None:
-    """Show the dialog; returns None if the viewer cancels.
+    """Show the dialog; returns None if the viewer cancels, or leaves.
 
     Enter confirms what leaves the mirror as it is, and STOP; it does not confirm what moves gas.
+
+    Parameters
+    ----------
+    action : ActionButton
+        The command; whether the viewer may give it is judged by the caller, before and after.
+    status : mapping
+        The hold's newest status, for the present value, the price and the locks.
+    config : Config or None
+        The hold's configuration; None if it runs on another machine: then no range and no price is
+        shown.
     """
     row = status.get("row") or {}
     allowed = find_range(action, row, config)

@@ -27,7 +27,16 @@ _CARD = """<div class="q-pa-xs col-12"><q-card flat bordered class="q-pa-sm">
 def alarms_panel(
     list_alarms: Callable[[], Awaitable[list[PastAlarm]]], utc: Callable[[], bool]
 ) -> Callable[[], Awaitable[None]]:
-    """Fill the tab; returns what reads the alarms again."""
+    """Fill the tab; returns what reads the alarms again.
+
+    Parameters
+    ----------
+    list_alarms : async callable
+        Returns the faults and notices of the last runs, newest first; made once for all viewers.
+        May raise PoolFullError, which is shown.
+    utc : callable
+        Whether this viewer reads times in UTC; else in the time zone of the service.
+    """
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
         for name, label in _COLUMNS.items()

@@ -68,8 +68,21 @@ class AllowedRange:
 def find_range(
     action: ActionButton, row: Mapping[str, Any], config: Config | None
 ) -> AllowedRange | None:
-    """The present value and the allowed range of a command with a number; None if its hold's
-    configuration is not known here.
+    """The present value and the allowed range of a command with a number.
+
+    Parameters
+    ----------
+    action : ActionButton
+        `setpoint` has the displacement limits; every other number is a flow.
+    row : mapping
+        The newest telemetry row: values by column, None where missing.
+    config : Config or None
+        The hold's configuration, whose limits are the range.
+
+    Returns
+    -------
+    AllowedRange or None
+        None for a command without a number, and if the hold's configuration is not known here.
     """
     if config is None or action.asks != "number":
         return None
@@ -89,6 +102,16 @@ def describe_price(action: ActionButton, row: Mapping[str, Any], config: Config 
 
     The leak is the present estimate of the hold; without one, that of the configuration's mirror is
     not assumed.
+
+    Parameters
+    ----------
+    action : ActionButton
+        Only `lower`, `vent`, `latch` and `stop` have a price: the mirror must be filled again.
+    row : mapping
+        The newest telemetry row, for the leak, µm/s.
+    config : Config or None
+        The hold's configuration: sag and pressure of the mirror, full flow of the pump. None if it
+        is not known here; then there is no sentence.
     """
     if action.do not in _COSTS_HOURS or config is None:
         return ""

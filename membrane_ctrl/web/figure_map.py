@@ -121,7 +121,18 @@ def make_figure_map(
 
 
 def describe_scalars(figure: ShapeEstimate, reference: ShapeEstimate | None, config: Config) -> str:
-    """Vertex, focus and RMS against a reference with their standard deviations, as a line."""
+    """Vertex, focus and RMS against a reference with their standard deviations, as a line.
+
+    Parameters
+    ----------
+    figure : ShapeEstimate
+        The figure to describe; its covariance gives the standard deviations.
+    reference : ShapeEstimate or None
+        Taken as exact: the line states the change since that figure. None: only the focus, which
+        needs no reference.
+    config : Config
+        Of the run: mirror and used aperture.
+    """
     against = figure if reference is None else reference
     found = measure_scalars(
         find_held_scalars(config),
@@ -150,8 +161,20 @@ def _list_colours() -> list[str]:
 
 
 def make_terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[str, Any]:
-    """Options of the bar chart of the terms from Z4: height, or change since the reference, with
-    an error bar of one standard deviation.
+    """Options of the bar chart of the terms from Z4, with an error bar of one standard deviation.
+
+    Parameters
+    ----------
+    figure : ShapeEstimate
+        Terms in µm; piston and tilt are not shown, because the mount determines them.
+    reference : ShapeEstimate or None
+        The bars are the change since it; None: the bars are the height. The error bar is that of
+        `figure` alone.
+
+    Returns
+    -------
+    dict
+        Options of Apache ECharts, plain JSON: NaN is None.
     """
     shown = slice(FIRST_FIGURE_INDEX - 1, None)
     terms_um = figure.coeffs_um - (0.0 if reference is None else reference.coeffs_um)

@@ -153,13 +153,34 @@ class GainsViews:
         self._chosen: dict[tuple[str, str], ChosenGains] = {}
 
     def find_chosen(self, hold: str, name: str) -> ChosenGains | None:
-        """What the sliders of a session or run are set to, for all viewers; None: nobody has moved
-        them.
+        """What the sliders of a session or run are set to, for all viewers.
+
+        Parameters
+        ----------
+        hold : str
+            Name of the hold on the page.
+        name : str
+            `tuning/SESSION` or the name of a run folder, as `list_sources` returns it.
+
+        Returns
+        -------
+        ChosenGains or None
+            None: no viewer has moved them since the service began.
         """
         return self._chosen.get((hold, name))
 
     def choose(self, hold: str, name: str, chosen: ChosenGains) -> None:
-        """Set the sliders of a session or run that can be explored, for all viewers."""
+        """Set the sliders of a session or run, for all viewers.
+
+        Parameters
+        ----------
+        hold : str
+            Name of the hold on the page.
+        name : str
+            Of a source that `open_source` has read: others would be kept for nothing.
+        chosen : ChosenGains
+            Replaces the setting of the viewer who moved them before.
+        """
         self._chosen[hold, name] = chosen
 
     async def list_sources(self, hold: str) -> list[str]:
@@ -169,7 +190,22 @@ class GainsViews:
         return await self._sources.get(hold)
 
     async def open_source(self, hold: str, name: str) -> GainsSource:
-        """Read one of them. Raises InputError if it cannot be explored, PoolFullError."""
+        """Read a session or run, on the pool of the gains.
+
+        Parameters
+        ----------
+        hold : str
+            Name of the hold on the page.
+        name : str
+            As `list_sources` returns it.
+
+        Raises
+        ------
+        InputError
+            It cannot be explored, or is not in the hold's folder.
+        PoolFullError
+            Too many viewers explore at once.
+        """
         return await GAINS.run(self._open, hold, name)
 
     async def explore(
@@ -194,8 +230,27 @@ class GainsViews:
         return await self._explored.get(hold, name, start, setting)
 
     async def save(self, hold: str, name: str, loop: Mapping[str, float], author: str) -> str:
-        """Save gains into a session; returns what to do next. Raises InputError, DeviceError,
-        PoolFullError.
+        """Save gains into a session as its chosen ones; returns what to do next, as a sentence.
+
+        Parameters
+        ----------
+        hold : str
+            Name of the hold on the page.
+        name : str
+            `tuning/SESSION`; a run takes no gains.
+        loop : mapping
+            Keys of `[loop]` with their values, as `ExploredGains.loop`.
+        author : str
+            Name of the user, for the session's log.
+
+        Raises
+        ------
+        InputError
+            The session runs, takes no gains, or these keep too little margin.
+        DeviceError
+            The session's folder cannot be written.
+        PoolFullError
+            Too many viewers explore at once.
         """
         return await GAINS.run(self._save, hold, name, dict(loop), author)
 

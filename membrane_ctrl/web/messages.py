@@ -9,7 +9,15 @@ MESSAGE_CSS = ".membrane-message { margin-bottom: 4.5rem }"
 
 
 def show_message(text: str, good: bool | None = None) -> None:
-    """Show the viewer a message for some seconds, away from the state and the stop button."""
+    """Show the viewer a message for some seconds, away from the state and the stop button.
+
+    Parameters
+    ----------
+    text : str
+        One sentence.
+    good : bool, optional
+        Green for a success, red for a failure, which stays longer; grey if it is neither.
+    """
     kind: Literal["positive", "negative"] | None = (
         None if good is None else "positive" if good else "negative"
     )

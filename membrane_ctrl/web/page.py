@@ -629,14 +629,32 @@ class WebPage:
 
 
 def format_number(column: TelemetryColumn, value: float | None) -> str:
-    """A value for its card; a fraction in per cent."""
+    """A value for its card; a fraction in per cent.
+
+    Parameters
+    ----------
+    column : TelemetryColumn
+        Its decimals and unit.
+    value : float or None
+        None or NaN: the column has no value now.
+    """
     if value is not None and column.name.endswith("_fraction"):
         return f"{100.0 * value:.0f} %"
     return column.format_value(value)
 
 
 def changes_something(action: ActionButton, status: Mapping[str, Any]) -> bool:
-    """Whether a command would change anything, as far as the status shows."""
+    """Whether a command would change anything, as far as the status shows.
+
+    A button without effect is disabled; the hold would answer it, and change nothing.
+
+    Parameters
+    ----------
+    action : ActionButton
+        The command of the button.
+    status : mapping
+        The hold's newest status; what it lacks counts as "would change something".
+    """
     match action.do:
         case "shape_on":
             return status.get("shape") in (None, "off")

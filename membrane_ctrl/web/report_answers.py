@@ -14,7 +14,20 @@ _REPORT_BYTES_MAX = 64_000_000
 
 
 def report_page(logs: Path | None, name: str) -> HTMLResponse:
-    """A run's report, in a sandbox: a run folder may come from anywhere."""
+    """A run's report, in a sandbox: a run folder may come from anywhere.
+
+    Parameters
+    ----------
+    logs : Path or None
+        Folder of the runs of the hold; None for a hold on another machine.
+    name : str
+        Name of the run folder, from the address of the page: may be anything.
+
+    Returns
+    -------
+    HTMLResponse
+        404 with a sentence if there is no such run or no report yet.
+    """
     folder = None if logs is None else run_folder(logs, name)
     if folder is None:
         return HTMLResponse("no such run", 404)
@@ -26,7 +39,21 @@ def report_page(logs: Path | None, name: str) -> HTMLResponse:
 
 
 def session_report(guided: GuidedSession, name: str, file: str) -> Response:
-    """The report of a commissioning session, HTML or PDF."""
+    """The report of a commissioning session, HTML or PDF.
+
+    Parameters
+    ----------
+    guided : GuidedSession
+        Knows the folder of the sessions.
+    name, file : str
+        Of the session's folder and of the file in it, from the address of the page: may be
+        anything. Only the two files of a report are given out.
+
+    Returns
+    -------
+    Response
+        404 with a sentence if there is no such session, file or report.
+    """
     try:
         folder = guided.find_folder(name)
         if file == session_state.PDF:

@@ -65,12 +65,36 @@ def _picture(folder: Path, ended: float | bool) -> str:
 
 
 def run_folder(logs: Path, name: str) -> Path | None:
-    """The folder of a run in `logs`; None for what is not a name: it comes from a browser."""
+    """The folder of a run in `logs`.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder of the runs.
+    name : str
+        From a browser: may be anything.
+
+    Returns
+    -------
+    Path or None
+        None for what is not a plain name, such as `../x` or a hidden folder. The folder itself need
+        not exist.
+    """
     return logs / name if name and name == Path(name).name and not name.startswith(".") else None
 
 
 def report_problem(folder: Path, user: WebUser) -> str:
-    """Write the run's report if there is none; returns why there is none, or an empty text."""
+    """Write the run's report if there is none; returns why there is none, or an empty text.
+
+    Takes seconds: called on the pool `REPORTS`.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    user : WebUser
+        All may read a report; writing one needs the role `WRITES`.
+    """
     if (folder / REPORT_NAME).exists():
         return ""
     if not role_includes(user.role, WRITES):
@@ -79,7 +103,17 @@ def report_problem(folder: Path, user: WebUser) -> str:
 
 
 async def open_report(folder: Path, hold: str, user: WebUser) -> None:
-    """Open a run's report in a new tab; write it before if there is none."""
+    """Open a run's report in a new tab of the viewer; write it before if there is none.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    hold : str
+        Name of the hold on the page: its folder of runs is looked up again for the address.
+    user : WebUser
+        Decides whether a missing report may be written.
+    """
     if not (folder / REPORT_NAME).exists() and role_includes(user.role, WRITES):
         show_message("Writing the report.")
     try:
@@ -95,7 +129,19 @@ async def open_report(folder: Path, hold: str, user: WebUser) -> None:
 def runs_panel(
     logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]
 ) -> Callable[[], Awaitable[None]]:
-    """Fill the tab; returns the function that lists the runs again."""
+    """Fill the tab; returns the function that lists the runs again.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder of the runs.
+    hold : str
+        Name of the hold on the page, for the addresses of the reports.
+    user : WebUser
+        Decides whether a missing report may be written.
+    utc : callable
+        Whether this viewer reads times in UTC; else in the time zone of the service.
+    """
     # A table of runs; a narrow window shows each run as a card.
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}

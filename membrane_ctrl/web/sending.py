@@ -12,7 +12,17 @@ from membrane_ctrl.web.messages import show_message
 
 
 async def send_and_show(feed: HoldFeed, asked: dict[str, Any]) -> None:
-    """Send a request on the pool of its kind, and show the outcome."""
+    """Send a request on the pool of its kind, and show the outcome.
+
+    Commands for safety have a pool of their own, so that STOP does not wait behind others.
+
+    Parameters
+    ----------
+    feed : HoldFeed
+        Of the hold that is to obey.
+    asked : dict
+        A request of the control port: its command is `do`.
+    """
     try:
         outcome = await pool_of_command(asked["do"]).run(feed.ask, asked)
     except PoolFullError as error:

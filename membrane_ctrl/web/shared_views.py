@@ -73,8 +73,23 @@ class SharedViews:
         self.sessions = MadeOnce(lambda hold: watches[hold].look(), SESSIONS, life_s=LOOK_S)
 
     async def chart(self, hold: str, signals: tuple[str, ...], span: str, utc: bool) -> bytes:
-        """Options of the history chart, as JSON in gzip. Raises PoolFullError if too many are asked
-        for.
+        """Options of the history chart, as JSON in gzip.
+
+        Parameters
+        ----------
+        hold : str
+            Name of the hold on the page.
+        signals : tuple of str
+            Columns, one panel each; as `parse_signals` returns them.
+        span : str
+            Key of `SPANS_S`. A short span is made again every second, a longer one twice a minute.
+        utc : bool
+            Labels in UTC; else in the time zone of the service.
+
+        Raises
+        ------
+        PoolFullError
+            Too many charts are wanted at once; the browser asks again.
         """
         charts = self._live_charts if SPANS_S[span] in CHART_EVERY_S else self._long_charts
         return await charts.get(hold, signals, span, utc)
@@ -82,7 +97,25 @@ class SharedViews:
     async def map(
         self, hold: str, removed: tuple[str, ...], reference: str, time_s: float
     ) -> figure_map.FigureMap:
-        """The map of the newest figure, which is that of `time_s`. Raises PoolFullError."""
+        """The map of the newest figure.
+
+        Parameters
+        ----------
+        hold : str
+            Name of the hold on the page.
+        removed : tuple of str
+            Terms left out of the map, sorted; as `parse_removed` returns them.
+        reference : str
+            One of `list_references`. The height is shown against one that is no longer kept.
+        time_s : float
+            Time of the newest figure, by the hold's clock. It only marks the map in the store:
+            viewers with the same figure share one map.
+
+        Raises
+        ------
+        PoolFullError
+            Too many maps are wanted at once.
+        """
         return await self._maps.get(hold, removed, reference, time_s)
 
     async def alarms(self, hold: str) -> list[alarm_history.PastAlarm]:

@@ -97,7 +97,19 @@ def _table(markdown: str) -> tuple[tuple[str, ...], ...]:
 
 
 def answered(session: Path, question: str, given: PageAnswer) -> Outcome:
-    """Give a session an answer; returns what became of it."""
+    """Give a session an answer; returns what became of it.
+
+    Waits until the session has removed the file of the answer, or takes it back: called on a pool.
+
+    Parameters
+    ----------
+    session : Path
+        Folder of the tuning session.
+    question : str
+        The question as the page has shown it: the session ignores an answer to another one.
+    given : PageAnswer
+        The candidate, empty for none of them, and who has chosen.
+    """
     what = given.answer or "none of them"
     try:
         write_answer(session, question, given)

@@ -79,11 +79,11 @@ def test_real_bench_shows_no_truth_and_an_open_run_no_end() -> None:
 
 def test_the_held_scalar_is_shown_with_its_offset() -> None:
     model = held()
-    assert not any("holds" in line for line in drawn(model))
+    assert not any("scalar" in line for line in drawn(model))
     model.add_row(replace(rows(76.0)[-1], held_offset_um=-3.21, held_offset_sigma_um=0.04))
     model.add_event(event(70.0, "held", holds="focus", state="tracking", offset_um=0.0, reason=""))
     page = "\n".join(drawn(model, width=120))
-    assert "holds focus is held; the centre stands -3.21 ± 0.040 µm from the setpoint" in page
+    assert "scalar focus is held; the centre stands -3.21 ± 0.040 µm from the setpoint" in page
 
 
 def everything_wrong() -> ConsoleModel:

@@ -10,8 +10,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, ShapeConfig, TwinConfig
-from membrane_ctrl.control.held_offset import HeldState
+from membrane_ctrl.config.schema import (
+    Config,
+    EstimatorConfig,
+    LoopConfig,
+    PumpConfig,
+    ShapeConfig,
+    TwinConfig,
+)
+from membrane_ctrl.control.held_offset import HeldOffset, HeldState
 from membrane_ctrl.controller.command import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.cross_check import cross_check
@@ -19,7 +26,7 @@ from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.figure.held_quantities import find_held_weights
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
-from membrane_ctrl.model.events import HeldScalarState, Maintenance, MaintenanceOver
+from membrane_ctrl.model.events import Fault, HeldScalarState, Maintenance, MaintenanceOver
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.film import NOMINAL_SAG_MM
@@ -170,7 +177,7 @@ def test_lost_optics_leave_the_last_offset_with_events() -> None:
     ticks = run_hold(config_of("focus", "laser", held_keep_s=20.0), 125.0, lost)
     offsets = [tick.row.held_offset_um for tick in ticks if 80.0 <= tick.row.mono_s < 115.0]
     assert np.ptp(offsets[200:]) == 0.0
-    assert states_of(ticks)[-4:] == ["tracking", "vertex", "expired", "tracking"]
+    assert states_of(ticks)[-4:] == ["tracking", "kept", "expired", "tracking"]
     opened = [e for tick in ticks for e in tick.events if isinstance(e, Maintenance)]
     closed = [e for tick in ticks for e in tick.events if isinstance(e, MaintenanceOver)]
     assert [e.name for e in opened].count("held_offset") == 1
@@ -193,7 +200,7 @@ def test_frozen_optics_do_not_move_the_offset() -> None:
     late = [tick.row.held_offset_um for tick in ticks if tick.row.mono_s > 55.0]
     assert np.ptp(late) == 0.0
     events = [e for tick in ticks for e in tick.events if isinstance(e, HeldScalarState)]
-    assert (events[-1].state, events[-1].code) == ("vertex", "camera_repeats")
+    assert (events[-1].state, events[-1].code) == ("kept", "camera_repeats")
 
 
 @pytest.mark.parametrize(
@@ -214,6 +221,35 @@ def test_bad_figures_do_not_move_the_offset(fault: str, code: str) -> None:
     events = [e for tick in ticks for e in tick.events if isinstance(e, HeldScalarState)]
     assert events[-1].code == code
     assert ticks[-1].row.state == State.HOLD
+
+
+def test_after_an_error_the_offset_stays_until_the_fault_of_the_next_tick(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench = VirtualBench(Plant(TWIN, PumpConfig()))
+    config = config_of("focus", "laser")
+    film = ChangingFilm(bench, config, 3, spherical_at, None)
+    run = VirtualRun(config, bench, zernike_projection(), film)
+    context = run._supervisor._controller._context
+    run.run_tick((Command("hold", "a test", "it runs"),))
+    while run.now_s < STARTS_S or context.held_offset_um == 0.0:
+        assert run.run_tick() is not None
+    before_um = context.held_offset_um
+
+    def fail(*_: object) -> float:
+        raise ValueError("an error")
+
+    monkeypatch.setattr(HeldOffset, "step", fail)
+    tick = run.run_tick()
+    assert tick is not None
+    assert tick.row.state == State.HOLD
+    assert context.held_offset_um == before_um
+    tick = run.run_tick()
+    assert tick is not None
+    assert [e.name for e in tick.events if isinstance(e, Fault)] == ["tick_error"]
+    assert tick.row.state == State.FAULT
+    assert context.held_offset_um == 0.0  # not applied in a fault
+    assert tick.row.held_offset_um == before_um  # but kept for the next hold
 
 
 def test_a_start_without_a_figure_holds_the_vertex() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.published_rings import publish_rings
 from membrane_ctrl.processes.ring import RingAddress, RingWriter, open_ring
 from membrane_ctrl.service.alarm_process import FolderAlarms, is_working
+from membrane_ctrl.service.ended_run import find_newest_run
 from membrane_ctrl.service.runs_to_follow import read_alarms_config
 
 DAY_S = 86_400.0
@@ -255,3 +257,18 @@ def test_a_folder_that_no_process_follows_stops_the_heartbeat(tmp_path: Path) ->
     now_s = time.monotonic()
     assert is_working([folder], now_s)
     assert not is_working([folder], now_s + 200.0)
+
+
+def test_a_copy_under_another_name_does_not_hide_the_run(
+    tmp_path: Path, stack: ExitStack, phone: list[str]
+) -> None:
+    run = Run(tmp_path, stack)
+    run.emit(**FAULT)
+    shutil.copytree(run.folder, tmp_path / "3-copy")
+    (tmp_path / "3-copy" / "events.jsonl").touch()
+    (tmp_path / "3-copy" / LOG_NAME).touch()
+    (run.folder / "events.jsonl").touch()
+    service = follow(tmp_path, stack)
+    service.step()
+    assert phone == ["fault"]
+    assert find_newest_run(tmp_path) == run.folder

@@ -15,7 +15,13 @@ from membrane_ctrl.config.port import SOCKET_NAME, PortConfig
 from membrane_ctrl.control_port.sockets import UnixListener
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.service import hold_starter
-from membrane_ctrl.service.hold_starter import LOG_NAME, HoldStarter, StartOptions, options_file
+from membrane_ctrl.service.hold_starter import (
+    LOG_NAME,
+    HoldStarter,
+    StartOptions,
+    find_name_of_run,
+    options_file,
+)
 
 # in place of the interpreter: writes its words, session and niceness, and ends
 PROGRAM = """#!{python}
@@ -171,3 +177,18 @@ def test_a_unit_gets_its_options_for_one_start(
         (tmp_path / "denied").touch()
         starter.start_hold("lab", "anna", StartOptions()).result()
         assert starter.failure == ("Access denied See `journalctl -u membrane-hold@lab.service`")
+
+
+@pytest.mark.parametrize(
+    ("run", "found"),
+    [
+        ("20261121T012345Z-lab", "lab"),
+        ("20261121T012345Z-new-lab", "new-lab"),
+        ("20261121T012345Z-lab-2", "lab"),  # the second run of this second
+        ("20261121T012345Z-other-lab", None),
+        ("20261121T012345Z-hold", None),
+        ("", None),
+    ],
+)
+def test_the_configuration_of_a_run_is_found_by_its_whole_name(run: str, found: str | None) -> None:
+    assert find_name_of_run(run, ["lab", "new-lab"]) == found
