@@ -24,7 +24,20 @@ def load_configuration(path: Path | None) -> schema.Config:
 
 
 def parse_configuration(text: str, path: Path) -> schema.Config:
-    """As `load_configuration`, of a text that is to become the file `path`."""
+    """As `load_configuration`, of a text that is not in its file yet: an editor checks it before.
+
+    Parameters
+    ----------
+    text : str
+        TOML.
+    path : Path
+        The file that it is to become: file names in the text are relative to its folder.
+
+    Raises
+    ------
+    InputError
+        With one line that names the file, the field and a valid value.
+    """
     return _resolve_files(toml_file.load_toml_text(text, path, schema.Config), path)
 
 

@@ -71,7 +71,20 @@ def list_places(
     interlocks: Sequence[settings.InterlockDriver],
     name_link: Callable[[str], Hashable],
 ) -> Iterator[DevicePlace]:
-    """Yield every place that the roles and interlocks use, in the order of the configuration."""
+    """Yield every place that the roles and interlocks use, in the order of the configuration.
+
+    A place is a register, an instrument, a line or an input that only one role may use.
+
+    Parameters
+    ----------
+    roles : mapping
+        By role, the table of its device (`DevicesConfig.roles`).
+    interlocks : sequence of InterlockDriver
+        Tables of the interlocks.
+    name_link : callable
+        Gives all spellings of a link one value: `normalise_link` by the text alone, or one that
+        looks up hosts and ports.
+    """
     for role, section in roles.items():
         key = f"devices.{role}"
         match section:
@@ -123,7 +136,17 @@ def _load_preset(name: str) -> dict[str, Any]:
 def find_circuit_place(
     key: str, interlock: settings.InterlockDriver, name_link: Callable[[str], Hashable]
 ) -> DevicePlace:
-    """The place of an interlock's circuit; `key` is that of its table."""
+    """The place of an interlock's circuit.
+
+    Parameters
+    ----------
+    key : str
+        Of the interlock's table, such as `devices.interlocks.0`.
+    interlock : InterlockDriver
+        The table: an input of the board, a GPIO line, or a bit of a Modbus module.
+    name_link : callable
+        As for `list_places`.
+    """
     match interlock:
         case settings.BoardInputConfig():
             words = f"input {interlock.input} of the pump board"

@@ -52,7 +52,22 @@ def load_toml(path: str | Path, model: type[Model], follow: bool = True) -> Mode
 
 
 def load_toml_text(text: str, path: Path, model: type[Model]) -> Model:
-    """As `load_toml`, of a text that is to become the file `path`. Raises InputError."""
+    """As `load_toml`, of a text that is to become a file.
+
+    Parameters
+    ----------
+    text : str
+        TOML.
+    path : Path
+        The file, for messages; a height map that the text names is read beside it.
+    model : type of BaseModel
+        The schema.
+
+    Raises
+    ------
+    InputError
+        With one line that names the file, the field and a valid value.
+    """
     return _parse_model(parse_toml(text, path), path, model, follow=True)
 
 
@@ -64,8 +79,19 @@ def _parse_model(tables: dict[str, Any], path: Path, model: type[Model], follow:
 
 
 def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
-    """The tables of a TOML file. Raises InputError naming the file (and the line, if it is not
-    TOML).
+    """Read the tables of a TOML file, without a schema.
+
+    Parameters
+    ----------
+    path : Path
+        UTF-8, at most 1 MB.
+    follow : bool
+        Whether it may be a symbolic link; not in a folder that comes from elsewhere.
+
+    Raises
+    ------
+    InputError
+        Names the file, and the line if it is not TOML.
     """
     try:
         text = read_text(path, _BYTES_MAX, follow=follow)
@@ -85,7 +111,20 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:
-    """The tables of a text of the file `path`. Raises InputError as `read_toml`."""
+    """Parse the tables of a text, without a schema.
+
+    Parameters
+    ----------
+    text : str
+        TOML; a byte order mark in front is ignored.
+    path : Path
+        The file that it comes from, for messages.
+
+    Raises
+    ------
+    InputError
+        As for `read_toml`; also for a key of very many parts, which are slow to parse.
+    """
     text = text.removeprefix("\ufeff")  # as some editors begin a file
     if any(map(_has_too_many_parts, text.splitlines())):
         raise InputError(f"{path}: not valid TOML: a key of more than {_PARTS_MAX} parts")
@@ -136,9 +175,22 @@ def _has_too_many_parts(line: str) -> bool:
 
 
 def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
-    """Replace `screen.height_map.file` by its numbers in the tables of a geometry from `where`.
+    """Replace `screen.height_map.file` by its numbers, in place.
 
-    Raises InputError if the file is missing or holds anything but rows of numbers.
+    Parameters
+    ----------
+    geometry : object
+        The tables of a geometry as parsed; whatever else it is stays, and is judged by the schema.
+    where : Path
+        The file that the tables come from: the name of the height map is relative to its folder.
+    follow : bool
+        Whether links, and files in other folders, may be read; not in a folder that comes from
+        elsewhere.
+
+    Raises
+    ------
+    InputError
+        The file is missing, or holds anything but rows of numbers (mm).
     """
     # Nothing to do without a height map that names a file.
     screen = None
@@ -164,7 +216,23 @@ def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
 
 
 def parse_tables(tables: dict[str, Any], model: type[Model], where: str) -> Model:
-    """Validate tables from `where`. Raises InputError like `load_toml`."""
+    """Validate tables by a schema.
+
+    Parameters
+    ----------
+    tables : dict
+        As parsed; a request of the control port comes in the same form.
+    model : type of BaseModel
+        The schema.
+    where : str
+        The file or the request, for the message.
+
+    Raises
+    ------
+    InputError
+        With one line that names the field and a valid value: of several errors the one that helps
+        most.
+    """
     try:
         return model.model_validate(tables)
     except ValidationError as error:
@@ -218,7 +286,15 @@ def dump_toml(config: BaseModel) -> str:
 
 
 def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
-    """One line for a validation error: the field, the problem and the remedy."""
+    """One line for a validation error: the field, the problem and the remedy.
+
+    Parameters
+    ----------
+    error : ErrorDetails
+        One error of pydantic. Its type decides, its text is only shown.
+    model : type of BaseModel
+        The schema, for the keys and drivers that are known.
+    """
     path, parent = _walk_location(model, error["loc"])
     field = ".".join(str(part) for part in path)
     kind = error["type"]
@@ -275,7 +351,17 @@ def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def suggest_word(word: str, known: list[str], otherwise: str = "") -> str:
-    """Return the nearest known word as a question; else `otherwise`, or all that are known."""
+    """What a person may have meant by a word that is not known.
+
+    Parameters
+    ----------
+    word : str
+        As written.
+    known : list of str
+        The words that count.
+    otherwise : str
+        What to suggest if none is similar; empty: all that are known.
+    """
     near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     if near:
         return f"did you mean {near[0]}?"

@@ -61,7 +61,17 @@ class UpgradedText:
 def upgrade_text(text: str, changed: Sequence[ChangedKey] = CHANGED_KEYS) -> UpgradedText:
     """Rename former keys in a configuration; comments and order stay.
 
-    Raises InputError for a text that is no TOML, or that has a former key and the present one.
+    Parameters
+    ----------
+    text : str
+        TOML.
+    changed : sequence of ChangedKey
+        The keys that releases have renamed or removed, oldest first.
+
+    Raises
+    ------
+    InputError
+        It is no TOML, or has a former key and the present one.
     """
     try:
         document = tomlkit.parse(text)

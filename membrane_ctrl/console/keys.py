@@ -50,8 +50,16 @@ class Desk:
         return f"{self._status_line}   · {_FOOT}"
 
     def process_keys(self, text: str, paused: bool) -> None:
-        """Take what was typed. Of several characters at once only the first is a command: the rest
-        may be a paste.
+        """Take what was typed, in the loop that draws the console.
+
+        Of several characters at once only the first is a command: the rest may be a paste.
+
+        Parameters
+        ----------
+        text : str
+            All characters since the last call; empty if there were none.
+        paused : bool
+            Whether the hold is paused now: the key `p` then resumes.
         """
         if not text:
             return

@@ -42,7 +42,15 @@ class Trend:
         self._seconds: deque[tuple[int, list[float]]] = deque(maxlen=TREND_S)
 
     def add(self, mono_s: float, value: float) -> None:
-        """Add a value; NaN leaves a gap."""
+        """Add a value to the mean of its second.
+
+        Parameters
+        ----------
+        mono_s : float
+            Time by the run's clock; must not fall.
+        value : float
+            NaN is left out: a second with nothing else is a gap.
+        """
         second = math.floor(mono_s)
         if not self._seconds or self._seconds[-1][0] != second:
             self._seconds.append((second, []))

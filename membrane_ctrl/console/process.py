@@ -96,10 +96,17 @@ class ConsoleSpec:
 
 
 def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
-    """Show the run on stderr until its "end" event, `processes.STOP`, or the death of the parent.
+    """Show the run on stderr until its `end` event, `processes.STOP`, or the death of the parent.
 
-    Target of a `spawn`ed process; reports over `status` that it is alive. Always restores the
-    terminal.
+    Target of a `spawn`ed process. Always restores the terminal.
+
+    Parameters
+    ----------
+    spec : ConsoleSpec
+        What the console needs of the run; plain data, because it is pickled by `multiprocessing`.
+    status : Connection, optional
+        Reports `Alive` to the control process, which replaces a console that is silent for longer;
+        None in tests.
     """
     child.leave_at_stop()
     # it may restore a terminal that has passed to the shell

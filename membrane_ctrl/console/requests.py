@@ -20,6 +20,18 @@ def request_sender(socket: Path, run: str) -> Send:
     """Return a function that sends requests to a run without waiting for the answer.
 
     They are sent one after the other, but safety commands do not wait for the others.
+
+    Parameters
+    ----------
+    socket : Path
+        The run's control port.
+    run : str
+        Name of the run: a later hold at the same socket gets nothing.
+
+    Returns
+    -------
+    callable
+        Takes a request; returns a future of the line for the operator.
     """
     worker, safety_worker = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
 
@@ -31,7 +43,22 @@ def request_sender(socket: Path, run: str) -> Send:
 
 
 def send_request(socket: Path, run: str, request: Request) -> str:
-    """Send a request to the run behind a socket; returns what became of it in one line."""
+    """Send a request to a run and wait for its answer; on a worker of `request_sender`.
+
+    Parameters
+    ----------
+    socket : Path
+        The run's control port.
+    run : str
+        Name of the run: another one at the same socket gets nothing.
+    request : dict
+        `do`, and what the command needs.
+
+    Returns
+    -------
+    str
+        What became of it, in one line; also if no hold answers.
+    """
     what = request["do"]
     try:
         with PortClient.unix(socket, notice=lambda _: None) as client:

@@ -78,7 +78,17 @@ _PLACED = frozenset(
 
 
 def level_bar(fraction: float, width: int, style: str = "cyan") -> Text:
-    """A bar of `width` characters, filled to `fraction` (0..1; NaN is empty)."""
+    """A bar of block characters.
+
+    Parameters
+    ----------
+    fraction : float
+        How much of it is filled, 0 to 1; values beyond are limited, NaN is empty.
+    width : int
+        Characters.
+    style : str
+        Rich style of the filled part.
+    """
     filled = 0
     if math.isfinite(fraction):
         filled = round(min(max(fraction, 0.0), 1.0) * width)
@@ -126,7 +136,15 @@ def signed_bars(values: Sequence[float], full: float, band: float, rows: int = 1
 
 
 def full_scale(values: Sequence[float], least: float) -> float:
-    """The smallest of 1, 2, 5 x 10^n that covers all values, and is at least `least`."""
+    """The smallest of 1, 2, 5 x 10^n that covers all values: a scale that seldom changes.
+
+    Parameters
+    ----------
+    values : sequence of float
+        NaN does not count.
+    least : float
+        The scale is never finer, so that noise does not fill the bars.
+    """
     largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
     if largest <= least:
         return least

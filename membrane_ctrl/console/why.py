@@ -171,7 +171,19 @@ def _describe_pump_flow(row: TelemetryRow) -> str:
 
 
 def format_number(value: float, digits: int, unit: str = "", sign: bool = False) -> str:
-    """Format `value` with its unit."""
+    """Format a value with its unit.
+
+    Parameters
+    ----------
+    value : float
+        NaN or infinite: the sign for a missing value.
+    digits : int
+        After the decimal point.
+    unit : str
+        Follows after a blank; empty: none.
+    sign : bool
+        A plus before positive values, for changes and errors.
+    """
     if not math.isfinite(value):
         return MISSING
     sign_option = "+" if sign else ""
@@ -180,7 +192,15 @@ def format_number(value: float, digits: int, unit: str = "", sign: bool = False)
 
 
 def format_percent(fraction: float, digits: int = 0) -> str:
-    """Format a fraction as a percentage."""
+    """Format a fraction as a percentage.
+
+    Parameters
+    ----------
+    fraction : float
+        1 is 100 %; NaN is the sign for a missing value.
+    digits : int
+        After the decimal point.
+    """
     return format_number(100.0 * fraction, digits, "%")
 
 

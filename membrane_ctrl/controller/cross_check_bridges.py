@@ -12,7 +12,15 @@ _REMEDIES = {
 
 
 def judge_bridges(config: Config, findings: ConfigFindings) -> None:
-    """Warn of bridges through which unidentified clients may act."""
+    """Warn of bridges through which unidentified clients may act.
+
+    Parameters
+    ----------
+    config : Config
+        Whose `[bridges]` are judged.
+    findings : ConfigFindings
+        Gets a warning for each.
+    """
     for bridge in list_bridge_accesses(config.bridges):
         acts = bridge.unknown and config.bridges.role != "read"
         findings.warn(

@@ -15,7 +15,15 @@ _MOMENT_S = 0.2  # a person's push of a button lasts at least this long
 
 
 def judge_interlocks(config: Config, findings: ConfigFindings) -> None:
-    """Judge the sources and what they are for."""
+    """Judge the sources of the interlocks, and what their safe levels can do on this bench.
+
+    Parameters
+    ----------
+    config : Config
+        Whose `[[devices.interlocks]]` are judged.
+    findings : ConfigFindings
+        Gets what is wrong. The fields have the interlock's index: `devices.interlocks.0.period_s`.
+    """
     for index, interlock in enumerate(config.interlocks):
         field = f"devices.interlocks.{index}"
         if isinstance(interlock, PolledInterlockConfig):
@@ -71,7 +79,18 @@ def _check_modbus(
 
 
 def judge_interlock_board(config: Config, board: BenchIdentity, findings: ConfigFindings) -> None:
-    """Refuse inputs that the board which answers does not have."""
+    """Refuse inputs that the board which answers does not have.
+
+    Parameters
+    ----------
+    config : Config
+        Whose interlocks name inputs of the board.
+    board : BenchIdentity
+        As read at the start; one without a watchdog and without a kind stands for "not read yet",
+        and is not judged.
+    findings : ConfigFindings
+        Gets what is wrong.
+    """
     if math.isnan(board.watchdog_s) and not board.kind:
         return  # no board has answered yet
     for index, interlock in enumerate(config.interlocks):

@@ -54,12 +54,31 @@ class ConfigFindings:
         self.found: list[ConfigFinding] = []
 
     def error(self, wrong: bool, field: str, why: str, remedy: str) -> None:
-        """Add an error on the field if `wrong`."""
+        """Add an error, which refuses the configuration, if there is one.
+
+        Parameters
+        ----------
+        wrong : bool
+            Whether there is: the callers read as a list of conditions.
+        field : str
+            Path of the key, such as `loop.kp_per_s` or `alarms.rules.0.raise_at`; its value is
+            looked up.
+        why : str
+            What would happen, for a person.
+        remedy : str
+            What to set instead, or to measure.
+        """
         if wrong:
             self.found.append(ConfigFinding("error", field, self._find_value(field), why, remedy))
 
     def warn(self, wrong: bool, field: str, why: str, remedy: str) -> None:
-        """Add a warning on the field if `wrong`."""
+        """Add a warning, which only reports, if there is one.
+
+        Parameters
+        ----------
+        wrong, field, why, remedy
+            As for `error`.
+        """
         if wrong:
             self.found.append(ConfigFinding("warning", field, self._find_value(field), why, remedy))
 
@@ -75,7 +94,15 @@ def flow_um_per_s(config: Config) -> float:
 
 
 def judge_pump(config: Config, findings: ConfigFindings) -> None:
-    """Judge the pump's curve against the loop and the actuator test."""
+    """Judge the pump's curve against the loop and the actuator test.
+
+    Parameters
+    ----------
+    config : Config
+        `[pump]`, `[loop]`, and the scales of the devices that take the commands.
+    findings : ConfigFindings
+        Gets what is wrong.
+    """
     pump, loop = config.pump, config.loop
     least = 0.0 if pump.curve_fraction else pump.dead_fraction  # of the straight line only
     why = f"must lie between dead_fraction ({least:g}) and start_fraction ({pump.start_fraction:g})"
@@ -130,7 +157,15 @@ def judge_pump(config: Config, findings: ConfigFindings) -> None:
 
 
 def judge_vent(config: Config, findings: ConfigFindings) -> None:
-    """Report what a bench without a vent cannot do, and how long its mirror takes to go down."""
+    """Report what a bench without a vent cannot do, and how long its mirror takes to go down.
+
+    Parameters
+    ----------
+    config : Config
+        The time is estimated from `optics.mirror` and `twin.leak_time_constant_s`.
+    findings : ConfigFindings
+        Gets one warning.
+    """
     if config.vent_fitted:
         return
     why = "no vent is fitted: the safe level vent, and `ctl vent`, only stop the pump"
@@ -184,7 +219,16 @@ def weak_gains(loop: LoopConfig) -> tuple[Severity, str] | None:
 
 
 def judge_loop(config: Config, findings: ConfigFindings) -> None:
-    """Judge gains, feed-forward, ramp, bleed and the rate of the flow."""
+    """Judge gains, feed-forward, ramp, bleed and the rate of the flow.
+
+    Parameters
+    ----------
+    config : Config
+        `[loop]` on the nominal pump: peak sensitivity, signs and sizes against physics, and what
+        the pump can follow.
+    findings : ConfigFindings
+        Gets what is wrong.
+    """
     loop, full_um_per_s = config.loop, flow_um_per_s(config)
     severity, why = weak_gains(loop) or ("", "")
     measure = "run `tune`, or use the default gains"
@@ -223,6 +267,15 @@ def judge_loop(config: Config, findings: ConfigFindings) -> None:
 
 
 def judge_shape(config: Config, findings: ConfigFindings) -> None:
+    """Judge the shape loop: ages and periods of the figures, and what the held scalar needs.
+
+    Parameters
+    ----------
+    config : Config
+        `[shape]`, and `loop.holds`.
+    findings : ConfigFindings
+        Gets what is wrong.
+    """
     shape = config.shape
     holds = config.loop.holds
     why = "the figure is not measured: shape.enabled is false"
@@ -252,6 +305,16 @@ def judge_shape(config: Config, findings: ConfigFindings) -> None:
 
 
 def judge_optics(config: Config, findings: ConfigFindings) -> None:
+    """Judge the geometry, and what a bench without a laser needs of its optics.
+
+    Parameters
+    ----------
+    config : Config
+        `[optics]`, the twin's own geometry, and `[shape]`.
+    findings : ConfigFindings
+        Gets an error where camera and screen cannot see each other in the mirror, a warning where
+        that is doubtful.
+    """
     if config.by_optics:
         shape, why = config.shape, "a bench held without a laser needs a figure from every frame"
         findings.error(not shape.enabled, "shape.enabled", why, "set it to true")
@@ -285,6 +348,15 @@ def _check_geometry(field: str, optics: OpticsConfig, used: bool, findings: Conf
 
 
 def judge_alarms(config: Config, findings: ConfigFindings) -> None:
+    """Judge the alarms: those that can never be raised, and a silence shorter than a tick.
+
+    Parameters
+    ----------
+    config : Config
+        `[alarms]`; the largest values follow from limits, pump and safety table.
+    findings : ConfigFindings
+        Gets what is wrong.
+    """
     alarms, tick_s = config.alarms, 1.0 / config.loop.rate_hz
     findings.error(
         alarms.silent_s < 2.0 * tick_s,
@@ -309,7 +381,16 @@ def judge_alarms(config: Config, findings: ConfigFindings) -> None:
 
 
 def judge_gauge(config: Config, findings: ConfigFindings) -> None:
-    """Judge the gauge as a guard and as a check of the laser."""
+    """Judge the gauge as a guard and as a check of the laser.
+
+    Parameters
+    ----------
+    config : Config
+        The limits of pressure, of a gauge that repeats itself, and of laser against gauge: each
+        must be able to trip, and must not trip by weather or noise alone.
+    findings : ConfigFindings
+        Gets what is wrong.
+    """
     limits, pressure_pa, tick_s = (
         config.limits,
         config.optics.mirror.pressure_pa,
@@ -366,7 +447,15 @@ def judge_gauge(config: Config, findings: ConfigFindings) -> None:
 
 
 def judge_film(config: Config, findings: ConfigFindings) -> None:
-    """Judge the film's data, which serve to judge gas, laser and gauge."""
+    """Judge the film's data, which serve to judge gas, laser and gauge.
+
+    Parameters
+    ----------
+    config : Config
+        `optics.mirror`, and the limits of leak and range.
+    findings : ConfigFindings
+        Gets what is wrong.
+    """
     limits, mirror = config.limits, config.optics.mirror
     # The growth of the leak that is a fault: within what the pump gives, and beyond what weather
     # shows.
@@ -416,7 +505,18 @@ def judge_film(config: Config, findings: ConfigFindings) -> None:
 
 
 def judge_ranges(config: Config, board: BenchIdentity, findings: ConfigFindings) -> None:
-    """Judge limits against sensor ranges: a limit outside its sensor's range never trips."""
+    """Judge limits against sensor ranges: a limit outside its sensor's range never trips.
+
+    Parameters
+    ----------
+    config : Config
+        The limits, and the ranges that the devices' tables state.
+    board : BenchIdentity
+        The ranges that the devices themselves state, in µm and Pa; infinite before they are read.
+        The narrower of both counts.
+    findings : ConfigFindings
+        Gets what is wrong.
+    """
     limits, devices = config.limits, config.devices
     laser = devices.displacement if devices is not None else None
     gauge = devices.roles().get("gauge_pressure") if devices is not None else None

@@ -86,8 +86,16 @@ class GainsTrial:
         self._end_trial()
 
     def replace_pump(self, pump: PumpConfig, loop: LoopConfig) -> None:
-        """Replace the pump's curve, which is not on trial, and the loop's settings by others that
-        stay.
+        """Replace the pump's curve, and the loop's settings with it, by others that stay.
+
+        Not during a trial: the caller waits for its end.
+
+        Parameters
+        ----------
+        pump : PumpConfig
+            The curve that the actuator test has found.
+        loop : LoopConfig
+            The loop's settings on it, in particular the largest flow.
         """
         self.memory.tried = replace(self.memory.tried, pump=pump)
         self.limit(loop)

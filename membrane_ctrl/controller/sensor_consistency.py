@@ -254,7 +254,15 @@ class SensorConsistency:
         return self._plausibility.judges
 
     def set_gains(self, loop: LoopConfig, pump: PumpConfig) -> None:
-        """Judge by these gains and this curve."""
+        """Judge by these gains and this curve from the next tick on.
+
+        Parameters
+        ----------
+        loop : LoopConfig
+            Its largest flow on this curve is what a growing leak is compared with.
+        pump : PumpConfig
+            Its `change_max` bounds how much the pump may have changed before it is reported.
+        """
         self._health.set_pump(loop.flow_most_um_per_s(pump))
         self._pump.set_pump(pump.change_max)
 

@@ -101,7 +101,16 @@ class FailureCounter:
         self._repeat_s = _FIRST_REPEAT_S
 
     def note_failure(self, message: str, now_s: float) -> None:
-        """An exchange failed."""
+        """Count a failed exchange, and report it if it begins a failure, is new, or is due again.
+
+        Parameters
+        ----------
+        message : str
+            What failed, in one line. Of many different ones only `_MESSAGES_MAX` are reported
+            before the next repeat.
+        now_s : float
+            The run's clock. A standing failure is repeated in doubling intervals.
+        """
         self._unreported += 1
         self._last_failure_s = now_s
         if not self._standing and self._unreported < self._first:

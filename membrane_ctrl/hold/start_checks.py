@@ -26,7 +26,13 @@ _UNLOCKS = (
 def require_possible(devices: DevicesConfig, lab: bool) -> None:
     """End with InputError for impossible settings, before anything is started.
 
-    An emulated lab needs no package for GPIO: it stands for these lines by a Modbus module.
+    Parameters
+    ----------
+    devices : DevicesConfig
+        The devices of the configuration; none is opened.
+    lab : bool
+        An emulated lab stands for lines of GPIO by a Modbus module, so that it needs no package for
+        GPIO.
     """
     gpio = tuple(found for found in devices.interlocks if isinstance(found, GpioLineConfig))
     emulated = (

@@ -51,7 +51,23 @@ def make_bench(devices: DevicesConfig, observe: bool = False) -> roles.Bench:
 def make_pump_board(
     devices: DevicesConfig, url: str, links: modbus_rtu.ModbusLinks | None = None
 ) -> PumpBoard:
-    """The board at this URL, not yet connected. Raises InputError."""
+    """Make the driver of a pump board, not yet connected.
+
+    Parameters
+    ----------
+    devices : DevicesConfig
+        Unit, time-out and watchdog of the board.
+    url : str
+        `tcp://HOST:PORT` or `rtu:///dev/PORT?baud=...`.
+    links : ModbusLinks, optional
+        The links of the bench: devices on one line share one connection, which sends their requests
+        one after the other. None: a link of its own.
+
+    Raises
+    ------
+    InputError
+        The address cannot be.
+    """
     try:
         link = (links or modbus_rtu.ModbusLinks()).link(url, devices.unit_id, devices.timeout_s)
         return PumpBoard(url, devices.unit_id, devices.timeout_s, devices.watchdog_s, link)

@@ -34,7 +34,21 @@ async def connect_bench(bench: roles.Bench, devices: DevicesConfig) -> roles.Ben
 
 
 async def retry_connecting(attempt: Callable[[], Awaitable[T]], where: str) -> T:
-    """Repeat an attempt to connect, as in `connect_bench`."""
+    """Repeat an attempt to connect, as in `connect_bench`.
+
+    Parameters
+    ----------
+    attempt : async callable
+        Connects, or raises LinkError. It is tried for 5 s; while another program has claimed the
+        device, until that claim would have lapsed; not again if it is the wrong device.
+    where : str
+        The device, for the message.
+
+    Raises
+    ------
+    DeviceError
+        With the last failure that names a cause.
+    """
     loop = asyncio.get_running_loop()
     begin_s, patience_s = loop.time(), _PATIENCE_S
     failure = ""

@@ -34,8 +34,20 @@ def _interlock_ports(devices: DevicesConfig) -> Iterator[str]:
 
 
 def modbus_names(url: str, unit_id: int) -> set[str]:
-    """A Modbus device's names: that of its serial line, which has one owner, or those of its host's
-    addresses.
+    """A Modbus device's names, by which two programs recognise that they want the same one.
+
+    Parameters
+    ----------
+    url : str
+        `tcp://HOST:PORT` or `rtu:///dev/PORT?baud=...`, however spelt.
+    unit_id : int
+        Its address on the line or behind the host. A serial line has one owner, whatever the unit.
+
+    Returns
+    -------
+    set of str
+        The real path of a serial port; of a host one name for each of its addresses. Two devices
+        are the same if their sets have a name in common.
     """
     if url.startswith("rtu:"):
         return {serial_name(url.removeprefix("rtu://").partition("?")[0])}

@@ -68,7 +68,24 @@ def make_driver(section: Any, where: str, kind: driver_kind.DriverKind, *more: A
 def make_emulator(
     section: settings.ExternalSection, where: str, kind: driver_kind.DriverKind, *more: Any
 ) -> Any:
-    """Make the emulator of a table's device. Raises InputError as `make_driver`."""
+    """Make the emulator of a device of another vendor, not yet started.
+
+    Parameters
+    ----------
+    section : ExternalSection
+        The device's table; its `name` is the entry point's.
+    where : str
+        Place of the table in the configuration, for messages.
+    kind : DriverKind
+        The role's kind, for which the package offers the emulator.
+    *more : object
+        What an emulator of this kind gets after its settings.
+
+    Raises
+    ------
+    InputError
+        As for `make_driver`, and if the package has no emulator.
+    """
     try:
         make = drivers.load_emulator(section.name, kind)
     except ValueError as error:

@@ -26,7 +26,25 @@ _SHARED_MEMORY_FOLDER = Path("/dev/shm")
 
 
 def publish_rings(run_dir: Path, rings: Mapping[str, RingAddress | None], stack: ExitStack) -> None:
-    """Write the addresses of the existing rings; the stack ends the lock. Raises OSError."""
+    """Write the addresses of the existing rings into the run's folder, and lock that file.
+
+    Called by the control process. The lock is the sign that it lives: the kernel removes it however
+    the process ends (`is_control_alive`).
+
+    Parameters
+    ----------
+    run_dir : Path
+        Folder of the run.
+    rings : mapping of RingAddress or None
+        By name: `telemetry`, `events`, `shapes`; None for one that this run has not.
+    stack : ExitStack
+        Ends the lock; the file stays.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written.
+    """
     found = {name: asdict(address) for name, address in rings.items() if address is not None}
     write_text_atomic(run_dir / _FILE, json.dumps(found, indent=1) + "\n")
     file = stack.enter_context(open_plain(run_dir / _FILE))

@@ -225,7 +225,20 @@ class RingReader:
 
 @contextmanager
 def open_ring(slots: int, slot_bytes: int) -> Iterator[RingAddress]:
-    """A ring for the duration of a `with` block."""
+    """A ring for the duration of a `with` block, in the process that lives longest.
+
+    Parameters
+    ----------
+    slots : int
+        Messages that are kept: a reader that is further behind loses the oldest.
+    slot_bytes : int
+        The longest message.
+
+    Yields
+    ------
+    RingAddress
+        For the writer and the readers, in this or another process; plain data.
+    """
     owner = Ring(slots, slot_bytes)
     try:
         yield owner.address

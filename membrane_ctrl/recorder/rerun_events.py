@@ -17,7 +17,16 @@ EVENTS_PATH = "/events"
 
 
 def send_events(recording: rerun_recording.Recording, events: Sequence[EventLine]) -> None:
-    """Send events in order: a sentence each, and vertical lines across plots."""
+    """Send events: a sentence each, and vertical lines across plots.
+
+    Parameters
+    ----------
+    recording : Recording
+        The present segment.
+    events : sequence of EventLine
+        Lines of the event log, in order of time. What an event means for plots is read from its
+        class (`from_dict`), not from the text.
+    """
     if not events:
         return
     timed = [(float(line.get("mono_s") or 0.0), from_dict(line)) for line in events]

@@ -215,14 +215,34 @@ class Recording:
         self.send_columns(path, time_s, rr.Measurements.columns(values=values, variances=variances))
 
     def log_component(self, path: str, time_s: float, archetype: rr.AsComponents) -> None:
-        """Send one component at one time of the run."""
+        """Send one component at one time of the run.
+
+        Parameters
+        ----------
+        path : str
+            Of the entity, such as `/events`.
+        time_s : float
+            Time of the run; UTC follows from it and the start.
+        archetype : rr.AsComponents
+            What Rerun shows there, such as a picture or a text.
+        """
         nanoseconds = np.timedelta64(round(time_s * 1e9), "ns")
         self._stream.set_time(RUN_TIME, duration=nanoseconds)
         self._stream.set_time(UTC, timestamp=self._origin + nanoseconds)
         self._stream.log(path, archetype)
 
     def send_page(self, path: str, time_s: float, markdown: str) -> None:
-        """Send a page of text at one time of the run."""
+        """Send a page of text at one time of the run.
+
+        Parameters
+        ----------
+        path : str
+            Of the entity; a later page at the same path replaces it in the viewer.
+        time_s : float
+            Time of the run.
+        markdown : str
+            The page.
+        """
         self.log_component(path, time_s, rr.TextDocument(markdown, media_type="text/markdown"))
 
     def lay_out_again(self) -> None:

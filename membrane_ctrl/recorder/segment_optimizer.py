@@ -21,10 +21,18 @@ _RERUN = Path(_PACKAGE.origin).parent / "rerun"
 
 
 def optimize_command(source: Path, target: Path, *options: str) -> list[str]:
-    """The command that writes `target` from `source`; it names the binary, as its Python wrapper
-    survives a kill.
+    """The command that writes one segment from another.
 
-    Options may include another source.
+    It names the binary: Rerun's Python wrapper would survive a kill of the recorder.
+
+    Parameters
+    ----------
+    source : Path
+        The closed segment.
+    target : Path
+        A new file beside it; not whole until the command has ended with 0.
+    *options : str
+        Options of `rerun rrd optimize`, and paths of other sources, which are merged.
     """
     return [
         "nice",

@@ -131,12 +131,31 @@ def replay_command(
     as_json: bool,
     state: bool = False,
 ) -> int:
-    """Replay and report; exit 3 if a row or a decision differs, else 0.
+    """Replay a run or a part of it, and print whether the controller decides as recorded.
 
-    `state`: print what the controller remembers at the end of the part, too.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    from_s, to_s : float
+        Part of the run to report, in its seconds; infinite for no limit. The replay begins at the
+        last snapshot before `from_s`.
+    to_test : str or None
+        Name of an incident to make of the part, which the tests then replay; None: none.
+    as_json : bool
+        Print one JSON object instead of text.
+    state : bool
+        Print what the controller remembers after the part, too.
 
-    Raises InputError if the run cannot be replayed, has no such part, or (with `to_test`) the name
-    is taken.
+    Returns
+    -------
+    int
+        `Exit.DONE` if all rows and decisions are the same, `Exit.REJECTED` (3) if one differs.
+
+    Raises
+    ------
+    InputError
+        The run cannot be replayed, has no such part, or the name of the incident is taken.
     """
     if from_s >= to_s:
         raise InputError(f"--from {from_s:g}s is not before --to {to_s:g}s")

@@ -41,9 +41,21 @@ class FileFinding:
 
 
 def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
-    """Repair and report; exit 0 also if nothing was wrong.
+    """Repair a run and print what was found; exit 0 also if nothing was wrong.
 
-    Raises InputError if it is not a run folder, or the run is still in progress.
+    Parameters
+    ----------
+    run_dir : Path
+        Folder of the run.
+    in_place : bool
+        Replace the damaged files; else repaired ones go to `repaired/`.
+    as_json : bool
+        Print one JSON object instead of text.
+
+    Raises
+    ------
+    InputError
+        It is not a run folder, or the run is still in progress.
     """
     findings = repair_run(run_dir, in_place)
     if as_json:

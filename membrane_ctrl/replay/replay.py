@@ -304,7 +304,18 @@ def recorded_ticks(
 def differing_fields(
     today: telemetry.TelemetryRow, recorded: telemetry.TelemetryRow
 ) -> dict[str, tuple[float, float]]:
-    """Fields that are not bit-identical: recorded and today's value."""
+    """Fields of a telemetry row that are not bit-identical; NaN equals NaN.
+
+    Parameters
+    ----------
+    today, recorded : TelemetryRow
+        The replay's row of a tick, and that of the run.
+
+    Returns
+    -------
+    dict
+        By field: the recorded value, and today's.
+    """
     fields: dict[str, tuple[float, float]] = {}
     for name in telemetry.FIELDS:
         then, now = getattr(recorded, name), getattr(today, name)

@@ -42,7 +42,16 @@ def parse_logged_line(line: events.EventLine) -> LoggedEvent:
 
 
 def read_events(folder: Path, notes: list[str]) -> tuple[LoggedEvent, ...]:
-    """Events and annotations in order of time; `notes` counts lines that are not JSON objects."""
+    """Events and annotations of a run in order of time.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run, which may be in progress.
+    notes : list of str
+        Gets a line if the file is missing or cannot be read, and the number of lines that are
+        damaged: these are left out.
+    """
     logged = _json_lines(folder / "events.jsonl", notes)
     if not (folder / "events.jsonl").exists():
         notes.append("events.jsonl: missing; states are taken from the telemetry")

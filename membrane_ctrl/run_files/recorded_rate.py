@@ -18,7 +18,17 @@ _WHOLE = 0.005
 
 
 def at_recorded_rate(config: Config, folder: Path, notes: list[str]) -> Config:
-    """The configuration with the rate of the run's first minutes, if that differs, and a note."""
+    """The configuration with the rate of the run's first minutes, if that differs.
+
+    Parameters
+    ----------
+    config : Config
+        As read from the run's folder; a damaged one has the default rate.
+    folder : Path
+        Folder of the run, whose tables state the true rate.
+    notes : list of str
+        Gets a line if the record's rate is used.
+    """
     configured_hz, found_hz = config.loop.rate_hz, recorded_rate_hz(folder)
     if found_hz is None or abs(found_hz / configured_hz - 1) <= _DIFFERS:
         return config

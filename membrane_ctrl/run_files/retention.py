@@ -1,7 +1,6 @@
 """Deletes runs that are too old or too large in total, except the present one and kept ones."""
 
 import os
-import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,8 +8,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from membrane_ctrl.model.files import folder_handle
+from membrane_ctrl.run_files.run_lookup import RUN_NAME
 
-_RUN = re.compile(r"(\d{8}T\d{6}Z)-.+")
 _DOOMED = ".deleted-"
 _KEEP = ".keep"
 # A clock that is wrong by years must not delete every run.
@@ -29,15 +28,24 @@ class OldRun:
 
 
 def list_deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[OldRun]:
-    """Runs in `logs_dir`, oldest first, except the present one, those that may still run, and those
-    with a `.keep`.
+    """Runs of a folder that may be deleted, oldest first.
 
     Considers only folders that look like a run: a name that begins with a time, and `config.toml`.
-    Symbolic links do not count: their targets are elsewhere.
+    Left out are symbolic links, whose targets are elsewhere, runs that may still be in progress,
+    and those with a file `.keep`.
+
+    Parameters
+    ----------
+    logs_dir : Path
+        Folder of the runs.
+    present : Path
+        The run of the caller, which is never deleted.
+    now_utc : datetime
+        A run without a summary that has changed within a day before this may be in progress.
     """
     found = []
     for folder in sorted(logs_dir.iterdir()):
-        match = _RUN.fullmatch(folder.name)
+        match = RUN_NAME.fullmatch(folder.name)
         if not match or folder.is_symlink() or not (folder / "config.toml").is_file():
             continue
         if folder.resolve() == present.resolve():

@@ -96,7 +96,13 @@ class Run:
         return self.origin_utc + timedelta(seconds=mono_s if abs(mono_s) < _RUN_MAX_S else 0.0)
 
     def log_between(self, start_s: float, end_s: float) -> tuple[event_log.LoggedEvent, ...]:
-        """The log of a part of the run."""
+        """The log of a part of the run.
+
+        Parameters
+        ----------
+        start_s, end_s : float
+            Seconds of the run; the end does not belong to the part.
+        """
         return tuple(each for each in self.log if start_s <= each.mono_s < end_s)
 
     def ticks(
@@ -492,6 +498,13 @@ def _plausible_count(value: object) -> int:
 def origin_of(folder: Path, log: Sequence[event_log.LoggedEvent]) -> datetime:
     """UTC at 0 s of a run: from its first event with both times, else from the folder's name or
     age.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run; its name begins with the start, to a second, if it was not renamed.
+    log : sequence of LoggedEvent
+        Events of the run; times that no run can have are passed over.
     """
     for each in log:
         try:

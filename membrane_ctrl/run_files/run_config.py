@@ -73,7 +73,18 @@ def read_exact_config(folder: Path) -> Config:
 
 
 def read_config(folder: Path, notes: list[str]) -> Config:
-    """`config.toml`; keys that this version does not understand get their defaults, with a note."""
+    """Read `config.toml` of a run, as far as this version understands it.
+
+    Never raises for the content: the record must be readable with a damaged or foreign
+    configuration. `read_exact_config` is for a replay, which must not guess.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    notes : list of str
+        Gets a line for damage, and for keys that were left out or have their defaults.
+    """
     path = folder / "config.toml"
     notes += _config_damage(path)
     try:

@@ -70,7 +70,20 @@ def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: 
 
 
 def write_heads(run_dir: Path, config: Config) -> None:
-    """Write `run.json`, and `config.toml` with every default. Raises OSError."""
+    """Write `run.json`, and `config.toml` with every default.
+
+    Parameters
+    ----------
+    run_dir : Path
+        Folder of the run.
+    config : Config
+        As the run has it. The file begins with a checksum in a comment, so that an edit is noticed.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written.
+    """
     run_head.write_run_head(run_dir)
     text = f"# {program.program_identity()}\n{toml_file.dump_toml(config)}"
     files.write_text_atomic(run_dir / CONFIG, file_checksums.add_checksum_comment(text))

@@ -34,7 +34,15 @@ def write_run_head(run_dir: Path) -> None:
 
 
 def read_run_head(folder: Path, notes: list[str]) -> RunHead:
-    """Read `run.json`; `notes` gets a line if it is damaged, or the folder has a later format."""
+    """Read `run.json`; without it, or if it is damaged, number 0 and no program.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    notes : list of str
+        Gets a line if it is damaged or edited, or the folder has a later format than this version.
+    """
     try:
         table = plain_json.loads(files.read_text(folder / HEAD_FILE, _BYTES_MAX))
     except FileNotFoundError:

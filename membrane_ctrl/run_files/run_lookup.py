@@ -5,7 +5,7 @@ from pathlib import Path
 
 from membrane_ctrl.model import errors
 
-_RUN_NAME = re.compile(r"\d{8}T\d{6}Z-.+")
+RUN_NAME = re.compile(r"(\d{8}T\d{6}Z)-.+")  # the start in UTC, and a name
 
 
 def is_run_name(name: str) -> bool:
@@ -14,7 +14,7 @@ def is_run_name(name: str) -> bool:
     The newest run of a folder is the last such name. A copy under another name, such as `3-copy`,
     would hide it.
     """
-    return _RUN_NAME.fullmatch(name) is not None
+    return RUN_NAME.fullmatch(name) is not None
 
 
 def find_folder(path: Path) -> Path:

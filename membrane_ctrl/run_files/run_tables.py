@@ -145,7 +145,17 @@ class RunTables:
         }
 
     def add_thumbnail(self, time_s: float, pattern: str, jpeg: bytes) -> None:
-        """Add a picture of a camera frame."""
+        """Add a picture of a camera frame.
+
+        Parameters
+        ----------
+        time_s : float
+            Time of the exposure, in seconds of the run.
+        pattern : str
+            Name of the pattern that the screen showed.
+        jpeg : bytes
+            The reduced picture.
+        """
         number = self._next_number(table_specs.THUMBNAILS)
         row = {"number": number, "time_s": time_s, "pattern": pattern, "jpeg": jpeg}
         self._add_dicts(table_specs.THUMBNAILS, [row])

@@ -151,8 +151,16 @@ def make_height_basis(x: Column, y: Column) -> Column:
 
 
 def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) -> Shapes:
-    """Shapes from the recorder's tables of figures and of covariances, whatever columns they have;
-    by time.
+    """Shapes from the recorder's tables, by time.
+
+    Parameters
+    ----------
+    figures : iterable of pyarrow.Table
+        With `time_s` (s) and `coeffs_um` (µm); others are left out. Columns that are missing in a
+        run of another version are NaN, and a missing verdict is `ok`.
+    covariances : iterable of pyarrow.Table
+        With `time_s` and `covariance_um2` (terms * terms numbers, µm^2); recorded less often than
+        the figures.
     """
     parts = [
         _read_figures(table)

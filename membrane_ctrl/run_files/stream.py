@@ -68,6 +68,16 @@ def make_figure_stream(plot: Plot) -> Stream:
 
 
 def make_second_line(what: str, colour: Colour, width: float) -> Line:
-    """Return a line of the overview; `what` is kept of the error in each second: `mean`, ..."""
+    """Return a line of the overview, which has one value of the error for each second.
+
+    Parameters
+    ----------
+    what : str
+        Which value, as its legend names it: `least`, `mean`, `greatest`.
+    colour : Colour
+        In the viewer and in reports.
+    width : float
+        Points.
+    """
     error = COLUMNS["error_um"]
     return Line("", f"{error.label}, {what} of a second {error.unit}", colour, width)

@@ -14,7 +14,20 @@ _SUMMARY_SCHEMA = "membrane-summary/2"
 
 
 def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
-    """`summary.json`; None with a note if it is missing or broken."""
+    """Read `summary.json`, which the recorder writes at the end.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    notes : list of str
+        Gets a line if it is missing or damaged, or of another schema.
+
+    Returns
+    -------
+    dict or None
+        None if it is missing or damaged. One of another schema is returned as it is, with the note.
+    """
     path = folder / "summary.json"
     try:
         summary: Any = plain_json.loads(files.read_text(path))

@@ -138,7 +138,24 @@ def restart_session(
 
 
 def make_session_folder(parent: Path, name: str, now: datetime) -> Path:
-    """Make `<UTC>-<name>` in a folder; raises like `begin_session`."""
+    """Make `<UTC>-<name>` in a folder.
+
+    Parameters
+    ----------
+    parent : Path
+        Folder of the sessions; made if it is missing.
+    name : str
+        1 to 64 letters, digits, dots, dashes and underscores, no dot in front.
+    now : datetime
+        In UTC; a second session of this second and name gets the suffix `-2`.
+
+    Raises
+    ------
+    InputError
+        The name has other characters.
+    DeviceError
+        The folder cannot be written.
+    """
     if not _NAME.fullmatch(name):
         raise errors.InputError(
             f"session name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no "

@@ -64,8 +64,18 @@ class LiveLog:
             self._append_entry({"every_s": self._every_s, **points})
 
     def log_entry(self, what: str, line: str, **more: float | Sequence[str]) -> None:
-        """Note what happens: `step` (name, `planned_s`, `after_s`), `result`, `asks` (`among`), or
-        `ended` (why).
+        """Note what happens, after the means of the ticks before it: the page draws both in one
+        order.
+
+        Parameters
+        ----------
+        what : str
+            `step`, `result`, `asks` or `ended`.
+        line : str
+            Name of the step, text of the result, the question, or why the session ended.
+        **more : float or sequence of str
+            With `step` its `planned_s` and `after_s`, the time planned for it and for the later
+            steps; with `asks` the answers `among` which the page may choose.
         """
         self.write_means()
         self._append_entry({what: line, "utc": folder.now_utc(), **more})
@@ -123,7 +133,24 @@ class PageAnswer:
 
 
 def write_answer(session: Path, question: str, given: PageAnswer) -> None:
-    """Leave the answer to a question where the session finds it. Raises OSError."""
+    """Leave the answer to a question where the session finds it.
+
+    Called by the service, on a pool. The session looks for the file while it asks, and removes it.
+
+    Parameters
+    ----------
+    session : Path
+        Folder of the session.
+    question : str
+        As the session asks it: an answer to another question is not taken.
+    given : PageAnswer
+        The answer, and the viewer's name.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written.
+    """
     text = json.dumps({"to": question, "answer": given.answer, "by": given.by})
     files.write_text_atomic(files.resolve_user_path(session / ANSWER), text + "\n")
 

@@ -86,7 +86,13 @@ class Progress:
         self.log_entry("result", line)
 
     def log_entry(self, what: str, line: str, **more: float | Sequence[str]) -> None:
-        """Note in the log, if there is one."""
+        """Note what happens in the log, if there is one.
+
+        Parameters
+        ----------
+        what, line, **more
+            As for `LiveLog.log_entry`.
+        """
         if self.log is not None:
             self.log.log_entry(what, line, **more)
 

@@ -48,8 +48,21 @@ def to_plain(value: Any) -> Any:
 
 
 def build_value(kind: type[T], data: Any) -> T:
-    """Build a value of a type from its plain form. Raises TypeError, ValueError or KeyError if it
-    is invalid.
+    """Build a value of a type from its plain form, as `to_plain` made it.
+
+    Parameters
+    ----------
+    kind : type
+        A dataclass or pydantic model, or a type of its fields: optional, literal, tuple, array,
+        number, text.
+    data : object
+        Plain JSON of a file that may be damaged or edited. Keys that the type does not have are
+        left out.
+
+    Raises
+    ------
+    TypeError, ValueError, KeyError
+        It does not fit, lacks a field, or has a number that no quantity of a bench has.
     """
     return cast(T, _build_plain(kind, data))
 

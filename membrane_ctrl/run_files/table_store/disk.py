@@ -25,13 +25,29 @@ class Disk:
         return os.open(path, _APPEND, 0o644)
 
     def write(self, descriptor: int, data: bytes) -> None:
-        """Write all of some bytes; on an error a part of them may be written."""
+        """Write all of some bytes.
+
+        Parameters
+        ----------
+        descriptor : int
+            Of a file that `create` or `open_to_append` has opened.
+        data : bytes
+            On an error a part of them may be written: the caller cuts the file (`truncate`).
+        """
         rest = memoryview(data)
         while rest:
             rest = rest[os.write(descriptor, rest) :]
 
     def truncate(self, descriptor: int, size_bytes: int) -> None:
-        """Cut a file to a size."""
+        """Cut a file to a size, and write from there on.
+
+        Parameters
+        ----------
+        descriptor : int
+            Of an open file.
+        size_bytes : int
+            Up to where its content is whole.
+        """
         os.ftruncate(descriptor, size_bytes)
         os.lseek(descriptor, size_bytes, os.SEEK_SET)
 
@@ -44,7 +60,15 @@ class Disk:
         os.close(descriptor)
 
     def rename(self, source: Path, target: Path) -> None:
-        """Give a file another name, in place of the file that has it."""
+        """Give a file another name, in place of the file that has it.
+
+        After a crash there is one of the two, whole; `sync_folder` makes sure of the new one.
+
+        Parameters
+        ----------
+        source, target : Path
+            In the same folder.
+        """
         source.replace(target)
 
     def remove(self, path: Path) -> None:

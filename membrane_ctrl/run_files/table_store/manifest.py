@@ -120,7 +120,21 @@ def _measure_sizes(path: Path) -> tuple[int, int]:
 
 
 def read_manifest(folder: Path, notes: list[str]) -> dict[int, PartEntry]:
-    """The manifest's lines by the part's number; `notes` gets a line for damage."""
+    """The manifest's lines by the part's number.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the table.
+    notes : list of str
+        Gets a line for damage. A torn last line, from a crash while it was written, counts as
+        damage.
+
+    Returns
+    -------
+    dict of PartEntry
+        Of two lines on one part the later counts: it was sealed again.
+    """
     name = f"{folder.name}/{MANIFEST}"
     try:
         text = read_text(folder / MANIFEST, MANIFEST_BYTES_MAX, errors="replace")

@@ -48,12 +48,28 @@ class TableSpec:
 
 
 def part_path(folder: Path, number: int) -> Path:
-    """The finished part of a number in a table's folder."""
+    """The finished part of a number.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the table, which has the table's name.
+    number : int
+        From 0 on, without gaps in a whole table.
+    """
     return folder / f"{folder.name}-{number:0{_DIGITS}d}{PART_SUFFIX}"
 
 
 def journal_path(folder: Path, number: int) -> Path:
-    """The journal that becomes the part of the same number."""
+    """The journal that becomes the part of the same number.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the table, which has the table's name.
+    number : int
+        As for `part_path`.
+    """
     return folder / f"{folder.name}-{number:0{_DIGITS}d}{JOURNAL_SUFFIX}"
 
 
