@@ -52,7 +52,7 @@ LAYERS = {
         "membrane_ctrl/model",
         "membrane_ctrl/report_pages",
     },
-    2: {"membrane_ctrl/config"},
+    2: {"membrane_ctrl/config", "membrane_ctrl/drawing"},
     3: {
         "membrane_ctrl/control",
         "membrane_ctrl/instruments",

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.colors import SymLogNorm
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 
+from membrane_ctrl.drawing import plot_axes
+from membrane_ctrl.drawing.axis_scale import AxisScale, Spacing, Tick, fit_scale
+from membrane_ctrl.drawing.canvas import Canvas
+from membrane_ctrl.drawing.plot_axes import Box, PlotAxes, Sheet
 from membrane_ctrl.measure.figure_results import ENERGY_SHARES, MeasuredFigure
+from membrane_ctrl.measure.map_colours import choose_map_colours, describe_map
 from membrane_ctrl.measure.measurement import Measurement
-from membrane_ctrl.measure.result_files import write_picture
 from membrane_ctrl.measure.results import ErrorBars
 from membrane_ctrl.metrology.figure import radial_profile
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
@@ -22,20 +22,22 @@ from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.rays import rim_outline
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.colours import DIVERGING_MAP, SEQUENTIAL_MAP
+from membrane_ctrl.model.files import write_bytes_atomic
 from membrane_ctrl.model.terminal import escape_controls
 
 _SHOWN_PX = 600  # side of pixel maps
 _MAP_CELLS = 450  # side of other maps
-# Largest value of a map over that of 99 % of it, beyond which a linear scale would hide the rest.
-_STEEP = 3.0
-_TYPICAL_PERCENTILES = (0.5, 99.5)
-_LEAST_SCALE = 1e-12
 _STAR_CELLS = 192  # side of the grid that the image of a star is made of
 _FAINTEST = 1e-4  # light of the star's image that is drawn, over its brightest
 _LARGE_UM = 1000.0  # beyond which its picture counts in millimetres
 _STAR_VIEW = 3.0  # half the side of its picture, over the radius with 80 % of the light
 _SHOWN_ROWS = 16  # of the budget: further ones add nothing
 _LONGEST_TITLE = 110
+_PERCENT = AxisScale(0, 101)
+_BAR = 0.4  # height of a bar, rows
+_NAMES_PX = 45  # that names of inputs need beside the space between plots
+_FRAME_OPACITY = 0.5  # of the tile of a frame
+_ACCEPTED_MM = 1e-6  # change at which the fit has converged
 
 
 def draw_measurement(
@@ -65,10 +67,12 @@ def draw_measurement(
     list of Path
         The files.
     """
-    # A title in a fixed place: matplotlib measures all labels of an axis twice to find a free one.
-    with rc_context({"axes.titley": 1.0}):
-        drawn = _draw_pictures(measurement, light, profile, outline, bars, figure)
-        return [write_picture(out / f"{name}.png", picture) for name, picture in drawn.items()]
+    paths = []
+    for name, canvas in _draw_pictures(measurement, light, profile, outline, bars, figure).items():
+        path = out / f"{name}.png"
+        write_bytes_atomic(path, canvas.encode_png())
+        paths.append(path)
+    return paths
 
 
 def _draw_pictures(
@@ -78,7 +82,7 @@ def _draw_pictures(
     outline: rim_outline.Outline | None,
     bars: ErrorBars | None,
     figure: MeasuredFigure | None,
-) -> dict[str, Figure]:
+) -> dict[str, Canvas]:
     """All pictures by their names."""
     drawn = {"frames": _draw_frames(measurement)}
     full = measurement.full
@@ -86,8 +90,8 @@ def _draw_pictures(
         axis_mm = full.grid.axis_mm
         residual_um = 1e3 * full.residual_mm
         seen = full.map() if figure is None else figure.seen
-        drawn["sag"] = _draw_map("height (mm)", axis_mm, full.height_mm(), SEQUENTIAL_MAP)
-        drawn["residual"] = _draw_map(
+        drawn["sag"] = _draw_single_map("height (mm)", axis_mm, full.height_mm(), SEQUENTIAL_MAP)
+        drawn["residual"] = _draw_single_map(
             "height over the fit (µm)", axis_mm, residual_um, DIVERGING_MAP, even=True
         )
         drawn["slopes"] = _draw_slopes(full, seen)
@@ -104,47 +108,10 @@ def _draw_pictures(
     return drawn
 
 
-def new_sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
-    """Make a figure and its axes with fixed margins: fitted ones double the time of a picture.
-
-    Parameters
-    ----------
-    width, height : float
-        Inches, margins included.
-    rows, columns : int
-        Number of axes.
-
-    Returns
-    -------
-    figure : Figure
-    axes : Axes or array of Axes
-        As `Figure.subplots` returns them: one, (columns,), (rows,) or (rows, columns).
-    """
-    figure = Figure(figsize=(width, height))
-    axes = figure.subplots(rows, columns)
-    figure.subplots_adjust(
-        left=0.8 / width,
-        right=1 - 0.35 / width,
-        bottom=0.6 / height,
-        top=1 - 0.4 / height,
-        wspace=0.25,
-        hspace=0.28,
-    )
-    return figure, axes
-
-
-def _plain_powers(*axes: Any) -> None:
-    """Label logarithmic axes like 1e-06, without ticks between: mathematical type takes a tenth of
-    a second a picture, and each tick as long as a label.
-    """
-    for axis in axes:
-        axis.set_major_formatter("{x:.0e}")
-        axis.set_minor_locator(NullLocator())
-
-
-def _draw_figure(found: MeasuredFigure) -> Figure:
+def _draw_figure(found: MeasuredFigure) -> Canvas:
     """Draw what deviates from the best sphere, its spectrum, and the encircled energy."""
-    figure, ((whole, rest), (spectrum, energy)) = new_sheet(12, 10, 2, 2)
+    sheet = Sheet(12, 10, 2, 2)
+    canvas = sheet.canvas
     numbers = found.figure.numbers
 
     # The deviation, and its part that is not rotationally invariant.
@@ -152,39 +119,39 @@ def _draw_figure(found: MeasuredFigure) -> Figure:
     deviation_um = found.figure.deviation_um
     asymmetry_um = deviation_um - found.figure.rotational_um
     title = f"less the best sphere, R = {numbers.radius_of_curvature_mm:.1f} mm (µm)"
-    show_map(whole, title, axis_mm, deviation_um, DIVERGING_MAP, even=True)
+    _show_map(canvas, sheet.box(0, 0), title, axis_mm, deviation_um, DIVERGING_MAP, even=True)
     title = "and less its rotationally invariant part (µm)"
-    show_map(rest, title, axis_mm, asymmetry_um, DIVERGING_MAP, even=True)
+    _show_map(canvas, sheet.box(0, 1), title, axis_mm, asymmetry_um, DIVERGING_MAP, even=True)
 
     # The spectrum with its band of 1 sigma.
     psd = found.spectrum
     density = psd.density_um2_mm2
     low = np.maximum(density - psd.sigma_um2_mm2, density / 10)
-    spectrum.fill_between(psd.frequency_per_mm, low, density + psd.sigma_um2_mm2, alpha=0.3)
-    spectrum.loglog(psd.frequency_per_mm, density)
-    spectrum.set(title="spectral density", xlabel="spatial frequency (1/mm)", ylabel="um^2 mm^2")
-    _plain_powers(spectrum.xaxis, spectrum.yaxis)
+    high = density + psd.sigma_um2_mm2
+    frequency = fit_scale(psd.frequency_per_mm, spacing=Spacing.LOGARITHMIC)
+    power = fit_scale(low, high, spacing=Spacing.LOGARITHMIC)
+    spectrum = PlotAxes(canvas, sheet.box(1, 0), frequency, power)
+    spectrum.fill_between(psd.frequency_per_mm, low, high)
+    spectrum.draw_line(psd.frequency_per_mm, density)
+    spectrum.draw_frame("spectral density", "spatial frequency (1/mm)", "µm² mm²")
 
     # The encircled energy, of a mirror that focuses.
+    radii_mm = np.quantile(found.figure.spot_mm, ENERGY_SHARES)
+    energy = PlotAxes(canvas, sheet.box(1, 1), fit_scale(0.0, radii_mm), _PERCENT)
+    title = ""
     if numbers.best_focus_mm > 0:
-        energy.plot(np.quantile(found.figure.spot_mm, ENERGY_SHARES), 100 * ENERGY_SHARES)
+        energy.draw_line(radii_mm, 100 * ENERGY_SHARES)
         for percent, name in ((50, "spot_50_mm"), (80, "spot_80_mm"), (95, "spot_95_mm")):
-            of_noise = getattr(found.noise.numbers, name)
-            of_geometry = getattr(found.geometry.numbers, name)
-            energy.errorbar(
-                getattr(numbers, name),
-                float(percent),
-                xerr=np.nan_to_num(np.hypot(of_noise, of_geometry)),
-                fmt="o",
-                capsize=4,
-                color="tab:red",
-            )
-        energy.set(title=f"encircled energy, {numbers.best_focus_mm:.1f} mm from the vertex")
-    energy.set(xlabel="radius (mm)", ylabel="% of the rays", ylim=(0, 101))
-    return figure
+            of_noise_mm = getattr(found.noise.numbers, name)
+            of_geometry_mm = getattr(found.geometry.numbers, name)
+            half_mm = float(np.nan_to_num(np.hypot(of_noise_mm, of_geometry_mm)))
+            energy.draw_interval(getattr(numbers, name), half_mm, percent)
+        title = f"encircled energy, {numbers.best_focus_mm:.1f} mm from the vertex"
+    energy.draw_frame(title, "radius (mm)", "% of the rays")
+    return canvas
 
 
-def _draw_star(found: MeasuredFigure) -> Figure | None:
+def _draw_star(found: MeasuredFigure) -> Canvas | None:
     """Draw the image of a distant point at the stated wavelength, and its energy by radius.
 
     None without a real focus. Where the cells do not resolve the differences of the paths, the
@@ -199,20 +166,22 @@ def _draw_star(found: MeasuredFigure) -> Figure | None:
         image = image_star(seen.axis_mm, seen.height_mm, found.wavelength_um)
     except ValueError:
         return None
-    figure, (picture, energy) = new_sheet(12, 5.2, 1, 2)
+    sheet = Sheet(12, 5.2, 1, 2)
     wave = f"at {found.wavelength_um:g} µm"
-    energy.set(title=f"focus {image.focus_mm:.1f} mm above the vertex", ylim=(0, 101))
+    title = f"focus {image.focus_mm:.1f} mm above the vertex"
     if not image.resolved:
         reason = (
             f"not resolved {wave}:\nthe paths to the focus differ by\n"
             f"{image.path_rms_um:.3g} µm RMS, and from cell to cell\nby more than half a wavelength"
         )
-        place = picture.transAxes
-        picture.text(0.5, 0.5, reason, transform=place, ha="center", va="center")
-        picture.set(title=f"image of a star {wave}", xticks=[], yticks=[])
-        energy.plot(np.quantile(found.figure.spot_mm, ENERGY_SHARES), 100 * ENERGY_SHARES)
-        energy.set(xlabel="radius (mm)", ylabel="% of the rays")
-        return figure
+        empty = PlotAxes(sheet.canvas, sheet.box(0, 0), AxisScale(0, 1), AxisScale(0, 1))
+        empty.write_note(reason, 0.5, 0.5, "middle", "middle", size_pt=10)
+        empty.draw_frame(f"image of a star {wave}", x_ticks=(), y_ticks=())
+        radii_mm = np.quantile(found.figure.spot_mm, ENERGY_SHARES)
+        energy = PlotAxes(sheet.canvas, sheet.box(0, 1), fit_scale(0.0, radii_mm), _PERCENT)
+        energy.draw_line(radii_mm, 100 * ENERGY_SHARES)
+        energy.draw_frame(title, "radius (mm)", "% of the rays")
+        return sheet.canvas
 
     # The light around the middle, in a unit that suits it.
     half_um = image.pixel_um * len(image.spread) / 2
@@ -220,129 +189,115 @@ def _draw_star(found: MeasuredFigure) -> Figure | None:
     unit, per_um = "µm", 1.0
     if view_um > _LARGE_UM:
         unit, per_um = "mm", 1e-3
-    half = per_um * half_um
     view = per_um * view_um
-    shown = picture.imshow(
-        np.log10(np.maximum(image.spread / image.spread.max(), _FAINTEST)),
-        extent=(-half, half, -half, half),
-        origin="lower",
-        cmap=SEQUENTIAL_MAP,
-        interpolation="nearest",
+    around = max(1, round(view_um / image.pixel_um))
+    middle = len(image.spread) // 2
+    near = slice(max(0, middle - around), middle + around)
+    bright = np.log10(np.maximum(image.spread[near, near] / image.spread.max(), _FAINTEST))
+    side = AxisScale(-view, view)
+    colours = AxisScale(np.log10(_FAINTEST), 0)
+    picture = plot_axes.draw_map(
+        sheet.canvas, sheet.box(0, 0), bright[::-1], side, side, colours, SEQUENTIAL_MAP
     )
-    figure.colorbar(shown, ax=picture, shrink=0.85)
-    picture.set(
-        title=f"image of a star {wave}, log10; Strehl {found.figure.numbers.strehl:.3g}",
-        xlabel=f"x ({unit})",
-        xlim=(-view, view),
-        ylim=(-view, view),
-    )
+    strehl = found.figure.numbers.strehl
+    picture.draw_frame(f"image of a star {wave}, log10; Strehl {strehl:.3g}", f"x ({unit})")
 
     # Its energy by radius.
     radius_um, share = image.energy_curve()
-    energy.plot(per_um * radius_um, 100 * share)
+    energy = PlotAxes(sheet.canvas, sheet.box(0, 1), AxisScale(0, view), _PERCENT)
+    energy.draw_line(per_um * radius_um, 100 * share)
     for percent, at_um in ((50, image.radius_50_um), (80, image.radius_80_um)):
         at = per_um * at_um
-        energy.plot(at, percent, "o", color="tab:red")
-        energy.annotate(f"  {percent} % within {at:.4g} {unit}", (at, percent))
-    energy.set(xlabel=f"radius ({unit})", ylabel="% of the light", xlim=(0, view))
-    return figure
+        energy.draw_dots(at, percent)
+        energy.write_beside(f"   {percent} % within {at:.4g} {unit}", at, percent)
+    energy.draw_frame(title, f"radius ({unit})", "% of the light")
+    return sheet.canvas
 
 
-def _draw_uncertainty(bars: ErrorBars) -> Figure:
+def _draw_uncertainty(bars: ErrorBars) -> Canvas:
     """Draw 1 sigma from the set itself and from the geometry, and the budget."""
-    figure, (left, middle, right) = new_sheet(17, 4.8, 1, 3)
+    sheet = Sheet(17, 4.8, 1, 3)
+    canvas = sheet.canvas
     of_noise_um, of_geometry_um = bars.maps_um()
     axis_mm = bars.grid.axis_mm
     title = "1 sigma from this set: noise, film, light (µm)"
-    show_map(left, title, axis_mm, of_noise_um, "magma")
-    show_map(middle, "1 sigma from the geometry (µm)", axis_mm, of_geometry_um, "magma")
+    _show_map(canvas, sheet.box(0, 0), title, axis_mm, of_noise_um, "magma")
+    title = "1 sigma from the geometry (µm)"
+    _show_map(canvas, sheet.box(0, 1), title, axis_mm, of_geometry_um, "magma")
 
     # The largest rows of the budget, the largest at the top.
-    rows = [row for row in bars.budget.rows() if row["height_rms_um"] > 0]
-    rows = list(reversed(rows[:_SHOWN_ROWS]))
-    places = np.arange(len(rows))
+    rows = [row for row in bars.budget.rows() if row["height_rms_um"] > 0][:_SHOWN_ROWS]
     heights_um = [row["height_rms_um"] for row in rows]
     figures_um = [row["figure_rms_um"] for row in rows]
-    right.barh(places + 0.2, heights_um, 0.4, label="height")
-    right.barh(places - 0.2, figures_um, 0.4, label="figure (without its plane)")
-    right.set_yticks(places, [row["name"] for row in rows], fontsize=8)
-    right.set(xscale="log", xlabel="µm RMS", title="budget: contribution of each input, 1 sigma")
-    right.legend(loc="lower right")
-    _plain_powers(right.xaxis)
-    return figure
+    size = fit_scale(heights_um, figures_um, spacing=Spacing.LOGARITHMIC)
+    box = sheet.box(0, 2)
+    box = replace(box, left=box.left + _NAMES_PX)
+    budget = PlotAxes(canvas, box, size, AxisScale(max(len(rows), 1) - 0.4, -0.6))
+    for place, (height_um, figure_um) in enumerate(zip(heights_um, figures_um, strict=True)):
+        upper = (place - _BAR, place)
+        lower = (place, place + _BAR)
+        budget.draw_bar(size.low, height_um, upper, plot_axes.FIRST_COLOUR)
+        budget.draw_bar(size.low, max(figure_um, size.low), lower, plot_axes.SECOND_COLOUR)
+    names = [Tick(place, row["name"]) for place, row in enumerate(rows)]
+    legend = [("height", plot_axes.FIRST_COLOUR)]
+    legend.append(("figure (without its plane)", plot_axes.SECOND_COLOUR))
+    budget.draw_legend(legend, along="bottom")
+    title = "budget: contribution of each input, 1 sigma"
+    budget.draw_frame(title, "µm RMS", y_ticks=names)
+    return canvas
 
 
-def _draw_map(
+def _draw_single_map(
     title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False
-) -> Figure:
-    """Draw one map, as `show_map`."""
-    figure, axes = new_sheet(6.4, 5.4)
-    show_map(axes, title, axis, values, colours, even)
-    return figure
+) -> Canvas:
+    """Draw one map, as `_show_map`."""
+    sheet = Sheet(6.4, 5.4)
+    _show_map(sheet.canvas, sheet.box(), title, axis, values, colours, even)
+    return sheet.canvas
 
 
-def show_map(
-    axes: Any, title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False
+def _show_map(
+    canvas: Canvas,
+    box: Box,
+    title: str,
+    axis: FloatArray,
+    values: FloatArray,
+    colours: str,
+    even: bool = False,
 ) -> None:
     """Draw a map with its colour scale, its peak to valley, and its RMS about its mean.
 
     Parameters
     ----------
-    axes : matplotlib axes
+    canvas : Canvas
+        The picture.
+    box : Box
         Where to draw.
     title : str
         Title, with the unit of the values.
     axis : (n,) array
         Coordinates along both sides, mm.
     values : (n, n) array
-        The map; NaN where nothing is known.
+        The map, from the lowest row on; NaN where nothing is known.
     colours : str
-        Name of the colour map.
+        Name of the colour table.
     even : bool
-        Centre the scale on 0; values far beyond those of the rest of the map make it logarithmic
-        beyond these.
+        Centre the scale on 0, as `choose_map_colours` does.
     """
-    # A scale from typical values, which single cells at the edge do not set.
     every = max(1, values.shape[0] // _MAP_CELLS)
-    low, high = np.nanpercentile(values[::every, ::every], _TYPICAL_PERCENTILES)
-    scale: dict[str, Any] = {"vmin": low, "vmax": high}
-    if even:
-        high = max(abs(low), abs(high), _LEAST_SCALE)
-        most = max(high, float(np.nanmax(np.abs(_local_mean(values)))))
-        scale = {"vmin": -most, "vmax": most}
-        if most > _STEEP * high:
-            scale = {"norm": SymLogNorm(high, vmin=-most, vmax=most)}
-            title += f", linear to +-{high:.2g}"
-
-    # The map.
-    extent = (axis[0], axis[-1], axis[0], axis[-1])
-    shown = axes.imshow(
-        values[::every, ::every],
-        origin="lower",
-        extent=extent,
-        cmap=colours,
-        interpolation="nearest",
-        **scale,
-    )
-    axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
-
-    # Its peak to valley and RMS, in the unit of the title.
-    known = values[np.isfinite(values)]
-    figures = f"PV {np.ptp(known):.3g}\nRMS {np.std(known):.3g}"  # in the unit of the title
-    axes.text(0.02, 0.98, figures, transform=axes.transAxes, va="top", fontsize=8)
-    axes.figure.colorbar(shown, ax=axes, shrink=0.85)
+    shown = values[::every, ::every]
+    scale = choose_map_colours(values, shown, even)
+    if scale.spacing is Spacing.SYMMETRIC:
+        title += f", linear to +-{scale.linear_to:.2g}"
+    side = AxisScale(float(axis[0]), float(axis[-1]))
+    axes = plot_axes.draw_map(canvas, box, shown[::-1], side, side, scale, colours)
+    axes.write_note(describe_map(values), 0.02, 0.98)
+    axes.draw_frame(title, "x (mm)", "y (mm)")
 
 
-def _local_mean(values: FloatArray) -> FloatArray:
-    """Mean over squares of 3 x 3 cells: a single wild cell does not set a scale."""
-    whole = [size // 3 * 3 for size in values.shape]
-    squares = values[: whole[0], : whole[1]].reshape(whole[0] // 3, 3, whole[1] // 3, 3)
-    return np.asarray(squares.mean(axis=(1, 3)))
-
-
-def _draw_slopes(full: FullResult, seen: SurfaceMap) -> Figure:
+def _draw_slopes(full: FullResult, seen: SurfaceMap) -> Canvas:
     """Draw the measured slopes and the residuals of the fit."""
-    figure, axes = new_sheet(11, 9, 2, 2)
+    sheet = Sheet(11, 9, 2, 2)
     grid = full.grid
     is_seen = grid.count > 0
     columns = (
@@ -351,12 +306,15 @@ def _draw_slopes(full: FullResult, seen: SurfaceMap) -> Figure:
     )
     for column, (name, measured, residual) in enumerate(columns):
         measured_mrad = np.where(is_seen, 1e3 * measured, np.nan)
-        title = f"{name} measured (mrad)"
-        show_map(axes[0, column], title, grid.axis_mm, measured_mrad, DIVERGING_MAP, even=True)
         residual_urad = np.where(is_seen, 1e6 * residual, np.nan)
-        title = f"{name} less the fit (µrad)"
-        show_map(axes[1, column], title, grid.axis_mm, residual_urad, DIVERGING_MAP, even=True)
-    return figure
+        panels = (
+            (f"{name} measured (mrad)", measured_mrad),
+            (f"{name} less the fit (µrad)", residual_urad),
+        )
+        for row, (title, values) in enumerate(panels):
+            box = sheet.box(row, column)
+            _show_map(sheet.canvas, box, title, grid.axis_mm, values, DIVERGING_MAP, even=True)
+    return sheet.canvas
 
 
 def _draw_modulation(
@@ -364,83 +322,91 @@ def _draw_modulation(
     full: FullResult,
     light: FloatArray,
     outline: rim_outline.Outline | None,
-) -> Figure:
+) -> Canvas:
     """Draw the fringe amplitude in the camera's picture beside the light with the detected rim."""
     camera = measurement.head.optics.camera
-    swing = np.full(camera.width_px * camera.height_px, np.nan, np.float32)
-    swing[full.index] = full.swing_adu
+    swing_adu = np.full(camera.width_px * camera.height_px, np.nan, np.float32)
+    swing_adu[full.index] = full.swing_adu
     step = max(1, camera.height_px // _SHOWN_PX)
-    figure, (left, right) = new_sheet(12, 5, 1, 2)
-    extent = (-0.5, camera.width_px - 0.5, camera.height_px - 0.5, -0.5)
-    picture = swing.reshape(camera.height_px, camera.width_px)[::step, ::step]
-    figure.colorbar(left.imshow(picture, extent=extent), ax=left, shrink=0.85)
-    left.set(title="fringe amplitude (ADU)", xlabel="column", ylabel="row")
-    right.imshow(light, extent=extent, cmap="gray")
-    right.set(title="light and rim", xlabel="column", ylabel="row")
+    picture = swing_adu.reshape(camera.height_px, camera.width_px)[::step, ::step].astype(float)
+    sheet = Sheet(12, 5, 1, 2)
+    columns = AxisScale(-0.5, camera.width_px - 0.5)
+    rows = AxisScale(camera.height_px - 0.5, -0.5)  # counted downwards
+
+    amplitude = fit_scale(picture)
+    left = plot_axes.draw_map(
+        sheet.canvas, sheet.box(0, 0), picture, columns, rows, amplitude, SEQUENTIAL_MAP
+    )
+    left.draw_frame("fringe amplitude (ADU)", "column", "row")
+
+    right = plot_axes.draw_map(
+        sheet.canvas, sheet.box(0, 1), light, columns, rows, fit_scale(light), "gray"
+    )
     if outline is not None:
-        right.plot(*outline.rim_px, ".", markersize=2, color="tab:orange")
-    return figure
+        rim_columns, rim_rows = outline.rim_px
+        right.draw_dots(rim_columns, rim_rows, plot_axes.SECOND_COLOUR, radius_px=1.2)
+    right.draw_frame("light and rim", "column", "row")
+    return sheet.canvas
 
 
-def _draw_frames(measurement: Measurement) -> Figure:
+def _draw_frames(measurement: Measurement) -> Canvas:
     """Draw one tile per frame, the flagged ones with their reason."""
     names = [pattern.name for pattern in measurement.head.patterns]
     reasons = {flag.frame: escape_controls(flag.reason) for flag in measurement.flags}
-    figure, axes = new_sheet(9, 0.28 * len(names) + 1.2)
-    colours = ["tab:red" if k in reasons else "tab:green" for k in range(len(names))]
-    axes.barh(range(len(names)), 1.0, color=colours, alpha=0.5)
-    for k in range(len(names)):
-        axes.text(
-            0.02, k, reasons.get(k, "as predicted"), va="center", fontsize=8, parse_math=False
-        )
-    axes.set_yticks(range(len(names)), names)
-    axes.invert_yaxis()
-    axes.set(xticks=[], xlim=(0, 1))
-    axes.set_title(
-        escape_controls(f"{measurement.verdict} {measurement.reason}")[:_LONGEST_TITLE],
-        parse_math=False,
-    )
-    return figure
+    sheet = Sheet(9, 0.28 * len(names) + 1.2)
+    axes = PlotAxes(sheet.canvas, sheet.box(), AxisScale(0, 1), AxisScale(len(names) - 0.5, -0.5))
+    for place in range(len(names)):
+        colour = plot_axes.MARK_COLOUR if place in reasons else plot_axes.GOOD_COLOUR
+        axes.draw_bar(0, 1, (place - _BAR, place + _BAR), colour, _FRAME_OPACITY)
+        axes.write_beside(f"  {reasons.get(place, 'as predicted')}", 0, place)
+    ticks = [Tick(place, name) for place, name in enumerate(names)]
+    title = escape_controls(f"{measurement.verdict} {measurement.reason}")[:_LONGEST_TITLE]
+    axes.draw_frame(title, x_ticks=(), y_ticks=ticks)
+    return sheet.canvas
 
 
-def _draw_profile(profile: radial_profile.RadialProfile) -> Figure:
+def _draw_profile(profile: radial_profile.RadialProfile) -> Canvas:
     """Draw the mean height over azimuth, and its difference from Hencky's film."""
-    figure, (upper, lower) = new_sheet(7, 6, 2, 1)
+    sheet = Sheet(7, 6, 2, 1)
+    radius_mm = profile.radius_mm
+    radius = fit_scale(radius_mm)
 
     # Above, the height.
-    upper.fill_between(
-        profile.radius_mm, profile.low_mm, profile.high_mm, alpha=0.4, label="95 % of the ring"
-    )
-    upper.plot(profile.radius_mm, profile.mean_mm, label="measured, mean over azimuth")
-    upper.plot(
-        profile.radius_mm, profile.hencky_mm, "--", label=f"Hencky, sag {profile.sag_mm:.3f} mm"
-    )
-    upper.set(
-        ylabel="height (mm)",
-        title=f"radial profile; pressure equivalent {profile.pressure_pa:.0f} Pa",
-    )
-    upper.legend(loc="best")
+    height = fit_scale(profile.low_mm, profile.high_mm, profile.hencky_mm)
+    upper = PlotAxes(sheet.canvas, sheet.box(0, 0), radius, height)
+    upper.fill_between(radius_mm, profile.low_mm, profile.high_mm)
+    upper.draw_line(radius_mm, profile.mean_mm)
+    upper.draw_line(radius_mm, profile.hencky_mm, plot_axes.SECOND_COLOUR, dashed=True)
+    legend = [("measured, mean and 95 % over azimuth", plot_axes.FIRST_COLOUR)]
+    legend.append((f"Hencky, sag {profile.sag_mm:.3f} mm", plot_axes.SECOND_COLOUR))
+    upper.draw_legend(legend, across="left")
+    title = f"radial profile; pressure equivalent {profile.pressure_pa:.0f} Pa"
+    upper.draw_frame(title, y_label="height (mm)")
 
     # Below, its difference from Hencky's bowl.
     low_um = 1e3 * (profile.low_mm - profile.hencky_mm)
     mean_um = 1e3 * (profile.mean_mm - profile.hencky_mm)
     high_um = 1e3 * (profile.high_mm - profile.hencky_mm)
-    lower.fill_between(profile.radius_mm, low_um, high_um, alpha=0.4)
-    lower.plot(profile.radius_mm, mean_um)
-    lower.set(xlabel="radius (mm)", ylabel="less Hencky (µm)")
-    return figure
+    lower = PlotAxes(sheet.canvas, sheet.box(1, 0), radius, fit_scale(low_um, high_um))
+    lower.fill_between(radius_mm, low_um, high_um)
+    lower.draw_line(radius_mm, mean_um)
+    lower.draw_frame("", "radius (mm)", "less Hencky (µm)")
+    return sheet.canvas
 
 
-def _draw_convergence(full: FullResult) -> Figure:
+def _draw_convergence(full: FullResult) -> Canvas:
     """Draw the largest change of height of each iteration."""
-    figure, axes = new_sheet(6, 4)
-    changes = full.fit.changes_mm
-    axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), "o-")
-    axes.axhline(1e-6, linestyle="--", color="tab:red")
-    axes.set(
-        xlabel="iteration",
-        ylabel="largest change of height (mm)",
-        title="bins first, then every pixel",
+    sheet = Sheet(6, 4)
+    changes_mm = np.maximum(full.fit.changes_mm, 1e-16)
+    numbers = np.arange(1.0, len(changes_mm) + 1)
+    size = fit_scale(changes_mm, _ACCEPTED_MM, spacing=Spacing.LOGARITHMIC)
+    number = fit_scale(numbers)
+    axes = PlotAxes(sheet.canvas, sheet.box(), number, size)
+    axes.draw_line([number.low, number.high], [_ACCEPTED_MM] * 2, plot_axes.MARK_COLOUR, True)
+    axes.draw_line(numbers, changes_mm)
+    axes.draw_dots(numbers, changes_mm, plot_axes.FIRST_COLOUR)
+    ticks = [Tick(value, f"{value:.0f}") for value in numbers]
+    axes.draw_frame(
+        "bins first, then every pixel", "iteration", "largest change of height (mm)", ticks
     )
-    _plain_powers(axes.yaxis)
-    return figure
+    return sheet.canvas

@@ -8,7 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from matplotlib.figure import Figure
 
-from membrane_ctrl.measure.pictures import show_map
+from membrane_ctrl.measure.matplotlib_sheet import show_map
 from membrane_ctrl.measure.rerun_recording import log_pictures, open_recording
 from membrane_ctrl.measure.result_files import write_picture
 from membrane_ctrl.model.arrays import FloatArray

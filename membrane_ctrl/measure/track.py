@@ -456,7 +456,7 @@ def _draw_track(
     path: Path, columns: dict[str, Any], change_um: FloatArray | None, residual_adu: FloatArray
 ) -> Path:
     """Draw the terms over time, the sag with its band, and what the fits left."""
-    from membrane_ctrl.measure.pictures import new_sheet
+    from membrane_ctrl.measure.matplotlib_sheet import new_sheet
 
     figure, (terms, sag, left) = new_sheet(9, 13, 3, 1)
     every = max(1, len(columns["time_s"]) // _SHOWN_FRAMES)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.measure.pictures import new_sheet
+from membrane_ctrl.measure.matplotlib_sheet import new_sheet
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 _THINNED = 400  # pixels along a side of an image in the document

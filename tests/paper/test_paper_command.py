@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.measure.pictures import new_sheet
+from membrane_ctrl.measure.matplotlib_sheet import new_sheet
 from membrane_ctrl.paper import paper_command, parts, pictures
 
 BLANK = pictures.to_png(new_sheet(3.0, 3.0)[0])

@@ -356,7 +356,7 @@ def _make_layout(count: int, picture: Path) -> "rrb.Blueprint":
 
 def _draw_modes(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
     """Draw the frequencies over time and the shapes of the strongest modes."""
-    from membrane_ctrl.measure.pictures import new_sheet
+    from membrane_ctrl.measure.matplotlib_sheet import new_sheet
 
     shown = modes[:_SHOWN]
     figure, axes = new_sheet(11, 3 * len(shown), len(shown), 2)
