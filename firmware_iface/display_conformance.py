@@ -38,7 +38,14 @@ class DisplayBench:
         self.lit: Levels | None = None
 
     def make(self, width_px: int, height_px: int) -> Display:
-        """Make a driver that is configured for a panel of this size, not yet connected."""
+        """Make a driver that is configured for a panel of this size, not yet connected.
+
+        Parameters
+        ----------
+        width_px, height_px : int
+            Size in the configuration. A check also gives another one than the panel's, which `open`
+            must refuse.
+        """
         raise NotImplementedError
 
     def unplug(self) -> None:

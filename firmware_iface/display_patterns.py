@@ -106,7 +106,18 @@ def compute_pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.
 
 
 def make_checkerboard(width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Black and white pixel by pixel, which no scaler reproduces."""
+    """Black and white pixel by pixel, which no scaler reproduces.
+
+    Parameters
+    ----------
+    width_px, height_px : int
+        Size of the panel.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height_px, width_px)
+        Levels 0 and 255; the upper left pixel is black.
+    """
     return np.asarray(np.indices((height_px, width_px)).sum(axis=0) % 2 * 255, np.uint8)
 
 

@@ -11,10 +11,18 @@ _LEAST_CONTRAST = 3.0
 
 
 def explain_exposure(white: Pixels, black: Pixels, full_scale_adu: int, exposure_ms: float) -> str:
-    """The problem and its remedy, from frames (H, W) of a white and a black screen;
-    empty if none.
+    """The problem of an exposure and its remedy, in one line; empty if there is none.
+
+    Parameters
+    ----------
+    white, black : ndarray of int, shape (H, W)
+        One frame of a white screen and one of a black screen, camera counts.
+    full_scale_adu : int
+        Largest count of a pixel, 255 for 8 bits.
+    exposure_ms : float
+        With which both were taken; a better one is proposed in proportion.
     """
-    # Brightest and darkest light without single pixels.
+    # Quantiles instead of extremes: dust and glints are single pixels.
     saturated = float(np.mean(white >= full_scale_adu))
     bright = float(np.quantile(white, 0.99))
     dark = float(np.quantile(black, 0.99))

@@ -11,7 +11,15 @@ class ConformanceError(Exception):
 
 
 def require(right: bool, problem: str) -> None:
-    """Raise ConformanceError with the problem unless the device or driver behaved correctly."""
+    """Raise ConformanceError unless the device or driver behaved correctly.
+
+    Parameters
+    ----------
+    right : bool
+        Whether it did.
+    problem : str
+        What is wrong otherwise, as a part of a sentence, with the measured value.
+    """
     if not right:
         raise ConformanceError(problem)
 
@@ -62,5 +70,15 @@ def require_identity(device: OpticalDevice) -> None:
 
 
 def overrides(bench: type, base: type, methods: Iterable[str]) -> bool:
-    """Whether a bench overrides all these methods of its base, i.e. can bring about the faults."""
+    """Whether a bench can bring about certain faults, which its base leaves to it.
+
+    Parameters
+    ----------
+    bench : type
+        Class of a driver's author.
+    base : type
+        Class of this package from which it inherits; there the methods raise NotImplementedError.
+    methods : iterable of str
+        Names of the methods that the faults need, such as `unplug`; without any, True.
+    """
     return all(getattr(bench, method) is not getattr(base, method) for method in methods)

@@ -47,7 +47,25 @@ KINDS = (INSTRUMENTS, CAMERAS, SCREENS)
 
 
 def load_built_in(name: str, kind: DriverKind) -> Any:
-    """Import the driver class of this name in this package; no other package can take its place."""
+    """Import the driver class of this name in this package; no other package can take its place.
+
+    Parameters
+    ----------
+    name : str
+        A key of `kind.built_in`, such as `mks_937b`.
+    kind : DriverKind
+        Of instruments, cameras or screens.
+
+    Returns
+    -------
+    type
+        The class, not yet made into a driver. What it imports (OpenCV, pygame) is imported now.
+
+    Raises
+    ------
+    ImportError
+        An extra that the driver needs is not installed.
+    """
     from importlib.metadata import EntryPoint
 
     return EntryPoint(name, kind.built_in[name], kind.group).load()
@@ -84,8 +102,19 @@ def load_driver(name: str, kind: DriverKind) -> Any:
 
 
 def load_emulator(name: str, kind: DriverKind) -> Any:
-    """Import the emulator class of the device of this driver.
-    Raises ValueError as `load_driver`.
+    """Import the emulator class of the device of a driver that another package installs.
+
+    Parameters
+    ----------
+    name : str
+        Of the driver, under which its package also names the emulator.
+    kind : DriverKind
+        Its `emulators` is the entry point group.
+
+    Raises
+    ------
+    ValueError
+        None or several packages install one, or it cannot be loaded.
     """
     return _load_entry(
         name, f"{kind.name.removesuffix('driver')}emulator", list_installed(kind.emulators)
@@ -93,7 +122,16 @@ def load_emulator(name: str, kind: DriverKind) -> Any:
 
 
 def has_emulator(name: str, kind: DriverKind) -> bool:
-    """Return whether an emulator of the device of this driver is installed."""
+    """Return whether an emulator of a driver's device is installed; nothing is imported.
+
+    Parameters
+    ----------
+    name : str
+        Of a driver that another package installs. The emulators of this package are no entry
+        points, and are not found here.
+    kind : DriverKind
+        Of instruments, cameras or screens.
+    """
     return any(entry.name == name for entry in list_installed(kind.emulators))
 
 

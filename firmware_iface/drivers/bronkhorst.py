@@ -68,7 +68,15 @@ class ParameterPort(Protocol):
         """A text."""
 
     async def write(self, parameter: InstrumentParameter, value: int) -> None:
-        """Write, and verify that the instrument has it."""
+        """Write, and verify that the instrument has it.
+
+        Parameters
+        ----------
+        parameter : InstrumentParameter
+            One of kind `u8` or `u16`.
+        value : int
+            In the instrument's counts: for a setpoint, 32000 is 100 % of the capacity.
+        """
 
     async def close(self) -> None:
         """Disconnect. Never raises."""
@@ -135,6 +143,8 @@ class BronkhorstFlow:
         DeviceRefusedError.
         """
         identity = await identify(self._port, FLOW_CONTROLLERS, self._serial)
+        # The setpoint first: in the mode "bus" the valve follows it at once, and the instrument may
+        # still have the one of an earlier program.
         await self._port.write(SETPOINT, 0)
         await self._port.write(CONTROL_MODE, BUS_SETPOINT)
         mode = await self._port.number(CONTROL_MODE)
@@ -156,9 +166,8 @@ class BronkhorstFlow:
 
     async def close(self) -> None:
         """Close the valve and disconnect. Never raises."""
-        with contextlib.suppress(
-            LinkError
-        ):  # out of reach: it keeps its last setpoint (see the class)
+        # out of reach: it keeps its last setpoint (see the class)
+        with contextlib.suppress(LinkError):
             await self._port.write(SETPOINT, 0)
         await self._port.close()
 

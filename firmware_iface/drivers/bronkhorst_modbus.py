@@ -10,7 +10,11 @@ MANUAL = "Bronkhorst 9.17.035, section 4.4.6"
 
 
 def register_of(parameter: InstrumentParameter) -> tuple[int, int]:
-    """First register and number of registers of a parameter."""
+    """First register on the wire (from 0) and number of registers of a parameter.
+
+    Source: manual 9.17.035, section 4.4.6: integers have one register at 32 process + number;
+    longer parameters have eight registers each from 0x8000 + 256 process + 8 number.
+    """
     if parameter.kind in ("u8", "u16"):
         return 32 * parameter.process + parameter.number, 1
     words = 2 if parameter.kind == "f32" else (parameter.chars + 1) // 2
@@ -56,7 +60,15 @@ class ModbusParameters:
             ) from error
 
     async def write(self, parameter: InstrumentParameter, value: int) -> None:
-        """Write one register; the echo carries address and value back. Raises LinkError."""
+        """Write one register; the echo carries address and value back. Raises LinkError.
+
+        Parameters
+        ----------
+        parameter : InstrumentParameter
+            One of kind `u8` or `u16`: others have several registers.
+        value : int
+            In the instrument's counts: for a setpoint, 32000 is 100 % of the capacity.
+        """
         await self._link.write_register(register_of(parameter)[0], value)
 
     async def close(self) -> None:

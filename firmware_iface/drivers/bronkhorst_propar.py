@@ -130,7 +130,15 @@ def make_request(parameters: Sequence[InstrumentParameter]) -> bytes:
 
 
 def write_data(parameter: InstrumentParameter, value: int) -> bytes:
-    """Data that writes a number and wants an answer."""
+    """Data of a message that writes a number; the instrument answers it with a status.
+
+    Parameters
+    ----------
+    parameter : InstrumentParameter
+        One of kind `u8` or `u16`.
+    value : int
+        In the instrument's counts, big end first on the wire.
+    """
     kind = _TYPES[parameter.kind]
     return bytes([WRITE, parameter.process, parameter.number | kind]) + struct.pack(
         _PROPAR_FORMATS[kind], value
@@ -225,7 +233,15 @@ class ProparParameters:
         return first.split(b"\0")[0].decode("ascii", "replace").strip()
 
     async def write(self, parameter: InstrumentParameter, value: int) -> None:
-        """Write, and read back. Raises LinkError."""
+        """Write, and read back, because ProPar has no checksum. Raises LinkError.
+
+        Parameters
+        ----------
+        parameter : InstrumentParameter
+            One of kind `u8` or `u16`.
+        value : int
+            In the instrument's counts: for a setpoint, 32000 is 100 % of the capacity.
+        """
         answer = await self._transact(write_data(parameter, value), f"writing {parameter.name}")
         if answer[0] != STATUS:
             raise LinkError(
@@ -263,7 +279,8 @@ class ProparParameters:
     async def _transact(self, data: bytes, what: str) -> bytes:
         """Data of the answer with the question's sequence number; a status other than 0 raises."""
         what = f"{self.name}: {what}"
-        # A second question fences off the answers to the first, should it be late.
+        # The fence is a harmless request with a sequence number of its own: its answer shows that
+        # no answer to an earlier question is still to come.
         question = self._make_question(data, what)
         fence = self._make_question(
             make_request([MEASURE]), f"{self.name}: asking again after a loss"

@@ -35,7 +35,20 @@ class VideoCapture(Protocol):
         """Whether there was a frame, and the frame."""
 
     def set(self, prop: int, value: float) -> bool:
-        """Whether the property is known to the camera."""
+        """Set a property.
+
+        Parameters
+        ----------
+        prop : int
+            One of OpenCV's `CAP_PROP_...`.
+        value : float
+            In the driver's unit, which for exposures differs between systems.
+
+        Returns
+        -------
+        bool
+            Whether the camera knows the property; not whether it took the value: read it back.
+        """
 
     def get(self, prop: int) -> float:
         """A property."""

@@ -48,7 +48,24 @@ class EmulatedGpio:
     def request_lines(
         self, chip: str, consumer: str, config: Mapping[int, LineSettings]
     ) -> "EmulatedRequest":
-        """Request lines. Raises OSError, and ValueError for lines that the chip does not have."""
+        """Request lines, as `gpiod.request_lines`.
+
+        Parameters
+        ----------
+        chip : str
+            Its device, such as `/dev/gpiochip0`.
+        consumer : str
+            Name of the program, which the kernel shows; ignored.
+        config : mapping of int to LineSettings
+            By number of the line on its chip.
+
+        Raises
+        ------
+        OSError
+            The present failure.
+        ValueError
+            The chip does not have a line.
+        """
         self.check()
         if missing := [line for line in config if (chip, line) not in self.contacts]:
             raise ValueError(f"line {missing[0]} does not exist")
@@ -93,6 +110,9 @@ class EmulatedRequest:
         """The electrical level: the contact's if it is closed,
         otherwise that of the pull resistor.
         """
+        # The wiring follows from the settings, as a person would wire it: a contact to ground for a
+        # line that is active when low, else to the supply. A pull resistor in the other direction
+        # makes a cut wire look open.
         to_ground = settings.active_low
         if self._gpio.contacts[self._chip, line] == "closed":
             return not to_ground

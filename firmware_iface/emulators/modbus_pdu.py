@@ -34,14 +34,43 @@ class RegisterTable(Protocol):
     """The registers that function codes read and write."""
 
     def read(self, address: int, count: int) -> list[int]:
-        """Words. Raises RegisterRefusal."""
+        """Words of one instant. Raises RegisterRefusal.
+
+        Parameters
+        ----------
+        address : int
+            First register on the wire, from 0.
+        count : int
+            Registers, 1..125; the caller has checked it.
+        """
 
     def write(self, address: int, words: Sequence[int]) -> None:
-        """All of it or nothing. Raises RegisterRefusal."""
+        """Write all of them or none. Raises RegisterRefusal.
+
+        Parameters
+        ----------
+        address : int
+            First register on the wire, from 0.
+        words : sequence of int
+            1..123 words, unsigned 16 bit; the caller has checked their number.
+        """
 
 
 def answer_request(pdu: bytes, table: RegisterTable) -> bytes:
-    """The answer to a request: function code and data, or an exception."""
+    """The answer to a request of the functions 3, 6, 16 and 23.
+
+    Parameters
+    ----------
+    pdu : bytes
+        Function code and data, without unit, header or CRC; at least one byte.
+    table : RegisterTable
+        What is read and written.
+
+    Returns
+    -------
+    bytes
+        The PDU of the answer: function code and data, or an exception.
+    """
     try:
         return pdu[:1] + _answer_function(pdu[0], pdu[1:], table)
     except RegisterRefusal as refusal:
@@ -51,7 +80,15 @@ def answer_request(pdu: bytes, table: RegisterTable) -> bytes:
 
 
 def exception_pdu(pdu: bytes, code: int) -> bytes:
-    """The exception answer to a request."""
+    """The exception answer to a request.
+
+    Parameters
+    ----------
+    pdu : bytes
+        The request; only its function code is used.
+    code : int
+        One of this module's, such as `ILLEGAL_ADDRESS`.
+    """
     return bytes([pdu[0] | 0x80, code])
 
 

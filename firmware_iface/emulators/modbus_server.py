@@ -95,6 +95,7 @@ class _Connection(asyncio.Protocol):
             self._transport.abort()
 
     def data_received(self, data: bytes) -> None:
+        # TCP has no borders between messages: the header gives the length, from the unit on.
         self._buffer += data
         while len(self._buffer) > _HEADER.size:
             transaction, protocol, length, unit = _HEADER.unpack_from(self._buffer)

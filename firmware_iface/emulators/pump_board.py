@@ -257,11 +257,22 @@ class BoardState:
     def write(self, address: int, words: Sequence[int]) -> None:
         """Write whole registers, all or none.
 
-        Raises RegisterRefusal: illegal address for a read-only or unknown register or for a part of
-        one, illegal value outside the limits and for disarming the watchdog while the pump is
-        commanded. With claims, illegal address for a part of a block, busy while another holds the
-        board, illegal value without any claim.
+        Parameters
+        ----------
+        address : int
+            First register on the wire, from 0.
+        words : sequence of int
+            Unsigned 16 bit; the map states how they encode the registers' values.
+
+        Raises
+        ------
+        RegisterRefusal
+            Illegal address for a read-only or unknown register or for a part of one; illegal value
+            outside the limits, and for disarming the watchdog while the pump is commanded. With
+            claims (map version 2 and later): illegal address for a part of a block, busy while
+            another holds the board, illegal value without any claim.
         """
+        # Everything is checked before anything is stored, so that a refused write changes nothing.
         target = self._find_written_block(address, len(words))
         written = target.decode(words)
         if not all(register.allows(written[register.name]) for register in target.registers):
@@ -313,11 +324,14 @@ class BoardState:
         return make_block("write", "rw", "", found)
 
     def _apply_settings(self, written: dict[str, float], *, whole_command: bool) -> None:
+        # The watchdog is fed by a whole command with a new heartbeat: a program that repeats one
+        # old message must not keep the pump running.
         arms = bool(written.get("watchdog_arm")) and not self._settable["watchdog_arm"]
         feeds = whole_command and written["heartbeat"] != self._heartbeat_fed
         self._settable |= written
         if feeds:
             self._heartbeat_fed = written["heartbeat"]
+        # `clear_faults` is a mask: it clears the named faults only, and the pump starts at zero.
         cleared = int(self._settable["clear_faults"]) & self._faults
         if cleared:
             self._faults &= ~cleared
@@ -376,7 +390,15 @@ class BoardPlant(Protocol):
         """The newest sample of the sensors; called every 10 ms and at every request."""
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
-        """Drive pump and vent, both 0..1; called when one of them changes."""
+        """Drive pump and vent; called when one of them changes.
+
+        Parameters
+        ----------
+        pump_fraction : float
+            0 (off) to 1 (full power), after the board's own limits.
+        vent_fraction : float
+            0 (closed) to 1 (open).
+        """
 
 
 class PumpBoardEmulator:

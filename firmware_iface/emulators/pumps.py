@@ -5,6 +5,7 @@ EL-PRESS, as Modbus registers or as a ProPar device on a serial line.
 """
 
 import asyncio
+import math
 import re
 import struct
 from collections.abc import Callable, Sequence
@@ -198,10 +199,26 @@ class Instrument:
         }[parameter]
 
     def write(self, parameter: bronkhorst_parameter.InstrumentParameter, raw: bytes) -> bool:
-        """Take a setting; False when the value is impossible."""
+        """Store a setting.
+
+        Parameters
+        ----------
+        parameter : InstrumentParameter
+            One of `WRITABLE`; `fsetpoint` sets the same as `setpoint`, in the capacity's unit.
+        raw : bytes
+            Its value, big end first, as long as its kind.
+
+        Returns
+        -------
+        bool
+            False if the value is impossible: nothing is stored.
+        """
         if parameter == bronkhorst.FSETPOINT:
             parameter = bronkhorst.SETPOINT
-            value = round(struct.unpack(">f", raw)[0] / self._capacity * bronkhorst.FULL_SCALE)
+            (flow,) = struct.unpack(">f", raw)
+            if not math.isfinite(flow):
+                return False
+            value = round(flow / self._capacity * bronkhorst.FULL_SCALE)
         else:
             (value,) = struct.unpack(_FORMATS[parameter.kind], raw)
         most = bronkhorst.FULL_SCALE if parameter == bronkhorst.SETPOINT else 255
@@ -219,7 +236,16 @@ class BronkhorstRegisters:
         self._instrument = instrument
 
     def read(self, address: int, count: int) -> list[int]:
-        """Words. Raises RegisterRefusal."""
+        """Words of one instant. Raises RegisterRefusal if a register does not exist.
+
+        Parameters
+        ----------
+        address : int
+            First register on the wire, from 0.
+        count : int
+            Registers; they may span several parameters.
+        """
+        # Only the parameters that the span touches: each read asks the instrument.
         words: dict[int, int] = {}
         for parameter in bronkhorst.ALL:
             first, length = bronkhorst_modbus.register_of(parameter)
@@ -233,7 +259,15 @@ class BronkhorstRegisters:
             raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_ADDRESS) from None
 
     def write(self, address: int, words: Sequence[int]) -> None:
-        """One parameter. Raises RegisterRefusal."""
+        """Write one parameter. Raises RegisterRefusal.
+
+        Parameters
+        ----------
+        address : int
+            First register of the parameter, on the wire, from 0.
+        words : sequence of int
+            All its registers, unsigned 16 bit; a part of a parameter is an illegal address.
+        """
         for parameter in WRITABLE:
             if bronkhorst_modbus.register_of(parameter) == (address, len(words)):
                 raw = struct.pack(f">{len(words)}H", *words)

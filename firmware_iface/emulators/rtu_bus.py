@@ -40,10 +40,13 @@ class RtuBusEmulator(SerialDevice):
         else:
             self._buffer = self._buffer + data
         self._received_s = now_s
+        # A frame carries no length: it is complete as soon as its last two bytes are the CRC of the
+        # rest. A half one that happens to pass is one in 65536.
         frame = self._buffer = self._buffer[-_LONGEST:]
-        if len(frame) < _SHORTEST or struct.unpack("<H", frame[-2:])[0] != compute_bitwise_crc(
-            frame[:-2]
-        ):
+        if len(frame) < _SHORTEST:
+            return
+        (received_crc,) = struct.unpack("<H", frame[-2:])
+        if received_crc != compute_bitwise_crc(frame[:-2]):
             return
         self._buffer = b""
         unit, pdu = frame[0], frame[1:-2]
@@ -51,7 +54,15 @@ class RtuBusEmulator(SerialDevice):
             self.send_answer(body + struct.pack("<H", compute_bitwise_crc(body)))
 
     def answer(self, unit: int, pdu: bytes) -> bytes:
-        """Unit id and answer PDU to a request; empty for none."""
+        """Unit id and PDU of the answer, without CRC; empty for no answer.
+
+        Parameters
+        ----------
+        unit : int
+            Of the slave; one of this bus.
+        pdu : bytes
+            Function code and data of the request.
+        """
         echoed = self._echo_test and pdu[0] == DIAGNOSTICS and pdu[1:3] == b"\0\0"
         reply = pdu if echoed else self._slaves[unit](pdu)
         return bytes([unit]) + reply if reply else b""

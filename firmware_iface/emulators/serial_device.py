@@ -70,7 +70,15 @@ class SerialDevice:
         self.received(data)
 
     def send_answer(self, answer: bytes, delay_s: float = 0.0) -> None:
-        """Send an answer after the bytes being sent."""
+        """Send an answer after the bytes being sent.
+
+        Parameters
+        ----------
+        answer : bytes
+            As on the wire. The other end gets it when its last byte would be in.
+        delay_s : float
+            Time in which the device prepares it; the wire is free meanwhile.
+        """
         begin_s = max(asyncio.get_running_loop().time() + delay_s, self._free_s)
         self._free_s = begin_s + len(answer) * self.settings.char_s
         self._call_later(self._free_s, self._transmit_bytes, answer)
@@ -130,10 +138,7 @@ class PtyWire:
         """Plug in. Raises OSError, for example when the path is taken."""
         device_end, program_end = os.openpty()
         # the second is kept open, or the first would report a hang-up
-        self._ends = (
-            device_end,
-            program_end,
-        )
+        self._ends = (device_end, program_end)
         tty.setraw(program_end)
         line = termios.tcgetattr(program_end)
         line[_SPEED] = line[_SPEED + 1] = _read_baud_rate(self._device)

@@ -166,21 +166,54 @@ class Aravis:
         return str(found, "utf-8", errors="replace")
 
     def set_double(self, instance: int, name: str, value: float) -> None:
-        """Set a property of type double."""
+        """Set a property of type double.
+
+        Parameters
+        ----------
+        instance : int
+            Address of the GObject, as `call` returns it.
+        name : str
+            Of the property, with dashes, such as `gvsp-lost-ratio`.
+        value : float
+            In the property's own unit.
+        """
         self._set_property(instance, name, _G_TYPE_DOUBLE, "g_value_set_double", value)
 
     def set_int(self, instance: int, name: str, value: int) -> None:
-        """Set a property of type int."""
+        """Set a property of type int.
+
+        Parameters
+        ----------
+        instance : int
+            Address of the GObject, as `call` returns it.
+        name : str
+            Of the property, with dashes, such as `socket-buffer-size`.
+        value : int
+            In the property's own unit.
+        """
         self._set_property(instance, name, _G_TYPE_INT, "g_value_set_int", value)
 
     def fix_socket_buffer(self, stream: int, size_bytes: int) -> None:
-        """Let a GigE Vision stream keep packets of this many bytes while it is busy."""
+        """Give the UDP socket of a GigE Vision stream a buffer of a fixed size.
+
+        Packets that arrive while the stream's thread does not run wait there; a buffer that is full
+        loses them.
+
+        Parameters
+        ----------
+        stream : int
+            Address of the ArvGvStream.
+        size_bytes : int
+            Requested; the kernel limits it to `net.core.rmem_max`.
+        """
         kind = self.call("arv_gv_stream_socket_buffer_get_type")
         # ..._FIXED, arvgvstream.h
         self._set_property(stream, "socket-buffer", kind, "g_value_set_enum", 0)
         self.set_int(stream, "socket-buffer-size", size_bytes)
 
     def _set_property(self, instance: int, name: str, kind: int, setter: str, value: float) -> None:
+        # glib's variadic `g_object_set` needs the C types of its arguments; a GValue carries its
+        # type with it.
         holder = _GValue()
         self.call("g_value_init", ctypes.byref(holder), kind)
         self.call(setter, ctypes.byref(holder), value)

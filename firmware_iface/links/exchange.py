@@ -148,6 +148,8 @@ class SerialExchange:
         LinkDownError
             The line is closed or went away.
         """
+        # Two locks make the turns fair between devices: a device has one question at a time in the
+        # queue for the line, however many of its callers wait.
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
             self._in_flight = asyncio.create_task(self._transact(question, timeout_s, fence, key))
@@ -164,7 +166,8 @@ class SerialExchange:
     ) -> bytes:
         try:
             self._require_open(question.what)
-            # Rule 2: silence; rule 3: after a loss, the fence
+            # Rule 2: silence. Rule 3: after a loss, the fence, for each device of the line the
+            # next time that it is asked. `_sure` holds the devices that need none.
             await self._wait_for_silence(question.what, timeout_s)
             if key not in self._sure and fence is not None:
                 await self._ask_once(fence, timeout_s)
@@ -192,6 +195,8 @@ class SerialExchange:
 
     async def _wait_for_silence(self, what: str, timeout_s: float) -> None:
         """Wait for the silence that is due."""
+        # Bytes that arrive during the wait move its end. The wait may last two silences and the
+        # time of one answer; on a line that talks longer there is no silence to find.
         loop = asyncio.get_running_loop()
         give_up_s = loop.time() + 2 * self._quiet_s + timeout_s
         while True:
@@ -207,6 +212,8 @@ class SerialExchange:
 
     async def _ask_once(self, question: WireQuestion, timeout_s: float) -> bytes:
         self._require_open(question.what)
+        # An echo that was found between two questions is reported by the second one, before
+        # anything else is sent.
         if self._echoes:
             self._echoes = False
             self._repeated = b""
@@ -226,6 +233,8 @@ class SerialExchange:
             await asyncio.wait([answer], timeout=timeout_s + wire_s)
         finally:
             self._answer = None
+        # No answer in time. The question stays in `_abandoned`, so that its late answer is
+        # recognised and the next error can state how late the device is.
         if not answer.done():
             if self._buffer == question.data:
                 raise DeviceRefusedError(f"{question.what}: {_ONLY_ECHO}")
@@ -237,6 +246,8 @@ class SerialExchange:
         self._late.note_in_time()
         self._abandoned.clear()
         received_bytes = answer.result()
+        # The answer equals the question: a device that confirms by repeating, or an echo. Only
+        # bytes that follow can show which.
         if self._buffer == question.data:
             self._repeated = question.data
         else:
@@ -263,14 +274,14 @@ class SerialExchange:
 
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
-        # Bytes that belong to no present question: a late answer, an echo, or noise.
         self._last_byte_s = asyncio.get_running_loop().time()
         is_late = self._completes_abandoned(data)
+        # Without a question these bytes are a late answer, an echo, or noise.
         if self._answer is None or self._answer.done() or self._question is None:
             self._noisy |= bool(data.strip(self._blank))  # unsolicited
             self._echoes |= self._is_second_copy(data)
             return
-        # More than the answer and an echo can have.
+        # More bytes than the answer and an echo can have end the question.
         question = self._question
         self._buffer += data
         if len(self._buffer) > question.answer_bytes + _EXTRA_BYTES_MAX:
@@ -278,13 +289,15 @@ class SerialExchange:
                 LinkError(f"{self.port.name}: {len(self._buffer)} bytes without an answer")
             )
             return
-        # An adapter that echoes gives the question first.
+        # An adapter that echoes delivers the question's own bytes first. They are an echo for sure
+        # as soon as more follows, unless the device's answer may repeat the question.
         is_echo = self._buffer.startswith(question.data)
         if is_echo and not question.answer_repeats:
             if len(self._buffer) > len(question.data):
                 self._answer.set_exception(DeviceRefusedError(f"{question.what}: {_ECHO}"))
             return
-        # A whole answer ends the exchange; a bad one is explained by the likeliest cause.
+        # A whole answer ends the exchange. A wrong one is explained by its likeliest cause: an
+        # echo, a late answer to an earlier question, else what the protocol found.
         try:
             answer = question.extract_answer(self._buffer)
         except LinkError as error:
@@ -306,6 +319,8 @@ class SerialExchange:
 
     def _completes_abandoned(self, data: bytes) -> bool:
         """Whether these bytes complete the answer to an abandoned question; notes its delay."""
+        # Each abandoned question collects the bytes for itself, oldest first, because a late answer
+        # may come in pieces and across the next question.
         for abandoned in self._abandoned:
             abandoned.received_bytes = (abandoned.received_bytes + data)[-_EXTRA_BYTES_MAX:]
             try:

@@ -47,7 +47,10 @@ _BUSY = 6
 
 
 class ModbusLink(Protocol):
-    """One Modbus device over any wire: what the drivers need. All raise LinkError kinds."""
+    """One Modbus device over any wire: what the drivers need. All raise LinkError kinds.
+
+    Addresses are those on the wire, from 0; manuals often number registers from 1, or from 40001.
+    """
 
     @property
     def name(self) -> str:
@@ -61,16 +64,58 @@ class ModbusLink(Protocol):
         """Connect again."""
 
     async def read_holding(self, address: int, count: int) -> list[int]:
-        """Function code 3."""
+        """Read holding registers (function code 3).
+
+        Parameters
+        ----------
+        address : int
+            First register on the wire, from 0.
+        count : int
+            Registers, 1..125.
+
+        Returns
+        -------
+        list of int
+            `count` words, unsigned 16 bit.
+        """
 
     async def read_input(self, address: int, count: int) -> list[int]:
-        """Function code 4."""
+        """Read input registers (function code 4).
+
+        Parameters
+        ----------
+        address : int
+            First register on the wire, from 0.
+        count : int
+            Registers, 1..125.
+
+        Returns
+        -------
+        list of int
+            `count` words, unsigned 16 bit.
+        """
 
     async def write_register(self, address: int, word: int) -> None:
-        """Function code 6; the echo is checked."""
+        """Write one holding register (function code 6); the echo is checked.
+
+        Parameters
+        ----------
+        address : int
+            The register on the wire, from 0.
+        word : int
+            Unsigned 16 bit.
+        """
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
-        """Function code 16; the echo is checked."""
+        """Write holding registers in one request (function code 16); the echo is checked.
+
+        Parameters
+        ----------
+        address : int
+            First register on the wire, from 0.
+        words : sequence of int
+            1..123 words, unsigned 16 bit.
+        """
 
     async def close(self) -> None:
         """Close; a request in flight fails at once."""
@@ -91,10 +136,26 @@ class ModbusBitLink(Protocol):
         """Connect again."""
 
     async def read_coils(self, address: int, count: int) -> list[bool]:
-        """Function code 1."""
+        """Read coils, the bits that can also be written (function code 1).
+
+        Parameters
+        ----------
+        address : int
+            First coil on the wire, from 0.
+        count : int
+            Coils, 1..2000.
+        """
 
     async def read_discrete(self, address: int, count: int) -> list[bool]:
-        """Function code 2."""
+        """Read discrete inputs (function code 2).
+
+        Parameters
+        ----------
+        address : int
+            First input on the wire, from 0.
+        count : int
+            Inputs, 1..2000.
+        """
 
     async def close(self) -> None:
         """Close; a request in flight fails at once."""

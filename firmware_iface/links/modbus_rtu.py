@@ -54,7 +54,15 @@ def _make_crc_entry(index: int) -> int:
 
 
 def rtu_frame(unit_id: int, pdu: bytes) -> bytes:
-    """Unit, PDU and CRC."""
+    """A frame as sent: unit, PDU and CRC.
+
+    Parameters
+    ----------
+    unit_id : int
+        Address of the device on its bus, 1..247 (0 is a broadcast, which nobody answers).
+    pdu : bytes
+        Function code and its data, at most 253 bytes.
+    """
     body = bytes([unit_id]) + pdu
     return body + struct.pack("<H", compute_crc16(body))
 
@@ -69,6 +77,7 @@ def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
     options = {}
     if parts.query:
         options = dict(parse_qsl(parts.query, strict_parsing=True))
+    # A path stands after three slashes, a USB identity where other URLs have the host.
     port = parts.netloc + parts.path
     if (
         parts.scheme != "rtu"
@@ -91,6 +100,7 @@ class RtuBus:
     """
 
     def __init__(self, port: serial_port.SerialPort, quiet_s: float = 0.2) -> None:
+        # Frames end with a silence of 3.5 characters (section 2.5.1.1).
         baud = port.settings.baud
         if baud > _FAST_BAUD:
             gap_s = _FAST_GAP_S
@@ -171,14 +181,14 @@ class GuardedModbusRtu:
         Parameters
         ----------
         address : int
-            Of the first.
+            First register on the wire, from 0.
         count : int
-            How many.
+            Registers, 1..125.
 
         Returns
         -------
         list of int
-            Their words.
+            `count` words, unsigned 16 bit.
 
         Raises
         ------
@@ -192,20 +202,51 @@ class GuardedModbusRtu:
         return await self._read(modbus_link.READ_HOLDING, address, count)
 
     async def read_input(self, address: int, count: int) -> list[int]:
-        """Read input registers (function code 4). Raises as `read_holding`."""
+        """Read input registers (function code 4). Raises as `read_holding`.
+
+        Parameters
+        ----------
+        address : int
+            First register on the wire, from 0.
+        count : int
+            Registers, 1..125.
+        """
         return await self._read(modbus_link.READ_INPUT, address, count)
 
     async def read_coils(self, address: int, count: int) -> list[bool]:
-        """Read coils (function code 1). Raises as `read_holding`."""
+        """Read coils (function code 1). Raises as `read_holding`.
+
+        Parameters
+        ----------
+        address : int
+            First coil on the wire, from 0.
+        count : int
+            Coils, 1..2000.
+        """
         return await self._read_bits(modbus_link.READ_COILS, address, count)
 
     async def read_discrete(self, address: int, count: int) -> list[bool]:
-        """Read discrete inputs (function code 2). Raises as `read_holding`."""
+        """Read discrete inputs (function code 2). Raises as `read_holding`.
+
+        Parameters
+        ----------
+        address : int
+            First input on the wire, from 0.
+        count : int
+            Inputs, 1..2000.
+        """
         return await self._read_bits(modbus_link.READ_DISCRETE, address, count)
 
     async def write_register(self, address: int, word: int) -> None:
         """Write one holding register (function code 6) and check the echo. Raises as
-        `read_holding`.
+        `write_registers`.
+
+        Parameters
+        ----------
+        address : int
+            The register on the wire, from 0.
+        word : int
+            Unsigned 16 bit.
         """
         what = f"{self.name}: writing {address}"
         pdu = struct.pack(">BHH", modbus_link.WRITE_SINGLE, address, word)
@@ -218,9 +259,9 @@ class GuardedModbusRtu:
         Parameters
         ----------
         address : int
-            Of the first.
+            First register on the wire, from 0.
         words : sequence of int
-            Their values.
+            1..123 words, unsigned 16 bit.
 
         Raises
         ------
@@ -294,6 +335,7 @@ class GuardedModbusRtu:
     ) -> exchange.WireQuestion:
         def extract_answer(received_bytes: bytes) -> bytes | None:
             reply = extract_reply(received_bytes, self._unit_id, pdu[0], answer_bytes, what)
+            # The fence must come back as sent: an echo with another number answers an earlier one.
             if (
                 exactly
                 and reply is not None

@@ -43,8 +43,7 @@ logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 _UNANSWERED_MAX = 3
 # Bytes from the device for one request: a reply has 260 at most, and late ones of earlier requests
 # may precede it. A peer that sends without end would keep the library, and so the control process,
-# busy for
-# seconds.
+# busy for seconds.
 _REPLY_BYTES_MAX = 1024
 _REMEMBERED_REQUESTS = 16
 
@@ -100,13 +99,12 @@ class GuardedModbusTcp:
         self._back_off.attempted(self._clock())
         self._request_times_s.clear()
 
-        # The library neither repeats a request nor connects by itself: a repeated write could move
-        # gas twice
-
         def changed(connected: bool) -> None:
             if not connected:
                 _fail_in_flight(client, f"{self.name}: connection lost")
 
+        # The library must neither repeat a request nor connect by itself: a repeated write could
+        # move gas twice.
         client = AsyncModbusTcpClient(
             self._host,
             port=self._port,
@@ -128,6 +126,9 @@ class GuardedModbusTcp:
         """Give up the connection to a peer that sends more than a device does, before the library
         reads it. Measure how late its replies are.
         """
+        # The library calls `data_received` with the bytes of each segment: this stands in front of
+        # it. A frame begins with its transaction number (16 bit, big end first), and a reply of a
+        # device usually arrives as one segment.
         read = client.ctx.data_received
         self._received_bytes = 0
 
@@ -165,14 +166,14 @@ class GuardedModbusTcp:
         Parameters
         ----------
         address : int
-            Of the first.
+            First register on the wire, from 0.
         count : int
-            How many.
+            Registers, 1..125.
 
         Returns
         -------
         list of int
-            Their words.
+            `count` words, unsigned 16 bit.
 
         Raises
         ------
@@ -186,20 +187,51 @@ class GuardedModbusTcp:
         return await self._read(READ_HOLDING, address, count)
 
     async def read_input(self, address: int, count: int) -> list[int]:
-        """Read `count` input registers (function code 4). Raises as `read_holding`."""
+        """Read input registers (function code 4). Raises as `read_holding`.
+
+        Parameters
+        ----------
+        address : int
+            First register on the wire, from 0.
+        count : int
+            Registers, 1..125.
+        """
         return await self._read(READ_INPUT, address, count)
 
     async def read_coils(self, address: int, count: int) -> list[bool]:
-        """Read `count` coils (function code 1). Raises as `read_holding`."""
+        """Read coils (function code 1). Raises as `read_holding`.
+
+        Parameters
+        ----------
+        address : int
+            First coil on the wire, from 0.
+        count : int
+            Coils, 1..2000.
+        """
         return await self._read_bits(READ_COILS, address, count)
 
     async def read_discrete(self, address: int, count: int) -> list[bool]:
-        """Read `count` discrete inputs (function code 2). Raises as `read_holding`."""
+        """Read discrete inputs (function code 2). Raises as `read_holding`.
+
+        Parameters
+        ----------
+        address : int
+            First input on the wire, from 0.
+        count : int
+            Inputs, 1..2000.
+        """
         return await self._read_bits(READ_DISCRETE, address, count)
 
     async def write_register(self, address: int, word: int) -> None:
         """Write one holding register (function code 6) and check the echo. Raises as
         `write_registers`.
+
+        Parameters
+        ----------
+        address : int
+            The register on the wire, from 0.
+        word : int
+            Unsigned 16 bit.
         """
         what = f"{self.name}: writing {address}"
         reply = await self._exchange_pdu(
@@ -218,9 +250,9 @@ class GuardedModbusTcp:
         Parameters
         ----------
         address : int
-            Of the first.
+            First register on the wire, from 0.
         words : sequence of int
-            Their values.
+            1..123 words, unsigned 16 bit.
 
         Raises
         ------
@@ -295,6 +327,8 @@ class GuardedModbusTcp:
         function_code: int,
         what: str,
     ) -> ModbusPDU:
+        # The turn belongs to the request, not to its caller: the task runs to its end and releases
+        # it, while `shield` lets a cancelled caller go at once.
         await self._turn.acquire()  # cancelled while waiting here, a request is never sent
         self._in_flight = asyncio.create_task(self._transact(send, function_code, what))
         self._in_flight.add_done_callback(self._release_turn)
@@ -323,7 +357,10 @@ class GuardedModbusTcp:
         except ConnectionException as error:
             raise LinkDownError(f"{what}: not connected") from error
         except ModbusIOException as error:
-            slow = f"; {explained}" if (explained := self._late.explain()) else ""
+            slow = self._late.explain()
+            if slow:
+                slow = f"; {slow}"
+            # The library itself closes a connection after `_UNANSWERED_MAX` requests.
             if not client.connected:
                 raise LinkDownError(
                     f"{what}: connection given up, no answer to several requests{slow}"
@@ -336,7 +373,7 @@ class GuardedModbusTcp:
 
 
 def _check_reply(reply: ModbusPDU, function_code: int, transaction_id: int, what: str) -> None:
-    """Whether this is the answer to that request; raises LinkError or DeviceRefusedError."""
+    """Require that this is the answer to that request; raises LinkError or DeviceRefusedError."""
     if reply.transaction_id != transaction_id:
         raise LinkError(
             f"{what}: answer to transaction {reply.transaction_id}, expected {transaction_id}"

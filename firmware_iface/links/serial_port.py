@@ -59,6 +59,8 @@ class BackOff:
 
     def attempted(self, now_s: float) -> None:
         """An attempt begins."""
+        # 0 becomes `FIRST_S`, then each attempt doubles the wait up to `LONGEST_S`. Only
+        # `succeeded` sets it back.
         self._wait_s = min(max(2 * self._wait_s, FIRST_S), LONGEST_S)
         self._attempt_s = now_s
         self._earliest_s = now_s + self._wait_s
@@ -67,6 +69,8 @@ class BackOff:
         """Note a valid answer to a read."""
         if now_s - self._attempt_s >= PROVEN_S:
             self._wait_s = 0.0
+        # After a first attempt, or a connection that has proven itself, the next attempt may
+        # follow at once: a replugged cable costs no wait.
         if self._wait_s <= FIRST_S:
             self._earliest_s = float("-inf")
 
@@ -159,6 +163,7 @@ class SerialPort:
         if (wait_s := self.retry_in_s) > 0:
             raise LinkWaitsError(f"{self._port}: next attempt to open in {wait_s:.1f} s")
         self.close()
+        # A port that is not there has a short wait of its own and does not count as an attempt.
         path = self._locate_port()
         self._back_off.attempted(self._clock())
         self._serial = _open_serial(path, self._port, self._settings)
@@ -166,7 +171,7 @@ class SerialPort:
         asyncio.get_running_loop().add_reader(self._serial.fileno(), self._read_available)
 
     def write(self, data: bytes) -> None:
-        """Hand over bytes for sending.
+        """Give bytes to the kernel for sending.
 
         Raises LinkDownError (the port is closed or just went away), LinkError (the kernel's buffer
         is full: nothing is being sent).

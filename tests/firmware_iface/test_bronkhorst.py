@@ -5,7 +5,9 @@ library against it.
 from __future__ import annotations
 
 import asyncio
+import math
 import random
+import struct
 import threading
 from collections.abc import Callable, Coroutine
 from functools import partial
@@ -17,6 +19,7 @@ import pytest
 from firmware_iface.drivers.bronkhorst import (
     CONTROL_MODE,
     FMEASURE,
+    FSETPOINT,
     SETPOINT,
     TEMPERATURE,
     BronkhorstFlow,
@@ -33,7 +36,7 @@ from firmware_iface.drivers.bronkhorst_propar import (
     parse_values,
     split_binary,
 )
-from firmware_iface.emulators.modbus_pdu import answer_request
+from firmware_iface.emulators.modbus_pdu import ILLEGAL_VALUE, WRITE_MULTIPLE, answer_request
 from firmware_iface.emulators.pumps import ANALOG_INPUT, BronkhorstRegisters, Instrument
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
@@ -98,6 +101,14 @@ def test_the_registers_of_the_manual() -> None:
     assert register_of(CONTROL_MODE) == (0x0024, 1)
     assert register_of(FMEASURE) == (0xA100, 2)
     assert register_of(TEMPERATURE) == (0xA138, 2)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])
+def test_a_flow_that_is_no_number_is_refused_as_an_illegal_value(value: float) -> None:
+    table = BronkhorstRegisters(flow([]))
+    address, count = register_of(FSETPOINT)
+    request = struct.pack(">BHHBf", WRITE_MULTIPLE, address, count, 2 * count, value)
+    assert answer_request(request, table) == bytes([WRITE_MULTIPLE | 0x80, ILLEGAL_VALUE])
 
 
 def test_binary_frames_survive_any_data_and_any_cut() -> None:
