@@ -60,9 +60,9 @@ class ClimateFit:
     follows_humidity_s : float
         Time constant of the moisture; NaN without humidity.
     residual_um : float
-        RMS of the spherical term that the climate does not explain.
+        RMS of the spherical term that neither the climate nor a steady drift explains.
     explained : float
-        Share of the variance of the spherical term that it explains.
+        Share that the climate explains of the variance of the spherical term about a steady drift.
     """
 
     film_per_k: Expansion | None
@@ -109,7 +109,81 @@ def fit_climate(
     """
     if time_s.size < 2 or time_s[-1] - time_s[0] < LEAST_S:
         raise ValueError(f"a record of {LEAST_S / 3600:.0f} hours is needed")
-    # The causes that have changed enough, filled where a minute is missing
+    causes = _list_causes(time_s, film_c, ring_c, humidity_percent)
+    if not causes:
+        raise ValueError("neither temperature nor humidity has changed enough")
+    good = np.isfinite(spherical_um)
+    if good.sum() < 0.5 * good.size:
+        raise ValueError("less than half of the record has figures")
+
+    # Figures and causes, smoothed equally.
+    width = _choose_width(list(causes.values()), float(np.median(np.diff(time_s))))
+    model = _ClimateModel(time_s, causes, sensitivity_um_per_ppm, width)
+    filled_um = np.interp(time_s, time_s[good], spherical_um[good])
+    wanted_um = _smooth(filled_um, width)
+
+    # The time constant T_m by a search, all else by least squares.
+    follows_s = model.find_time_constant(wanted_um)
+    columns = model.make_columns(follows_s)
+    solution, misfit = _solve(columns, wanted_um)
+    measured = wanted_um.size
+
+    # What is known of the ring is one more row; without it the row is 0.
+    noises = model.list_noises()
+    known, known_um = model.make_ring_row(known_ring, solution, misfit, noises)
+    columns = np.vstack([columns, known])
+    wanted_um = np.append(wanted_um, known_um)
+    solution, _ = _solve(columns, wanted_um)
+
+    # The residual itself, by the jackknife; T_m is free in it to first order.
+    free = columns
+    if "humidity" in causes:
+        slower = model.make_columns(follows_s * np.exp(_LOG_STEP)) @ solution
+        by_log_time = (slower - columns[:-1] @ solution) / _LOG_STEP
+        free = np.column_stack([columns, np.append(by_log_time, 0.0)])
+    sigmas = _jackknife(free, wanted_um, _smooth(time_s, width))
+
+    # Noise of each sensor makes its expansion too small: the share of the noise in the variance
+    # that this sensor alone shows, beside all other columns.
+    for i, noise in enumerate(noises):
+        own = _solve(np.delete(columns, i, axis=1), columns[:, i])[1]
+        sigmas[i] = np.hypot(sigmas[i], abs(solution[i]) * noise / own)
+
+    # The error of what is known of the ring enters all expansions.
+    if known_ring is not None and known.any():
+        other_um = np.append(wanted_um[:-1], known_um + np.linalg.norm(known) * known_ring.sigma)
+        shift = _solve(columns, other_um)[0] - solution
+        sigmas[: shift.size] = np.hypot(sigmas[: shift.size], shift)
+
+    # The film's law, from which S follows, scales all expansions.
+    sigmas = np.hypot(sigmas, _LAW_ERROR * np.abs(np.append(solution, 0.0)[: sigmas.size]))
+    expansions = {
+        name: Expansion(float(solution[i]), float(sigmas[i])) for i, name in enumerate(causes)
+    }
+
+    # What remains of the figures, and what would remain with a drift alone.
+    residual_um = (wanted_um - columns @ solution)[:measured]
+    misfit = float(np.mean(residual_um**2))
+    _, drift_misfit = _solve(model.make_drift(), wanted_um[:measured])
+    explained = 0.0
+    if drift_misfit > 0:
+        explained = 1.0 - misfit / drift_misfit
+    return ClimateFit(
+        expansions.get("film"),
+        expansions.get("ring"),
+        expansions.get("humidity"),
+        follows_s,
+        float(np.sqrt(misfit)),
+        explained,
+    )
+
+
+def _list_causes(
+    time_s: FloatArray, film_c: FloatArray, ring_c: FloatArray, humidity_percent: FloatArray
+) -> dict[str, FloatArray]:
+    """The causes that have changed enough, (n,) about their means and filled where a value is
+    missing. A warmer ring acts as a colder film.
+    """
     causes: dict[str, FloatArray] = {}
     for name, values, least, sign in (
         ("film", film_c, _LEAST_CHANGE_K, 1.0),
@@ -121,88 +195,104 @@ def fit_climate(
             continue
         filled = np.interp(time_s, time_s[seen], values[seen])
         causes[name] = sign * (filled - filled.mean())
-    if not causes:
-        raise ValueError("neither temperature nor humidity has changed enough")
-    good = np.isfinite(spherical_um)
-    if good.sum() < 0.5 * good.size:
-        raise ValueError("less than half of the record has figures")
-    width = _choose_width(list(causes.values()), float(np.median(np.diff(time_s))))
-    seen_um = np.interp(time_s, time_s[good], spherical_um[good])
+    return causes
 
-    def make_columns(follows_s: float) -> FloatArray:
+
+class _ClimateModel:
+    """The linear part of the equation above, for a time constant of the moisture.
+
+    Parameters
+    ----------
+    time_s : (n,) array
+        Evenly spaced.
+    causes : dict of (n,) arrays
+        As `_list_causes` returns them.
+    sensitivity_um_per_ppm : float
+        S.
+    width : int
+        Values of a running mean.
+    """
+
+    def __init__(
+        self,
+        time_s: FloatArray,
+        causes: dict[str, FloatArray],
+        sensitivity_um_per_ppm: float,
+        width: int,
+    ) -> None:
+        self._time_s = time_s
+        self._causes = causes
+        self._sensitivity_um_per_ppm = sensitivity_um_per_ppm
+        self._width = width
+
+    def make_columns(self, follows_s: float) -> FloatArray:
+        """Columns (n - width + 1, unknowns), smoothed: the causes', then z_0 and z_1, then m(0).
+
+        `follows_s` is T_m; NaN without humidity.
+        """
         columns = [
-            _follow(values, time_s, follows_s) if name == "humidity" else values
-            for name, values in causes.items()
+            _follow(values, self._time_s, follows_s) if name == "humidity" else values
+            for name, values in self._causes.items()
         ]
-        drift = (time_s - time_s[0]) / (time_s[-1] - time_s[0])
-        scaled = [sensitivity_um_per_ppm * column for column in columns]
-        rest = [np.ones_like(drift), drift]
-        if "humidity" in causes:
-            # The film was not in balance at first
-            rest.append(np.exp(-(time_s - time_s[0]) / follows_s))
-        return np.column_stack([_smooth(column, width) for column in (*scaled, *rest)])
+        scaled = [self._sensitivity_um_per_ppm * column for column in columns]
+        smoothed = [_smooth(column, self._width) for column in scaled]
+        if "humidity" not in self._causes:
+            return np.column_stack([*smoothed, self.make_drift()])
 
-    wanted_um = _smooth(seen_um, width)
+        # The film was not in balance at first: its moisture approaches the room's.
+        decay = np.exp(-(self._time_s - self._time_s[0]) / follows_s)
+        return np.column_stack([*smoothed, self.make_drift(), _smooth(decay, self._width)])
 
-    def find_misfit(log_follows_s: float) -> float:
-        return _solve(make_columns(float(np.exp(log_follows_s))), wanted_um)[1]
+    def make_drift(self) -> FloatArray:
+        """Columns (n - width + 1, 2) of z_0 and z_1."""
+        since_s = self._time_s - self._time_s[0]
+        share = since_s / since_s[-1]
+        constant = _smooth(np.ones_like(share), self._width)
+        return np.column_stack([constant, _smooth(share, self._width)])
 
-    follows_s = float("nan")
-    if "humidity" in causes:
+    def find_time_constant(self, wanted_um: FloatArray) -> float:
+        """T_m with the least misfit to the smoothed figures, s; NaN without humidity."""
+        if "humidity" not in self._causes:
+            return float("nan")
+
+        def find_misfit(log_follows_s: float) -> float:
+            """Mean square of the residual with this time constant."""
+            columns = self.make_columns(float(np.exp(log_follows_s)))
+            return _solve(columns, wanted_um)[1]
+
         bounds = (np.log(_FASTEST_S), np.log(_SLOWEST_S))
         found = minimize_scalar(find_misfit, bounds=bounds, method="bounded")
-        follows_s = float(np.exp(found.x))
-    columns = make_columns(follows_s)
-    solution, misfit = _solve(columns, wanted_um)
-    # Noise of each sensor, by its differences
-    noises = [
-        sensitivity_um_per_ppm**2 * float(np.var(np.diff(values))) / 2 / width
-        for values in causes.values()
-    ]
-    # What is known of the ring counts as one more row, of the weight that the noise gives it
-    names = list(causes)
-    known = np.zeros(columns.shape[1])
-    known_um = 0.0
-    if known_ring is not None and "ring" in causes:
+        return float(np.exp(found.x))
+
+    def list_noises(self) -> list[float]:
+        """Variance of each smoothed column of a cause by noise of its sensor, from differences."""
+        scale = self._sensitivity_um_per_ppm**2
+        return [
+            scale * float(np.var(np.diff(values))) / 2 / self._width
+            for values in self._causes.values()
+        ]
+
+    def make_ring_row(
+        self,
+        known_ring: Expansion | None,
+        solution: FloatArray,
+        misfit: float,
+        noises: list[float],
+    ) -> tuple[FloatArray, float]:
+        """The row (unknowns,) and the value of what is known of the ring; 0 without it.
+
+        Its weight is that of one figure: the standard deviation of a figure by the residual
+        (`misfit`) and by the noise of the sensors, over that of the known expansion.
+        """
+        row = np.zeros(solution.size)
+        if known_ring is None or "ring" not in self._causes:
+            return row, 0.0
         hidden = sum(
             noise * value**2 for noise, value in zip(noises, solution[: len(noises)], strict=True)
         )
-        weight = np.sqrt(width * (misfit + hidden)) / known_ring.sigma
-        known[names.index("ring")] = weight
-        known_um = weight * known_ring.value
-    columns = np.vstack([columns, known])
-    wanted_um = np.append(wanted_um, known_um)
-    solution, misfit = _solve(columns, wanted_um)
-    free = columns
-    if "humidity" in causes:
-        # The derivative by the logarithm of the time constant, by a step of a hundredth
-        slower = make_columns(follows_s * np.exp(_LOG_STEP)) @ solution
-        derivative = (slower - columns[:-1] @ solution) / _LOG_STEP
-        free = np.column_stack([columns, np.append(derivative, 0.0)])
-    sigmas = _jackknife(free, wanted_um, _smooth(time_s, width))
-    for i, noise in enumerate(noises):
-        # Against what only this sensor, and what is known, show
-        own = _solve(np.delete(columns, i, axis=1), columns[:, i])[1]
-        sigmas[i] = np.hypot(sigmas[i], abs(solution[i]) * noise / own)
-    if known_ring is not None and known.any():
-        # The error of what is known enters all expansions
-        other_um = np.append(wanted_um[:-1], known_um + np.linalg.norm(known) * known_ring.sigma)
-        shift = _solve(columns, other_um)[0] - solution
-        sigmas[: shift.size] = np.hypot(sigmas[: shift.size], shift)
-    # The law of the film, by which all expansions are computed
-    sigmas = np.hypot(sigmas, _LAW_ERROR * np.abs(np.append(solution, 0.0)[: sigmas.size]))
-    expansions = {
-        name: Expansion(float(solution[i]), float(sigmas[i])) for i, name in enumerate(names)
-    }
-    variance = float(np.var(wanted_um))
-    return ClimateFit(
-        expansions.get("film"),
-        expansions.get("ring"),
-        expansions.get("humidity"),
-        follows_s,
-        float(np.sqrt(misfit)),
-        1.0 - misfit / variance if variance > 0 else 0.0,
-    )
+        weight = float(np.sqrt(self._width * (misfit + hidden)) / known_ring.sigma)
+        row[list(self._causes).index("ring")] = weight
+        return row, weight * known_ring.value
 
 
 def _choose_width(causes: list[FloatArray], step_s: float) -> int:

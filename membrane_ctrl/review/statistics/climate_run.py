@@ -118,8 +118,8 @@ def format_fit(fit: ClimateFit) -> list[str]:
     if fit.film_per_percent in film and np.isfinite(fit.follows_humidity_s):
         lines.append(f"film_follows_humidity_s = {fit.follows_humidity_s:.0f}")
     lines.append(
-        f"# the climate explains {fit.explained:.1%} of the spherical term's variance; "
-        f"{1e3 * fit.residual_um:.0f} nm remain"
+        f"# about a steady drift, the climate explains {fit.explained:.1%} of the spherical "
+        f"term's variance; {1e3 * fit.residual_um:.0f} nm remain"
     )
     return lines
 

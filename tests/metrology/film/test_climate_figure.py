@@ -200,3 +200,19 @@ def test_a_cause_that_does_not_change_is_not_fitted() -> None:
     still = {**night, "film_c": np.full(600, 21.0), "ring_c": np.full(600, 21.0)}
     with pytest.raises(ValueError, match="neither"):
         fit_climate(**still, sensitivity_um_per_ppm=0.08)
+
+
+def test_noise_about_the_bowl_of_the_film_is_not_explained_by_the_climate() -> None:
+    """The film's bowl alone has a spherical term of a hundred micrometres."""
+    rng = np.random.default_rng(3)
+    time_s = 60.0 * np.arange(600)
+    none = np.full(600, np.nan)
+    found = fit_climate(
+        time_s,
+        -150.0 + 0.05 * rng.standard_normal(600),
+        21.0 + np.cos(2 * np.pi * time_s / 20_000.0),
+        none,
+        none,
+        sensitivity_um_per_ppm=0.08,
+    )
+    assert abs(found.explained) < 0.1
