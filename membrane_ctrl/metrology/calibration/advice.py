@@ -41,8 +41,8 @@ def advise_number(solution: Solution, index: int) -> Advice | None:
     index : int
         Number of the set whose sag is considered.
     """
-    # The sag's sigma with each free parameter known better.
-    # Each number in turn, as if it were known better: the covariance follows without new residuals.
+    # The sag's sigma with each free parameter in turn known better. The covariance follows from the
+    # same equations with another prior: no residual is computed again.
     sums = np.sum([each.eliminate_surface() for each in solution.equations], axis=0)
     sigmas = solution.problem.sigmas
     advice = []

@@ -248,7 +248,7 @@ def _jackknife_sigmas(views: Sequence[BoardView], stated: CameraConfig) -> Float
 
 def _bowed_views(views: Sequence[BoardView]) -> list[BoardView]:
     """The views as if the board were bowed by `FLATNESS` of its longest side."""
-    # A paraboloid over the longest side, 0 at its ends.
+    # A paraboloid over the longest side, 0 at its ends and highest in the middle.
     every = np.concatenate([view.place for view in views])[:, :2]
     middle = (every.max(axis=0) + every.min(axis=0)) / 2
     side = float(np.max(np.ptp(every, axis=0)))

@@ -32,12 +32,16 @@ def find_other_board(stated: Board, photographs: Sequence[Levels]) -> Board | No
     Board or None
         None without one.
     """
+    # Some photographs, shrunk for speed; the markers of a charuco board are detected once for all
+    # sizes.
     small = [_shrink(photograph) for photograph in photographs[:_TRIED]]
     needed = min(_CONFIRMED, len(small))
     markers: list[Markers | None] = [None] * len(small)
     if stated.kind == "charuco":
         markers = [detect_markers(photograph) for photograph in small]
-    best, best_score = None, (0, 0)
+    # The size with the most corners; of equal ones the smallest, as a detector also finds a part.
+    best: Board | None = None
+    best_score = (0, 0)
     for board in _list_candidates(stated, small, markers):
         counts = [
             len(board.corners(photograph, seen)[0])
@@ -46,7 +50,8 @@ def find_other_board(stated: Board, photographs: Sequence[Levels]) -> Board | No
         shown = sum(count >= LEAST_CORNERS for count in counts)
         score = (sum(counts), -board.columns * board.rows)
         if shown >= needed and score > best_score:
-            best, best_score = board, score
+            best = board
+            best_score = score
     return best
 
 

@@ -135,17 +135,24 @@ def _solve_turn(sums: FloatArray, of_turned: FloatArray) -> tuple[float, FloatAr
     of_turned : array of that shape
         Sums of the rows during which the camera was turned.
     """
+    # Where the sums have the set's own unknowns with the right side, and the camera's angles.
     local = forward_model.LOCAL
     own = np.append(np.arange(local), len(sums) - 1)
     angles = local + np.array(_ANGLES)
     count = angles.size
+
+    # Equations of own unknowns, turn, right side. The own unknowns act in all rows; the turn acts
+    # in the turned rows only, so that all products with it are sums over these.
     whole = np.zeros((local + count + 1,) * 2)
     places = np.append(np.arange(local), local + count)
     turn = np.arange(local, local + count)
     whole[np.ix_(places, places)] = sums[np.ix_(own, own)]
     whole[np.ix_(turn, places)] = of_turned[np.ix_(angles, own)]
     whole[np.ix_(places, turn)] = of_turned[np.ix_(own, angles)]
-    whole[np.ix_(turn, turn)] = of_turned[np.ix_(angles, angles)] + np.eye(count) / _SIGMA_DEG**2
+    prior = np.eye(count) / _SIGMA_DEG**2
+    whole[np.ix_(turn, turn)] = of_turned[np.ix_(angles, angles)] + prior
+
+    # The surface eliminated, then the turn: the least sum of squares is c - b^T A^-1 b.
     reduced = normal_equations.eliminate_first(whole, local)
     turned_deg = np.linalg.solve(reduced[:-1, :-1], reduced[:-1, -1])
     least = float(reduced[-1, -1] - reduced[:-1, -1] @ turned_deg)

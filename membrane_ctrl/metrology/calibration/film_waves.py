@@ -114,7 +114,8 @@ def _solve_unturned(
         if not group or freed is None or verdict.list_causes(freed):
             continue
 
-        # What the freed figures explain, and what would explain more in their place.
+        # What the freed figures explain: the fall of the sum of squares, less 2 for each number
+        # that is free (Akaike). Another cause that explains more is named instead.
         bound = turn_tests.bind_figures(freed, problem)
         fall = model_tests.sum_of_squares(bound) - model_tests.sum_of_squares(freed)
         explained = fall - 2 * len(film_form.TURNING) * len(group)
@@ -123,6 +124,7 @@ def _solve_unturned(
             largest = verdict.find_largest_cause(others)
             if largest.explained > explained:
                 return freed, (largest.finding,)
+        # The angle at which the mirror of each set seems to stand.
         findings = []
         for k in group:
             found_deg = turn_tests.find_angle_of_set(freed, k)

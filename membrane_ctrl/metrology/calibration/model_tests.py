@@ -311,11 +311,12 @@ def find_mount_creep(solution: solver.Solution) -> MountCreep | None:
     count = len(solution.states)
     if count < _LEAST_TO_CREEP:
         return None
+    # A creep is even in the number of the set, 0 in the middle; amounts are from first to last.
     share = np.linspace(-0.5, 0.5, count)
     units = [parameter.unit for parameter in bench_parameters.POSE]
     sigmas = np.array([_CAMERA_SIGMA_DEG if unit == "deg" else _CREEP_SIGMA_MM for unit in units])
 
-    # All poses together, and each alone.
+    # All poses together decide whether anything crept; the one that alone explains most is named.
     poses = tuple(range(len(bench_parameters.POSE)))
     _, fall = _free_motion(solution, poses, share, sigmas)
     alone = [_free_motion(solution, (k,), share, sigmas[[k]]) for k in poses]
@@ -380,9 +381,11 @@ def leave_set_out(solution: solver.Solution, index: int) -> solver.Solution:
     index : int
         Number of the set.
     """
+    # The problem without the set.
     keep = [k for k in range(len(solution.states)) if k != index]
     problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
     linear = tuple(solution.equations[k] for k in keep)
+    # One step from the same residuals: the surfaces are eliminated, the prior is added.
     sigmas = problem.sigmas
     of_sets = np.sum([each.eliminate_surface() for each in linear], axis=0)
     moved = solver.solve_step(of_sets + solution.prior_sums(sigmas), sigmas)

@@ -103,7 +103,8 @@ def reduce_weights(
             side_px = across_px(phases) / _PATCHES
         patches.append(_patch_means(phases, residual_mm, weights, side_px))
 
-    # A pattern of all films shows in their sum.
+    # A pattern of all films shows in their sum, whose variance is that of one if they are
+    # independent. An artefact shares no shape with the films.
     of_films = np.sum([patches[k] for k in films], axis=0) / np.sqrt(len(films))
     chi_square_of_films = _reduced_chi_square(of_films)
     reduced = []

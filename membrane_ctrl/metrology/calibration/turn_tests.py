@@ -97,6 +97,7 @@ def bind_figures(solution: Solution, stated: Problem) -> Solution:
     stated : Problem
         The problem as stated.
     """
+    # A stated angle adds rows to the sums of its set: its figure less the film's, turned.
     equations = list(solution.equations)
     sets = list(solution.problem.sets)
     for k, phases in enumerate(stated.sets):
@@ -151,6 +152,7 @@ def find_wrong_angles(
     list of (int, float)
         Number of the set, and the angle of its figure in degrees.
     """
+    # Sets of the mirror as it was: without one there is nothing to compare with.
     not_turned = [k for k in problem.film_sets if problem.sets[k].turned is None]
     if not not_turned:
         return []
@@ -159,7 +161,7 @@ def find_wrong_angles(
         turned = problem.sets[k].turned
         if turned is None:
             continue
-        # The film's figure is that of the set with the nearest sag.
+        # The film's figure is that of the set with the nearest sag, as it depends on the sag.
         sag_mm = states[k].surface.sag_mm
         near = min(not_turned, key=lambda j: abs(states[j].surface.sag_mm - sag_mm))
         of_film = states[near].surface.parameters[list(film_form.TURNING)]
@@ -205,6 +207,7 @@ def _find_angle(
     """The angle at which a film's figure fits a surface, its axis anywhere; None if the stated one
     fits about as well.
     """
+    # The terms that a turn changes, and their changes by a shift of the axis, in sigmas.
     terms = np.array(film_form.TURNING)
     seen = surface.parameters[terms]
     shifts = turned_rows.shift_derivatives(surface, terms) / sigmas_mm[:, None]

@@ -83,7 +83,7 @@ def weak_combinations(
     for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
         if value < WEAK**2:
             break
-        # One sigma of the combination, as amounts of its parameters.
+        # One sigma of the combination, as amounts of its parameters; the large ones are named.
         left = float(np.sqrt(value))
         amounts = vector * np.sqrt(value) * solution.problem.sigmas[free]
         order = [k for k in np.argsort(-np.abs(vector)) if abs(vector[k]) > _LEAST_PART]
@@ -117,8 +117,8 @@ def _describe_combination(
     `parts` are the parameters that are named; `amounts` (k,) are those of all free parameters,
     whose numbers are `free` (k,).
     """
-    # The effect of one sigma on the surface; the laser's scale has none.
-    # The change of the surface, as heights over the disc, with and without its plane.
+    # The effect of one sigma on the surface, as heights over the disc with and without their
+    # plane. The laser's scale has none.
     is_optical = free < bench_poses.OPTICAL
     response = surface_response(solution, index)[:, free[is_optical]]
     change_mm = response @ amounts[is_optical]
@@ -150,6 +150,7 @@ def _name_effect(
     `moved_um` (n,) is the change at points of the disc, `figure_um` (n,) the same without its
     plane, and `plane` (n, 3) are 1, x and y there.
     """
+    # Too small to show in a figure, or mostly the plane that its removal takes.
     total = float(np.mean(moved_um**2))
     if total < _NOTHING_UM**2:
         return "nothing that a figure shows"
@@ -160,7 +161,8 @@ def _name_effect(
         slope = np.linalg.lstsq(plane, moved_um, rcond=None)[0][1:]
         return f"a tilt of the surface by {np.hypot(*slope):.2g} µm at the rim{kept}"
 
-    # Changes of height by a scale of the surface, and by its turn about z.
+    # Changes of height by a scale of the surface, h itself, and by its turn about z,
+    # x dh/dy - y dh/dx. A name fits by the share of the square that its best multiple explains.
     x = plane[:, 1]
     y = plane[:, 2]
     parameters = solution.states[index].surface.parameters

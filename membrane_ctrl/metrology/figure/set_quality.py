@@ -31,10 +31,12 @@ def set_quality(
     -------
     Quality
     """
+    # Bins of the mirror, also those that are left out because they are clipped.
     area_mm2 = math.pi * optics.mirror.analysis_radius_mm**2
     used = [k for frames in checked.view.used for k in frames]
     clipped = checked.binned.saturated[used].any(axis=0)
     on_mirror = (checked.view.mask | clipped) & checked.near
+    # Shares of full scale and of the analysed disc; the residual is the RMS of one slope.
     shares = clipped_shares(checked.binned, used, on_mirror)
     return Quality(
         modulation_share=swing_adu / (2**optics.camera.bits - 1),

@@ -133,7 +133,8 @@ def find_paths(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     ValueError
         A mirror without a focus in front of it.
     """
-    # Start: the focus of the paraboloid through the points, whose axis is turned to z
+    # Start: the paraboloid z = c_0 + c_1 u + c_2 v + c_3 (u^2 + v^2) through the points, by least
+    # squares. u and v are about 1, so that the normal matrix is well conditioned.
     x, y, z = points_mm
     scale_mm = float(np.sqrt(np.mean(np.square(points_mm[:2])) * 2))
     normal = np.zeros((4, 4))
@@ -147,13 +148,16 @@ def find_paths(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     tilt_x, tilt_y, curvature = found[1:] / (scale_mm, scale_mm, scale_mm**2)
     if curvature <= 0:
         raise ValueError("the mirror has no focus in front of it")
+    # The wave comes along the paraboloid's axis: turn it to z. Its focus is 1 / (4 c) above it.
     turned_mm = np.stack((x, y, z - tilt_x * x - tilt_y * y))
-
-    # The focus, and the paths to it
     focus = np.array([0.0, 0.0, 1 / (4 * curvature)])
+
+    # Steps to the focus of the points themselves, the first ones with some of them.
     some_mm = turned_mm[:, :: max(1, x.size // _FEW_POINTS)]
     for cloud_mm in [some_mm] * _FIRST_STEPS + [turned_mm] * _LAST_STEPS:
         focus = focus + _focus_step(cloud_mm, focus)
+
+    # L = |F - P| - z.
     path = np.empty(x.size)
     for block in column_blocks(x.size):
         towards = focus[:, None] - turned_mm[:, block]
@@ -163,7 +167,8 @@ def find_paths(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _focus_step(points_mm: FloatArray, focus_mm: FloatArray) -> FloatArray:
     """Gauss-Newton step (3,) of the focus towards the least variance of the paths."""
-    # Sums of the gradients of the paths, of the paths less that of the vertex, and of products
+    # Sums of the gradients dL/dF = (F - P) / |F - P|, of the paths L, and of their products. The
+    # path of the vertex is subtracted: sums of whole paths would lose digits.
     count = points_mm.shape[1]
     of_gradient = np.zeros(3)
     of_path = 0.0
@@ -179,7 +184,7 @@ def _focus_step(points_mm: FloatArray, focus_mm: FloatArray) -> FloatArray:
         normal += gradient @ gradient.T
         right += gradient @ path
 
-    # Both about their means, as the mean path is free
+    # The mean path is free: the products about the means, sum g g^T - n mean(g) mean(g)^T.
     mean = of_gradient / count
     normal -= count * np.outer(mean, mean)
     right -= mean * of_path

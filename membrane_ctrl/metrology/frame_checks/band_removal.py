@@ -60,15 +60,20 @@ class _Steps:
     def __init__(
         self, stack: FrameStack, binned: Binned, frames: list[int], index: IntArray
     ) -> None:
+        # The chosen bins: their rows in the picture, and their light (N, n) in each frame.
         self.frames = frames
         _, rows, columns = binned.means.shape
         self._row = index // columns
         self._rows = np.arange(rows)
-        self._shifts_rad = stack.shifts_rad(frames)
         means = binned.means[frames].reshape(len(frames), -1)
         self._seen = np.take(means, index, axis=1)
+
+        # Model of the steps: level, cosine and sine of a bin, and their least squares.
+        self._shifts_rad = stack.shifts_rad(frames)
         self._design = stack.design(frames)
         self._inverse = np.linalg.pinv(stack.design(frames))
+
+        # Begin without bands; what the steps leave then is what bands have to explain.
         self.unexplained = 0.0
         self.rad_per_row = _NONE
         self.amplitudes = np.zeros((len(frames), 0))

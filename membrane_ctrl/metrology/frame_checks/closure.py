@@ -162,20 +162,24 @@ def closure_with_level(
     ValueError
         As `compute_closure`.
     """
+    # I_k - A = C cos d_k - S sin d_k, with C^2 + S^2 = B^2 (section 1 of
+    # docs/explanation/metrology.md).
     stack, shifts = _check_frames(frames, shifts_rad)
     count = len(shifts)
     centred = stack - np.ravel(mean_adu)
     amplitude = np.ravel(amplitude_adu)
     design = np.stack([np.cos(shifts), -np.sin(shifts)], axis=1)
 
-    # One equation is the phasor's length: N + 1 equations, two unknowns.
+    # The RMS of all frames: N equations and that of the length, less two unknowns.
     rms_adu = math.sqrt(_level_rss(centred, design, amplitude) / (count - 1))
+    # The same without each frame in turn: the suspect is the one without which the rest agrees.
     without_rms_adu = np.empty(count)
     for left_out in range(count):
         kept = np.arange(count) != left_out
         rss = _level_rss(centred[kept], design[kept], amplitude)
         without_rms_adu[left_out] = math.sqrt(rss / (count - 2))
 
+    # What each frame leaves of the best phasor.
     residual = centred - design @ np.linalg.pinv(design) @ centred
     frame_rms_adu = np.sqrt(np.mean(residual**2, axis=1))
     return Closure(rms_adu, frame_rms_adu, without_rms_adu)
@@ -187,13 +191,18 @@ def _level_rss(centred: FloatArray, design: FloatArray, amplitude: FloatArray) -
     The latter is in units of the phasor's variance along itself. `centred` (N, pixels) are the
     intensities less the known mean.
     """
-    covariance = np.linalg.inv(design.T @ design)  # of the phasor, for noise of 1
+    # The phasor by least squares, and its covariance for noise of 1.
+    covariance = np.linalg.inv(design.T @ design)
     phasor = covariance @ design.T @ centred
+
+    # Variance along the phasor itself: e^T C e.
     length = np.linalg.norm(phasor, axis=0)
     direction = phasor / np.maximum(length, _TINY)
     variance = np.einsum("ip,ij,jp->p", direction, covariance, direction)
     least_variance = np.linalg.eigvalsh(covariance)[0]  # a phasor of 0 has no direction
     variance = np.maximum(variance, least_variance)
+
+    # The frames' residuals, and the length's difference from the amplitude as one more.
     rss = np.sum((centred - design @ phasor) ** 2, axis=0)
     of_length = (length - amplitude) ** 2 / variance
     return float(np.mean(rss + of_length))

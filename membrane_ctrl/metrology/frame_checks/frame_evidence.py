@@ -94,7 +94,9 @@ def measure_frames(
         for k, reading_um in enumerate(readings_um)
     ]
     waves = [model.wave() for model in models]
-    # What it shows: the pattern that it is most like, and the parameters of its own.
+
+    # What it shows: the pattern that it is most like, and the light, step and place that fit its
+    # own pattern best.
     evidence = {}
     for k in readable:
         seen = binned.means[k].reshape(-1)[scene.index].astype(float)

@@ -211,6 +211,7 @@ def _name_sinusoid_defect(
     largest: _Deviation, own: FrameEvidence, usual_level: float, usual_moved_um: float
 ) -> tuple[FrameDefect, str]:
     """The defect of a sinusoid, and its reason. Wrong light comes first: it causes all else."""
+    # Light that is wrong by much.
     light = own.level / max(usual_level, _TINY)
     if own.saturated > _BURNT_SHARE or largest is _Deviation.SATURATED:
         return FrameDefect.SATURATED, f"saturated: {own.saturated:.0%} of the bins"
@@ -218,6 +219,7 @@ def _name_sinusoid_defect(
         return FrameDefect.DARK, f"dark: {light:.2f} of the light of the others"
     if largest is _Deviation.LIGHT or abs(light - 1) > _FLICKER:
         return FrameDefect.FLICKER, f"flicker: {light:.3f} of the light of the others"
+    # The right light: the film elsewhere, another phase step, or a cause that is not known.
     away_um = own.moved_um - usual_moved_um
     if largest in (_Deviation.MOVED, _Deviation.REST) and abs(away_um) > MOVED_UM:
         reason = f"moved: the film was {away_um:+.0f} µm from where the others saw it"
@@ -284,6 +286,7 @@ def _name_gray_defect(
 
 def _judge_flat(frame: int, own: FrameEvidence, bright: float, is_white: bool) -> list[Flag]:
     """A frame of one level over the whole mirror: all bright (`is_white`), or all dark."""
+    # How far level and evenness are from their limits: 1 is at the limit.
     light = own.level / max(bright, _TINY)
     rest_severity = own.rest / (FLAT_REST * bright)
     light_severity = light / _MOST_BLACK
@@ -291,6 +294,7 @@ def _judge_flat(frame: int, own: FrameEvidence, bright: float, is_white: bool) -
         light_severity = abs(light - 1) / WHITE_SHARE
     if max(rest_severity, light_severity) <= 1:
         return []
+    # An uneven frame shows another picture; so does a black one that is too bright.
     if rest_severity > light_severity or not is_white:
         differs = f"stale or wrong picture: differs from its prediction by {own.rest / bright:.0%}"
         return [Flag(frame, FrameDefect.WRONG_PICTURE, differs, rest_severity)]

@@ -308,7 +308,10 @@ def _find_same_picture(
     axis: AxisSeries, index: int, axes: tuple[AxisSeries, ...]
 ) -> tuple[int, str] | None:
     """A step of a series that shows the picture of an earlier frame, and the reason."""
+    # Two frames show the same picture if they differ by less than this share of the fringes' swing.
     largest_difference = SAME_SHARE * _series_amplitude(axis.frames[index], axis.shifts_rad)
+    # The frames in the order of capture; each step of this series against all before it, the last
+    # one first, since a camera or panel that lags repeats that.
     earlier: list[tuple[str, FloatArray]] = []
     for series in axes:
         for k, steps in enumerate(series.frames):
@@ -330,7 +333,8 @@ def _judge_white_and_black(
     axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArray
 ) -> list[SeriesFlag]:
     """Flags of white and black, which must enclose all that the fringes show."""
-    # Brightest and darkest tenth of the fringes at each pixel, against white and black.
+    # Brightest and darkest tenth of the fringes at each pixel, against white and black with a
+    # margin for noise and flicker.
     frames = np.concatenate([axis.frames.reshape(-1, black.size) for axis in axes])
     margin = _BEYOND_MARGIN * np.ptp(np.percentile(frames, [5, 95]))
     typical_high, typical_low = np.percentile(frames, [90, 10], axis=0)

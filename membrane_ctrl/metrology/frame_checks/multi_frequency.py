@@ -274,11 +274,13 @@ def _unwrap_finest(
     """Absolute phase (rows, columns) of the finest fringes; NaN where not known. Raises
     RejectedSetError.
     """
+    # The phase of the finest fringes, modulo 2 pi.
     finest = next(each for each in series if each.axis == axis)
     wrapped_rad = np.full(mask.shape, np.nan)
     wrapped_rad[mask] = np.angle(finest.phasor)
 
-    # Each bin votes for the order that is next to its place by all periods.
+    # Each bin votes for the order that is next to its place by all periods; neighbours then agree
+    # on one order for each connected region.
     coarse_rad = 2 * np.pi * place_mm / finest.period_mm - np.pi
     orders = np.rint((coarse_rad - wrapped_rad[mask]) / (2 * np.pi))
     voted_rad = np.full(mask.shape, np.nan)
@@ -290,5 +292,6 @@ def _unwrap_finest(
             "orders: check period_mm, axis and index of these frames",
             flags,
         )
+    # Phases beside the pattern are those of no fringe.
     inside = screen_scale.inside_pattern(found.phase_rad, optics.pattern)
     return np.where(inside, found.phase_rad, np.nan)

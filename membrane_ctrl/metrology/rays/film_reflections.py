@@ -202,7 +202,8 @@ def find_reflecting_rays(geometry: Geometry, optics: OpticsConfig, rays: FloatAr
 
 
 def _spread_places(count: int) -> FloatArray:
-    """Places (2, n) spread evenly over the unit disc."""
+    """Places (2, n) spread evenly over the unit disc: a sunflower."""
+    # Radii of equal areas, and an angle that grows by the golden one.
     k = np.arange(count)
     rho = np.sqrt((k + 0.5) / count)
     theta = k * np.pi * (3 - np.sqrt(5))
@@ -221,10 +222,13 @@ def _fit_images(unit: FloatArray, images_mm: FloatArray) -> FloatArray:
     """Polynomials (4, degree + 1, degree + 1) through images at places (2, n) of the unit disc; an
     image that is not there is far beside the screen.
     """
+    # Columns x^i y^j with i + j up to the degree.
     chosen = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
     powers = series.polyvander2d(unit[0], unit[1], [_DEGREE, _DEGREE])
     powers = powers.reshape(unit.shape[1], _DEGREE + 1, -1)
     design = np.stack([powers[:, i, j] for i, j in chosen], axis=1)
+
+    # Each coordinate of each image from the places that show it; elsewhere the rays miss.
     out = np.zeros((4, _DEGREE + 1, _DEGREE + 1))
     for row, values in zip(out, images_mm.reshape(4, -1), strict=True):
         known = np.isfinite(values)

@@ -107,15 +107,15 @@ def trace_gas_lens(
     -------
     GasLens
     """
-    # Places spread evenly over the disc, on bowls of two depths.
     # Places spread evenly over the disc: a sunflower, whose angle grows by the golden one.
     k = np.arange(_PLACES)
     rho = np.sqrt((k + 0.5) / (_PLACES - 0.5))
     theta = k * np.pi * (3 - np.sqrt(5))
     x = rho * np.cos(theta)
     y = rho * np.sin(theta)
+    # The shift of the screen points: the rays of these places with the film, less those without.
+    # For two depths, as the shift changes linearly with the depth.
     tables = []
-    # For each depth, the rays of these places with the film and without.
     for sag_mm in (cushion.sag_mm, cushion.sag_mm + _DEEPER_MM):
         bowl = Surface.hencky_bowl(sag_mm, cushion.radius_mm)
         bench = CushionBench(cushion, bowl, 0.0, screen_origin_mm, screen_axes)
@@ -134,6 +134,7 @@ def trace_gas_lens(
 
 def _fit_polynomials(x: FloatArray, y: FloatArray, values: FloatArray) -> FloatArray:
     """Polynomials (2, degree + 1, degree + 1) through values (2, n), by least squares."""
+    # Columns x^i y^j with i + j up to the degree.
     chosen = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
     powers = series.polyvander2d(x, y, [_DEGREE, _DEGREE]).reshape(x.size, _DEGREE + 1, -1)
     design = np.stack([powers[:, i, j] for i, j in chosen], axis=1)

@@ -497,6 +497,7 @@ def _move_to_face(out, tangents, face, first, count):  # type: ignore[no-untyped
     if screen_face.is_plane(face):
         return
     for k in range(count):
+        # Where the ray crosses the plane, and how far it moves along it per mm of w.
         a = out[0, first + k]
         b = out[1, first + k]
         tangent_a = tangents[0, k]

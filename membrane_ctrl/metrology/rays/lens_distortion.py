@@ -51,6 +51,7 @@ def _find_fold(distortion: tuple[float, ...]) -> float:
     """Distance from the axis, as a tangent, at which the lens' radial part stops growing; at most 2
     (63 degrees).
     """
+    # The radial part, along x: without the tangential coefficients p1 and p2.
     radius: FloatArray = np.linspace(0.0, 2.0, 2001)
     radial_alone = (*distortion[:2], 0.0, 0.0, *distortion[4:])
     distorted = distort_points(radius, np.zeros_like(radius), radial_alone)[0]

@@ -64,6 +64,7 @@ def _smooth_sweep(right, down, rhs, h, forward):  # type: ignore[no-untyped-def]
 @compile_kernel
 def _apply_laplacian(right, down, h, out):  # type: ignore[no-untyped-def]
     """The Laplacian of h into `out`: sum over the links of a cell of weight (h - h_neighbour)."""
+    # Each link once: what it adds to one cell it takes from the other.
     rows, columns = h.shape
     out[:, :] = 0.0
     for i in range(rows):
@@ -103,6 +104,7 @@ def _coarser_links(right, down, coarse_right, coarse_down):  # type: ignore[no-u
     coarse_down[:, :] = 0.0
     for i in range(rows):
         for j in range(columns):
+            # A link from an odd column or row to the next one leaves its joined cell.
             if j % 2 == 1 and j + 1 < columns:
                 coarse_right[i // 2, j // 2] += right[i, j]
             if i % 2 == 1 and i + 1 < rows:

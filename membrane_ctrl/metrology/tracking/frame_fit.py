@@ -101,19 +101,27 @@ class FrameFitter:
     def __init__(self, scene: CrossedScene, bands: Bands, jacobian: Singles | None = None) -> None:
         self.scene = scene
         self.bands = bands
+
+        # What varies slowly over the mirror, as planes over cells of bins: derivatives of both
+        # phases by the surface, and the Noll terms of the maps of light.
         self._cells = scene.cells
         if jacobian is None:
             jacobian = self._cells.fit_planes(scene.jacobian(scene.surface))
         self.jacobian = jacobian
         self._basis = self._cells.fit_planes(scene.basis)
+        self._slow = self._cells.arrange_blocks(*self.jacobian, self._basis)
+
+        # Light of the bins, and their phases at the surface of the last exact trace.
         self.light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
         self._base = _reduce_phase(scene.phase_rad(scene.surface))
+        self._response = scene.response.astype(np.float32)
+
+        # (J^T W J)^-1, kept from frame to frame, and memory of the last evaluation: residual,
+        # weights and the sums for bands of each bin; J^T W r of the surface and of three maps.
         self._inverse: FloatArray | None = None
         self._out = np.empty((4, scene.index.size), np.float32)
-        self._slow = self._cells.arrange_blocks(*self.jacobian, self._basis)
         self._pull = np.empty((4, PARAMETERS))
-        self._response = scene.response.astype(np.float32)
 
     def fit(
         self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach_adu: Singles

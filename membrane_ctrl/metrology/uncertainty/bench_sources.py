@@ -83,8 +83,8 @@ def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
     path_mm = np.linalg.norm(leaving, axis=0)
     leaving /= path_mm
 
-    # Glass: the tangents of the ray in it, with sines of 1 / n.
-    # Snell's law: the components of the direction along the screen shrink by 1 / n.
+    # Glass, by Snell's law: the components of the direction along the screen shrink by 1 / n. The
+    # tangents of the ray in the glass shift the point that is seen, per mm of its thickness.
     sines = (geometry.screen_axes @ leaving)[:2]
     tangents = sines / np.sqrt(_GLASS_INDEX**2 - np.sum(sines**2, axis=0))
     description = "glass in front of the screen's pixels"

@@ -207,7 +207,6 @@ def _absorbed_terms(
 
 def _mean_of_rings(rings: RoundSlopes, absorbed: FloatArray, radius_mm: float) -> FloatArray:
     """Mean radial slopes (rings, k), in radii, that the fit leaves of the round terms beyond it."""
-    # Points of each ring.
     # Points on circles within each ring.
     share = (np.arange(_RADII) + 0.5) / _RADII
     width_mm = (rings.outer_mm - rings.inner_mm)[:, None]
@@ -218,11 +217,12 @@ def _mean_of_rings(rings: RoundSlopes, absorbed: FloatArray, radius_mm: float) -
     cosine = np.cos(theta)
     sine = np.sin(theta)
 
-    # Their radial slopes, and the means, weighted by area.
+    # Slopes of the terms beyond the fit, less those that the fit's parameters take of them.
     _, own_x, own_y = surface_basis.evaluate_basis(rho * cosine, rho * sine)
     _, beyond_x, beyond_y = surface_basis.evaluate_round_basis(rho * cosine, rho * sine)
     left_x = beyond_x - absorbed.T @ own_x
     left_y = beyond_y - absorbed.T @ own_y
+    # Radial slopes, averaged over each circle, then over the ring with the circles' lengths.
     radial = left_x * cosine + left_y * sine
     of_radii = radial.reshape(-1, *radius.shape, _AZIMUTHS).mean(axis=-1)
     means = np.sum(of_radii * radius, axis=-1) / np.sum(radius, axis=-1)
@@ -262,6 +262,7 @@ def film_shape_sources(full: FullResult, slope_variance: FloatArray) -> tuple[bu
     places_mm = np.stack([x[seen], y[seen]])
     slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
     rings = RoundSlopes.from_points(places_mm, grid.count[seen], slopes, float(grid.axis_mm[-1]))
+    # What the unexplained slopes allow of round terms and of waves beyond the fit's.
     of_round = round_effect(patches, rings, radius_mm, inverse, variance)
     of_waves = wave_effect(patches, radius_mm, inverse, variance)
     rows = (

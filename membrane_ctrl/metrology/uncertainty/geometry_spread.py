@@ -59,6 +59,7 @@ class GeometrySpread:
     covariance: FloatArray
 
     def __post_init__(self) -> None:
+        # Each name once, and the poses in one of the two forms of a geometry.
         if len(set(self.names)) != len(self.names):
             raise ValueError("names: one occurs twice")
         poses = set(self.names) - set(OPTIONAL_NAMES)
@@ -68,6 +69,8 @@ class GeometrySpread:
                 f"{', '.join(GENERAL_NAMES)}, "
                 f"the rest from {', '.join(OPTIONAL_NAMES)}"
             )
+        # A covariance: square, finite, symmetric, no negative variance and no negative eigenvalue.
+        # The eigenvalues are those of the correlation, which has no units.
         if self.covariance.shape != (len(self.names), len(self.names)):
             raise ValueError(f"matrix: {len(self.names)} names need as many rows and columns")
         is_symmetric = np.all(np.isfinite(self.covariance)) and np.allclose(
@@ -167,6 +170,7 @@ def change_geometry(
     amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
     if not amounts:
         return geometry
+    # A geometry by a, b and alpha changes these numbers themselves.
     camera = geometry.camera
     screen = geometry.screen
     if camera is None or screen is None or screen.pose is None:
@@ -177,7 +181,7 @@ def change_geometry(
     if unknown := set(names) - set(GENERAL_NAMES):
         raise ValueError(f"{min(unknown)}: the geometry is given by two poses")
 
-    # The camera.
+    # The camera: its position is shifted, its axes are turned about it.
     turn = _rotation(amounts, "camera")
     rows = [_to_vector(turn @ np.array(row)) for row in camera.rotation]
     moved_camera = CameraPoseConfig(
@@ -185,7 +189,7 @@ def change_geometry(
         rotation=(rows[0], rows[1], rows[2]),
     )
 
-    # The screen.
+    # The screen, about its origin O'.
     turn = _rotation(amounts, "screen")
     origin_mm, s_x, s_y = screen.pose
     moved_screen = screen.model_copy(

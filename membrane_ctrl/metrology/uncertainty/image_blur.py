@@ -85,7 +85,6 @@ def estimate_blur_px(
         Sigma of the Gaussian, pixels.
     """
     # |grad phase|^2 of x and of y, per pixel.
-    # |grad phase|^2 of x and of y, per pixel.
     squares = []
     for phase in predicted_rad:
         grid = np.full(shape, np.nan)

@@ -124,8 +124,10 @@ def image_lag_effect(
     scale = screen_scale.mm_per_rad(bench.optics.pattern)
     centre_rad = screen_scale.centre_phase_rad(bench.optics.pattern)
     angle = bench.screen_mm / scale + centre_rad
+
+    # Error of the phase of x and of y, frame by frame, as error of the screen points. A share f
+    # adds f (previous - own) to a frame; C and S are linear in the frames, with these weights.
     off = np.zeros_like(bench.screen_mm)
-    # Error of the phase of x and of y, frame by frame, as error of the screen points.
     for axis, frames in enumerate(used):
         _, cosine, sine = phase_steps.step_weights(stack.shifts_rad(frames))
         for k, frame in enumerate(frames):
@@ -136,6 +138,8 @@ def image_lag_effect(
             off[axis] -= (
                 scale * change * (cosine[k] * np.sin(angle[axis]) - sine[k] * np.cos(angle[axis]))
             )
+
+    # The surface that such screen points give, less the true one.
     solved = bench.solve(bench.geometry(), off, linear=True)
     return np.asarray(solved - bench.surface.parameters)
 

@@ -50,9 +50,9 @@ from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_DEGREE
 # Least K over the tilt that a motion of the mirror alone would explain: a camera that turns tilts
 # the ring by a fourth of its turn, a screen that shifts by a fifth.
 _KNOCK_PER_TILT = 5.0
-# Decreases of chi-square.
-# Noise gives 1 for each component on average: what is beyond it is motion. Leaving out more (4)
-# leaves out turns of 18 to 30 µrad where a figure has 0.1 µm of noise: 6 sigma off in an `ok` one.
+# Decreases of chi-square. Noise gives 1 for each component on average, and what is beyond it is
+# motion. Leaving out more (4) leaves out turns of 18 to 30 µrad where a figure has 0.1 µm of noise:
+# 6 sigma off in an `ok` one.
 _CHANCE_GAIN = 1.0
 _SURE_GAIN = 25.0  # 5 sigma
 _PLAUSIBLE_GAIN = 9.0  # below the best: 3 sigma

@@ -149,7 +149,7 @@ class _SlopesOfScreen:
     def __init__(self, tracer: Tracer, surface: Surface, position_mm: FloatArray) -> None:
         self._tracer = tracer
         self._surface = surface
-        # Rays from the pinhole to the points of the surface, and what they see of the screen.
+        # Rays d = (P - F) / |P - F| to the points of the surface, and what they see of the screen.
         height_mm = tracer.vertex_z_mm + surface.height(position_mm[0], position_mm[1])
         way_mm = np.vstack([position_mm, height_mm]) - tracer.geometry.pinhole_mm[:, None]
         rays = way_mm / np.linalg.norm(way_mm, axis=0)
@@ -181,17 +181,20 @@ class _PartGrid:
     """A grid about the vertex over the part with reflections and the mirror around it."""
 
     def __init__(self, left: LeftReflections) -> None:
-        # A grid about the vertex whose cells have some points each.
+        # A grid about the vertex, wider than the part with reflections: the mirror around it is
+        # what the zero is counted from. Its cells have some points each, on the part's ellipse.
         position_mm = left.position_mm
         reach_mm = float(np.max(np.hypot(*position_mm)))
         area_mm2 = np.pi * (np.ptp(position_mm[0]) / 2) * (np.ptp(position_mm[1]) / 2)
         step_mm = math.sqrt(_POINTS_A_CELL * area_mm2 / position_mm.shape[1])
         half = math.ceil(_REACH * reach_mm / step_mm)
         self._axis_mm: FloatArray = step_mm * np.arange(-half, half + 1, dtype=float)
+        # The cell of each point: the nearest middle, with the vertex in the middle of the grid.
         side = self._axis_mm.size
         column, row = np.rint(position_mm / step_mm).astype(int) + half
         self._cell = row * side + column
         self._count = np.bincount(self._cell, minlength=side**2)
+        # The mirror around the part, and the cells near the vertex.
         x_mm, y_mm = np.meshgrid(self._axis_mm, self._axis_mm)
         from_vertex_mm = np.hypot(x_mm, y_mm)
         self._ring = from_vertex_mm > _RING * self._axis_mm[-1]
@@ -210,6 +213,7 @@ class _PartGrid:
 
     def _integrate(self, slopes: FloatArray) -> FloatArray:
         """Height (m, m), 0 at the vertex; cells without a point have no slope."""
+        # Means over the cells, then heights whose differences fit the slopes best.
         side = self._axis_mm.size
         count = np.maximum(self._count, 1)
         slope_x, slope_y = (

@@ -33,8 +33,15 @@ def second_reflection_source(bench: TrialBench, seen: SecondReflection) -> Sourc
     Source
         A limit if nothing was found.
     """
-    sigma = seen.sigma if math.isfinite(seen.sigma) else 0.0
-    share = seen.share if seen.is_found else _UNIFORM * _HIDDEN_SIGMAS * sigma
+    # Share of the light: as found, or the largest that may hide in the noise of the Gray frames.
+    sigma = 0.0
+    if math.isfinite(seen.sigma):
+        sigma = seen.sigma
+    share = _UNIFORM * _HIDDEN_SIGMAS * sigma
+    if seen.is_found:
+        share = seen.share
+
+    # Light r of another place turns a phase by r sin(phi' - phi): the surface for each axis alone.
     scale = screen_scale.mm_per_rad(bench.optics.pattern)
     effects = []
     for axis in range(2):
