@@ -50,7 +50,8 @@ class Lab:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._servers: dict[str, modbus_server.ModbusTcpServer] = {}
         self._tables: defaultdict[str, dict[int, modbus_pdu.RegisterTable]] = defaultdict(dict)
-        # Instruments on lines of their own, and registers of those on Modbus, by link and unit
+
+        # Instruments on lines of their own, and registers of those on Modbus, by link and unit.
         for role, section in devices.roles().items():
             if isinstance(section, settings.BronkhorstModbusConfig):
                 instrument = self._make_bronkhorst(role, section.serial)
@@ -65,7 +66,7 @@ class Lab:
             self._tables[devices.board][devices.unit_id] = self._board.state
         self._modules: defaultdict[str, dict[int, input_module.InputModule]] = defaultdict(dict)
         self._add_modules()
-        # A Modbus RTU bus is a serial line with several units
+        # A Modbus RTU bus is a serial line with several units.
         for url in self._modbus_urls:
             if url.startswith("rtu:"):
                 _, line = modbus_rtu.parse_rtu_url(url)
@@ -78,6 +79,7 @@ class Lab:
         """Plug everything in; returns the configuration with the emulators' addresses. Raises
         OSError.
         """
+        # A pseudo-terminal for each serial line, and a server for each Modbus TCP link.
         self._folder = tempfile.TemporaryDirectory(prefix="membrane-lab-")
         for number, (port, device) in enumerate(self.serial.items()):
             self.wires[port] = serial_device.PtyWire(
@@ -90,6 +92,7 @@ class Lab:
                     partial(self._answer_unit_safely, url), "127.0.0.1", 0
                 )
                 await self._servers[url].start()
+        # The same configuration, with the addresses of the emulators.
         interlocks = tuple(
             self._moved_interlock(interlock) for interlock in self._devices.interlocks
         )
@@ -165,6 +168,7 @@ class Lab:
         """One module for all interlocks at the same unit, and one for each GPIO chip; every circuit
         is closed.
         """
+        # Circuits by link, unit, table of bits and address.
         bits: defaultdict[tuple[str, int], dict[str, dict[int, Callable[[], bool]]]] = defaultdict(
             lambda: {"discrete": {}, "coil": {}}
         )
@@ -304,12 +308,18 @@ def _gpio_url(chip: str) -> str:
 
 
 class MapDevice:
-    """A `RegisterTable` for any server: maps that are read, each with the value's source, and maps
-    that are written.
+    """A `RegisterTable` for any server.
 
-    `constants` are words by address, for identity and version; words outside `raw_limits` are
-    refused with exception
-    3.
+    Parameters
+    ----------
+    sensors : mapping of ValueMap to callable
+        Maps that are read; the function returns the present value in the map's unit.
+    outputs : mapping of ValueMap to callable
+        Maps that are written; the function receives each new value.
+    constants : mapping of int to int, optional
+        Words by address, for identity and version.
+    raw_limits : (int, int)
+        Written words outside are refused with exception 3.
     """
 
     def __init__(

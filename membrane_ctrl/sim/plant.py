@@ -66,18 +66,27 @@ class Plant:
         self._sensors = Sensors(twin, noise)
         self._room = Room(twin)
         self._disturbance = Disturbance(twin, events, STEP_S, chance)
+
+        # Leak and vent as conductances: the leak empties the mirror with its time constant, the
+        # vent moves the nominal centre at its speed.
         self._leak_ml_per_s_per_pa = gas_compliance_ml_per_pa() / twin.leak_time_constant_s
         self._vent_ml_per_s_per_pa = (
             VENT_OPEN_UM_PER_S / NOMINAL_UM_PER_ML / film.NOMINAL_PRESSURE_PA
         )
         self._pump = PumpModel(pump, pump.flow_full_um_per_s / NOMINAL_UM_PER_ML, STEP_S, twin)
-        self._loaded_s = 0.0 if twin.from_flat else film.SETTLED_S
+        # Time in steps, commands, and the first block of surroundings.
+        self._loaded_s = film.SETTLED_S
+        if twin.from_flat:
+            self._loaded_s = 0.0
         self._steps = 0
         self._rest = 0.0
-        self._pump_fraction = self._vent_fraction = self._inflow_ml_per_s = 0.0
+        self._pump_fraction = 0.0
+        self._vent_fraction = 0.0
+        self._inflow_ml_per_s = 0.0
         self._climate: ClimateBlock | None = None
         self._load_block()
         self._index = 0
+
         # From flat films without gas, or at the setpoint with the pump at the flow that holds it.
         if twin.from_flat:
             self._gas = Gas(0.0, self._air_k[0], 0.0)
@@ -136,7 +145,8 @@ class Plant:
         """The true state."""
         i = self._index
         # Depth by the pressure, and its change per amount of gas, by which flows become speeds.
-        gas, ambient_pa = self._gas, self._ambient_pa[i]
+        gas = self._gas
+        ambient_pa = self._ambient_pa[i]
         gauge_pa = gas.gauge_pressure_pa
         sag_mm = self._sag[i] * gas.root_pa
         um_per_ml = 1e3 * self._sag[i] * gas.root_pa_per_ml(ambient_pa, self._volume[i])
@@ -159,7 +169,11 @@ class Plant:
         )
 
     def _run_steps(self, start: int, stop: int) -> None:
-        """Steps `start` to `stop` of the block."""
+        """Steps `start` to `stop` of the block.
+
+        The gas is one state, the cube root of its gauge pressure. Leak and vent are laminar: their
+        flow is in proportion to the pressure.
+        """
         gas_step = self._gas.step
         gas = self._gas
         pump_step = self._pump.step
@@ -184,7 +198,7 @@ class Plant:
 
     def _load_block(self) -> None:
         """Surroundings and creep of the next block, as lists: indexing them gives plain floats."""
-        # Surroundings.
+        # Surroundings and the films' age at each step.
         block = self._disturbance.next_steps(_BLOCK_STEPS)
         age_s = self._loaded_s + block.time_s
         self._ambient_pa: list[float] = block.ambient_pa.tolist()
@@ -193,21 +207,20 @@ class Plant:
         self._laser_bias_um: list[float] = block.laser_bias_um.tolist()
         self._laser_lost: list[float] = block.laser_lost.tolist()
         # Sag and volume of the films over the cube root of the pressure, as they creep.
+        mirror_m3 = film.MIRROR_FILM.volume_m3_per_root_pa(age_s)
+        back_m3 = film.BACK_FILM.volume_m3_per_root_pa(age_s)
         self._sag: list[float] = film.MIRROR_FILM.sag_mm_per_root_pa(age_s).tolist()
         self._back_sag: list[float] = film.BACK_FILM.sag_mm_per_root_pa(age_s).tolist()
-        volume = film.MIRROR_FILM.volume_m3_per_root_pa(
-            age_s
-        ) + film.BACK_FILM.volume_m3_per_root_pa(age_s)
-        self._volume: list[float] = volume.tolist()
+        self._volume: list[float] = (mirror_m3 + back_m3).tolist()
         self._index = -1
         if self._room.is_steady:
             return
+        # The room's climate: warmer air, and films whose strain changes sag and volume alike.
         time_s = np.asarray(block.time_s, dtype=np.float64)
         weather = self._room.make_block(time_s)
         self._climate = weather
         self._air_k = (block.air_k + weather.air_k).tolist()
         self._sag = (np.asarray(self._sag) * weather.mirror_factor).tolist()
         self._back_sag = (np.asarray(self._back_sag) * weather.back_factor).tolist()
-        mirror = film.MIRROR_FILM.volume_m3_per_root_pa(age_s) * weather.mirror_factor
-        back = film.BACK_FILM.volume_m3_per_root_pa(age_s) * weather.back_factor
-        self._volume = (mirror + back).tolist()
+        volume_m3 = mirror_m3 * weather.mirror_factor + back_m3 * weather.back_factor
+        self._volume = volume_m3.tolist()

@@ -65,21 +65,25 @@ class _RitzFilm:
     """Basis functions at the places of the quadrature, and Newton's solution."""
 
     def __init__(self) -> None:
+        # Places and weights of the quadrature: Gauss in r^2, even in the azimuth.
         nodes, weights = np.polynomial.legendre.leggauss(_RADII)
         radius = np.sqrt((nodes + 1) / 2)  # even in area
         angle = 2 * np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
         self.x = np.outer(radius, np.cos(angle)).ravel()
         self.y = np.outer(radius, np.sin(angle)).ravel()
         self.weights = np.repeat(weights / 2, _AZIMUTHS) * np.pi / _AZIMUTHS
+        # The basis functions there: of w with the derivatives that make strains, of u and v.
         self.height_powers = _list_powers(_HEIGHT_DEGREE)
         w, w_x, w_y = _evaluate(self.height_powers, self.x, self.y)
         _, u_x, u_y = _evaluate(_list_powers(_PLANE_DEGREE), self.x, self.y)
         self._slopes = np.stack([w_x, w_y])
         none = np.zeros_like(u_x)
-        # Strains (3, n, unknowns) of u and of v
+        # Strains e_x, e_y and g (3, n, unknowns) of u and of v.
         self._in_plane = np.stack(
             [np.hstack([u_x, none]), np.hstack([none, u_y]), np.hstack([u_y, u_x])]
         )
+        # Work of the load per unit of each unknown, height of the centre, and Hooke's law of plane
+        # stress for E t = 1.
         self._load = self.weights @ w
         self._centre = _evaluate(self.height_powers, np.zeros(1), np.zeros(1))[0][0]
         nu = POISSON_RATIO
@@ -88,6 +92,8 @@ class _RitzFilm:
 
     def solve(self, strain: FloatArray, depth: float) -> FloatArray:
         """Coefficients of w for a strain (n,) at the places, at a depth of the centre."""
+        # Begin with a paraboloid (1 - r^2) depth; the load of a film goes with the cube of its
+        # depth, which corrects it in each round.
         heights = len(self.height_powers)
         unknowns = np.zeros(heights + self._in_plane.shape[2])
         unknowns[0] = depth
@@ -95,6 +101,7 @@ class _RitzFilm:
         for _ in range(_LOAD_ROUNDS):
             unknowns = self._solve_loaded(unknowns, strain, load)
             load *= (depth / float(self._centre @ unknowns[:heights])) ** 3
+        # What is left of the difference, by scale.
         found = unknowns[:heights]
         return np.asarray(found * depth / float(self._centre @ found))
 
@@ -123,6 +130,7 @@ class _RitzFilm:
             gradient[:heights] -= load * self._load
             stiff_rows = np.einsum("ik,knj->inj", self._stiffness, rows) * self.weights[:, None]
             hessian = np.tensordot(rows, stiff_rows, axes=([0, 1], [0, 1]))
+            # The forces act on the second derivatives of the strains, w_x^2 / 2 and w_x w_y.
             n_x, n_y, n_xy = (self.weights * forces)[:, :, None]
             crossed = by_x.T @ (n_xy * by_y)
             hessian[:heights, :heights] += (
@@ -144,8 +152,11 @@ def _evaluate(
     powers: list[tuple[int, int]], x: FloatArray, y: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(1 - r^2) x^i y^j and its derivatives by x and y, (n, powers) each."""
+    # (c t)_x = c t_x - 2 x t with the clamp c = 1 - r^2 and the term t = x^i y^j.
     clamp = 1 - x * x - y * y
-    values, by_x, by_y = [], [], []
+    values = []
+    by_x = []
+    by_y = []
     for i, j in powers:
         term = x**i * y**j
         term_x = i * x ** max(i - 1, 0) * y**j
@@ -174,12 +185,14 @@ def compute_patch_polynomial(patch: Patch) -> FloatArray:
     (k, k) array
         Coefficients of x^i y^j on the unit disc, µm of height, 0 at vertex and rim.
     """
+    # Half the difference of a warm and a cold patch: terms of even order in the strain cancel.
     film = _make_film()
     depth = NOMINAL_SAG_MM / RADIUS_MM
     profile = patch.profile(film.x, film.y)
     solved = [film.solve(sign * _STRAIN * profile, depth) for sign in (1, -1)]
-    # Heights are upward: a deeper place is lower
+    # Heights are upward: a deeper place is lower. In µm, for a strain of 1e-6.
     change = -1e3 * RADIUS_MM * 1e-6 * (solved[0] - solved[1]) / (2 * _STRAIN)
+    # (1 - x^2 - y^2) x^i y^j, multiplied out.
     polynomial = np.zeros((_HEIGHT_DEGREE + 3, _HEIGHT_DEGREE + 3))
     for (i, j), value in zip(film.height_powers, change, strict=True):
         polynomial[i, j] += value

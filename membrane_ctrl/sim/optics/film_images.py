@@ -54,6 +54,7 @@ def light_of_pattern(shown: Pattern, config: PatternConfig, light: Light) -> Scr
 
         def crossed(s_x_mm: FloatArray, s_y_mm: FloatArray) -> FloatArray:
             """Fringes of both axes."""
+            # Level (1 + (cos phi_x + cos phi_y) / 2) / 2, phi = 2 pi s / T - pi + shift.
             turns_x = 2 * np.pi * shown.index * s_x_mm / side_mm
             turns_y = 2 * np.pi * shown.index * s_y_mm / side_mm
             along_x = np.cos(turns_x + shown.shift_rad - np.pi)
@@ -99,6 +100,7 @@ def light_of_panel(panel: PanelPicture, light: Light) -> ScreenLight:
 
     def nearest(s_x_mm: FloatArray, s_y_mm: FloatArray) -> FloatArray:
         """Light at places that may be beside the panel."""
+        # Columns grow with s_x; rows count down while s_y is up.
         column = np.rint(low_column + s_x_mm / pitch_mm).astype(int)
         row = np.rint(low_row - s_y_mm / pitch_mm).astype(int)
         rows, columns = pixels.shape

@@ -1,4 +1,4 @@
-"""Turns traced nodes into counts: one compiled pass, about ten nanoseconds per pixel."""
+"""Turns traced nodes into a picture of a pattern along one axis: about ten nanoseconds a pixel."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from firmware_iface.optical_roles import Pixels
 from membrane_ctrl.model.arrays import FloatArray, Singles
 from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.sim.optics.node_interpolation import interpolate_cubic, interpolate_row
-from membrane_ctrl.sim.optics.pixel_noise import GOLDEN, LOW_16, MIX_1, random_64_bits
+from membrane_ctrl.sim.optics.row_exposure import BESIDE_FILM, expose_row
 
 
 def vignetting_loss(
@@ -95,65 +95,30 @@ def shade_rows(
     step = weights.shape[0]
     width = out.shape[1]
     values, cell_mm, smooth = table
-    dark, white, leak, full = scale
-    column_loss, row_loss = loss
-    quantiles, sigma, seed = noise
-    more, first_row, first_column = added
+    leak = scale[2]
     radius2_mm2 = radius_mm * radius_mm
     # An array for each quantity, not rows of one: a view taken per pixel costs more than the pixel.
     line_x = np.empty(nodes.shape[2])
     line_y = np.empty(nodes.shape[2])
     line_r2 = np.empty(nodes.shape[2])
-    line_factor = np.ones(nodes.shape[2])
-    line_room = np.zeros(nodes.shape[2])
-    disturbed = nodes.shape[0] > 3
-    bits = np.uint64(0)
+    light = np.empty(width)
     for row in range(start, stop):
-        # The random numbers do not depend on how rows are shared between threads.
-        state = np.uint64(seed) * MIX_1 + np.uint64(row) * np.uint64((width + 3) // 4) * GOLDEN
-
-        # The quantities at the row, in the columns of the nodes.
+        # Where the rays meet screen and film, in the columns of the nodes.
         interpolate_row(nodes, 0, row // step, weights[row % step], line_x)
         interpolate_row(nodes, 1, row // step, weights[row % step], line_y)
         interpolate_row(nodes, 2, row // step, weights[row % step], line_r2)
-        if disturbed:
-            interpolate_row(nodes, 3, row // step, weights[row % step], line_factor)
-            interpolate_row(nodes, 4, row // step, weights[row % step], line_room)
         for cell in range((width + step - 1) // step):
             for k in range(min(step, width - cell * step)):
                 column = cell * step + k
-                counts = dark
-                if interpolate_cubic(line_r2, cell, weights, k) <= radius2_mm2:  # on the film
-                    # Light of the screen where the ray meets it: the level of the pattern inside
-                    # its region, the panel's leak beside it.
+                light[column] = BESIDE_FILM
+                if interpolate_cubic(line_r2, cell, weights, k) <= radius2_mm2:
+                    # The level of the pattern inside its region, the panel's leak beside it.
                     s_x_mm = interpolate_cubic(line_x, cell, weights, k)
                     s_y_mm = interpolate_cubic(line_y, cell, weights, k)
-                    light = leak
+                    light[column] = leak
                     if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:
                         s_mm = s_x_mm
                         if axis == 1:
                             s_mm = s_y_mm
-                        light = _look_up_level(s_mm, values, cell_mm, smooth)
-
-                    # What the bench does to it, and the lens' vignetting.
-                    if disturbed:
-                        light *= interpolate_cubic(line_factor, cell, weights, k)
-                        counts += interpolate_cubic(line_room, cell, weights, k)
-                    counts += white * light * (1.0 - column_loss[column] - row_loss[row])
-
-                # Light of further images of the screen.
-                i = row - first_row
-                j = column - first_column
-                if 0 <= i < more.shape[0] and 0 <= j < more.shape[1]:
-                    counts += more[i, j]
-
-                # Noise: four 16-bit numbers from each 64-bit one.
-                if sigma > 0.0:
-                    if column & 3 == 0:
-                        state += GOLDEN
-                        bits = random_64_bits(state)
-                    counts += sigma * quantiles[bits & LOW_16]
-                    bits >>= np.uint64(16)
-
-                # The converter rounds, and clips at both ends.
-                out[row, column] = min(max(counts + 0.5, 0.0), full)
+                        light[column] = _look_up_level(s_mm, values, cell_mm, smooth)
+        expose_row(nodes, weights, row, light, scale, loss, noise, added, out)

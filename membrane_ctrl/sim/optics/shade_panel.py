@@ -11,7 +11,7 @@ from membrane_ctrl.model.arrays import FloatArray, Singles
 from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.sim.optics.node_interpolation import interpolate_cubic, interpolate_row
 from membrane_ctrl.sim.optics.pattern_levels import Light, screen_light
-from membrane_ctrl.sim.optics.pixel_noise import GOLDEN, LOW_16, MIX_1, random_64_bits
+from membrane_ctrl.sim.optics.row_exposure import BESIDE_FILM, expose_row
 
 # Blur of the lens, in pixels of the panel: it does not resolve a checkerboard, and lowers the
 # contrast of a fringe of 100 px by 0.4 %.
@@ -75,50 +75,31 @@ def shade_panel_rows(
         As in `shade.shade_rows`.
     """
     step = weights.shape[0]
-    dark, white, leak, full = scale
-    column_loss, row_loss = loss
-    quantiles, sigma, seed = noise
+    width = out.shape[1]
+    leak = scale[2]
     low_column, low_row, pitch_mm = places
-    more, first_row, first_column = added
-    lines = np.empty((nodes.shape[0], nodes.shape[2]))
+    radius2_mm2 = radius_mm * radius_mm
+    line_x = np.empty(nodes.shape[2])
+    line_y = np.empty(nodes.shape[2])
+    line_r2 = np.empty(nodes.shape[2])
+    light = np.empty(width)
     for row in range(start, stop):
-        # The random numbers do not depend on how rows are shared between threads.
-        state = np.uint64(seed) * MIX_1 + np.uint64(row) * np.uint64(out.shape[1]) * GOLDEN
-
-        # The quantities at the row, in the columns of the nodes.
-        for k in range(nodes.shape[0]):
-            interpolate_row(nodes, k, row // step, weights[row % step], lines[k])
-        for column in range(out.shape[1]):
+        # Where the rays meet screen and film, in the columns of the nodes.
+        interpolate_row(nodes, 0, row // step, weights[row % step], line_x)
+        interpolate_row(nodes, 1, row // step, weights[row % step], line_y)
+        interpolate_row(nodes, 2, row // step, weights[row % step], line_r2)
+        for column in range(width):
             cell = column // step
             k = column % step
-            counts = dark
-            if (
-                interpolate_cubic(lines[2], cell, weights, k) <= radius_mm * radius_mm
-            ):  # on the film
-                # Light of the panel's pixels where the ray meets them.
-                s_x_mm = interpolate_cubic(lines[0], cell, weights, k)
-                s_y_mm = interpolate_cubic(lines[1], cell, weights, k)
+            light[column] = BESIDE_FILM
+            if interpolate_cubic(line_r2, cell, weights, k) <= radius2_mm2:
+                # Light of the panel's pixels where the ray meets them; y is up, rows count down.
+                s_x_mm = interpolate_cubic(line_x, cell, weights, k)
+                s_y_mm = interpolate_cubic(line_y, cell, weights, k)
                 panel_column = low_column + s_x_mm / pitch_mm
                 panel_row = low_row - s_y_mm / pitch_mm
-                light = _pixel_light(picture, panel_column, panel_row, leak)
-
-                # What a disturbed bench does to it, and the lens' vignetting.
-                if nodes.shape[0] > 3:
-                    light *= interpolate_cubic(lines[3], cell, weights, k)
-                    counts += interpolate_cubic(lines[4], cell, weights, k)
-                counts += white * light * (1.0 - column_loss[column] - row_loss[row])
-
-            # Light of further images of the screen.
-            i = row - first_row
-            j = column - first_column
-            if 0 <= i < more.shape[0] and 0 <= j < more.shape[1]:
-                counts += more[i, j]
-
-            # Noise; then the converter rounds, and clips at both ends.
-            if sigma > 0.0:
-                state += GOLDEN
-                counts += sigma * quantiles[random_64_bits(state) & LOW_16]
-            out[row, column] = min(max(counts + 0.5, 0.0), full)
+                light[column] = _pixel_light(picture, panel_column, panel_row, leak)
+        expose_row(nodes, weights, row, light, scale, loss, noise, added, out)
 
 
 @compile_loop()
