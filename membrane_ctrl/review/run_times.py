@@ -8,6 +8,9 @@ from datetime import datetime, timedelta
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.durations import parse_duration_s
 
+_START = re.compile(r"\+? *0+[dhms]?")
+_CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::([0-5]\d(?:\.\d+)?))?")
+
 
 def moment_s(text: str, origin_utc: datetime) -> float:
     """Return the seconds of the run of a written time: `03:12[:30]` (UTC), ISO 8601, or `+90s`,
@@ -25,12 +28,15 @@ def moment_s(text: str, origin_utc: datetime) -> float:
     origin_utc : datetime
         Start of the run.
     """
+    # Counted from the start; 0 is no valid duration.
     text = text.strip()
-    if re.fullmatch(r"\+? *0+[dhms]?", text):  # the start, which is not a valid duration
+    if _START.fullmatch(text):
         return 0.0
     if text.startswith("+"):
         return parse_duration_s(text[1:])
-    clock = re.fullmatch(r"(\d{1,2}):(\d{2})(?::([0-5]\d(?:\.\d+)?))?", text)
+
+    # A time of day, or ISO 8601; what is neither may be a duration without its sign.
+    clock = _CLOCK.fullmatch(text)
     try:
         if clock:
             day = origin_utc.replace(
@@ -51,6 +57,20 @@ def moment_s(text: str, origin_utc: datetime) -> float:
             f"time {text!r}: write 03:12, 2026-11-21T03:12:00 or +90m from the start (UTC)"
         ) from None
     return (moment - origin_utc).total_seconds()
+
+
+def is_from_start(text: str) -> bool:
+    """Whether a time that `moment_s` accepts is counted from the start of the run."""
+    text = text.strip()
+    if _START.fullmatch(text) or text.startswith("+"):
+        return True
+    if _CLOCK.fullmatch(text):
+        return False
+    try:
+        datetime.fromisoformat(text)
+    except ValueError:
+        return True
+    return False
 
 
 def part_s(origin_utc: datetime, start: str | None, end: str | None) -> tuple[float, float]:

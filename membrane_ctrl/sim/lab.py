@@ -66,6 +66,7 @@ class Lab:
             self._tables[devices.board][devices.unit_id] = self._board.state
         self._modules: defaultdict[str, dict[int, input_module.InputModule]] = defaultdict(dict)
         self._add_modules()
+
         # A Modbus RTU bus is a serial line with several units.
         for url in self._modbus_urls:
             if url.startswith("rtu:"):
@@ -92,6 +93,7 @@ class Lab:
                     partial(self._answer_unit_safely, url), "127.0.0.1", 0
                 )
                 await self._servers[url].start()
+
         # The same configuration, with the addresses of the emulators.
         interlocks = tuple(
             self._moved_interlock(interlock) for interlock in self._devices.interlocks

@@ -74,6 +74,7 @@ class Plant:
             VENT_OPEN_UM_PER_S / NOMINAL_UM_PER_ML / film.NOMINAL_PRESSURE_PA
         )
         self._pump = PumpModel(pump, pump.flow_full_um_per_s / NOMINAL_UM_PER_ML, STEP_S, twin)
+
         # Time in steps, commands, and the first block of surroundings.
         self._loaded_s = film.SETTLED_S
         if twin.from_flat:
@@ -215,6 +216,7 @@ class Plant:
         self._index = -1
         if self._room.is_steady:
             return
+
         # The room's climate: warmer air, and films whose strain changes sag and volume alike.
         time_s = np.asarray(block.time_s, dtype=np.float64)
         weather = self._room.make_block(time_s)

@@ -72,16 +72,19 @@ class _RitzFilm:
         self.x = np.outer(radius, np.cos(angle)).ravel()
         self.y = np.outer(radius, np.sin(angle)).ravel()
         self.weights = np.repeat(weights / 2, _AZIMUTHS) * np.pi / _AZIMUTHS
+
         # The basis functions there: of w with the derivatives that make strains, of u and v.
         self.height_powers = _list_powers(_HEIGHT_DEGREE)
         w, w_x, w_y = _evaluate(self.height_powers, self.x, self.y)
         _, u_x, u_y = _evaluate(_list_powers(_PLANE_DEGREE), self.x, self.y)
         self._slopes = np.stack([w_x, w_y])
         none = np.zeros_like(u_x)
+
         # Strains e_x, e_y and g (3, n, unknowns) of u and of v.
         self._in_plane = np.stack(
             [np.hstack([u_x, none]), np.hstack([none, u_y]), np.hstack([u_y, u_x])]
         )
+
         # Work of the load per unit of each unknown, height of the centre, and Hooke's law of plane
         # stress for E t = 1.
         self._load = self.weights @ w
@@ -101,6 +104,7 @@ class _RitzFilm:
         for _ in range(_LOAD_ROUNDS):
             unknowns = self._solve_loaded(unknowns, strain, load)
             load *= (depth / float(self._centre @ unknowns[:heights])) ** 3
+
         # What is left of the difference, by scale.
         found = unknowns[:heights]
         return np.asarray(found * depth / float(self._centre @ found))
@@ -130,6 +134,7 @@ class _RitzFilm:
             gradient[:heights] -= load * self._load
             stiff_rows = np.einsum("ik,knj->inj", self._stiffness, rows) * self.weights[:, None]
             hessian = np.tensordot(rows, stiff_rows, axes=([0, 1], [0, 1]))
+
             # The forces act on the second derivatives of the strains, w_x^2 / 2 and w_x w_y.
             n_x, n_y, n_xy = (self.weights * forces)[:, :, None]
             crossed = by_x.T @ (n_xy * by_y)
@@ -190,8 +195,10 @@ def compute_patch_polynomial(patch: Patch) -> FloatArray:
     depth = NOMINAL_SAG_MM / RADIUS_MM
     profile = patch.profile(film.x, film.y)
     solved = [film.solve(sign * _STRAIN * profile, depth) for sign in (1, -1)]
+
     # Heights are upward: a deeper place is lower. In µm, for a strain of 1e-6.
     change = -1e3 * RADIUS_MM * 1e-6 * (solved[0] - solved[1]) / (2 * _STRAIN)
+
     # (1 - x^2 - y^2) x^i y^j, multiplied out.
     polynomial = np.zeros((_HEIGHT_DEGREE + 3, _HEIGHT_DEGREE + 3))
     for (i, j), value in zip(film.height_powers, change, strict=True):

@@ -51,3 +51,11 @@ def test_the_climate_of_a_run_is_shown_with_what_it_predicts() -> None:
 def test_a_bench_without_sensors_has_no_such_section() -> None:
     level = {"time_s": LEVEL["time_s"], "mean_film_temperature_c": UNKNOWN}
     assert review_climate(run_of(0.0, 0.0), level) is None
+
+
+def test_a_run_without_ticks_shows_its_sensors_and_no_strains() -> None:
+    run = SimpleNamespace(config=Config(), tick_blocks=lambda *_: iter([]))
+    climate = review_climate(run, LEVEL)  # type: ignore[arg-type]
+    assert climate is not None
+    assert climate.film_c[-1] == 23.0
+    assert np.isnan([climate.film_ppm, climate.ring_ppm, climate.spherical_um]).all()

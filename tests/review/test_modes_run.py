@@ -69,6 +69,15 @@ def test_a_mode_that_moves_within_a_week_is_reported(
     assert output.count("mode  ") == 1
 
 
+@pytest.mark.parametrize(("searches", "seen", "modes"), [(5, 2, 0), (5, 3, 1), (4, 2, 1)])
+def test_a_mode_is_in_at_least_half_of_the_searches(searches: int, seen: int, modes: int) -> None:
+    line = SimpleNamespace(frequency_hz=48.3, evidence=1.0, is_like=lambda other: True)
+    found = [(line,)] * seen + [()] * (searches - seen)
+    usual, passing = modes_run._group_lines(np.arange(searches, dtype=float), found)  # type: ignore[arg-type]
+    assert len(usual) == modes
+    assert passing == (0 if modes else seen)
+
+
 def test_a_run_without_vibrations_is_reported_as_such(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,6 +10,7 @@ import pytest
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model.telemetry import COLUMN, get_column
 from membrane_ctrl.review import open_run
+from membrane_ctrl.review.run_times import is_from_start
 from membrane_ctrl.review.statistics.analysis import analyse_run
 from tests.support.review_runs import written
 from tests.worlds.nights import night, write_run
@@ -54,7 +55,8 @@ def test_faults_and_missed_ticks_of_a_part_are_its_own(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("part", "whole", "message"),
     [
-        (["--from", "+100s", "--to", "+180s"], False, ", same part: Held for 1 min 15 s"),
+        # the plus sign may be omitted
+        (["--from", "100s", "--to", "+180s"], False, ", same part: Held for 1 min 15 s"),
         (["--from", "18:02", "--to", "18:04"], True, ", all of it: Held for 5 min 55 s"),
         ([], True, "-other: Held for 5 min 55 s"),
     ],
@@ -79,3 +81,13 @@ def test_a_part_is_compared_with_the_same_part_or_marked_as_not_compared(
     assert table["whole_run"] is whole
     page = (tmp_path / "o" / "report.html").read_text()
     assert ("Part of this run against the whole other run" in page) is (whole and bool(part))
+
+
+@pytest.mark.parametrize("text", ["+100s", "100s", "1h5m", "0", " +0s"])
+def test_a_duration_is_counted_from_the_start(text: str) -> None:
+    assert is_from_start(text)
+
+
+@pytest.mark.parametrize("text", ["03:12", "03:12:30", "2026-11-21T03:12:00", "2026-11-21"])
+def test_a_time_of_day_and_a_date_are_not(text: str) -> None:
+    assert not is_from_start(text)

@@ -39,6 +39,7 @@ def find_other_board(stated: Board, photographs: Sequence[Levels]) -> Board | No
     markers: list[Markers | None] = [None] * len(small)
     if stated.kind == "charuco":
         markers = [detect_markers(photograph) for photograph in small]
+
     # The size with the most corners; of equal ones the smallest, as a detector also finds a part.
     best: Board | None = None
     best_score = (0, 0)

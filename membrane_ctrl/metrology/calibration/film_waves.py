@@ -124,6 +124,7 @@ def _solve_unturned(
             largest = verdict.find_largest_cause(others)
             if largest.explained > explained:
                 return freed, (largest.finding,)
+
         # The angle at which the mirror of each set seems to stand.
         findings = []
         for k in group:

@@ -311,6 +311,7 @@ def find_mount_creep(solution: solver.Solution) -> MountCreep | None:
     count = len(solution.states)
     if count < _LEAST_TO_CREEP:
         return None
+
     # A creep is even in the number of the set, 0 in the middle; amounts are from first to last.
     share = np.linspace(-0.5, 0.5, count)
     units = [parameter.unit for parameter in bench_parameters.POSE]
@@ -385,6 +386,7 @@ def leave_set_out(solution: solver.Solution, index: int) -> solver.Solution:
     keep = [k for k in range(len(solution.states)) if k != index]
     problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
     linear = tuple(solution.equations[k] for k in keep)
+
     # One step from the same residuals: the surfaces are eliminated, the prior is added.
     sigmas = problem.sigmas
     of_sets = np.sum([each.eliminate_surface() for each in linear], axis=0)

@@ -161,6 +161,7 @@ def find_wrong_angles(
         turned = problem.sets[k].turned
         if turned is None:
             continue
+
         # The film's figure is that of the set with the nearest sag, as it depends on the sag.
         sag_mm = states[k].surface.sag_mm
         near = min(not_turned, key=lambda j: abs(states[j].surface.sag_mm - sag_mm))

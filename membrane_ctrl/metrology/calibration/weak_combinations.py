@@ -83,6 +83,7 @@ def weak_combinations(
     for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
         if value < WEAK**2:
             break
+
         # One sigma of the combination, as amounts of its parameters; the large ones are named.
         left = float(np.sqrt(value))
         amounts = vector * np.sqrt(value) * solution.problem.sigmas[free]

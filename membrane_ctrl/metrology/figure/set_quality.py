@@ -36,6 +36,7 @@ def set_quality(
     used = [k for frames in checked.view.used for k in frames]
     clipped = checked.binned.saturated[used].any(axis=0)
     on_mirror = (checked.view.mask | clipped) & checked.near
+
     # Shares of full scale and of the analysed disc; the residual is the RMS of one slope.
     shares = clipped_shares(checked.binned, used, on_mirror)
     return Quality(

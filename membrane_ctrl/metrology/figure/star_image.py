@@ -148,6 +148,7 @@ def find_paths(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     tilt_x, tilt_y, curvature = found[1:] / (scale_mm, scale_mm, scale_mm**2)
     if curvature <= 0:
         raise ValueError("the mirror has no focus in front of it")
+
     # The wave comes along the paraboloid's axis: turn it to z. Its focus is 1 / (4 c) above it.
     turned_mm = np.stack((x, y, z - tilt_x * x - tilt_y * y))
     focus = np.array([0.0, 0.0, 1 / (4 * curvature)])

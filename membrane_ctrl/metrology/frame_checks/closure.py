@@ -172,6 +172,7 @@ def closure_with_level(
 
     # The RMS of all frames: N equations and that of the length, less two unknowns.
     rms_adu = math.sqrt(_level_rss(centred, design, amplitude) / (count - 1))
+
     # The same without each frame in turn: the suspect is the one without which the rest agrees.
     without_rms_adu = np.empty(count)
     for left_out in range(count):

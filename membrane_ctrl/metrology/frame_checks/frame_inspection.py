@@ -219,6 +219,7 @@ def _name_sinusoid_defect(
         return FrameDefect.DARK, f"dark: {light:.2f} of the light of the others"
     if largest is _Deviation.LIGHT or abs(light - 1) > _FLICKER:
         return FrameDefect.FLICKER, f"flicker: {light:.3f} of the light of the others"
+
     # The right light: the film elsewhere, another phase step, or a cause that is not known.
     away_um = own.moved_um - usual_moved_um
     if largest in (_Deviation.MOVED, _Deviation.REST) and abs(away_um) > MOVED_UM:
@@ -294,6 +295,7 @@ def _judge_flat(frame: int, own: FrameEvidence, bright: float, is_white: bool) -
         light_severity = abs(light - 1) / WHITE_SHARE
     if max(rest_severity, light_severity) <= 1:
         return []
+
     # An uneven frame shows another picture; so does a black one that is too bright.
     if rest_severity > light_severity or not is_white:
         differs = f"stale or wrong picture: differs from its prediction by {own.rest / bright:.0%}"

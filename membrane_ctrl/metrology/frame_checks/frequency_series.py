@@ -310,6 +310,7 @@ def _find_same_picture(
     """A step of a series that shows the picture of an earlier frame, and the reason."""
     # Two frames show the same picture if they differ by less than this share of the fringes' swing.
     largest_difference = SAME_SHARE * _series_amplitude(axis.frames[index], axis.shifts_rad)
+
     # The frames in the order of capture; each step of this series against all before it, the last
     # one first, since a camera or panel that lags repeats that.
     earlier: list[tuple[str, FloatArray]] = []

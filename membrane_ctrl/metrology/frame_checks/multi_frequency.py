@@ -292,6 +292,7 @@ def _unwrap_finest(
             "orders: check period_mm, axis and index of these frames",
             flags,
         )
+
     # Phases beside the pattern are those of no fringe.
     inside = screen_scale.inside_pattern(found.phase_rad, optics.pattern)
     return np.where(inside, found.phase_rad, np.nan)

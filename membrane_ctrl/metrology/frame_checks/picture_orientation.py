@@ -150,6 +150,7 @@ def _residual_urad(
     count = int(np.count_nonzero(inside))
     if count < _LEAST_BINS:
         return math.inf, count
+
     # A fit from the paper's parabola (equation 20), with the tolerance that the comparison needs.
     points = Points.from_rays(rays[:, inside], screen_mm[:, inside])
     start = make_parabola(optics.mirror.sag_mm, tracer.radius_mm)

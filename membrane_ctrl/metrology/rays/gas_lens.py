@@ -113,6 +113,7 @@ def trace_gas_lens(
     theta = k * np.pi * (3 - np.sqrt(5))
     x = rho * np.cos(theta)
     y = rho * np.sin(theta)
+
     # The shift of the screen points: the rays of these places with the film, less those without.
     # For two depths, as the shift changes linearly with the depth.
     tables = []

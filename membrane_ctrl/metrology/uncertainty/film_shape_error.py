@@ -222,6 +222,7 @@ def _mean_of_rings(rings: RoundSlopes, absorbed: FloatArray, radius_mm: float) -
     _, beyond_x, beyond_y = surface_basis.evaluate_round_basis(rho * cosine, rho * sine)
     left_x = beyond_x - absorbed.T @ own_x
     left_y = beyond_y - absorbed.T @ own_y
+
     # Radial slopes, averaged over each circle, then over the ring with the circles' lengths.
     radial = left_x * cosine + left_y * sine
     of_radii = radial.reshape(-1, *radius.shape, _AZIMUTHS).mean(axis=-1)
@@ -262,6 +263,7 @@ def film_shape_sources(full: FullResult, slope_variance: FloatArray) -> tuple[bu
     places_mm = np.stack([x[seen], y[seen]])
     slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
     rings = RoundSlopes.from_points(places_mm, grid.count[seen], slopes, float(grid.axis_mm[-1]))
+
     # What the unexplained slopes allow of round terms and of waves beyond the fit's.
     of_round = round_effect(patches, rings, radius_mm, inverse, variance)
     of_waves = wave_effect(patches, radius_mm, inverse, variance)

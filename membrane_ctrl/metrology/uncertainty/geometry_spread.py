@@ -69,6 +69,7 @@ class GeometrySpread:
                 f"{', '.join(GENERAL_NAMES)}, "
                 f"the rest from {', '.join(OPTIONAL_NAMES)}"
             )
+
         # A covariance: square, finite, symmetric, no negative variance and no negative eigenvalue.
         # The eigenvalues are those of the correlation, which has no units.
         if self.covariance.shape != (len(self.names), len(self.names)):
@@ -170,6 +171,7 @@ def change_geometry(
     amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
     if not amounts:
         return geometry
+
     # A geometry by a, b and alpha changes these numbers themselves.
     camera = geometry.camera
     screen = geometry.screen

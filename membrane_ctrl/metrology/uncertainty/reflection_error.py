@@ -149,6 +149,7 @@ class _SlopesOfScreen:
     def __init__(self, tracer: Tracer, surface: Surface, position_mm: FloatArray) -> None:
         self._tracer = tracer
         self._surface = surface
+
         # Rays d = (P - F) / |P - F| to the points of the surface, and what they see of the screen.
         height_mm = tracer.vertex_z_mm + surface.height(position_mm[0], position_mm[1])
         way_mm = np.vstack([position_mm, height_mm]) - tracer.geometry.pinhole_mm[:, None]
@@ -189,11 +190,13 @@ class _PartGrid:
         step_mm = math.sqrt(_POINTS_A_CELL * area_mm2 / position_mm.shape[1])
         half = math.ceil(_REACH * reach_mm / step_mm)
         self._axis_mm: FloatArray = step_mm * np.arange(-half, half + 1, dtype=float)
+
         # The cell of each point: the nearest middle, with the vertex in the middle of the grid.
         side = self._axis_mm.size
         column, row = np.rint(position_mm / step_mm).astype(int) + half
         self._cell = row * side + column
         self._count = np.bincount(self._cell, minlength=side**2)
+
         # The mirror around the part, and the cells near the vertex.
         x_mm, y_mm = np.meshgrid(self._axis_mm, self._axis_mm)
         from_vertex_mm = np.hypot(x_mm, y_mm)

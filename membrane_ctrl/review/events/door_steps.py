@@ -119,6 +119,7 @@ def _find_candidates(
     """
     parts = []
     for lag in lags:  # one after the other: each takes 20 MB for a month
+        # A change over the lag, against the usual changes over it nearby.
         change = values[lag:] - values[:-lag]
         size = np.abs(change)
         sigma = np.fmax(local_sigma(change, _USUAL_SHARE), max(floor_pa, 1e-9))

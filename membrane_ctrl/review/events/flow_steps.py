@@ -77,8 +77,8 @@ def _find_long_steps(held: found_event.Level) -> list[found_event.FoundEvent]:
 
 def _find_short_steps(held: found_event.Level) -> list[found_event.FoundEvent]:
     """The largest step, if it is far above the scatter on both sides."""
-    # The place with the largest difference of means on both sides.
-    # Student's t of the flow after each window against the flow before it.
+    # Student's t of the flow after each window against the flow before it; the place where it is
+    # largest.
     windows = levels.coarser_level(held, SHORT_WINDOW_S)
     flow = _holding_flow(windows)
     places = range(SHORT_HALF, flow.size - SHORT_HALF)
@@ -86,12 +86,15 @@ def _find_short_steps(held: found_event.Level) -> list[found_event.FoundEvent]:
     if not judged:
         return []
     best = max(judged, key=lambda place: abs(_t_value(flow, place)[0]))
+
+    # It must be large against the flow itself, and against the scatter.
     size, t_value = _t_value(flow, best)
     old = float(flow[best - SHORT_HALF : best].mean())
     least = max(SHORT_LEAST_UM_PER_S, SHORT_LEAST_SHARE * old)
     if old <= 0 or abs(size) < least or t_value < SHORT_LEAST_T:
         return []
-    # Chance of so large a t value at any of the places.
+
+    # Chance of so large a t value at any of the places, to either side.
     chance = 2.0 * len(judged) * float(special.stdtr(2 * SHORT_HALF - 2, -t_value))
     event = found_event.event_around(
         "flow step", windows, best, SHORT_WINDOW_S, 100 * size / old, "%", max(0.0, 1.0 - chance)

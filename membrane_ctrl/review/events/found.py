@@ -214,20 +214,24 @@ def find_lateness_bursts(level: found_event.Level) -> list[found_event.FoundEven
 
 def find_noise_changes(level: found_event.Level) -> list[found_event.FoundEvent]:
     """The spread of the error changes for minutes."""
-    # Each second of the hold, with the number of its minute.
-    # Seconds of the held mirror, numbered by their minute.
+    # Seconds of the held mirror, numbered by their minute from the first one on.
     held = _select_held(level)
     minute = np.floor(held["time_s"] / 60).astype(int)
     error = held["mean_error_um"]
     there = np.isfinite(error)
     if not there.any():
         return []
-    first, size = minute[0], minute[-1] - minute[0] + 1
-    number, error = minute[there] - first, error[there]
+    first = minute[0]
+    size = minute[-1] - first + 1
+    number = minute[there] - first
+    error = error[there]
+
     # Standard deviation of the error within each minute.
     count = np.bincount(number, minlength=size)
     mean = np.bincount(number, error, size) / np.maximum(count, 1)
-    spread = np.sqrt(np.bincount(number, (error - mean[number]) ** 2, size) / np.maximum(count, 1))
+    squares = np.bincount(number, (error - mean[number]) ** 2, size)
+    spread = np.sqrt(squares / np.maximum(count, 1))
+
     # Its logarithm, so that a step is a factor; minutes with few seconds do not count.
     value = np.where((count >= 50) & (spread > 0), np.log(np.maximum(spread, 1e-12)), np.nan)
     found = steps.find_steps(

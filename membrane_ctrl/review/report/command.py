@@ -10,7 +10,7 @@ from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.report.json import make_verdict, report_table
 from membrane_ctrl.review.report.pump_history import explain_pump_change, pump_history
 from membrane_ctrl.review.report.run_page import render_report
-from membrane_ctrl.review.run_times import part_s
+from membrane_ctrl.review.run_times import is_from_start, part_s
 from membrane_ctrl.review.statistics import compare
 from membrane_ctrl.review.statistics.analysis import Analysis, analyse_run
 from membrane_ctrl.run_files.run import Run, open_run
@@ -115,8 +115,7 @@ def _open_other(run: Run, start: str | None, end: str | None) -> Analysis:
     """The run to compare with: the same part if counted from the start, else all, as times of day
     differ.
     """
-    from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
-    if from_start:
+    if all(text is None or is_from_start(text) for text in (start, end)):
         return analyse_run(run, *part_s(run.origin_utc, start, end))
     return analyse_run(run)
 

@@ -9,6 +9,8 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.run_files.run import Run
 
 _LAST_S = 60.0  # of the run: the strains and the error at its end are those of this time
+_SPHERICAL = 11  # Noll index
+_STRAINS = ("film_strain_ppm", "ring_strain_ppm", "climate_sigma_um")
 _SENSORS = {
     "film": "film_temperature_c",
     "ring": "ring_temperature_c",
@@ -59,23 +61,29 @@ def review_climate(run: Run, level: dict[str, FloatArray]) -> ClimateReview | No
     level : dict of str to (n,) array
         Its overview level (`run_files.levels`).
     """
+    # Means of the sensors, and the figure's change that the tick predicted from them.
     unknown = np.full(len(level["time_s"]), np.nan)
     means = {key: level.get(f"mean_{name}", unknown) for key, name in _SENSORS.items()}
     figure_um = np.asarray(level.get("mean_climate_figure_um", unknown), float)
     if not any(np.isfinite(values).any() for values in means.values()):
         return None
+
+    # The strains at the end, from the ticks around the last prediction.
+    film_ppm = ring_ppm = sigma_um = float("nan")
     known = np.flatnonzero(np.isfinite(figure_um))
-    film_ppm = ring_ppm = sigma_um = spherical_um = float("nan")
     if known.size:
         end_s = float(level["time_s"][known[-1]])
-        names = ("film_strain_ppm", "ring_strain_ppm", "climate_sigma_um")
-        blocks = list(run.tick_blocks(names, end_s - _LAST_S))
+        blocks = list(run.tick_blocks(_STRAINS, end_s - _LAST_S))
         film_ppm, ring_ppm, sigma_um = (
-            _find_last(np.concatenate([block[name] for block in blocks])) for name in names
+            _find_last(np.concatenate([np.empty(0), *(block[name] for block in blocks)]))
+            for name in _STRAINS
         )
-        mirror = run.config.optics.mirror
-        terms_um = compute_climate_sensitivity(mirror.radius_mm, mirror.sag_mm).terms_um
-        spherical_um = float(terms_um[10]) * (film_ppm - ring_ppm)
+
+    # The spherical term by the excess strain of the film over its ring (section 1 of
+    # docs/explanation/climate.md).
+    mirror = run.config.optics.mirror
+    terms_um = compute_climate_sensitivity(mirror.radius_mm, mirror.sag_mm).terms_um
+    spherical_um = float(terms_um[_SPHERICAL - 1]) * (film_ppm - ring_ppm)
     return ClimateReview(
         time_s=np.asarray(level["time_s"], float),
         film_c=np.asarray(means["film"], float),

@@ -62,6 +62,8 @@ def compare_analyses(ours: Analysis, theirs: Analysis) -> list[Difference]:
     list of Difference
         Every number that both have, with the probability of its difference by chance.
     """
+    # The error by the reading, and by the true centre of a twin. The figures' references differ by
+    # chance, and so do the true centres that they hold.
     found: list[Difference] = []
     for name, a, b in (
         ("reading", ours.reading, theirs.reading),
@@ -73,6 +75,8 @@ def compare_analyses(ours: Analysis, theirs: Analysis) -> list[Difference]:
                 offset_um = math.hypot(_reference_um(ours), _reference_um(theirs))
             tracks = name == "true centre" and (_is_tracking(ours) or _is_tracking(theirs))
             found += _compare_series(name, a, b, offset_um, tracks)
+
+    # What the feed-forward takes away, the loop, and the figure.
     if ours.benefit is not None and theirs.benefit is not None:
         without = ours.benefit.without_um, theirs.benefit.without_um
         p_value = spread_p(ours.benefit.without_seconds_um, theirs.benefit.without_seconds_um)

@@ -93,28 +93,29 @@ def describe_error(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
 
 def slow_spectrum(time_s: Column, means: Column) -> power_spectrum.Spectrum:
     """Return the spectrum of 1 s means in segments half as long as the longest gapless stretch:
-    three in a whole hold.
-
-    `time_s` (n,) are the middles of the seconds; gaps up to 5 s are bridged.
+    three in a whole hold. Gaps up to 5 s are bridged.
 
     Parameters
     ----------
     time_s : (n,) array
         Middles of the seconds.
     means : (n,) array
-        Their means.
+        Their means, in any unit.
     """
     if not time_s.size:
         return power_spectrum.power_spectrum(np.empty(0), 1.0)
+
+    # The means on a grid of whole seconds, short gaps filled.
     place = np.floor(time_s - time_s[0] + 0.5).astype(np.int64)
     grid = np.full(int(place[-1]) + 1, np.nan, dtype=np.float32)
     grid[place] = means
     grid = fill_short_gaps(grid, _FILLED_SECONDS)
+
+    # The longest stretch between two gaps; the ends count as gaps.
     gaps = np.flatnonzero(~np.isfinite(np.concatenate(([np.nan], grid, [np.nan]))))
     longest = int(np.diff(gaps).max()) - 1
-    return power_spectrum.power_spectrum(
-        grid, 1.0, fft.prev_fast_len(max(8, longest // 2), real=True)
-    )
+    segment = fft.prev_fast_len(max(8, longest // 2), real=True)
+    return power_spectrum.power_spectrum(grid, 1.0, segment)
 
 
 def fill_short_gaps(values: Singles, most: int) -> Singles:

@@ -59,23 +59,29 @@ def film_run_command(
     CommandError
         A run cannot be read, or the result cannot be written.
     """
+    # The readings of all runs: sag by figures, pressure by the gauge.
     runs = [open_run(folder) for folder in folders]
     radius_mm = runs[0].config.optics.mirror.radius_mm
     time_s, sag_mm, pressure_pa = (
         np.concatenate(part) for part in zip(*map(_read_cycles, runs), strict=True)
     )
+
+    # By the law the pressure is in proportion to the stiffness E t at the same sag.
     law = FilmLaw(prestrain, poisson, 1.0, radius_mm)
     try:
         stiffness = pressure_pa / law.pressure_pa(law.with_sag(sag_mm))
         creep = fit_creep(time_s, np.log(stiffness), _DAY_S)
     except ValueError as error:
         raise errors.RejectedError(f"film: {error}") from None
-    # at the same pressure a softer film is deeper by the law
+
+    # At the same pressure a softer film is deeper: the change of sag for a logarithm of stiffness.
     now = law.with_sag(sag_mm[np.argmax(time_s)])
     softer = FilmLaw(prestrain, poisson, math.exp(-1e-3), radius_mm).under_pressure(
         law.pressure_pa(now)
     )
     um_per_log = -1e6 * float(softer.sag_mm - now.sag_mm)
+
+    # The result.
     table = _make_table(runs, stiffness, creep, um_per_log) | {
         "prestrain": prestrain,
         "poisson": poisson,

@@ -3,6 +3,7 @@ moves.
 """
 
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -121,6 +122,8 @@ def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pict
         for part in terminal.track_progress(_choose_minutes(time_s), "searches"):
             times.append(origin_s + float(time_s[part].mean()))
             searches.append(find_modes(time_s[part], coeffs_um[part]))
+
+    # A search without enough frames at a steady rate has no result.
     done = [(at_s, lines) for at_s, lines in zip(times, searches, strict=True) if lines is not None]
     if not done:
         raise errors.RejectedError(
@@ -130,6 +133,8 @@ def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pict
     modes, passing = _group_lines(
         np.array([at_s for at_s, _ in done]), [lines for _, lines in done]
     )
+
+    # The result.
     table = _make_table(folders, modes, passing, len(done))
     out = (out or folders[-1] / "modes").resolve()
     with errors.convert_write_errors(out):
@@ -214,9 +219,9 @@ def _group_lines(
     """Lines of neighbouring frequencies in at least half of the searches, the strongest first; how
     many others.
     """
-    modes: list[SeenMode] = []
     # In the order of their frequencies, each line joins the first mode whose last line it
     # resembles, unless that mode already has a line of the same search.
+    modes: list[SeenMode] = []
     seen = [(line, at_s) for at_s, lines in zip(times_s, searches, strict=True) for line in lines]
     for line, at_s in sorted(seen, key=lambda each: each[0].frequency_hz):
         near = (
@@ -229,7 +234,7 @@ def _group_lines(
         else:
             modes[k] = SeenMode(np.append(modes[k].time_s, at_s), (*modes[k].lines, line))
     # Keep modes that were seen often enough, the strongest evidence first.
-    least = max(1, round(_USUAL * len(searches)))
+    least = math.ceil(_USUAL * len(searches))
     usual = sorted(
         (mode for mode in modes if len(mode.lines) >= least),
         key=lambda mode: -sum(one.evidence for one in mode.lines),
@@ -265,6 +270,7 @@ def _make_table(
 def _format_table(table: dict[str, Any]) -> list[str]:
     lines = [f"searches   {table['searches']} of a minute at most"]
     for mode in table["modes"]:
+        # The mode by its frequency, and its shape by the largest terms.
         terms = np.argsort(np.abs(mode["shape"]))[::-1][:3]
         made = ", ".join(f"{mode['shape'][j]:+.2f} Z{j + 1}" for j in terms)
         line = (
@@ -276,6 +282,8 @@ def _format_table(table: dict[str, Any]) -> list[str]:
             others = ", ".join(f"{alias:.2f}" for alias in mode["aliases_hz"])
             line += f"; or {others} Hz: the frames have one rate"
         lines.append(line)
+
+        # A frequency goes with the root of the tension.
         if abs(mode["moved"]) > MOVED:
             lines.append(
                 f"           it moved by {mode['moved']:+.1%}: the film's tension by "
@@ -358,11 +366,13 @@ def _draw_modes(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
     """Draw the frequencies over time and the shapes of the strongest modes."""
     from membrane_ctrl.measure.matplotlib_sheet import new_sheet
 
+    # A row of two pictures for each mode.
     shown = modes[:_SHOWN]
     figure, axes = new_sheet(11, 3 * len(shown), len(shown), 2)
     side = np.linspace(-1, 1, 121)
     x, y = np.meshgrid(side, side)
     for mode, (over_time, shape) in zip(shown, np.reshape(axes, (-1, 2)), strict=True):
+        # Frequency of each search with its 1 sigma.
         minutes = (mode.time_s - begin_s) / 60
         over_time.errorbar(
             minutes,
@@ -371,9 +381,10 @@ def _draw_modes(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
             fmt=".",
         )
         over_time.set(xlabel="time (min)", ylabel="frequency (Hz)")
-        height = np.where(
-            np.hypot(x, y) <= 1, np.tensordot(mode.shape, zernike.evaluate_terms(x, y), 1), np.nan
-        )
+
+        # Height over the unit disc, of unit RMS.
+        height = np.tensordot(mode.shape, zernike.evaluate_terms(x, y), 1)
+        height = np.where(np.hypot(x, y) <= 1, height, np.nan)
         most = float(np.nanmax(np.abs(height)))
         shape.imshow(
             height, cmap=DIVERGING_MAP, vmin=-most, vmax=most, origin="lower", extent=(-1, 1, -1, 1)

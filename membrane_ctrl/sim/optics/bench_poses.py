@@ -87,6 +87,7 @@ def camera_pose(geometry: GeometryConfig) -> CameraPose:
     """
     if geometry.camera is not None:
         return CameraPose(np.array(geometry.camera.position_mm), np.array(geometry.camera.rotation))
+
     # Forward points from F to O.
     a_mm, _, alpha = _find_short_form(geometry)
     forward = np.array([-cos(alpha), 0.0, -sin(alpha)])
@@ -115,6 +116,7 @@ def screen_pose(geometry: GeometryConfig, error: ScreenError | None = None) -> S
         origin_mm = b_mm * np.array([-cos(alpha), 0.0, sin(alpha)])
         s_x = np.array([-sin(alpha), 0.0, -cos(alpha)])
         s_y = np.array([0.0, 1.0, 0.0])
+
     # The error: about s_x first, then about the s_y that is turned by it; its bow adds to the face.
     error = error or ScreenError()
     s_y = _rotate_vector(s_y, s_x, radians(error.tilt_about_x_deg))
@@ -160,6 +162,7 @@ def _undistort_points(
     """
     if not distortion:
         return x_d, y_d
+
     # OpenCV's order; coefficients that are not given are 0.
     k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *[0.0] * 8)[:8]
     x, y = x_d, y_d

@@ -130,6 +130,7 @@ class FilmShape:
             raise ValueError(
                 f"sag_mm = {self.sag_mm:g}: a concave sphere's is above 0 and below its radius"
             )
+
         # The terms added to it, and the material.
         if not all(isfinite(c) for c in self.zernike_um):
             raise ValueError("zernike_um: every value must be a number")
@@ -139,6 +140,7 @@ class FilmShape:
             )
         if not 0 <= self.poisson <= 0.5:
             raise ValueError(f"poisson = {self.poisson:g} is outside 0 .. 0.5")
+
         # Computed once: the numbers from which compiled loops make heights.
         object.__setattr__(self, "terms", _film_terms(self))
 
@@ -197,11 +199,13 @@ class FilmShape:
             return None
         if any(self.zernike_um[ZERNIKE_TERMS:]):
             return None
+
         # The film's own terms, and the paraboloid's.
         coeffs = np.zeros(ZERNIKE_TERMS)
         own_um = self.zernike_um[:ZERNIKE_TERMS]
         coeffs[: len(own_um)] = own_um
         coeffs[3] += 1000.0 * self.sag_at_mm(displacement_um) / (2.0 * sqrt(3.0))
+
         # Piston so that the height at the vertex is 0.
         coeffs[0] = 0.0
         coeffs[0] = -zernike_polynomial(coeffs)[0, 0]

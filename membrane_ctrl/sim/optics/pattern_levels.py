@@ -98,6 +98,7 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
         levels = 0.5 + 0.5 * np.cos(phi + pattern.shift_rad)
         period_mm = pattern.period_mm or config.period_mm
         return LevelTable(screen_light(levels, light), period_mm / _SINE_CELLS, smooth=True)
+
     # The others change at half periods: Gray's code of the number of the half period.
     half_periods = np.arange(2 * config.periods)
     if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
@@ -138,6 +139,7 @@ def pattern_sequence(
     """
     if kind not in ("full", "fringes", "frequencies"):
         raise ValueError(f"kind = {kind!r} must be full, fringes or frequencies")
+
     # Phase steps, and Gray bits in a full set, axis by axis.
     shifts = shifts_rad or tuple(2.0 * np.pi * k / config.steps for k in range(config.steps))
     patterns: list[Pattern] = []
@@ -145,6 +147,7 @@ def pattern_sequence(
         patterns += [Pattern("sin", axis, k, shift) for k, shift in enumerate(shifts)]
         if kind == "full":
             patterns += [Pattern("gray", axis, bit) for bit in range(1, _GRAY_BITS + 1)]
+
     # The same steps with each coarser period.
     finest = list(patterns)
     for period_mm in coarser_mm:
