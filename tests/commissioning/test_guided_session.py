@@ -117,6 +117,21 @@ def test_a_stated_front_film_stays_without_an_answer(tmp_path: Path, bench: Quic
     assert front.bulge_mm == 61.0
 
 
+def test_a_diaphragm_pump_in_place_of_a_proportional_one_stalls_again(
+    tmp_path: Path, bench: QuickBench
+) -> None:
+    first = Person(**{"mirror.pump_kind": "proportional"})
+    run_stages(tmp_path, bench, first, "mirror")
+    assert load_toml(tmp_path / CONFIGURATION, Config).pump.stall_fraction == 0.0
+    second = Person(**{"devices.kind": "back", "mirror.pump_kind": "diaphragm"})
+    assert run_stages(tmp_path, bench, second, *DESK) == Exit.INTERRUPTED
+    pump = load_toml(tmp_path / CONFIGURATION, Config).pump
+    assert (pump.start_fraction, pump.stall_fraction) == (0.22, 0.15)
+    assert failed_in(tmp_path, second) == [
+        "least flow of the running pump over the leak, as stated"
+    ]
+
+
 def test_a_pump_that_can_only_switch_is_refused(tmp_path: Path, bench: QuickBench) -> None:
     person = Person(**{"mirror.pump_kind": "diaphragm"})
     assert run_stages(tmp_path, bench, person, "mirror") == Exit.INTERRUPTED

@@ -22,7 +22,20 @@ _INTERLOCK = "emergency stop, door, oxygen monitor, supply pressure"
 
 
 def ask_device_tables(dialogue: Dialogue, found: Sequence[FoundDevice]) -> TomlTable:
-    """Ask for the devices; returns the table `devices`."""
+    """Ask for the devices of every role, and for interlocks.
+
+    Parameters
+    ----------
+    dialogue : Dialogue
+        Asks, and keeps the answers for the next start.
+    found : sequence of FoundDevice
+        What is connected; it is shown, and its ports are offered as choices.
+
+    Returns
+    -------
+    TomlTable
+        The table `devices`, each of its parts valid by itself.
+    """
     for each in found:
         dialogue.show(f"  found: {each.kind} {each.name}")
     kind = dialogue.ask_choice(

@@ -261,7 +261,25 @@ class Dialogue:
         return self._ask(asked, parse)
 
     def confirm(self, key: str, question: str) -> bool:
-        """Ask yes or no; there is no default, because it must be seen each time."""
+        """Ask yes or no; there is no default, because it must be seen each time.
+
+        Parameters
+        ----------
+        key : str
+            Identifies the question to displays and tests; the answer is not kept.
+        question : str
+            For the person.
+
+        Returns
+        -------
+        bool
+            True for yes.
+
+        Raises
+        ------
+        GoBackError, StopSessionError
+            The person answers `back` or `quit`, as to every question.
+        """
         asked = Question(key=key, kind=QuestionKind.CONFIRMATION, text=question)
         while True:
             typed = self._read(asked).lower()
@@ -272,7 +290,20 @@ class Dialogue:
             self.show("  answer y or n")
 
     def wait(self, key: str, request: str) -> None:
-        """Ask the person to do something and to state that it is done."""
+        """Ask the person to do something and to state that it is done.
+
+        Parameters
+        ----------
+        key : str
+            Identifies the request to displays and tests.
+        request : str
+            What to do, as an imperative.
+
+        Raises
+        ------
+        GoBackError, StopSessionError
+            The person answers `back` or `quit`.
+        """
         self._read(Question(key=key, kind=QuestionKind.READINESS, text=request))
 
     def _ask(self, asked: Question, parse: Callable[[str], T]) -> T:

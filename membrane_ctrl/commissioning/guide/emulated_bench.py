@@ -125,7 +125,26 @@ class EmulatedBench:
         return EmulatedOptics(config, self._use_bench(config).plant, self.lens)
 
     def act(self, config: Config, action: Action[T]) -> T:
-        """Open the board, do something with it, and leave it with the pump off."""
+        """Open the board, do something with it, and leave it with the pump off.
+
+        Parameters
+        ----------
+        config : Config
+            Of the session; its interlocks are applied, and the bench stays the one that the first
+            call has made.
+        action : Action[T]
+            Gets the opened bench, whose time passes only in its `sleep`.
+
+        Returns
+        -------
+        T
+            What the action returns.
+
+        Raises
+        ------
+        DeviceError
+            The bench does not open, for example with a pulled cable.
+        """
         return asyncio.run(self._act(self._use_bench(config), action))
 
     async def _act(self, bench: virtual_bench.VirtualBench, action: Action[T]) -> T:
@@ -179,7 +198,20 @@ class EmulatedBench:
     def start_hold(
         self, folder: Path, config: Config, name: str, by_frames: bool = False
     ) -> Iterator[HoldLink]:
-        """Start the controller in standby, in virtual time."""
+        """Start the controller in standby, in virtual time.
+
+        Parameters
+        ----------
+        folder : Path
+            Of the session; not used: a virtual hold records no run.
+        config : Config
+            The configuration of the hold.
+        name : str
+            Of the run.
+        by_frames : bool
+            Measure figures from rendered frames instead of simulated figures; each costs seconds of
+            processor time.
+        """
         alter = self.lens.alter_picture if by_frames else None
         link = self._make_hold(config, self._use_bench(config), name, alter)
         try:
@@ -194,7 +226,24 @@ class EmulatedBench:
     def run_tuning(
         self, folder: Path, config: Config, command: str, show: Callable[[str], None]
     ) -> int:
-        """Run `tune` on a twin of its own; its gains are not saved."""
+        """Run `tune` on a twin of its own; its gains are not saved.
+
+        Parameters
+        ----------
+        folder : Path
+            Of the session; has the configuration, and gets the tuning session.
+        config : Config
+            Not used: the program reads the file in `folder`.
+        command : str
+            `run` or `pump`.
+        show : callable
+            Gets each printed line.
+
+        Returns
+        -------
+        int
+            The program's exit code, 0 if it is done.
+        """
         configuration = str(folder / CONFIGURATION)
         # Its own folder: `tune run` would continue the session of `tune pump`, whose curve the
         # configuration has not.

@@ -36,5 +36,13 @@ def select_good(values: Iterable[float], sensor: str) -> list[float]:
 
 
 def average_good(values: Iterable[float], sensor: str) -> float:
-    """The mean of the readings that are there. Raises StageFailedError as `select_good`."""
+    """The mean of the readings that are there. Raises StageFailedError as `select_good`.
+
+    Parameters
+    ----------
+    values : iterable of float
+        In any unit, which the mean has, too; NaN where the sensor had no reading.
+    sensor : str
+        For the message.
+    """
     return float(np.mean(select_good(values, sensor)))

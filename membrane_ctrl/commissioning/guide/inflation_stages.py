@@ -125,7 +125,20 @@ def hold_depth(context: StageContext, link: HoldLink, setpoint_um: float) -> Dep
 
 
 def acknowledge_fault(context: StageContext, link: HoldLink) -> None:
-    """Let a person clear the fault of an earlier hold, which keeps every later one in standby."""
+    """Let a person clear the fault of an earlier hold, which keeps every later one in standby.
+
+    Parameters
+    ----------
+    context : StageContext
+        Of the stage; its dialogue asks.
+    link : HoldLink
+        Of the hold in standby, which gets the command `ack`.
+
+    Raises
+    ------
+    StageFailedError
+        The person does not confirm that the cause is removed.
+    """
     latched = context.access.find_latched_fault(context.folder)
     if not latched:
         return
@@ -202,7 +215,22 @@ def watch_rows(
 
 
 def collect_rows(link: HoldLink, duration_s: float) -> list[TelemetryRow]:
-    """The rows of a time. Raises StageFailedError on a fault, HoldError if the hold ends."""
+    """Collect the rows of the ticks from now on.
+
+    Parameters
+    ----------
+    link : HoldLink
+        Of the hold.
+    duration_s : float
+        Between the first row and the last one, in the hold's time.
+
+    Raises
+    ------
+    StageFailedError
+        A fault.
+    HoldError
+        The hold ends.
+    """
     rows: list[TelemetryRow] = []
     while not rows or rows[-1].mono_s - rows[0].mono_s < duration_s:
         rows += read_sound_news(link).rows
@@ -228,6 +256,8 @@ def judge_law(context: StageContext, points: list[DepthPoint]) -> None:
         return
     depths_mm = np.array([point.sag_mm for point in points])
     pressures_pa = np.array([point.pressure_pa for point in points])
+    # Weighted least squares, linear in p0, a and c. The error of a gauge is a share of its reading,
+    # so without weights the largest pressure alone would decide the fit.
     weights = 1.0 / np.maximum(_LAW_PA, 0.02 * pressures_pa)
     matrix = np.stack([np.ones_like(depths_mm), depths_mm, depths_mm**3], axis=1)
     limits = [-np.inf, 0.0, -np.inf], np.inf
@@ -280,7 +310,8 @@ def measure_leak(context: StageContext) -> None:
         raise StageFailedError(f"the controller ended it: {error}") from None
     if len(rows) < 10:
         raise StageFailedError("the pump did not stay off")
-    # The mirror sinks evenly in a minute: the slope of a straight line.
+    # In a minute the depth changes by so little that the leak is constant: the speed is the slope
+    # of a straight line.
     select_good([row.displacement_um for row in rows], "laser")
     seen = [row for row in rows if np.isfinite(row.displacement_um)]
     times_s = np.array([row.mono_s for row in seen])
@@ -305,20 +336,39 @@ def measure_leak(context: StageContext) -> None:
     )
     estimated = float(np.nanmean([row.leak_um_per_s for row in held]))
     context.note("leak as the controller estimates it", f"{estimated:.2f} µm/s")
-    # w0 / (3 T) is the speed: with it the twin leaks as this mirror does.
+    # The pressure falls with exp(-t / T), and the depth w goes with its cube root: at the depth w0
+    # the centre sinks at w0 / (3 T). With this T the twin leaks as this mirror does.
     time_constant_s = 1e3 * context.facts.sag_mm / (3.0 * max(leak_um_per_s, 1e-6))
     context.set_keys("twin", leak_time_constant_s=float(f"{time_constant_s:.4g}"))
     context.note("time constant of the leak", format_duration(time_constant_s))
 
 
 def run_tuning_in_hold(context: StageContext, run_name: str, command: str) -> int:
-    """Run a command of `tune` on a hold of the bench at its depth; its exit code.
+    """Run a command of `tune` on a hold of the bench at its depth.
 
-    Raises StageFailedError if the controller ends the hold.
+    Parameters
+    ----------
+    context : StageContext
+        Of the stage.
+    run_name : str
+        Last part of the run folder's name.
+    command : str
+        `run` or `pump`.
+
+    Returns
+    -------
+    int
+        The exit code of `tune`, 0 if it is done.
+
+    Raises
+    ------
+    StageFailedError
+        The controller ends the hold.
     """
     try:
         with context.access.start_hold(context.folder, context.config, run_name) as link:
             hold_depth(context, link, context.config.loop.setpoint_um)
+            # Release the command: `tune` is a program of its own, and needs it.
             link.close()
             show = context.dialogue.show
             return context.access.run_tuning(context.folder, context.config, command, show)

@@ -24,7 +24,15 @@ class SteppedPlant:
         return self._sample
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
-        """Drive pump and vent."""
+        """Drive pump and vent, from now on.
+
+        Parameters
+        ----------
+        pump_fraction : float
+            0 (off) to 1 (full power).
+        vent_fraction : float
+            0 (closed) to 1 (open).
+        """
         self._mirror.actuate(pump_fraction, vent_fraction)
 
     async def keep_moving(self) -> None:
@@ -36,7 +44,20 @@ class SteppedPlant:
 
 
 async def probe_instruments(mirror: plant.Plant, devices: DevicesConfig) -> list[check.DeviceProbe]:
-    """Emulate the instruments, probe them with their drivers, and switch them off."""
+    """Emulate the instruments, probe them with their drivers, and switch them off.
+
+    Parameters
+    ----------
+    mirror : Plant
+        What the emulated sensors measure; it advances in real time meanwhile.
+    devices : DevicesConfig
+        Single instruments; their ports are replaced by emulated ones.
+
+    Returns
+    -------
+    list of DeviceProbe
+        One for each role; a device that fails is reported in its probe, and nothing is raised.
+    """
     moving = SteppedPlant(mirror)
     emulated = lab.Lab(moving, devices)
     moved = await emulated.start()

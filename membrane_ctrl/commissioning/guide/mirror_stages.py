@@ -32,6 +32,7 @@ _QUESTIONS = (
 _OWN, _PAPER = "own", "paper"
 _DIRECTLY, _THROUGH = "directly", "through"
 _DIAPHRAGM, _PROPORTIONAL = "diaphragm", "proportional"
+_PUMP_FRACTIONS = ("dead_fraction", "start_fraction", "stall_fraction")
 _RAMP_SHARE = 0.65  # of the full flow: the rest is for the leak
 
 
@@ -136,7 +137,20 @@ def list_facts(facts: MirrorFacts) -> list[tuple[str, str]]:
 
 
 def explain_design(facts: MirrorFacts, design: MirrorDesign) -> list[str]:
-    """What follows from the data, a line each, for people."""
+    """What follows from the mirror's data, for people.
+
+    Parameters
+    ----------
+    facts : MirrorFacts
+        As stated by the person.
+    design : MirrorDesign
+        Derived from them.
+
+    Returns
+    -------
+    list of str
+        Indented lines, with units.
+    """
     lowering = format_duration(design.lowering_s)
     return [
         f"  pressure at {facts.sag_mm:g} mm: {design.pressure_pa:.0f} Pa (p ~ sag^3)",
@@ -183,7 +197,20 @@ def _judge_design(context: StageContext, facts: MirrorFacts, design: MirrorDesig
 
 
 def write_design(context: StageContext, facts: MirrorFacts, design: MirrorDesign) -> None:
-    """Write what follows from the mirror's data into the configuration."""
+    """Write what follows from the mirror's data into the configuration.
+
+    An answer that replaces an earlier one must also undo what that one has written: the front film,
+    and the pump that follows its command from zero on.
+
+    Parameters
+    ----------
+    context : StageContext
+        Of the stage; its folder has the configuration.
+    facts : MirrorFacts
+        As stated by the person.
+    design : MirrorDesign
+        Derived from them.
+    """
     flow_um_per_s = _round(design.flow_full_um_per_s)
     context.set_keys(
         "optics.mirror",
@@ -199,7 +226,7 @@ def write_design(context: StageContext, facts: MirrorFacts, design: MirrorDesign
             thickness_um=_round(facts.back_thickness_um),
         )
     else:
-        context.remove_table("optics.mirror", "front_film")
+        context.remove_keys("optics.mirror", "front_film")
     context.set_keys(
         "limits",
         displacement_min_um=design.displacement_min_um,
@@ -207,8 +234,7 @@ def write_design(context: StageContext, facts: MirrorFacts, design: MirrorDesign
         gauge_pressure_max_pa=design.gauge_max_pa,
     )
     context.set_keys("pump", flow_full_um_per_s=flow_um_per_s)
-    if facts.pump_proportional:
-        context.set_keys("pump", dead_fraction=0.0, start_fraction=0.0, stall_fraction=0.0)
+    _write_pump_kind(context, is_proportional=facts.pump_proportional)
     context.set_keys(
         "loop",
         flow_max_um_per_s=flow_um_per_s,
@@ -219,6 +245,20 @@ def write_design(context: StageContext, facts: MirrorFacts, design: MirrorDesign
     filling_s = min(2.0 * design.filling_s, 1e6)
     context.set_keys("states", inflate_timeout_s=_round(max(filling_s, 600.0)))
     context.set_keys("twin", leak_time_constant_s=_round(facts.leak_time_constant_s))
+
+
+def _write_pump_kind(context: StageContext, is_proportional: bool) -> None:
+    """Write where the pump starts and stalls.
+
+    A diaphragm pump keeps what is configured, which a measured curve may have set, unless that is
+    the proportional pump of an earlier answer: then the defaults return.
+    """
+    pump = context.config.pump
+    was_proportional = pump.dead_fraction == pump.start_fraction == pump.stall_fraction == 0.0
+    if is_proportional:
+        context.set_keys("pump", **dict.fromkeys(_PUMP_FRACTIONS, 0.0))
+    elif was_proportional:
+        context.remove_keys("pump", *_PUMP_FRACTIONS)
 
 
 def _round(value: float) -> float:

@@ -95,7 +95,20 @@ def ask_geometry(context: StageContext) -> None:
 
 @contextlib.contextmanager
 def hold_without_camera(context: StageContext, name: str) -> Iterator[None]:
-    """Hold the mirror at its depth while this session, and not the hold, uses the camera."""
+    """Hold the mirror at its depth while this session, and not the hold, uses the camera.
+
+    Parameters
+    ----------
+    context : StageContext
+        Of the stage.
+    name : str
+        Last part of the run folder's name.
+
+    Raises
+    ------
+    StageFailedError
+        The controller ends the hold.
+    """
     try:
         with (
             without_camera(context),
@@ -235,5 +248,13 @@ def calibrate_optics(context: StageContext) -> None:
 
 
 def has_camera(state: SessionState, tables: TomlTable) -> bool:
-    """Whether a camera is configured."""
+    """Whether a camera is configured, so that the stages of the optics are needed.
+
+    Parameters
+    ----------
+    state : SessionState
+        Not used; every stage's `is_needed` gets it.
+    tables : TomlTable
+        The configuration as it is in the file; empty before it is written.
+    """
     return "camera" in tables.get("devices", {})

@@ -82,7 +82,28 @@ class RealBench:
             optics.close()
 
     def act(self, config: Config, action: Action[T]) -> T:
-        """Open the bench, do something with it, and leave it with the pump off."""
+        """Open the bench, do something with it, and leave it with the pump off.
+
+        Parameters
+        ----------
+        config : Config
+            With the devices.
+        action : Action[T]
+            Gets the opened bench.
+
+        Returns
+        -------
+        T
+            What the action returns.
+
+        Raises
+        ------
+        DeviceError
+            No devices are configured, another program uses them, a lock forbids it, or one does
+            not open.
+        LinkError
+            The bench fails meanwhile.
+        """
         devices = config.devices
         if devices is None:
             raise DeviceError("no devices are configured")
@@ -103,13 +124,31 @@ class RealBench:
             await made.close()
 
     def move_hand(self, motion: HandMotion) -> None:
-        """The person has done it."""
+        """Do nothing: the person has moved the real thing."""
 
     @contextlib.contextmanager
     def start_hold(
         self, folder: Path, config: Config, name: str, by_frames: bool = False
     ) -> Iterator[HoldLink]:
-        """Start `hold --standby` with the session's configuration, and stop it at the end."""
+        """Start `hold --standby` with the session's configuration, and stop it at the end.
+
+        Parameters
+        ----------
+        folder : Path
+            Of the session: its `lab.toml` is the configuration, `logs` gets the run, `NAME.log`
+            what the hold prints.
+        config : Config
+            Not used: the program reads the file in `folder`.
+        name : str
+            Last part of the run folder's name.
+        by_frames : bool
+            Not used: a real hold always measures with its camera.
+
+        Raises
+        ------
+        DeviceError
+            The hold does not start, or does not end.
+        """
         logs = _find_logs(folder)
         logs.mkdir(parents=True, exist_ok=True)
         command = [
@@ -144,7 +183,24 @@ class RealBench:
     def run_tuning(
         self, folder: Path, config: Config, command: str, show: Callable[[str], None]
     ) -> int:
-        """Run `tune` on the hold that runs."""
+        """Run `tune` on the hold that runs; save what it finds in the session's configuration.
+
+        Parameters
+        ----------
+        folder : Path
+            Of the session; its `logs` has the hold's socket.
+        config : Config
+            Not used: the program takes the configuration of the hold.
+        command : str
+            `run` or `pump`.
+        show : callable
+            Gets each printed line.
+
+        Returns
+        -------
+        int
+            The exit code of the first program that fails, else 0.
+        """
         logs = str(_find_logs(folder))
         arguments = [*OWN_PROGRAM, "tune", command, "--logs", logs, "--yes", "--take-over"]
         code = run_shown(arguments, show)
@@ -161,7 +217,7 @@ def _find_logs(folder: Path) -> Path:
 
 
 async def stop_outputs(open_bench: roles.Bench) -> None:
-    """Switch the pump off and shut the vent; a bench that does not answer has its watchdog."""
+    """Switch the pump off and close the vent; the watchdog stops a bench that does not answer."""
     with contextlib.suppress(roles.LinkError):
         await open_bench.write(roles.BenchCommand(0.0, 0.0))
 

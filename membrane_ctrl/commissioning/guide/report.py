@@ -43,7 +43,23 @@ _NOTHING_REAL = "This session ran on the emulated bench: it proves the procedure
 def find_reasons(
     stages: Sequence[CommissioningStage], state: SessionState, tables: TomlTable
 ) -> list[str]:
-    """Why a bench is not accepted; empty if it is."""
+    """Why a bench is not accepted.
+
+    Parameters
+    ----------
+    stages : sequence of CommissioningStage
+        All stages, in their order.
+    state : SessionState
+        Its records of the finished stages.
+    tables : TomlTable
+        The configuration, which decides what stages are needed.
+
+    Returns
+    -------
+    list of str
+        One for each needed stage that is not done, each failed check, and each check that was left
+        out; empty if the bench is accepted.
+    """
     reasons = []
     for stage in stages:
         if not stage.is_needed(state, tables):

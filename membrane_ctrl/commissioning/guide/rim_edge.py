@@ -31,6 +31,8 @@ def measure_rim_edge_px(pictures: MirrorPictures) -> float:
     float
         In px, the median of the sectors that show the rim; NaN without one.
     """
+    # The difference of both pictures contains the screen's light only: the mirror is bright, and
+    # lamps and the room are gone. Its mean position is the centre from which the rim is searched.
     light = pictures.white.astype(np.float32) - pictures.black.astype(np.float32)
     bright = float(np.quantile(light, _BRIGHT_QUANTILE))
     if bright < _LEAST_COUNTS:
@@ -49,6 +51,8 @@ def _measure_sector_px(
     light: AnyArray, centre: tuple[float, float], sector: int, level: float
 ) -> float:
     """Width of the mean edge of a sector's spokes, each shifted to its own crossing of a level."""
+    # Sample the picture along rays from the centre. Each profile is cut about its own outermost
+    # crossing of the level, so that an elliptic rim does not smear the mean of the profiles.
     reach_px = float(np.hypot(*light.shape))
     along_px = np.arange(0.0, reach_px, _STEP_PX)
     half = round(_HALF_WINDOW_PX / _STEP_PX)
@@ -64,6 +68,8 @@ def _measure_sector_px(
             edges.append(profile[lit[-1] - half : lit[-1] + half])
     if len(edges) < _SPOKES // 2:
         return float("nan")
+    # Scale the mean profile to 1 inside the mirror and 0 outside: levels from the ends of the
+    # window, by medians, because patterns and dust are near.
     mean = np.mean(edges, axis=0)
     inside = float(np.median(mean[: half // 2]))
     outside = float(np.median(mean[-half // 2 :]))

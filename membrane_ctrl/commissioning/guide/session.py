@@ -181,7 +181,7 @@ class CommissioningSession:
         ]
         if not problem and not stage.must_pass:
             choices.append(
-                Choice(name=_ON, meaning="go on; the report names it as a reason not to accept")
+                Choice(name=_ON, meaning="continue; the report names it as a reason not to accept")
             )
         self._state.answers.pop(f"{stage.name}.after", None)
         try:

@@ -154,7 +154,15 @@ class MessageDisplay(SessionDisplay):
                 return given.answer
 
     def show_end(self, code: int, problem: str = "") -> None:
-        """Send that the session has ended."""
+        """Send that the session has ended.
+
+        Parameters
+        ----------
+        code : int
+            Exit code of the program (`errors.Exit`).
+        problem : str
+            What it would print on a terminal; empty without a problem.
+        """
         self._send(EndMessage(code=code, problem=problem))
 
     def _send(self, message: BaseModel) -> None:

@@ -114,7 +114,20 @@ def read_state(folder: Path) -> SessionState | None:
 
 
 def write_state(folder: Path, state: SessionState) -> None:
-    """Write the state durably. Raises DeviceError."""
+    """Write the state durably, in place of the former one.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the session; gets `session.json`.
+    state : SessionState
+        All of it.
+
+    Raises
+    ------
+    DeviceError
+        The file cannot be written.
+    """
     path = folder / _NAME
     with errors.convert_write_errors(path, errors.DeviceError):
         files.write_text_atomic(path, state.model_dump_json(indent=1) + "\n")
@@ -129,7 +142,27 @@ def read_tables(folder: Path) -> TomlTable:
 
 
 def write_tables(folder: Path, tables: TomlTable) -> Config:
-    """Check tables and write them durably. Raises InputError for tables that are refused."""
+    """Check tables, then write them durably as the session's configuration.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the session; gets `lab.toml`.
+    tables : TomlTable
+        The whole configuration; comments of the former file are lost.
+
+    Returns
+    -------
+    Config
+        The tables with all defaults.
+
+    Raises
+    ------
+    InputError
+        The tables are refused; the file stays as it is.
+    DeviceError
+        The file cannot be written.
+    """
     path = folder / CONFIGURATION
     config = toml_file.parse_tables(tables, Config, str(path))
     with errors.convert_write_errors(path, errors.DeviceError):
@@ -138,7 +171,17 @@ def write_tables(folder: Path, tables: TomlTable) -> Config:
 
 
 def set_keys(tables: TomlTable, table: str, **keys: Any) -> None:
-    """Set keys of a table, such as `optics.mirror`, that may be missing."""
+    """Set keys in place.
+
+    Parameters
+    ----------
+    tables : TomlTable
+        The whole configuration; changed.
+    table : str
+        Dotted name, such as `optics.mirror`; missing tables are added.
+    **keys : object
+        Values that TOML can hold.
+    """
     target = tables
     for name in table.split("."):
         target = target.setdefault(name, {})

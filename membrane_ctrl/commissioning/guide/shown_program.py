@@ -13,6 +13,18 @@ def run_shown(words: Sequence[str], show: Callable[[str], None]) -> int:
     """Run a program, show its lines as they come, and return its exit code.
 
     An interrupted session interrupts it, and waits until it has ended.
+
+    Parameters
+    ----------
+    words : sequence of str
+        Program and arguments; no shell is used.
+    show : callable
+        Gets each line of its output and errors, indented, without line end.
+
+    Raises
+    ------
+    subprocess.TimeoutExpired
+        An interrupted program does not end within two minutes.
     """
     with subprocess.Popen(
         words,

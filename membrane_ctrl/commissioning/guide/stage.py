@@ -84,14 +84,37 @@ class StageContext:
         return devices
 
     def set_keys(self, table: str, **keys: Any) -> None:
-        """Set keys of a table, such as `optics.mirror`, in the configuration file."""
+        """Set keys of a table in the configuration file; the other keys stay.
+
+        Parameters
+        ----------
+        table : str
+            Dotted name, such as `optics.mirror`; it may be missing.
+        **keys : object
+            Values that TOML can hold, in the units of their keys.
+
+        Raises
+        ------
+        StageFailedError
+            The configuration would be refused; the file stays as it is.
+        """
         tables = read_tables(self.folder)
         set_keys(tables, table, **keys)
         self._write(tables)
 
     @contextlib.contextmanager
     def lend_keys(self, table: str, **keys: float | bool) -> Iterator[None]:
-        """Change keys of a table for a time; a killed session restores them at its next start."""
+        """Change keys of a table for a time; a killed session restores them at its next start.
+
+        Parameters
+        ----------
+        table : str
+            A top-level table, such as `limits`.
+        **keys : float or bool
+            Values for the block, in the units of their keys.
+        """
+        # The former values are on the disk before the file changes: whenever the process dies,
+        # the next start knows what to restore.
         present = getattr(self.config, table)
         names = tuple(f"{table}.{key}" for key in keys)
         self.state.lent |= {f"{table}.{key}": getattr(present, key) for key in keys}
@@ -102,17 +125,39 @@ class StageContext:
         finally:
             restore_lent_keys(self.folder, self.state, names)
 
-    def remove_table(self, parent: str, name: str) -> None:
-        """Remove a table below another, such as `front_film` of `optics.mirror`, if it is there."""
+    def remove_keys(self, table: str, *names: str) -> None:
+        """Remove keys or tables from the configuration file, so that their defaults apply.
+
+        Parameters
+        ----------
+        table : str
+            Dotted name of the table that holds them, such as `optics.mirror`; it may be missing.
+        *names : str
+            Such as `front_film`; those that are not there are left out.
+        """
         tables = read_tables(self.folder)
         target = tables
-        for part in parent.split("."):
+        for part in table.split("."):
             target = target.get(part, {})
-        if target.pop(name, None) is not None:
+        removed = [name for name in names if target.pop(name, None) is not None]
+        if removed:
             self._write(tables)
 
     def replace_table(self, table: str, content: TomlTable) -> None:
-        """Replace a top-level table of the configuration file."""
+        """Replace a top-level table of the configuration file.
+
+        Parameters
+        ----------
+        table : str
+            Such as `devices`; added if it is missing.
+        content : TomlTable
+            All its keys: none of the former ones stays.
+
+        Raises
+        ------
+        StageFailedError
+            The configuration would be refused; the file stays as it is.
+        """
         tables = read_tables(self.folder)
         tables[table] = content
         self._write(tables)
@@ -178,11 +223,27 @@ class StageContext:
         return is_right
 
     def note(self, name: str, seen: str) -> None:
-        """Record a fact without a verdict."""
+        """Record a fact without a verdict.
+
+        Parameters
+        ----------
+        name : str
+            What it is about, as the report names it.
+        seen : str
+            The fact, with its unit.
+        """
         self._add(CheckRecord(name=name, measured=seen, verdict=CheckVerdict.NOTED))
 
     def leave_out(self, name: str, why: str) -> None:
-        """Record that a check was not done, and why."""
+        """Record that a check was not done; the bench is then not accepted.
+
+        Parameters
+        ----------
+        name : str
+            The check, as the report names it.
+        why : str
+            The reason, for the person who reads the report.
+        """
         self._add(CheckRecord(name=name, measured=why, verdict=CheckVerdict.NOT_DONE))
 
     def _add(self, check: CheckRecord) -> None:

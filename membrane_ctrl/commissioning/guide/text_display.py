@@ -73,7 +73,15 @@ class TextDisplay(SessionDisplay):
 
 
 def read_terminal_line(key: str, prompt: str) -> str:
-    """Read a line from the terminal. Raises EOFError at its end."""
+    """Read a line from the terminal. Raises EOFError at its end.
+
+    Parameters
+    ----------
+    key : str
+        Key of the question; not used here: tests answer by it.
+    prompt : str
+        Printed in front of the answer, without the colon.
+    """
     print(f"{prompt}: ", end="", flush=True)
     line = sys.stdin.readline()
     if not line:

@@ -40,7 +40,15 @@ _VENTED = roles.BenchCommand(0.0, 1.0)
 
 
 async def read_for(opened: OpenBench, duration_s: float) -> list[roles.BenchReading]:
-    """Read again and again, with everything off."""
+    """Read every 0.1 s, with pump and vent commanded off.
+
+    Parameters
+    ----------
+    opened : OpenBench
+        The bench; its `sleep` decides whether time is real.
+    duration_s : float
+        Of the whole.
+    """
     readings = []
     for _ in range(round(duration_s / _PERIOD_S)):
         await opened.bench.write(_OFF)
@@ -52,7 +60,15 @@ async def read_for(opened: OpenBench, duration_s: float) -> list[roles.BenchRead
 def stop_at_open_circuit(
     reading: roles.BenchReading, interlocks: tuple[InterlockDriver, ...]
 ) -> None:
-    """Raise StageFailedError if a reading shows the circuit of an interlock open."""
+    """Raise StageFailedError if a reading shows the circuit of an interlock open.
+
+    Parameters
+    ----------
+    reading : BenchReading
+        Bit i of its `interlocks_open` belongs to interlock i.
+    interlocks : tuple of InterlockDriver
+        In the order of the configuration.
+    """
     words = [
         f"{interlock.name} is open: {interlock.text}"
         for bit, interlock in enumerate(interlocks)
@@ -66,7 +82,23 @@ def stop_at_open_circuit(
 
 
 async def wait_for_circuits(opened: OpenBench, interlocks: tuple[InterlockDriver, ...]) -> None:
-    """Wait until every source has been asked. Raises StageFailedError if a circuit is open."""
+    """Wait until all circuits are closed, a second at most.
+
+    A circuit counts as open until its source has answered once, so the first reading after opening
+    the bench shows nothing yet.
+
+    Parameters
+    ----------
+    opened : OpenBench
+        The bench.
+    interlocks : tuple of InterlockDriver
+        In the order of the configuration, for the message.
+
+    Raises
+    ------
+    StageFailedError
+        A circuit is still open.
+    """
     reading = await opened.bench.read()
     for _ in range(round(_STOPPED_S / _PERIOD_S)):
         if not reading.interlocks_open:
@@ -257,6 +289,7 @@ def test_watchdog(context: StageContext) -> None:
 
 async def _time_watchdog(opened: OpenBench, interlocks: tuple[InterlockDriver, ...]) -> float:
     """Time beyond the watchdog's period until the pump's read-back is 0; NaN if it stays on."""
+    # Run the pump, then only read: reading does not feed a watchdog, so that it must trip.
     command = roles.BenchCommand(PUMP_FRACTION, 1.0)
     await wait_for_circuits(opened, interlocks)
     for _ in range(round(1.0 / _PERIOD_S)):
@@ -333,7 +366,9 @@ def test_interlocks(context: StageContext) -> None:
             "wire at least the emergency stop to one (docs/how-to/operations.md, Interlocks)",
         )
         return
-    # Closed, opened by its contact, without its signal, closed again.
+    # Four states of each circuit: closed, opened by its contact, without its signal (a cut wire
+    # must count as open), closed again. In each, exactly this circuit may be open, which also
+    # finds exchanged wires.
     for bit, interlock in enumerate(interlocks):
         name = interlock.name
         _require_mask(context, f"{name} closed", 0)
@@ -479,5 +514,14 @@ def _bench_pressure_pa(context: StageContext) -> float:
 
 
 def has_laser(state: SessionState, tables: TomlTable) -> bool:
+    """Whether a laser is configured: behind a board, or as an instrument.
+
+    Parameters
+    ----------
+    state : SessionState
+        Not used; every stage's `is_needed` gets it.
+    tables : TomlTable
+        The configuration as it is in the file; empty before it is written.
+    """
     devices = tables.get("devices", {})
     return "board" in devices or "displacement" in devices
