@@ -18,7 +18,31 @@ from membrane_ctrl.sessions.progress import Progress
 def confirm_and_replace(
     path: Path, before: str, after: str, folder: SessionFolder, yes: bool
 ) -> bool:
-    """Show the difference and ask, unless `yes`; whether the file was written."""
+    """Show the difference of a configuration, and write it if the person agrees.
+
+    Parameters
+    ----------
+    path : Path
+        The configuration; a link is followed.
+    before : str
+        The text that it has. It is not written if the file has another one by now.
+    after : str
+        The text that it shall have.
+    folder : SessionFolder
+        Whose results these are, for the heading of the difference.
+    yes : bool
+        Write without asking. Without it, and without a terminal, nothing is written.
+
+    Returns
+    -------
+    bool
+        Whether the file was written.
+
+    Raises
+    ------
+    InputError
+        The file has changed meanwhile, or cannot be written.
+    """
     shown = difflib.unified_diff(
         before.splitlines(), after.splitlines(), str(path), folder.path.name, lineterm="", n=1
     )
@@ -34,7 +58,20 @@ def confirm_and_replace(
 
 
 def list_changes(old: Section, new: Section, keys: Collection[str] = ()) -> dict[str, Any]:
-    """Settings of a table that differ, all or some, as plain values."""
+    """Settings of a table that differ.
+
+    Parameters
+    ----------
+    old, new : Section
+        The same table of two configurations.
+    keys : collection of str
+        Only these are compared; all if it is empty.
+
+    Returns
+    -------
+    dict
+        The new values by key, as TOML holds them.
+    """
     plain = new.model_dump(mode="json", include=set(keys) or None)
     return {key: value for key, value in plain.items() if getattr(new, key) != getattr(old, key)}
 

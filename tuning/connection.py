@@ -26,8 +26,27 @@ def open_on_hold(
     again: str = "resume it with `membrane-ctrl tune run --resume {}`",
     refusal: Callable[[Config], str] = lambda config: "",
 ) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
-    """Yield a session's folder and hold; restore the last good gains if it ends early, and print
-    how to continue.
+    """Yield a session's folder, its hold and its progress.
+
+    If the block ends early, the last good gains are restored, and it is printed how to continue.
+
+    Parameters
+    ----------
+    options : TuneOptions
+        Of the command: which hold, or the twin; which session; what to print.
+    fresh : bool
+        Start a new session, even if the newest one on this hold is not finished.
+    again : str
+        The line that tells how to continue; `{}` becomes the session's folder.
+    refusal : callable
+        Why the configuration of the hold is not fit for this command; empty if it is.
+
+    Raises
+    ------
+    InputError
+        The hold is refused, or the named session does not fit it.
+    DeviceError
+        There is no such hold, it ends, or the session's folder cannot be written.
     """
     progress = Progress()
     with connect_to_hold(options, f"tune {options.name}") as link:
@@ -70,7 +89,26 @@ def _restore_gains(rig: HoldRig, progress: Progress) -> None:
 def connect_to_hold(
     options: TuneOptions, session: str = ""
 ) -> contextlib.AbstractContextManager[HoldLink]:
-    """Connect to the hold; with the name of a `session`, claim its command."""
+    """Connect to the running hold, or start one on the twin.
+
+    Parameters
+    ----------
+    options : TuneOptions
+        Of the command: which hold, whether to wait for it and to take its command over. On the
+        twin, a resumed session has the configuration that it began with.
+    session : str
+        Name under which the command of the hold is claimed; empty: only read.
+
+    Returns
+    -------
+    context manager of HoldLink
+        Its end releases the command; a hold on the twin ends.
+
+    Raises
+    ------
+    DeviceError
+        There is no such hold, or another client has its command.
+    """
     if not options.twin:
         return live_hold(options.where, options.take_over, wait=options.wait, session=session)
     config = open_session(options.session).config if options.session is not None else options.config
@@ -81,7 +119,23 @@ def connect_to_hold(
 
 
 def find_session(options: TuneOptions, link: HoldLink | None, fresh: bool = False) -> SessionFolder:
-    """Return the named session, else the newest, or a new one if there is a hold to start it on."""
+    """Find the session to continue, or create one.
+
+    Parameters
+    ----------
+    options : TuneOptions
+        `session` is the folder of a session; without it, the newest one counts.
+    link : HoldLink or None
+        The hold. None: a session is only read, and none is created. With a hold, the newest session
+        is continued only if it has the same name, began on this hold and is not verified.
+    fresh : bool
+        Create a session, unless `options` name one.
+
+    Raises
+    ------
+    InputError
+        There is no session, or the named one does not fit the hold.
+    """
     if link is None:
         return (
             find_newest_session(options.logs)

@@ -157,8 +157,19 @@ def find_roll_back(logs: Path, gains_only: bool = False) -> GainsEntry:
 
 
 def find_kept_shape_s(logs: Path, session: str = "") -> float | None:
-    """The shape loop's time constant kept last, by any or this session,
-    and not rolled back since.
+    """The time constant of the shape loop that was kept last and not rolled back since, s.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder of runs and sessions.
+    session : str
+        Name of a session's folder; empty: by any session.
+
+    Returns
+    -------
+    float or None
+        None if none was kept.
     """
     of_it = (line.shape_s for line in _list_used_gains(logs) if session in ("", line.session))
     return next((shape_s[1] for shape_s in of_it if shape_s is not None), None)
@@ -166,6 +177,8 @@ def find_kept_shape_s(logs: Path, session: str = "") -> float | None:
 
 def _list_used_gains(logs: Path) -> Iterator[GainsEntry]:
     """What was kept and not rolled back since, newest first."""
+    # Backwards through the journal: a roll-back undoes what the same session has kept before it,
+    # gains or time constant.
     undone: set[tuple[str, bool]] = set()
     for found in reversed(read_entries(logs)):
         of = (found.session, found.shape_s is None)

@@ -63,8 +63,21 @@ def continue_on_hold(folder: SessionFolder, link: HoldLink) -> SessionFolder:
 
 
 def require_same_devices(path: Path | str, config: schema.Config, folder: SessionFolder) -> None:
-    """Raises InputError if the session tuned the simulated bench,
-    and the configuration is another.
+    """Require that results of the twin are not used for devices.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file or hold that shall get them, for the message.
+    config : Config
+        Its configuration.
+    folder : SessionFolder
+        The session.
+
+    Raises
+    ------
+    InputError
+        The session tuned the simulated bench, and the configuration has devices.
     """
     if config.devices is not None and (
         folder.config.devices is None or folder.head.source == "twin"

@@ -19,11 +19,31 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
     """Save what a session kept into a configuration file: gains, curve of the pump, time constant
     of the shape loop.
 
-    By default the gains and the time constant that were kept last. Returns the exit code.
+    It shows the difference and asks; comments of the file stay.
 
-    Shows the difference and asks; without a terminal only `yes` writes. Comments stay.
+    Parameters
+    ----------
+    path : Path
+        The configuration, one TOML file.
+    name : Path or None
+        Folder of a session. None: the gains and the time constant that were kept last, which may be
+        of two sessions.
+    logs : Path
+        Folder of the runs; its `tuning` holds sessions and journal.
+    author : str
+        Who saves, for the journal.
+    yes : bool
+        Write without asking; without a terminal nothing is written otherwise.
 
-    Raises InputError if the gains were not kept, or are not for this configuration.
+    Returns
+    -------
+    int
+        The exit code.
+
+    Raises
+    ------
+    InputError
+        The gains were not kept, or are not for this configuration.
     """
     config = toml_file.load_toml(path, schema.Config)
     # A hold without PI loop has tuned only its estimator.

@@ -55,6 +55,8 @@ def compute_curves(name: str, gains: closed_loop.Gains, of: Workpiece, duration_
     figures = candidate.evaluate_candidate(name, gains, of.model, of.weather, of.loop, demands)
     w = closed_loop.make_frequencies(dt_s)
     response = closed_loop.compute_loop_response(gains, of.model, w, dt_s)
+    # Two sources move the true centre: weather through the sensitivity S = 1 / (1 + L), and the
+    # laser's noise, which the loop follows, through T = 1 - S.
     sensitivity = 1 / (1 + response)
     moving, noise = of.weather.psd(w, of.model, of.loop), of.weather.rest.white_psd
     centre = np.abs(sensitivity) ** 2 * moving + np.abs(1 - sensitivity) ** 2 * noise
@@ -66,7 +68,15 @@ def compute_curves(name: str, gains: closed_loop.Gains, of: Workpiece, duration_
 
 
 def find_duration_s(gains: closed_loop.Gains, model: plant_model.PlantModel) -> float:
-    """How long the responses of the gains are worth a look."""
+    """Duration in which the responses of the gains settle, s.
+
+    Parameters
+    ----------
+    gains : Gains
+        Of the loop.
+    model : PlantModel
+        Its dead time and lag set the scale together with filter and integral time.
+    """
     return _SETTLINGS * (model.delay_s + gains.filter_s + 0.2 * gains.ti_s)
 
 
@@ -95,6 +105,8 @@ def simulate_response(
     time_s, centre_um : (n,) arrays
         At each tick; the delayed flow changes once within a tick, which is taken into account.
     """
+    # The controller of the hold, tick by tick: measurement filter, setpoint behind the same filter,
+    # PI with derivative on the measurement.
     loop, model = of.loop, of.model
     dt_s = max(of.weather.rest.dt_s, duration_s / _POINTS_MAX)
     shaped = _Setpoint(loop, gains.ti_s, dt_s)
@@ -109,15 +121,19 @@ def simulate_response(
     out = np.empty(count)
     for tick in range(count):
         out[tick] = centre
-        before, filtered = filtered, filtered + smooth * (centre - filtered)
+        before = filtered
+        filtered += smooth * (centre - filtered)
         matched += smooth * (shaped.at(setpoint_um) - matched)
         error = matched - filtered
         flow = gains.kp_per_s * (error - gains.td_s * (filtered - before) / dt_s) + integral
         integral += gains.kp_per_s / gains.ti_s * error * dt_s
+        # The plant: the flow after its dead time, through the lag of first order to the speed of
+        # the centre, integrated by the trapezoidal rule.
         flows = [flow, *flows[:-1]]
         arriving = model.gain * (early * flows[whole] + (1.0 - early) * flows[whole + 1])
-        old, speed = speed, speed + follow * (arriving - speed)
-        centre += ((old + speed) / 2 - load_um_per_s) * dt_s
+        old_speed = speed
+        speed += follow * (arriving - speed)
+        centre += ((old_speed + speed) / 2 - load_um_per_s) * dt_s
     return np.arange(count, dtype=float) * dt_s, out
 
 

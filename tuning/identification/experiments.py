@@ -68,7 +68,15 @@ class ExperimentRig(Protocol):
         ...
 
     def around(self, held: Record, limit_um: float) -> operating_point.OperatingPoint:
-        """Operating point of an experiment."""
+        """Operating point of an experiment.
+
+        Parameters
+        ----------
+        held : Record
+            A quiet hold: mean flow and noise of the laser are taken from it.
+        limit_um : float
+            Largest excursion of the centre from the setpoint in the experiment.
+        """
         ...
 
     def perform(self, spec: ExperimentSpec) -> tuple[Record, Finished]:

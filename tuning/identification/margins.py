@@ -93,6 +93,7 @@ def is_stable(response: ComplexArray) -> bool:
     response : (n,) complex array
         L at rising frequencies, close enough that 1 + L turns by less than 180 deg between two.
     """
+    # Sum the turns from one frequency to the next: the angle itself would jump at +-180 degrees.
     one_plus_l = 1 + response
     turns_rad = np.angle(one_plus_l[1:] / one_plus_l[:-1])
     start_rad = float(np.angle(one_plus_l[0])) % (-2 * math.pi)
@@ -105,8 +106,12 @@ def find_sensitivity_peak(gains: Gains, model: PlantModel, dt_s: float) -> float
 
     Parameters
     ----------
-    gains, model, dt_s : as in `compute_margins`
-        -
+    gains : Gains
+        Of the PID and its filter.
+    model : PlantModel
+        The plant.
+    dt_s : float
+        Period of a tick.
 
     Returns
     -------

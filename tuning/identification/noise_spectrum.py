@@ -4,8 +4,8 @@ The response to the flow is removed from the readings, z = y - k int v(t - theta
 made the flow. The rest is the weather and the laser's noise. Its increments have the spectrum (per
 sample, dt S)
 
-    |1 - e^(-j w dt)|^2 (r + sum of s_i / dt / (1 + w^2 tau_i^2)^2)  +  q_fast dt  +  q_slow dt / (1
-    + w^2 tau^2)
+    |1 - e^(-j w dt)|^2 (r + sum of s_i / dt / (1 + w^2 tau_i^2)^2)
+        + q_fast dt + q_slow dt / (1 + w^2 tau^2)
 
 r: laser noise (µm^2 per sample), q_fast: a random walk (air pressure), q_slow: a random walk that
 reaches the gas through the film, tau = 12 s (air temperature), s_i: movement of any other colour,

@@ -30,7 +30,21 @@ _DAMAGED = (
 
 
 def save_record(path: Path, record: Record) -> None:
-    """Write a record atomically."""
+    """Write a record atomically.
+
+    Parameters
+    ----------
+    path : Path
+        A compressed NumPy archive (`.npz`): the columns of `COLUMNS`, `dt_s`, the origin, and the
+        hash that `load_record` checks.
+    record : Record
+        Evenly sampled readings and commanded flows.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
     file = io.BytesIO()
     columns = {name: getattr(record, name) for name in COLUMNS}
     np.savez_compressed(

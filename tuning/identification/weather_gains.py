@@ -191,8 +191,7 @@ def _regress_gains(
     -------
     gains, sigmas : (k,) arrays
     """
-    # Increments of the means over blocks, without their trend.
-    # Means of blocks, and their increments without the mean drift.
+    # Increments of the means over blocks, less their mean: a drift is no effect of the weather.
     used = z.size // per_block * per_block
     means = [column[:used].reshape(-1, per_block).mean(axis=1) for column in (z, *columns)]
     moved = np.diff(np.array(means), axis=1)

@@ -14,12 +14,28 @@ _DPI = 100
 
 
 def save_figure(path: Path, figure: Figure) -> None:
-    """Write a picture to a file of the session."""
+    """Write a picture to a file of the session.
+
+    Parameters
+    ----------
+    path : Path
+        A PNG file, replaced as a whole.
+    figure : Figure
+        Drawn; its size in inches counts 100 px each.
+    """
     write_picture(resolve_user_path(path), figure, _DPI)
 
 
 def embed_picture(folder: SessionFolder, name: str) -> list[PagePicture]:
-    """Return a picture of the session for its report; empty if it is missing."""
+    """Return a picture of the session for its report; empty if it is missing.
+
+    Parameters
+    ----------
+    folder : SessionFolder
+        The session.
+    name : str
+        File name within it, such as `fit.png`.
+    """
     path = folder.file_path(name)
     if not path.exists():
         return []
@@ -27,7 +43,17 @@ def embed_picture(folder: SessionFolder, name: str) -> list[PagePicture]:
 
 
 def is_outdated(folder: SessionFolder, picture: str, *steps: str) -> bool:
-    """Whether the picture is no file, or older than a result of one of the steps."""
+    """Whether a picture must be drawn (again): it is no file, or older than what it shows.
+
+    Parameters
+    ----------
+    folder : SessionFolder
+        The session.
+    picture : str
+        File name within it.
+    *steps : str
+        Finished steps whose files it shows; at least one.
+    """
     path = folder.file_path(picture)
     if path.is_symlink() or not path.is_file():
         return True

@@ -182,7 +182,20 @@ def explain_no_benefit(session: folder.SessionFolder) -> str:
 
 
 def explain_no_benefit_of(session: folder.SessionFolder, name: str) -> str:
-    """Why a named candidate is not worth a trial; empty if it is. Raises like `find_candidate`."""
+    """Why a named candidate is not worth a trial; empty if it is.
+
+    Parameters
+    ----------
+    session : SessionFolder
+        In which the step is done.
+    name : str
+        As in `candidates.md`, for example `balanced`.
+
+    Raises
+    ------
+    InputError
+        It is unknown or must not be applied.
+    """
     chosen = find_candidate(session, name)
     rows, _ = load_candidates(session)
     present = next((row for row in rows if row.name == candidate.PRESENT), None)
