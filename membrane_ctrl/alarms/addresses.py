@@ -95,10 +95,30 @@ def _import_apprise() -> Any:
 
 
 def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json: bool) -> int:
-    """`alarm test`: send one message to the alarm addresses, and with `escalated` to the escalation
-    addresses.
+    """`alarm test`: send one message to the alarm addresses.
 
-    Raises InputError without addresses, DeviceError if no service accepts it.
+    Parameters
+    ----------
+    config : Config
+        `alarms.urls_file` names the file with the addresses, one Apprise URL a line.
+    source : str
+        Its file, for messages.
+    escalated : bool
+        Send it also to those of `alarms.escalation_urls_file`.
+    as_json : bool
+        Print `{"sent": true}` or `false` instead of a line for people.
+
+    Returns
+    -------
+    int
+        The exit code of the command.
+
+    Raises
+    ------
+    InputError
+        No addresses are configured, or one is not an address.
+    DeviceError
+        No service of a list accepts the message, or Apprise is not installed.
     """
     alarms = config.alarms
     if alarms.urls_file is None:
@@ -115,12 +135,12 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
     if escalated:
         lists.append(alarms.escalation_urls_file)
     with limited_memory():
-        deaf = [file for file, send in zip(lists, senders, strict=False) if not send(message)]
+        failed = [file for file, send in zip(lists, senders, strict=False) if not send(message)]
     if as_json:
-        print(json.dumps({"sent": not deaf}))
-    if deaf:
+        print(json.dumps({"sent": not failed}))
+    if failed:
         raise errors.DeviceError(
-            f"{' and '.join(map(str, deaf))}: no service accepted the message; check "
+            f"{' and '.join(map(str, failed))}: no service accepted the message; check "
             "addresses and network"
         )
     if not as_json:

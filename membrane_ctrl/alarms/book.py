@@ -166,6 +166,8 @@ class AlarmBook:
         now_s : float
             Time of the sign, on the clock of `step`.
         """
+        # A first condition opens the alarm; nothing is sent before it has persisted. A latched
+        # fault replaces an alarm whose condition is over, even if nobody has been sent its end.
         alarm = self._alarms.get(sign.name)
         if alarm is None or (sign.bad and sign.always_new and math.isfinite(alarm.gone_s)):
             if sign.bad:
@@ -200,6 +202,8 @@ class AlarmBook:
             All of the run, oldest first.
         now_s : float
         """
+        # The conditions that this book has followed stay; what it has noted as sent is
+        # replaced by what the log states. An alarm that is over, and was never sent, is dropped.
         for name, alarm in list(self._alarms.items()):
             alarm.reported_s = alarm.reminded_s = math.inf
             alarm.escalated = alarm.acknowledged = False
@@ -264,6 +268,8 @@ class AlarmBook:
         return messages
 
     def _list_due(self, alarm: _Alarm, now_s: float) -> MessageKind | None:
+        # In this order: the end, the first message after the condition has persisted; then, unless
+        # a person has acknowledged it, once to more people, and from then on reminders.
         config = self._config
         if now_s - alarm.gone_s >= config.clear_after_s:
             return "cleared"

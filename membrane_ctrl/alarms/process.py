@@ -84,9 +84,8 @@ def watch_run(
         # The service sends; this process does so only without one
         alarms = RunAlarms(spec.config, sent_log, senders, WITHOUT_SERVICE_S, clock.now)
         while True:
-            lives = (
-                parent_lives()
-            )  # before the rings: a dying parent has written its last message first
+            # before the rings are read: a dying parent has written its last message first
+            lives = parent_lives()
             report(child_events.Alive(_SENDING_S))
             alarms.process_news(telemetry.drain(), events.drain())
             _report_attempts(sent_log, report)

@@ -61,7 +61,15 @@ class RunAlarms:
         return all(outbox.is_empty for outbox in self._outboxes)
 
     def process_news(self, rows: Sequence[bytes], events: Sequence[bytes]) -> None:
-        """Take rows and events; send what is due."""
+        """Take rows and events; send what is due.
+
+        Parameters
+        ----------
+        rows : sequence of bytes
+            Packed telemetry rows since the last call, in order.
+        events : sequence of bytes
+            Events since the last call as JSON, in order.
+        """
         self._watcher.take_news(rows, events, self._now())
         self.send_due()
 
@@ -81,6 +89,9 @@ class RunAlarms:
 
     def _choose_sender(self) -> None:
         """Become the sender if there has been none for long enough; stop if another is."""
+        # Two processes watch one run: the service and the hold's own alarm process. The log decides
+        # which of them sends. The one that waits follows all conditions, so that it can take over
+        # with the messages that are due, and without those that were sent.
         if self._watcher.is_sender:
             self._watcher.is_sender = self._log.is_sender()
             if self._watcher.is_sender:

@@ -26,7 +26,15 @@ class Service:
         self._accepted = False
 
     def begin_sending(self, title: str, body: str, kind: str) -> None:
-        """Begin to send, unless the last attempt still hangs."""
+        """Begin to send, unless the last attempt still hangs.
+
+        Parameters
+        ----------
+        title, body : str
+            Of the message, as text.
+        kind : str
+            Apprise's type: `info`, `success`, `warning` or `failure`.
+        """
         self._begun = self._thread is None or not self._thread.is_alive()
         if not self._begun:
             return
@@ -61,7 +69,7 @@ def send_to_all(services: Sequence[Service], title: str, body: str, kind: str) -
     ----------
     services : sequence of Service
     title, body, kind : str
-        As Apprise takes them.
+        As for `Service.begin_sending`.
 
     Returns
     -------
@@ -71,7 +79,6 @@ def send_to_all(services: Sequence[Service], title: str, body: str, kind: str) -
     until_s = time.monotonic() + SERVICE_S
     for service in services:
         service.begin_sending(title, body, kind)
-    accepted = [
-        service.has_accepted(until_s) for service in services
-    ]  # wait for all: each gets every message
+    # Wait for all, not only for the first that accepts: each gets every message.
+    accepted = [service.has_accepted(until_s) for service in services]
     return any(accepted)

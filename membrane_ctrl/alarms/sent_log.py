@@ -133,7 +133,15 @@ class SentLog:
         return [each for each in found if each is not None]
 
     def was_sent(self, message: AlarmMessage, to: str) -> bool:
-        """Whether a message was accepted before; a reminder may be sent again."""
+        """Whether a message was accepted before, sent by whichever process.
+
+        Parameters
+        ----------
+        message : AlarmMessage
+            Compared by name, kind and occurrence. A reminder may be sent again: False.
+        to : str
+            Key of the configuration that names the list of services.
+        """
         if message.kind == "reminder":
             return False
         return any(
@@ -170,12 +178,17 @@ class SentLog:
 
     def _append(self, line: Line) -> None:
         """Write a line; on a full disk keep it in memory only: the alarm matters more."""
-        data = b"\n" * self._is_torn + json.dumps(line).encode() + b"\n"
+        # A line that a full disk has cut gets its end first, so that it spoils no other line.
+        data = json.dumps(line).encode() + b"\n"
+        if self._is_torn:
+            data = b"\n" + data
         try:
             written = os.write(self._log, data)
         except OSError:
             written = 0
-        self._is_torn = 0 < written < len(data) or (self._is_torn and not written)
+        was_cut = 0 < written < len(data)
+        nothing_written = written == 0
+        self._is_torn = was_cut or (self._is_torn and nothing_written)
         if written < len(data):
             self._entries.append(line)
 

@@ -103,9 +103,28 @@ def calibrate_camera(options: CameraOptions) -> int:
 
 
 def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height_px: int) -> int:
-    """Write the board as a picture for a screen of the given size in pixels.
+    """Write the board as a picture for a screen, in the middle of it.
 
-    Raises InputError if it does not fit, or cannot be written.
+    Parameters
+    ----------
+    out : Path
+        Its suffix chooses the format; one without loss, such as PNG, keeps the edges sharp.
+    board_text : str
+        KIND:COLUMNSxROWS in squares, such as `charuco:15x9`.
+    square_px : int
+        Side of a square; a multiple of 8, for the markers within.
+    width_px, height_px : int
+        Size of the screen, and of the picture.
+
+    Returns
+    -------
+    int
+        The exit code of the command.
+
+    Raises
+    ------
+    InputError
+        The board does not fit, or the picture cannot be written.
     """
     try:
         levels = on_screen(_parse_board(board_text), square_px, width_px, height_px)

@@ -17,9 +17,30 @@ _PHASES = 720  # per period, to include the worst one
 
 
 def calibrate_display(config: Config, source: str, as_json: bool) -> int:
-    """Open camera and screen, measure, and report the resulting error. Raises CommandError.
+    """Open camera and screen, measure settling and response, and report the resulting error.
 
     Call from the main thread only (because of the screen).
+
+    Parameters
+    ----------
+    config : Config
+        With `devices.camera` and `devices.screen`.
+    source : str
+        Its file, for messages.
+    as_json : bool
+        Print the report as JSON instead of lines for people.
+
+    Returns
+    -------
+    int
+        The exit code of the command.
+
+    Raises
+    ------
+    InputError
+        Camera or screen is not configured.
+    DeviceError
+        One of them fails, or the camera cannot see the screen.
     """
     if config.devices is None or config.devices.camera is None or config.devices.screen is None:
         raise errors.InputError(
@@ -77,7 +98,23 @@ def measure_display(
 def display_report(
     settling: Settling, response: DisplayResponse, pattern: PatternConfig
 ) -> dict[str, object]:
-    """The findings, schema membrane-calibrate-display/1."""
+    """The findings as the command prints them in JSON.
+
+    Parameters
+    ----------
+    settling : Settling
+        Measured times, s; those that could not be measured are NaN.
+    response : DisplayResponse
+        Measured light of the grey levels.
+    pattern : PatternConfig
+        The fringes for which the error is computed.
+
+    Returns
+    -------
+    dict
+        Schema `membrane-calibrate-display/1`: times in ms (None if not measured), gamma, and the
+        RMS error of a screen coordinate in µm, with levels as sent and corrected.
+    """
     bare, corrected = (fringe_error_mm(response, pattern, linear) for linear in (False, True))
     return {
         "schema": "membrane-calibrate-display/1",
@@ -129,7 +166,8 @@ def fringe_error_mm(response: DisplayResponse, pattern: PatternConfig, corrected
         levels = np.rint(255 * wanted)
     light = np.interp(levels, response.levels, response.light)
 
-    # The phase that it shows, less the true one, within half a turn.
+    # The phase that the N-step formula gives, less the true one, within half a turn. Harmonics of
+    # the light up to order N - 2 cancel in it; a gamma makes those beyond.
     sine = -np.sin(shifts) @ light
     cosine = np.cos(shifts) @ light
     seen = np.arctan2(sine, cosine)

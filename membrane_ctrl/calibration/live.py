@@ -145,7 +145,25 @@ def take_sets(
 def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     """Solve a session's sets, and adopt the new geometry if a person agrees.
 
-    Old and new geometry are printed before. Returns the exit code of the command.
+    Old and new geometry are printed before.
+
+    Parameters
+    ----------
+    session : CalibrationSession
+        All its sets are there.
+    options : LiveOptions
+        `solving` holds the options of the solver, except sets and result, which are the session's;
+        `yes` adopts without asking.
+
+    Returns
+    -------
+    int
+        The exit code of the command: that of the solver, also if nothing is adopted.
+
+    Raises
+    ------
+    CommandError
+        The sets are refused, or a file cannot be written.
     """
     solving = replace(
         options.solving,

@@ -61,7 +61,20 @@ class CalibrationSession:
         return self.path / "geometry.toml"
 
     def keep_set(self, index: int, taken: Path) -> None:
-        """Copy a set from the run's folder, atomically. Raises DeviceError."""
+        """Copy a set from the run's folder, atomically: a set that is there is complete.
+
+        Parameters
+        ----------
+        index : int
+            Of its setpoint, from 0.
+        taken : Path
+            Folder of the set in the run, which stays.
+
+        Raises
+        ------
+        DeviceError
+            It cannot be read or written.
+        """
         folder = self.set_folders[index]
         part = folder.with_name(f".{folder.name}.part")
         try:
@@ -78,8 +91,25 @@ class CalibrationSession:
 def begin_session(
     logs: Path, name: str, head: CalibrationHead, config: schema.Config
 ) -> CalibrationSession:
-    """Begin a session. Raises errors.InputError for a bad name, DeviceError if it cannot be
-    written.
+    """Begin a session in a new folder.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder of the runs; the session goes to its `calibration`.
+    name : str
+        Last part of the folder's name, after the time.
+    head : CalibrationHead
+        What is known at its beginning; becomes `session.json`.
+    config : Config
+        That of the hold, stored with the session.
+
+    Raises
+    ------
+    InputError
+        The name cannot be a part of a folder's name.
+    DeviceError
+        The folder cannot be written.
     """
     return CalibrationSession(
         session_folder.begin_session(logs / "calibration", name, head, config, SCHEMA), head, config

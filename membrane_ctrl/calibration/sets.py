@@ -229,8 +229,20 @@ def join_moved_screen(
 
 
 def with_priors(bundle: Bundle, priors: Sequence[prior_file.Prior]) -> Bundle:
-    """The sets with the bench as found by auxiliary calibrations. Raises InputError for a different
-    camera.
+    """The sets with the bench as found by auxiliary calibrations.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        The sets with the bench that they state.
+    priors : sequence of Prior
+        Results of `calibrate-camera` or `calibrate-pose`; of two that give the same value, the last
+        one counts.
+
+    Raises
+    ------
+    InputError
+        A prior is of a different camera.
     """
     optics = bundle.optics
     for prior in priors:
