@@ -34,9 +34,15 @@ def bridges(
     config: Annotated[
         Path | None, typer.Option("--config", help="Configuration with the table `[bridges]`.")
     ] = None,
-    logs: Annotated[Path | None, typer.Option("--logs", help="Folder of the runs.")] = None,
+    logs: Annotated[
+        Path | None,
+        typer.Option("--logs", help="Folder of the runs; recording.logs_dir by default."),
+    ] = None,
     socket: Annotated[
-        Path | None, typer.Option("--socket", help="Control port of the hold.")
+        Path | None,
+        typer.Option(
+            "--socket", help="Control port of the hold; that of the configuration by default."
+        ),
     ] = None,
     host: HostOption = "",
     token_file: TokenOption = None,

@@ -1,5 +1,10 @@
 """The command line: one thin function per command; errors end in one line and an exit code
 (docs/reference/interfaces.md).
+
+A command's docstring is its help and its manual page. Its parameters are documented once, by the
+`help` of their annotations, which `--help`, manual pages and a reader of the code all see; so the
+docstrings have no section for them. Every command returns its exit code (`errors.Exit`) and raises
+`errors.CommandError` kinds, which `run` prints.
 """
 
 import os
@@ -29,6 +34,8 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code; print an expected failure on stderr, one line per
     finding.
     """
+    # Typer does not end the process itself (`standalone_mode=False`): every way out of a command
+    # becomes an exit code here, so that scripts can rely on it.
     with terminal.only_text():
         try:
             if os.environ.get(_COMPLETION_VARIABLE):  # the words are in another variable

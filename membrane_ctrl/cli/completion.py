@@ -11,9 +11,21 @@ _LOGS = Path("logs")
 
 
 def complete_run(context: typer.Context, incomplete: str) -> list[str]:
-    """Names of the runs that begin so, in the folder of `--logs` if that is given, newest first.
+    """Names of runs for the shell, newest first, after `last`.
 
     Without a match the shell completes a path.
+
+    Parameters
+    ----------
+    context : Context
+        Of the command line so far; its `--logs` names the folder of the runs, `logs` by default.
+    incomplete : str
+        What is typed of the name.
+
+    Returns
+    -------
+    list of str
+        Empty if there is no such folder: a completion must not print an error.
     """
     from membrane_ctrl.run_files.run_lookup import is_run
 

@@ -32,7 +32,13 @@ TokenOption = Annotated[
 AuthorityOption = Annotated[
     Path | None, typer.Option(help="With --host: the CA of the service's certificate.")
 ]
-OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
+OnArgument = Annotated[
+    bool,
+    typer.Argument(
+        metavar="on|off",
+        help="on: hold the figure as it is from now on; off: the trim keeps its value.",
+    ),
+]
 TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="The remark.")]
 ReasonArgument = Annotated[str, typer.Argument(metavar="TEXT", help="Why the mirror is locked.")]
 WordArgument = Annotated[
@@ -108,6 +114,8 @@ def _add_command(action: str, does: str, own: Callable[..., dict[str, Any]]) -> 
     """
     parameters = inspect.signature(own).parameters
 
+    # Typer reads options from a signature: the command takes whatever is given, and gets the joined
+    # signature of its own arguments and the common options.
     def command(**given: Any) -> int:
         from membrane_ctrl.control_port.ctl import ctl
 

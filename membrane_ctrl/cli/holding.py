@@ -97,6 +97,8 @@ def hold(
     json: JsonOption = False,
 ) -> int:
     """Hold the mirror until stopped."""
+    # Everything that can be refused is refused before the control program is loaded, which takes
+    # seconds.
     settings = _start_from_flat(_with_devices(config, devices, twin), from_flat)
     if observe:
         settings = _make_observing(settings)
@@ -329,8 +331,8 @@ def alarm_test(
 
 
 def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> "Config":
-    """Return the configuration with the [devices] of the `--devices` file, which can also be used
-    alone.
+    """Return the configuration with the [devices] of the `--devices` file; that file alone is the
+    configuration if there is no other.
     """
     if devices is None:
         return load_configuration(config)

@@ -74,7 +74,9 @@ def measure(
     ] = False,
     nominal_radius_mm: Annotated[
         float | None,
-        typer.Option(help="Nominal radius of curvature, for the deviation of the power."),
+        typer.Option(
+            help="Nominal radius of curvature, mm; without it no deviation of the power is stated."
+        ),
     ] = None,
     report: Annotated[
         bool, typer.Option("--report", help="Write report.html and report.pdf.")
@@ -185,7 +187,7 @@ def film(
         float, typer.Option(min=0.0, max=0.5, help="RUN: its Poisson ratio.")
     ] = 0.35,
     gauge_offset_pa: Annotated[
-        float, typer.Option(min=0.0, help="Standard uncertainty of the gauge's zero.")
+        float, typer.Option(min=0.0, help="Standard uncertainty of the gauge's zero, Pa.")
     ] = 1.0,
     gauge_scale: Annotated[
         float, typer.Option(min=0.0, help="Standard uncertainty of its scale, relative.")
@@ -296,9 +298,19 @@ def paper(
 
     if quick and full_size:
         raise InputError("--quick, --full-size: give one of them")
-    options = QUICK if quick else PaperOptions(shrink=1 if full_size else 2)
+    if quick:
+        options = QUICK
+    elif full_size:
+        options = PaperOptions(shrink=1)
+    else:
+        options = PaperOptions(shrink=2)
     options = replace(options, seed=seed, scheduler=scheduler)
-    arguments = " --quick" * quick + " --full-size" * full_size
+    # The document states the command that makes it again.
+    arguments = ""
+    if quick:
+        arguments += " --quick"
+    if full_size:
+        arguments += " --full-size"
     if sets is not None:
         arguments += f" --sets {shlex.quote(str(sets))}"
     if seed != 1:
@@ -348,10 +360,22 @@ def simulate(
     figure: Annotated[
         bool, typer.Option(help="Add the aberrations of a mounted film, e.g. astigmatism.")
     ] = True,
-    steps: Annotated[int | None, typer.Option(min=3, max=64, help="Phase steps.")] = None,
-    bits: Annotated[int | None, typer.Option(min=8, max=16, help="Bits per pixel.")] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            min=3, max=64, help="Phase steps of each axis; by default the configuration's."
+        ),
+    ] = None,
+    bits: Annotated[
+        int | None,
+        typer.Option(min=8, max=16, help="Bits per pixel; by default the configuration's."),
+    ] = None,
     noise_adu: Annotated[
-        float | None, typer.Option(min=0.0, help="Noise of each pixel, counts.")
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Standard deviation of each pixel, counts; by default the configuration's.",
+        ),
     ] = None,
     shrink: Annotated[
         int, typer.Option(min=1, max=16, help="Use larger and fewer pixels, by this factor.")
@@ -364,7 +388,7 @@ def simulate(
         float, typer.Option(help="Initial displacement from that depth, µm.")
     ] = 0.0,
     laser_noise_um: Annotated[
-        float, typer.Option(min=0.0, help="Noise of the laser readings, µm.")
+        float, typer.Option(min=0.0, help="Standard deviation of the laser readings, µm.")
     ] = 0.0,
     stated: StatedOption = None,
     exact: Annotated[

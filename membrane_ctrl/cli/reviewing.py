@@ -268,12 +268,18 @@ def prune_runs(
     context: typer.Context,
     logs: OneLogsOption = None,
     keep_days: Annotated[
-        float | None, typer.Option(min=0, max=1e5, help="Delete runs older than this many days.")
+        float | None,
+        typer.Option(
+            min=0, max=1e5, help="Delete runs older than this many days; by default no age counts."
+        ),
     ] = None,
     keep_gb: Annotated[
         float | None,
         typer.Option(
-            min=0, max=1e6, help="Then delete the oldest until the rest take at most this, GB."
+            min=0,
+            max=1e6,
+            help="Then delete the oldest until the rest take at most this, GB; by default no size "
+            "counts.",
         ),
     ] = None,
     delete: Annotated[

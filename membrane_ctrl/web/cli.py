@@ -165,7 +165,7 @@ def check(
 @app.command("add-user")
 def add_user(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Users file; created if absent.")],
-    name: Annotated[str, typer.Argument(metavar="NAME")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name to log in with.")],
     role: Annotated[str, typer.Argument(metavar="ROLE", help="read, operate or tune.")],
 ) -> None:
     """Add a user to a users file, or change one; asks for the password."""

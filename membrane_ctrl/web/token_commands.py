@@ -35,7 +35,9 @@ def list_tokens() -> None:
 
 
 @app.command("revoke")
-def revoke_token(name: Annotated[str, typer.Argument(metavar="NAME")]) -> None:
+def revoke_token(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the program.")],
+) -> None:
     """Remove a token: the next request with it is refused."""
     from membrane_ctrl.service import tokens
 

@@ -66,3 +66,13 @@ def test_a_folder_that_cannot_be_written_is_one_line(
     (tmp_path / "file").touch()
     assert cli.run(["man", str(tmp_path / "file" / "man1")]) == 2
     assert "cannot be written (not a directory); name another folder" in capsys.readouterr().err
+
+
+def test_every_parameter_of_every_command_is_documented(root: Any) -> None:
+    undocumented = [
+        f"{name}: {parameter.name}"
+        for name, command in list_commands(root).items()
+        for parameter in command.params
+        if not parameter.hidden and parameter.name != "help" and not parameter.help
+    ]
+    assert not undocumented
