@@ -52,17 +52,28 @@ class BoardSettingsError(ValueError):
 def make_record(table: Mapping[str, Any]) -> bytes:
     """The record of a board's settings.
 
-    `table`, as read from TOML, has `unit_id`, `baud`, `parity` ("N", "E", "O"), `silence_us` (by
-    default the standard's), `pressure_limit_pa`, `pump_limit_fraction`, and `channel.<register>`
-    with `points` ([[raw, value], [raw, value]], in the register's unit) and `plausible_raw`
-    ([lowest, highest]; anything else is "no value"). An omitted channel arrives in counts of its
-    register.
+    Parameters
+    ----------
+    table : mapping
+        As read from TOML. It has `unit_id`, `baud`, `parity` ("N", "E", "O"), `silence_us` (by
+        default the standard's), `pressure_limit_pa`, `pump_limit_fraction`, and
+        `channel.<register>` with `points` ([[raw, value], [raw, value]], in the register's unit)
+        and `plausible_raw` ([lowest, highest]; anything else is "no value"). An omitted channel
+        arrives in counts of its register.
 
-    `gauge_fitted` (true) with `gauge_timeout_s` (15) and `gauge_frozen_s` (60; 0: not judged) state
-    how the board guards its pump against a lost gauge; `interlocks_fitted` lists the interlock
-    inputs in use, from 0 (none).
+        `gauge_fitted` (true) with `gauge_timeout_s` (15) and `gauge_frozen_s` (60; 0: not judged)
+        state how the board guards its pump against a lost gauge; `interlocks_fitted` lists the
+        interlock inputs in use, from 0 (none).
 
-    Raises BoardSettingsError (an unknown or missing key, or a value outside what the board takes).
+    Returns
+    -------
+    bytes
+        Words of 32 bits, big end first: magic, length, settings, CRC-32 of all before it.
+
+    Raises
+    ------
+    BoardSettingsError
+        An unknown or missing key, or a value outside what the board takes.
     """
     _check_keys("", table, _KEYS)
     baud = _read_whole(table, "baud", 1200, 1_000_000, 115_200)
@@ -125,6 +136,8 @@ def _interlock_mask(table: Mapping[str, Any]) -> int:
 
 def _read_scale(name: str, table: Mapping[str, Any]) -> bytes:
     _check_keys(f"channel.{name}.", table, _CHANNEL_KEYS)
+    # The board works with integers: a line through the first point, its slope as two whole numbers
+    # (counts of the register over raw counts).
     counts_per_unit = load_default_map().register(name).counts_per_unit
     points = table.get("points", [[0, 0.0], [1, 1 / counts_per_unit]])
     low, high = table.get("plausible_raw", [-_I32_MAX, _I32_MAX])

@@ -2,8 +2,7 @@
 anything else.
 
 docs/reference/firmware.md explains the requirements; each check names its section. The pump is
-briefly commanded to a few per
-cent: do not run it on a mirror that must not move.
+briefly commanded to a few per cent: do not run it on a mirror that must not move.
 """
 
 import contextlib

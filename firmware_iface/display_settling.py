@@ -86,6 +86,8 @@ def fit_settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Set
     shares = np.asarray(left, np.float64)
     order = np.argsort(delays)
     delays, shares = delays[order], shares[order]
+    # Four cases, from the fastest display to the slowest: settled in the first frame; never
+    # settled; a transition too short for a fit, which is bounded; and the fit of the exponential.
     floor = max(_FIT_TO, _NOISE_SIGMAS * noise)
     unsettled = np.flatnonzero(shares > floor)
     if unsettled.size == 0:  # faster than the first frame; its remainder decays at least as fast

@@ -131,6 +131,8 @@ class GuardedCamera:
                 f"{sensor.width_px} x "
                 f"{sensor.height_px} {sensor.dtype}"
             )
+        # A frame from before its trigger shows the pattern before; one from the future has a time
+        # of another clock. Both are lost frames: the pattern is shown again.
         earliest_s = triggered_s - _CLOCK_TOLERANCE_S
         latest_s = self._now() + _CLOCK_TOLERANCE_S
         if not isinstance(frame.time_s, int | float) or not earliest_s <= frame.time_s <= latest_s:

@@ -137,6 +137,8 @@ class CircuitPoller:
 
     async def _read_once(self) -> None:
         """One request; a failure leaves the last answer to grow old."""
+        # The age of an answer counts from its request, not from its arrival: a slow source must not
+        # make an old state look new.
         source = self.polled.source
         try:
             if not self._opened:

@@ -175,6 +175,8 @@ class RegisterMap:
         """
         if not 1 <= version <= self.map_version:
             raise RegisterMapError(f"map version {version} is none of 1..{self.map_version}")
+        # Registers are only ever added at the end of a block (`_parse_block` checks it), so what an
+        # earlier version has keeps its addresses, and blocks may be missing as a whole.
         had = {
             block: [register for register in block.registers if register.since <= version]
             for block in self.blocks

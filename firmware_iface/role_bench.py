@@ -2,10 +2,9 @@
 
 The actuators decide whether the bench is there. Without the pump (and the vent, if there is one)
 nothing can be made safe, so their errors are raised, and the loss of their link is the loss of the
-bench's. A failed sensor is a missing
-value: NaN, on which the controller holds the flow, ramps down or continues without it, and the
-sensor is reopened in the background, so that a replugged cable gives good readings within its
-back-off.
+bench's. A failed sensor is a missing value: NaN, on which the controller holds the flow, ramps down
+or continues without it, and the sensor is reopened in the background, so that a replugged cable
+gives good readings within its back-off.
 
 Watchdog: only the pump board has its own. An instrument keeps its last setpoint, so this bench
 watches itself: without a `write` within `watchdog_s` it sets the pump to 0 and reports that. This

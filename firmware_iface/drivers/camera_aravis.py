@@ -100,6 +100,8 @@ class AravisCamera:
 
         Raises LinkError without a camera.
         """
+        # No frame of an earlier exposure may be left, in flight or in the stream: frames carry no
+        # number of their trigger, so the next one would be taken for the answer to this one.
         if self._pending is not None and self._stream is not None:
             self._discard_pending()
         if self._stream is None:
@@ -203,6 +205,8 @@ class AravisCamera:
             raise arv.AravisError("another controller", arv.NOT_CONTROLLER)
 
     def _apply_settings(self) -> None:
+        # Every setting is read back: a camera may round a value, or ignore a write. First the size
+        # and format of the frames, on which the size of the buffers depends.
         call, camera, config = arv.load_aravis().call, self._camera, self.config
         sensor = [ctypes.c_int() for _ in range(2)]
         call("arv_camera_get_sensor_size", camera, *map(ctypes.byref, sensor))
@@ -223,6 +227,7 @@ class AravisCamera:
         # (FrameStart, or only FrameBurstStart as on Hikrobot's cameras)
         call("arv_camera_set_trigger", camera, b"Software")
         self._must_be("trigger source", call("arv_camera_get_trigger_source", camera), b"Software")
+        # Exposure and gain by hand: an automatic would follow the patterns on the screen.
         if call("arv_camera_is_exposure_auto_available", camera):
             call("arv_camera_set_exposure_time_auto", camera, _AUTO_OFF)
         call("arv_camera_set_exposure_time", camera, 1000.0 * config.exposure_ms)
@@ -260,6 +265,7 @@ class AravisCamera:
             raise roles.LinkError("no stream")
         if gige:
             library.fix_socket_buffer(self._stream, _SOCKET_BYTES)
+        # Buffers must be in the stream before frames arrive: without one, frames are lost.
         payload_bytes = library.call("arv_camera_get_payload", camera)
         for _ in range(_BUFFERS):
             buffer = library.call("arv_buffer_new_allocate", payload_bytes)

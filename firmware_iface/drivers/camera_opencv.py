@@ -120,6 +120,8 @@ class UvcCamera:
         if self._capture is None:
             self.open()
         assert self._capture is not None
+        # The camera runs freely: frames whose exposure may have begun before this call are read and
+        # dropped. The last one begins after the frame before it was delivered.
         image, time_s = None, self._now()
         for _ in range(_STALE_FRAMES + 1):
             time_s = self._now()

@@ -2,9 +2,9 @@
 
 The package `gpiod` (libgpiod 2, the kernel developers' own binding) requests the lines; the kernel
 then refuses them to every other program. A line of an I2C or USB expander may take long to answer,
-and a request for it cannot be
-abandoned: each call runs in a thread, so that the tick never waits for it. The threads are daemons
-and not those of asyncio's executor, for whose end the program would wait.
+and a request for it cannot be abandoned: each call runs in a thread, so that the tick never waits
+for it. The threads are daemons and not those of asyncio's executor, for whose end the program would
+wait.
 
 Source: libgpiod 2, Python bindings; Documentation/userspace-api/gpio/chardev.rst of the Linux
 kernel.

@@ -56,9 +56,8 @@ class Mks937b(line_link.LineDriver):
         """
         await self._link.close()
         self._reset_step_gate()
-        return await self._open_port(
-            self._begin, ";FF"
-        )  # ends what an earlier program left half sent
+        # the greeting ends what an earlier program left half sent
+        return await self._open_port(self._begin, ";FF")
 
     async def _begin(self) -> roles.DeviceIdentity:
         config = self._config
@@ -74,7 +73,8 @@ class Mks937b(line_link.LineDriver):
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: {model} is not a {' or '.join(_MODELS)}"
             )
-        # Does its channel have a manometer? Each module has two channels.
+        # Does its channel have a manometer? Channels 1 and 2 are in module A, 3 and 4 in B, 5 and 6
+        # in C; a module answers with the kinds of both, such as CMNG.
         module = "ABC"[(config.channel - 1) // 2]
         kinds = _SENSORS.fullmatch(await self._query_gauge(f"ST{module}?"))
         kind = kinds[1 + (config.channel - 1) % 2] if kinds else "none"
@@ -99,6 +99,7 @@ class Mks937b(line_link.LineDriver):
         Raises LinkError (no valid answer, or a jump that is ignored until it repeats),
         LinkDownError (the port is gone, or the unit was changed: open it again).
         """
+        # A jump may be another unit, chosen at the front panel: 1 mbar reads as 1 instead of 100.
         if self._jumped:
             await self._require_pascal()
         pressure_pa, self._jumped = await self._reading_pa()

@@ -60,7 +60,8 @@ class StreamParser:
         """Digital values or error codes (n,) of the trusted measurements that are complete with
         these bytes.
         """
-        # Frames begin where the two upper bits of successive bytes are those of a frame
+        # A frame begins where the two upper bits of six successive bytes have the marks of a frame.
+        # All places are compared at once: at 4 kHz there are 24,000 bytes a second.
         stream = np.frombuffer(self._rest + data, np.uint8)
         marks = stream >> 6
         candidates = np.arange(max(0, len(stream) - _BYTES + 1))
@@ -68,7 +69,7 @@ class StreamParser:
         for offset, mark in enumerate(_MARKS):
             is_start &= marks[offset : offset + len(candidates)] == mark
         starts = candidates[is_start]
-        # Keep the bytes that may begin the next frame
+        # Keep the bytes that may begin the next frame; all others outside of frames are lost.
         if len(starts):
             used = int(starts[-1]) + _BYTES
         else:
@@ -144,14 +145,17 @@ class Optoncdt1420:
         self._reset_stream()
         self._port.open(self)
         try:
-            # refused together with a half-sent earlier command
+            # The sensor may hold the first half of a command that an earlier program left: it
+            # refuses that together with this one. The second time the command arrives alone.
             with contextlib.suppress(roles.DeviceRefusedError):
                 await self._send_command("OUTPUT NONE")
             await self._send_command("OUTPUT NONE")
             identity = await self._identify()
             for setting in self._list_settings():
                 await self._write_setting(setting)
-            self._port.write(b"OUTPUT RS422\n")  # stream data mixed with this answer are skipped
+            # The answer to this command comes mixed with the first data, so it is not awaited: the
+            # parser skips it as bytes outside of frames.
+            self._port.write(b"OUTPUT RS422\n")
             self._buffer = None
             await self._first_readings()
         except roles.LinkError:
@@ -259,6 +263,8 @@ class Optoncdt1420:
         Raises LinkError (no value in time, or an impossible one, which is dropped), LinkDownError
         (the port is gone, or the sensor stopped streaming: open it again).
         """
+        # A sensor that has restarted does not stream: after a few readings without any value it
+        # must be opened again, which sends its settings.
         try:
             await self._wait_for_values()
         except roles.LinkDownError:

@@ -102,7 +102,8 @@ class PumpBoard:
             raise
 
     async def _identify(self) -> roles.BenchIdentity:
-        # these two never move; the other registers are valid only if they match
+        # Kind and version are at the same addresses in every version of the map; where the other
+        # registers are follows from them.
         identity = register_map.load_default_map().block("identity")
         kind, version = await self._link.read_holding(identity.address, 2)
         if kind != register_map.load_default_map().device_kind:
@@ -137,6 +138,7 @@ class PumpBoard:
             await self._write_settings(arm=1.0)
         except roles.DeviceBusyError:
             raise await self._held_by_another() from None
+        # Read back what the board has: another program may have written between the two requests.
         settings = await self._read_block(self._registers.block("settings"))
         sensors = await self._read_sensors()
         set_s = settings["watchdog_period_s"]
@@ -172,6 +174,7 @@ class PumpBoard:
         settings: call `open` again).
         """
         values = await self._read_sensors()
+        # A board that restarts has its watchdog off: its pump would run without a guard.
         if self._armed and not values["watchdog_armed"]:
             await self._link.close()
             raise roles.LinkDownError(
@@ -200,10 +203,16 @@ class PumpBoard:
         """
         if self._registers.map_version == 1:
             return 0
-        taken = sensors["claim_in_force"] != self._claim_id or self._busy_writes >= _BUSY_WRITES_MAX
-        return roles.FOREIGN_CLAIM * taken | roles.FOREIGN_PERIOD * (
-            sensors["period_in_force_s"] != self._watchdog_s
-        )
+        # The claim's name is public: another program may claim with the same one and another key.
+        # Then the name is right, and every write is refused as busy.
+        has_other_name = sensors["claim_in_force"] != self._claim_id
+        is_refused = self._busy_writes >= _BUSY_WRITES_MAX
+        found = 0
+        if has_other_name or is_refused:
+            found |= roles.FOREIGN_CLAIM
+        if sensors["period_in_force_s"] != self._watchdog_s:
+            found |= roles.FOREIGN_PERIOD
+        return found
 
     async def write(self, command: roles.BenchCommand) -> None:
         """Write pump and vent with a new heartbeat, in one transaction, which feeds the watchdog.

@@ -68,7 +68,9 @@ class Ventus(line_link.LineDriver):
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: device type {kind} is not a Ventus driver (2 or 3)"
             )
-        wanted = self._find_wrong_settings()
+        # Manual mode with the power from the register: only there the power is what is written.
+        # The pump stays off meanwhile (`open` has switched it off).
+        wanted = self._list_wanted_settings()
         found = await self._write_and_read(wanted, *wanted)
         if found != wanted:
             raise roles.DeviceRefusedError(
@@ -79,7 +81,7 @@ class Ventus(line_link.LineDriver):
             f"Ventus {DEVICE_TYPES[kind]}", "", f"{about[FIRMWARE]:g}.{about[FIRMWARE_MINOR]:g}"
         )
 
-    def _find_wrong_settings(self) -> dict[int, float]:
+    def _list_wanted_settings(self) -> dict[int, float]:
         return {
             STREAM: 0.0,
             MODE: float(_MODE_MANUAL),
@@ -128,7 +130,7 @@ class Ventus(line_link.LineDriver):
         return state[SET_VALUE] if state[ENABLE] else 0.0
 
     def _as_commanded(self, state: dict[int, float]) -> bool:
-        settings = self._find_wrong_settings()
+        settings = self._list_wanted_settings()
         return (
             abs(state[SET_VALUE] - self._commanded_mw) < _STEP_MW
             and bool(state[ENABLE]) == (self._commanded_mw > 0)

@@ -126,6 +126,8 @@ class Procedure:
         """Move the mirror back at the end, also after an error or Ctrl-C, unless the hold ended."""
         try:
             yield
+        # The hold has ended, or a person moves the mirror now: no command of this program may
+        # follow.
         except HoldError:
             off = ""
             if session.head.shape_on:
@@ -135,6 +137,7 @@ class Procedure:
                 f"{session.path}"
             )
             raise
+        # Any other end, Ctrl-C too: the mirror goes back, and a second Ctrl-C may stop that wait.
         except BaseException:
             self.progress.interrupted = False
             missing_count = len(session.missing_indices)

@@ -216,7 +216,8 @@ def join_moved_screen(
     nearest = films[int(np.nanargmin(differences_um))]
     base = sets[nearest]
 
-    # The move, and by how much the film was deeper then.
+    # The move of the screen as stated, and by how much the film was deeper in the second set: the
+    # solution corrects the difference of the two figures by it.
     known = MovedScreen(
         moved.shift_mm,
         moved.shift_sigma_mm,

@@ -74,13 +74,14 @@ class Sweep:
                     f"{self._link.name}: no shape within {_SHAPE_WITHIN_S:.0f} s; "
                     "does this run have a camera that sees the mirror? (ctl status)"
                 )
+        # The mean flow replaces the leak while there is no estimate of it, which needs some minutes
+        # of hold.
         newest = rows[-1]
         leaks = [row.leak_um_per_s for row in rows if math.isfinite(row.leak_um_per_s)]
         return HeldMirror(
             setpoint_um=newest.target_um,
             sag_mm=1e-3 * shape.sag_um,
             pressure_pa=_mean_of_finite([row.gauge_pressure_pa for row in rows]),
-            # the mean flow replaces the leak, whose own estimate needs a while of hold
             leak_um_per_s=_mean_of_finite(leaks or [row.i_um_per_s for row in rows]),
             swing_adu=shape.modulation_median_adu,
             shape_on=newest.shape_state != telemetry.ShapeState.OFF,
@@ -121,6 +122,8 @@ class Sweep:
                     raise HoldError(f"someone else moved the setpoint to {row.target_um:g} µm")
                 if math.isnan(begin_s):
                     begin_s = row.mono_s
+                # The row's setpoint is that of the loop: the ramped target plus trim and offset of
+                # the held scalar. Without these it is the ramp, which ends at the target.
                 offset_um = row.held_offset_um
                 if math.isnan(offset_um):  # the centre is held
                     offset_um = 0.0

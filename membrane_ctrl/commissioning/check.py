@@ -151,6 +151,7 @@ def probe_all_devices(
     devices = config.devices
     if devices is None:
         return probe_optics(config), []
+    # Opening an instrument stops its pump or changes its settings: never while a hold has it.
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(device_claim.claim_devices(device_names.list_device_names(devices)))
@@ -443,12 +444,11 @@ async def _probe_role(
     identity = " ".join(
         part for part in (found.kind, found.serial, found.firmware, found.detail) if part
     )
+    # The last reading decides: a laser has error codes of its own, and a rate of samples.
     problem = ""
-    # What its last reading says: a laser has its own error codes and rate.
     samples_hz = math.nan
     value = timed.last
     if isinstance(value, roles.DisplacementSample):
-        problem = ""
         if value.quality != 0:
             problem = f"no reading, error code {value.quality}; check aim and manual"
         samples_hz = _measure_samples_hz(timed.first, value)
@@ -487,6 +487,7 @@ class TimedReads:
 
 async def _time_reads(read: Callable[[], Awaitable[Any]]) -> TimedReads:
     """Read many times, and long enough to measure the rate of samples."""
+    # Of the values only the first and the last are kept: their counters give the rate of samples.
     took_ms: list[float] = []
     values: list[Any] = []
     started_s = time.monotonic()

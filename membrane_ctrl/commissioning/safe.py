@@ -67,15 +67,19 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
             print(asyncio.run(_after_a_run(config.devices)), file=sys.stderr)
         return Exit.DONE
     folder = logs_dir or Path(config.recording.logs_dir)
+    # First the gas, at the device itself: this works without any other program. Then the hold, if
+    # one runs, which would command the pump again with its next tick.
     stopped = _try_to_stop(config.devices)
     by_hold = _lock_hold(config, folder)
     if not stopped.lasts:  # the hold may have commanded the pump again before it was locked
         stopped = _try_to_stop(config.devices)
+    # One of the two is enough: a hold that is locked has stopped its pump.
     if stopped.problem and not by_hold.locked:
         raise DeviceError(f"{stopped.problem}; cut the pump's power if it runs")
     for line in (stopped.words, by_hold.words):
         if line:
             print(line, file=sys.stderr)
+    # The lock on the disk keeps later programs from the devices, too.
     if not by_hold.stored:
         _store_lock(config.devices)
     return Exit.DONE
@@ -158,6 +162,8 @@ async def _read_stopped_board(board: PumpBoard, watchdog_s: float) -> BenchReadi
     """Reading of a stopped pump; a pump still running after the watchdog period is stopped, which
     latches.
     """
+    # Wait for the watchdog instead of stopping at once: a stop is a latched fault, which a person
+    # would have to clear after every ordinary end of a hold.
     for _ in range(math.ceil((watchdog_s + _LAPSE_S) / _LOOK_S)):
         if (reading := await board.read()).pump_fraction == 0.0:
             return reading

@@ -105,10 +105,9 @@ def _to_be_tried(
     if abs(after_s / before_s - 1) < 0.1:
         progress.print_line(f"the present time constant, {before_s:.0f} s, fits")
         return False
-    is_interactive = not options.yes and sys.stdin.isatty()
-    answer = (
-        progress.ask_question(f"try it instead of {before_s:.0f} s? [y/N]", ("yes",))
-        if is_interactive
-        else ""
-    )
-    return options.yes or answer.lower() in ("y", "yes")
+    if options.yes:
+        return True
+    if not sys.stdin.isatty():
+        return False
+    answer = progress.ask_question(f"try it instead of {before_s:.0f} s? [y/N]", ("yes",))
+    return answer.lower() in ("y", "yes")

@@ -232,7 +232,8 @@ class _Mirror:
         """
         gram, determinant = self._gram_matrix((delay_s, lag_s, white), changes, flows)
 
-        # Without delay and lag, for the likelihood of this actuator.
+        # The cost compares actuators, so it must not contain the freedom of delay and lag: it is
+        # computed without their columns. The errors of the flows must contain it.
         without_off = np.delete(np.delete(gram, _OFF, axis=0), _OFF, axis=1)
         variance, values, covariance = _least_squares(without_off, self._rows)
         cost = determinant + self._rows * math.log(variance)
@@ -243,6 +244,8 @@ class _Mirror:
 
     def improve_delay_and_lag(self, best: _Flows) -> _Flows:
         """With a better delay and lag, if there are any."""
+        # The step of Gauss and Newton is too long where the likelihood is far from a parabola: a
+        # shorter one is tried before giving up.
         noise = best.white, best.leak_changes_um_per_s
         off_s = self.solve_flows(best.delay_s, best.lag_s, *noise, best.values).values[-2:]
         for share in _STEP_SHARES:

@@ -352,7 +352,7 @@ class PumpSurvey:
 
     def _plan_visits(self) -> list[Level]:
         """Levels to visit in the next round: new ones once, small ones first, then others as often
-        as they ask for.
+        as their errors require.
 
         A round reaches only the first of them. Where the leak's error keeps every level from being
         known, those with the largest error of their own must be among them.
@@ -410,6 +410,9 @@ class PumpSurvey:
 
     def _plan_visit(self, level: Level) -> list[PumpStep]:
         """From where the mirror may be to the level's run, and until its gas has arrived."""
+        # A visit has to show a motion as long as the limit permits, in one direction. So a level
+        # that lifts the mirror begins below the centre, and one on which it sinks above; the steps
+        # before the run bring it there.
         leak = max(self.fit.leak_um_per_s, _LEAST_LEAK_UM_PER_S)
         travel_um = self._travel_um
         run = _make_step(level.fraction, self._run_s(level))

@@ -69,6 +69,8 @@ def bound_load_peak_um(
     float
         In µm.
     """
+    # The peak of the second-order answer; while the loop does not see the step yet, for its delay
+    # and filter, the centre moves on at the step's speed.
     natural = math.sqrt(model.gain * gains.kp_per_s / gains.ti_s)
     zeta = math.sqrt(model.gain * gains.kp_per_s * gains.ti_s) / 2
     if zeta < 1:

@@ -138,7 +138,8 @@ class HoldRig:
         rows = self._request_experiment(spec)
         # Ticks that were queued before the request belong to the record, and are no answer to it:
         # the first read after the request has them all
-        reads, asked_tick = self._reads, math.nan
+        reads = self._reads
+        asked_tick = math.nan
         begun = False
         while not begun or rows[-1].state == telemetry.State.TUNE:
             rows.append(self._next_held())
@@ -154,6 +155,8 @@ class HoldRig:
         """Ask for an experiment, again while a lost reading makes the hold refuse it; returns the
         ticks of the time between.
         """
+        # A refusal is repeated only if the safety table held the mean flow around it, which is for
+        # a reading that was lost for a moment. Any other refusal would come again.
         command = Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec)
         rows: list[telemetry.TelemetryRow] = []
         for number in range(_REFUSALS_MOST):
@@ -220,6 +223,8 @@ class HoldRig:
         if self._state != telemetry.State.TUNE:
             return
         self._link.send_command(Command("hold", self._who, "tuning session interrupted"))
+        # The command takes effect some ticks later: drop the ticks until one shows another state,
+        # and of the last news those that are still in the experiment.
         while not self._rows or self._rows[-1].state == telemetry.State.TUNE:
             self._rows.clear()
             self._read_news()

@@ -29,8 +29,7 @@ from tuning.rigs.hold_rig import HoldRig
 _MAP_S = 3600.0
 # Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes
 # seconds to answer; behind a slow ramp an actuator several times as strong as configured does not
-# carry the mirror
-# past the setpoint.
+# carry the mirror past the setpoint.
 _CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0, "setpoint_ramp_um_per_s": 0.5}
 # K times how late the actuator is; SIMC with that as time constant has 0.5
 _SLOW = 0.5
@@ -140,6 +139,9 @@ def _calm_hold(rig: HoldRig, limit_um: float) -> None:
 
 
 def _survey_pump(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
+    # Round by round: give the commands that the survey wants, add what they have shown, and bring
+    # the mirror back before the next round. Each round knows flow and delay better than the one
+    # before, and the guard of the experiment works with what is known.
     _brought_back(rig)
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
     holding = PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s)
@@ -156,6 +158,8 @@ def _survey_pump(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
         survey.add_run(run, finished.completed)
         if survey.dark >= _DARK_MOST:
             raise ValueError(finished.reason)
+        # As soon as there is a curve that reaches the leak, the mirror is brought back on it, with
+        # gains that suit the delay found so far. The configured curve may be far off.
         with contextlib.suppress(ValueError):  # none yet
             found = survey.make_map()
             if _reaches_leak(found):
@@ -181,7 +185,7 @@ def _free_flow_limit(
     taken for.
     """
     if loop.flow_max_um_per_s < before.flow_full_um_per_s:
-        return loop  # somebody wants it gentle
+        return loop  # a person has limited it
     # from none to full within two seconds, as `check` demands
     most_um_per_s = min(pump.flow_full_um_per_s, 2.0 * loop.flow_rate_limit_um_per_s2)
     return loop.model_copy(update={"flow_max_um_per_s": most_um_per_s})
