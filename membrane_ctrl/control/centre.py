@@ -396,7 +396,7 @@ class CentreFilter:
         memory.x[slot] = self._compute_centre_um()
 
     def _compute_centre_um(self) -> float:
-        """Compute the centre from the states."""
+        """Compute the centre from the states: the first two lines of the module's equations."""
         x, origin = self.memory.x, self.memory.origin
         by_error_um = self._pressure_gain * x[_PRESSURE_ERROR] * (
             x[_AMBIENT] - origin.mean_pressure_pa
@@ -410,10 +410,12 @@ class CentreFilter:
         Without its sensor the weather is estimated from the centre, and shows nothing of its gain.
         """
         x, origin = self.memory.x, self.memory.origin
+        # dc/dz = 1, dc/dp = g_p (1 + e_p), dc/dT_gas = g_T (1 + e_T)
         row: FloatArray = np.zeros(_STATES)
         row[_GAS] = 1.0
         row[_AMBIENT] = self._pressure_gain * (1.0 + x[_PRESSURE_ERROR])
         row[_WARMTH] = self._warmth_gain * (1.0 + x[_WARMTH_ERROR])
+        # dc/de_p = g_p (p - p_0), dc/de_T = g_T (T_gas - T_0): only weather that changes shows them
         if self._learns_gain(Sensor.BAROMETER, now_s):
             row[_PRESSURE_ERROR] = self._pressure_gain * (x[_AMBIENT] - origin.mean_pressure_pa)
         if self._learns_gain(Sensor.THERMOMETER, now_s):
@@ -435,6 +437,7 @@ class CentreFilter:
         if math.isfinite(after[late]):
             share = float((time_s - times[early]) / (times[late] - times[early]))
             row += share * (_ONE[_PLANT + late] - _ONE[_PLANT + early])
+        # The stated noise of the change of sag, and what no covariance contains: motions of the air
         variance = given.sag_change_sigma_um**2 + self._config.optics_noise_um**2
         if math.isnan(memory.origin.sag_um):
             memory.origin.sag_um = given.sag_um
@@ -445,6 +448,7 @@ class CentreFilter:
             longer_s = min(interval_s, FRESH_S[Sensor.OPTICS]) - memory.frame_interval_s
             memory.frame_interval_s += _INTERVAL_SHARE * longer_s
         memory.last_frame_s = time_s
+        # The zero of the optics is locked once it is known well, or cannot become better known
         if not memory.frames:
             memory.first_frame_s = given.now_s
         memory.frames += 1
@@ -495,7 +499,7 @@ class CentreFilter:
         taken_s = now_s if math.isnan(taken_s) else taken_s
         memory = self.memory
         watch, x, p = memory.watches[sensor], memory.x, memory.p
-        # The innovation, in units of its own standard deviation
+        # The innovation y - h x, in units of its own standard deviation sqrt(h P h^T + r)
         variance *= memory.noises[sensor].factor
         innovation = float(value - row @ x)
         if abs(innovation) > _IMPOSSIBLE:
@@ -530,6 +534,8 @@ class CentreFilter:
         gain = ph / spread
         x += gain * innovation
         p -= gain[:, None] * ph
+        # Bookkeeping: when the sensor was used last, its share of the estimate, and what its
+        # innovation shows of the leak's walk
         since_s = min(now_s - watch.seen_s, FRESH_S[sensor])
         watch.seen_s = now_s
         watch.taken_s = taken_s
@@ -601,7 +607,9 @@ class CentreFilter:
         if squared <= _FAR2:
             watch.far = 0
             return False
-        watch.far_since_s = watch.far_since_s if watch.far else taken_s
+        # The time of the first of them: the jump was then, also if it is found later
+        if not watch.far:
+            watch.far_since_s = taken_s
         watch.far += 1
         waits = sensor == Sensor.LASER and self._is_fresh(Sensor.OPTICS, now_s)
         return watch.far < _FAR_COUNT or (
@@ -617,12 +625,16 @@ class CentreFilter:
         since_s = self.memory.watches[sensor].far_since_s
         self._jumped.append(f"{sensor.name.lower()} {innovation:+.3g}")
         self._jumped_sensors.append(sensor)
+        # A film that has moved since then: the gas, and every clone made after the jump
         moved = _ONE[_GAS] + self._centre_since(since_s)
         if sensor == Sensor.THERMOMETER:
             self._widen_states(innovation * _ONE[_AIR])
         elif sensor == Sensor.LASER and self._judged and self._is_fresh(Sensor.OPTICS, now_s):
+            # Three sensors are compared, and the optics show no jump: the laser's mount was knocked
             self._widen_states(innovation * _ONE[_MOUNT])
         elif sensor == Sensor.BAROMETER:
+            # Either the air's pressure has jumped, and the centre with it, or the barometer alone:
+            # the film then has not moved, and the gas makes up for the expected motion
             pressure_gain = self._pressure_gain * (1.0 + float(self.memory.x[_PRESSURE_ERROR]))
             self._widen_states(
                 innovation * (_ONE[_AMBIENT] + pressure_gain * self._centre_since(since_s))
@@ -638,6 +650,8 @@ class CentreFilter:
                 innovation * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT])
             )
         else:
+            # The film itself, in the usual case. What the other sensor of the centre has missed may
+            # be a move of the optics instead: their zero gets a share
             self._widen_states(innovation * moved)
             if sensor == Sensor.LASER and self._is_fresh(Sensor.OPTICS, now_s):
                 self.relock()  # the optics missed it: their zero is where the laser shows the film
@@ -657,6 +671,8 @@ class CentreFilter:
 
     def _open_leak(self, ramp: InnovationRamp, now_s: float, sigma_um: float) -> None:
         """Add the variance of a leak that changed when the innovations began to run away."""
+        # A leak that is smaller by 1 since then has raised the centre by the time since then; the
+        # clones made meanwhile by the time until they were made
         jump = (now_s - ramp.since_s) * _ONE[_GAS] - _ONE[_LEAK]
         jump[_PLANT:] = np.maximum(self.memory.times - ramp.since_s, 0.0)
         self._widen_states(ramp.slope * sigma_um * jump)
@@ -664,6 +680,7 @@ class CentreFilter:
 
     def _is_fresh(self, sensor: Sensor, now_s: float) -> bool:
         limit_s = FRESH_S[sensor]
+        # Optics with many figures a second are missed sooner
         if sensor == Sensor.OPTICS:
             limit_s = min(
                 limit_s, max(FRESH_S[Sensor.LASER], _FRAMES_LOST * self.memory.frame_interval_s)
@@ -677,6 +694,7 @@ class CentreFilter:
         if self._gas_follows_air_s > 0:
             gain = self._warmth_gain * (1.0 + x[_WARMTH_ERROR])
             drift -= float(gain * (x[_AIR] - x[_WARMTH]) / self._gas_follows_air_s)
+        # In the laser's coordinates: the setpoint is one of the laser, and the trim is the mount
         um = self._compute_centre_um() + float(x[_MOUNT])
         pulls = sum(watch.pull for watch in self.memory.watches)
         return CentreEstimate(

@@ -141,6 +141,9 @@ class Climate:
         -------
         ClimateStrain
         """
+        # A film without a sensor of its own has the air's temperature at once, a ring without one
+        # follows the air slowly. A bench that ever had a film sensor does not fall back to the air:
+        # that would be a step
         memory, config = self.memory, self._config
         memory.has_film_sensor |= math.isfinite(given.film_c)
         film_c = given.film_c

@@ -82,6 +82,7 @@ class ClimateSensors:
             A fault that begins, in words; empty for one that is over; None if nothing changed. A
             sensor that never had a value is none of the bench.
         """
+        # 1. Is the reading there, possible, and not the same for an hour?
         watch = self.memory.watches[sensor]
         low, high = _POSSIBLE[sensor]
         is_present = math.isfinite(value)
@@ -91,6 +92,8 @@ class ClimateSensors:
             watch.value = value
         usable = is_possible and watch.repeated_s < _FROZEN_S
         watch.unusable_s = 0.0 if usable else watch.unusable_s + dt_s
+        # 2. The fault in words: a missing value counts only after a while, and only of a sensor
+        #    that has had one
         fault = ""
         if is_present and not is_possible:
             fault = f"the {NAMES[sensor]} reads {value:g}: check its unit"

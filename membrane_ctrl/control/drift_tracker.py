@@ -19,7 +19,7 @@ from membrane_ctrl.model.state_tree import StateNode
 
 @dataclass(slots=True)
 class DriftTracker(StateNode):
-    """Value and rate of a drift that is initially 0; the memory T (`memory_s`) may change."""
+    """Value and rate of a drift that is initially 0; T (`time_constant_s`) may change."""
 
     time_s: float = math.nan
     value_um: float = 0.0
@@ -28,44 +28,45 @@ class DriftTracker(StateNode):
     def begin(self, time_s: float) -> None:
         """Set drift and rate to 0 at this time.
 
-        An initially short memory would find an old drift sooner, but its noise would move a still
-        mirror.
+        An initially short time constant would find an old drift sooner, but its noise would move a
+        still mirror.
         """
         self.time_s = time_s
         self.value_um = 0.0
         self.rate_um_per_s = 0.0
 
-    def drift_at(self, time_s: float, memory_s: float) -> float:
+    def drift_at(self, time_s: float, time_constant_s: float) -> float:
         """Return the value expected at a time.
 
         Parameters
         ----------
         time_s : float
             Not before the last reading's.
-        memory_s : float
-            Memory of value and rate; a rate is used for so long and no longer.
+        time_constant_s : float
+            T of value and rate; a rate is used for so long and no longer.
 
         Returns
         -------
         float
             In µm.
         """
-        return self.value_um + self.rate_um_per_s * min(time_s - self.time_s, memory_s)
+        return self.value_um + self.rate_um_per_s * min(time_s - self.time_s, time_constant_s)
 
-    def add_reading(self, reading_um: float, time_s: float, memory_s: float) -> None:
-        """Take a reading into the memory.
+    def add_reading(self, reading_um: float, time_s: float, time_constant_s: float) -> None:
+        """Use a reading.
 
         Parameters
         ----------
         reading_um : float
         time_s : float
             Later than that of the last reading.
-        memory_s : float
-            Memory of value and rate.
+        time_constant_s : float
+            T of value and rate.
         """
+        # The gains of the module's equations
         dt_s = time_s - self.time_s
-        beta = math.exp(-dt_s / memory_s)
-        expected_um = self.drift_at(time_s, memory_s)
+        beta = math.exp(-dt_s / time_constant_s)
+        expected_um = self.drift_at(time_s, time_constant_s)
         residual_um = reading_um - expected_um
         self.value_um = expected_um + (1.0 - beta**2) * residual_um
         self.rate_um_per_s += (1.0 - beta) ** 2 * residual_um / dt_s

@@ -63,6 +63,8 @@ class FeedForward:
         float
             In µm/s.
         """
+        # The centre follows gain x weather; the opposite flow is gain x its rate. The temperature
+        # acts through the gas, which follows the air behind a lag
         loop = self._loop
         pressure_pa, temperature_c = discard_impossible_weather(
             ambient_pressure_pa, air_temperature_c

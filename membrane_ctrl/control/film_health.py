@@ -80,6 +80,7 @@ class FilmHealth:
         """
         if not (math.isfinite(leak_um_per_s) and math.isfinite(gauge_pressure_pa)):
             return ()
+        # Means of an hour; then the hour is compared with the first one and with the day before
         memory = self.memory
         memory.held_s += dt_s
         memory.leak_um += dt_s * leak_um_per_s
@@ -105,6 +106,7 @@ class FilmHealth:
         self.memory.pressure_pa_s = 0.0
 
     def _list_changes(self, hour: Hour, first: Hour) -> list[MaintenanceNotice]:
+        # Each warning: its name, how far beyond its limit (1 is at the limit), and its sentence
         leak, most = hour.leak_um_per_s, self._flow_max_um_per_s
         creep = self._creep_per_day()
         found = (

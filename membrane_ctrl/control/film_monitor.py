@@ -118,10 +118,12 @@ class _GaugeComparison:
         str
             Empty if they agree.
         """
+        # The first readings are the reference
         if math.isnan(memory.laser_um):
             memory.laser_um = laser_um
             memory.trim_um = trim_um
             memory.root = root
+        # Changes since the reference; by the gauge, sag is proportional to the root of its pressure
         by_laser_um = laser_um - memory.laser_um
         trimmed_um = trim_um - memory.trim_um
         by_gauge_um = (sag_um - by_laser_um) * (root / memory.root - 1)
@@ -129,11 +131,13 @@ class _GaugeComparison:
         difference_um = min(
             abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um)
         )
+        # The limit, and a share of the motion: the law of the film is not exact
         memory.share = difference_um / (
             self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um))
         )
         if memory.share > 1.0:
             return f"{self.sensor} {by_laser_um:+.0f} µm, gauge {by_gauge_um:+.0f} µm"
+        # While they agree, the reference follows: differences count for `follow_s`
         share = lag_step_fraction(dt_s, self.follow_s)
         memory.laser_um += share * by_laser_um
         memory.trim_um += share * trimmed_um
@@ -271,6 +275,7 @@ class FilmMonitor:
     def _explain_not_nominal(self, laser_um: float, gauge_pa: float) -> str:
         if self._pressure_pa == 0.0 or self.memory.seen_s < NOMINAL_S:
             return ""
+        # p ~ sag^3 (Hencky); a factor of 2 or so is a wrong unit or range, not a film
         wanted_pa = self._pressure_pa * max(1 + laser_um / self._sag_um, 0.0) ** 3
         if (
             wanted_pa / NOMINAL_FACTOR - NOMINAL_SLACK_PA

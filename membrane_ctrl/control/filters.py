@@ -101,10 +101,12 @@ class LagRate(StateNode):
         """
         share = lag_step_fraction(dt_s, time_constant_s)
         if math.isfinite(given):
+            # Back after an absence: the lag is placed where the step below gives the present rate
             if self.absent or abs(given - self.input) > step_max:
                 self.lag = given - self.rate_per_s * dt_s / share
             self.input = given
         self.absent = not math.isfinite(given)
+        # An absent input stays at its last value: the lag approaches it, and the rate decays
         if math.isfinite(self.input):
             moved = share * (self.input - self.lag)
             self.lag += moved

@@ -53,9 +53,12 @@ class Transit:
             Rise of the centre in it, µm, by the gas that has arrived.
         """
         memory = self.memory
+        # A queue of the commanded flows, one a tick: a late tick fills several places
         for _ in range(max(1, round(dt_s / self._period_s))):
             memory.flows.appendleft(flow_um_per_s)
             memory.flows.pop()
+        # The flow of one dead time ago, linear between the two ticks about it; then the pump's lag.
+        # Over a step the lag passes on the flow less what it keeps: lag times its own change
         late = (1 - self._rest) * memory.flows[self._ticks] + self._rest * memory.flows[
             self._ticks + 1
         ]
@@ -65,6 +68,7 @@ class Transit:
 
     def coming_um(self, drift_um_per_s: float) -> float:
         """Rise still to come, if from now on the pump gives the drift."""
+        # The flows in the queue, less the drift during the dead time, and what the lag still keeps
         flows = self.memory.flows
         pending = self._period_s * (
             sum(islice(flows, self._ticks)) + self._rest * flows[self._ticks]
@@ -77,6 +81,7 @@ class Transit:
 
     def due_um_per_s(self) -> float:
         """Flow at the end of the dead time: what the pump now receives comes on top of it."""
+        # The lag fed by the queue, oldest flow first
         flow = self.memory.arriving
         for late in range(self._ticks, -1, -1):
             step_s = self._period_s * (self._rest if late == self._ticks else 1.0)

@@ -236,6 +236,7 @@ class HeldOffset:
             if reference.complete:
                 self._begin_tracking(given.setpoint_um)
             return
+        # A figure older than the tracker's last reading adds nothing
         reading_um = self._find_offset_change(figure)
         expected_um = memory.drift.drift_at(figure.time_s, self._time_constant_s)
         interval_s = figure.time_s - memory.drift.time_s
@@ -279,6 +280,7 @@ class HeldOffset:
 
     def _move_offset(self, given: HeldFigure) -> None:
         """Move the offset to the tracker's value, bounded in rate and size."""
+        # base: the offset at the reference; the tracker: what the figure has changed by since then
         memory, most_um = self.memory, self._limits.offset_max_um
         goal_um = memory.base_um + memory.drift.drift_at(given.now_s, self._time_constant_s)
         bounded_um = min(max(goal_um, -most_um), most_um)

@@ -296,10 +296,13 @@ class InnerLoop:
         the flow after its limits, cannot wind up. Everything that `_step_on_laser` needs follows,
         so that either may take over at any tick.
         """
+        # What the laser's loop would need to take over: reading, matched setpoint, integrator
         self.memory.measured.reset(estimate.um)
         shaped_um, ramp_um_per_s = self._shape_setpoint(given, estimate.um, dt_s)
         self.memory.matched.reset(shaped_um)
         self._pid.place(estimate.leak_um_per_s)
+        # Equation 2: the error of the centre after all gas in transit has arrived, and the flow
+        # that is due at the end of the dead time
         aim_um = shaped_um + self.memory.limit_bias.offset_um
         p_um_per_s = (
             self._error_gain_per_s * (aim_um - estimate.ahead_um)
@@ -343,6 +346,7 @@ class InnerLoop:
         filtered_um = math.nan
         if seen:
             filtered_um = self._filter_reading(given.displacement_um, dt_s)
+        # The ramp waits where it stands, and the weather's rates decay as without sensors
         if not math.isnan(self._ramp.value_um):
             self.memory.setpoint_um = self._ramp.value_um + given.trim_um
         self._feedforward.update(math.nan, math.nan, dt_s)
@@ -484,6 +488,7 @@ class InnerLoop:
         """Take another curve of the pump; the mean command stays, and the mean flow becomes the
         flow that the new curve has there.
         """
+        # The command that held the mirror is known for certain, the flow only by the old curve
         mean_fraction = self._curve.fraction(self._pid.integral_um_per_s / self._drift.correction)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         self._probe_um = pump.probe_um
@@ -508,6 +513,7 @@ class InnerLoop:
         self, given: LoopInput, filtered_um: float, dt_s: float
     ) -> tuple[float, float]:
         """Advance the setpoint; return it as the loop sees it, and its speed in µm/s."""
+        # First tick: the setpoint begins at the reading, and the ramp below it by the trim
         if math.isnan(self.memory.setpoint_um):
             self._hold_setpoint_at(filtered_um)
         if math.isnan(self._ramp.value_um):

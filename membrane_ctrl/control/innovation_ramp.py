@@ -50,13 +50,16 @@ class InnovationRamp(StateNode):
         """
         found = False
         innovation = min(max(innovation, -_STEEPEST), _STEEPEST)
+        # S <- max(0, S + y - slack) on either side: white innovations return S to 0 again and again
         for side, sign in ((self.up, 1.0), (self.down, -1.0)):
+            # The ramp began at the last reading with S = 0
             if side.total == 0.0:
                 side.began_s = self.last_s
                 side.count = 0
             side.count += 1
             side.total = max(0.0, side.total + sign * innovation - _SLACK)
             if side.total > limit:
+                # The mean of a ramp is half of its height: the slope is twice that over its time
                 mean = sign * (side.total / side.count + _SLACK)
                 self.since_s = side.began_s
                 self.slope = 2 * mean / max(taken_s - self.since_s, _SHORTEST_S)

@@ -66,11 +66,14 @@ class LeakGrowth(StateNode):
         """
         if not (math.isfinite(leak_um_per_s) and math.isfinite(flow_um_per_s)):
             return ""
+        # 1. What the film takes for certain: the smaller of leak and mean flow
         flow_um_per_s = self.flow.update(flow_um_per_s, dt_s, FLOW_MEAN_S)
         takes_um_per_s = min(leak_um_per_s, flow_um_per_s)
         self.still_s += dt_s
         if self.still_s < LEAK_STANDS_S:
             return ""
+        # 2. Against the usual consumption; of a tight film against a least leak, so that a small
+        #    one does not count as many times as much
         usual_um_per_s = max(self.usual.value, 0.0)
         excess_um_per_s = (most - 1) * max(usual_um_per_s, LEAK_LEAST_UM_PER_S)
         if not takes_um_per_s > usual_um_per_s + excess_um_per_s:
@@ -83,6 +86,7 @@ class LeakGrowth(StateNode):
                 takes_um_per_s = leak_um_per_s
             self.usual.update(takes_um_per_s, dt_s, LEAK_REFERENCE_S)
             return ""
+        # 3. It must last; meanwhile the usual consumption does not follow
         self.stands_s += dt_s
         if self.stands_s < LEAK_STANDS_S:
             return ""

@@ -200,9 +200,11 @@ class PumpCurve:
         float
             Fraction of full scale.
         """
+        # Less than half of the smallest flow of a running pump: off is nearer
         if flow_um_per_s <= 0.5 * self.least_flow_um_per_s:
             self.note_stop()
             return 0.0
+        # More flow is found on the rising branch, less on the falling one
         memory = self.memory
         if flow_um_per_s > memory.flow_um_per_s:
             branch = self._rising
@@ -211,6 +213,7 @@ class PumpCurve:
         fraction = min(
             max(branch.fraction(flow_um_per_s), self._least_fraction), branch.highest_fraction
         )
+        # A pump that stands needs more to start than to run
         if memory.kick_left_s > 0.0:
             memory.kick_left_s -= dt_s
             fraction = max(fraction, self._start_fraction)

@@ -28,7 +28,7 @@ class PumpHealth:
         self.memory = memory or PumpHealthState()
 
     def set_pump(self, change_max: float) -> None:
-        """Start again with another curve, and this limit of its drift."""
+        """Set by which share the pump may differ from its curve (`pump.change_max`)."""
         self._change_max = change_max
 
     def step(self, known: PumpScale) -> tuple[bool, tuple[MaintenanceNotice, ...]]:

@@ -229,6 +229,7 @@ def _simulate_paths(
     time_s: FloatArray, switches: Sequence[Switch], delays_s: FloatArray, lags_s: FloatArray
 ) -> FloatArray:
     """Path of a mirror of gain 1 for each response, (times, responses)."""
+    # The integral of a step behind dead time and lag, t - L (1 - exp(-t / L)), for each switch
     paths = np.zeros((len(time_s), len(delays_s)))
     for number, switch in enumerate(switches):
         sign = 1.0 if switch.on else -1.0

@@ -275,6 +275,7 @@ class ShapeLoop:
 
     def _move_trim(self, now_s: float, dt_s: float) -> None:
         """Move the trim to the drift, bounded in rate and range."""
+        # base: the trim at the reference; the tracker: the drift of the laser's mount since then
         config = self._config
         memory = self.memory
         goal_um = memory.base_um + memory.drift.drift_at(now_s, self._time_constant_s)

@@ -45,20 +45,25 @@ from membrane_ctrl.sim.twin_process import TwinProcess
 def hold_mirror(options: HoldOptions) -> int:
     """Hold the mirror until the duration is over, a signal arrives, or a safety trip ends the run.
 
-    Returns the exit code. Raises InputError or DeviceError (one line) for failures before the first
-    tick.
+    The command `hold`; it runs in the main thread, and the ticks in its event loop.
+
+    Parameters
+    ----------
+    options : HoldOptions
+        The options of the command, with the configuration as read.
+
+    Returns
+    -------
+    int
+        The exit code (`errors.Exit`).
+
+    Raises
+    ------
+    InputError, DeviceError
+        In one line, for failures before the first tick.
     """
-    if options.config.devices is None and not options.twin:
-        raise errors.InputError(
-            f"{options.source}: devices: missing; name the pump board in [devices], or use --twin"
-        )
-    for warning in cross_check.require_sound(options.config, options.source):
-        print(warning.line(options.source), file=sys.stderr)
-    if options.config.devices is not None and (options.lab or not options.twin):
-        require_possible(options.config.devices, options.lab)
-        if options.config.shape.enabled:
-            driver_check.require_optics(options.config.devices)
-    require_sendable(options.config.alarms)
+    # 1. The configuration, before anything is created
+    _check_configuration(options)
     config, figure_mode = choose_figure_mode(options.config)
     options = replace(options, config=config)
     geometry = read_configured_geometry(options.config)
@@ -66,7 +71,8 @@ def hold_mirror(options: HoldOptions) -> int:
     # SIGTERM before and after the ticks cleans up as well
     with job_control.ends_as_by_ctrl_c(), contextlib.ExitStack() as stack:
         logs_dir = options.logs_dir or Path(options.config.recording.logs_dir)
-        # a second hold ends here, devices untouched
+        # 2. What one hold alone may have: the port of its folder, then its devices.
+        #    A second hold of the folder ends here, devices untouched
         listeners = sockets.listeners_for(options.config.port, logs_dir, stack)
         twin = (
             TwinProcess.start_twin(options.config, clock, stack, options.lab)
@@ -79,12 +85,15 @@ def hold_mirror(options: HoldOptions) -> int:
         # A hold with other folders ends here; a board behind a network may be read beside one
         if not (observe and (config.devices.board or "").startswith("tcp://")):
             stack.enter_context(claim_devices(list_device_names(config.devices)))
-        lock_storage = find_locks(config, options)  # before anything is cleared
+        # 3. May this mirror be held? Locks first, before a latched fault is cleared; then the
+        #    devices themselves
+        lock_storage = find_locks(config, options)
         latched = open_latched_fault(config, logs_dir, options)
         resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)
         terminal.print_progress(f"connecting to {config.devices.name}")
         found = make_bench(config.devices, observe)
         board = asyncio.run(identify_board(found, config, options, resumes))
+        # 4. The run: its folder, rings in shared memory, and the processes that use both
         run_dir = run_folder.create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         geometry.copy_to_run(run_dir)
         rings = child_processes.make_rings(config, twin.truth if twin else None, stack)
@@ -103,9 +112,9 @@ def hold_mirror(options: HoldOptions) -> int:
         page = _start_service(options, logs_dir, stack)
         if options.autotune:
             stack.callback(start_autotune(listeners.path, run_dir))
-        bench = make_bench(
-            config.devices, observe
-        )  # a link belongs to the event loop that opened it
+        # 5. The ticks, on a new bench: the links of the first one belong to the event loop that
+        #    has identified it
+        bench = make_bench(config.devices, observe)
         parts = HoldResources(
             bench=bench,
             config=config,
@@ -120,6 +129,8 @@ def hold_mirror(options: HoldOptions) -> int:
             make_latch=partial(FaultLatch, latched, resumes, run_dir.name, clock.utc),
             make_keeper=partial(LockKeeper, lock_storage),
         )
+        # 6. The end: the ticks have brought the bench to its safe state; then the recording, and
+        #    with the stack, last made first, all else
         closing = RunEnd()
         try:
             asyncio.run(run_ticks(parts, closing))
@@ -133,6 +144,22 @@ def hold_mirror(options: HoldOptions) -> int:
     with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
         print_closing_report(run_dir, options.json, closing, page_at_end)
     return closing.exit
+
+
+def _check_configuration(options: HoldOptions) -> None:
+    """Print the warnings on the configuration. Raises InputError for one that cannot be held."""
+    config = options.config
+    if config.devices is None and not options.twin:
+        raise errors.InputError(
+            f"{options.source}: devices: missing; name the pump board in [devices], or use --twin"
+        )
+    for warning in cross_check.require_sound(config, options.source):
+        print(warning.line(options.source), file=sys.stderr)
+    if config.devices is not None and (options.lab or not options.twin):
+        require_possible(config.devices, options.lab)
+        if config.shape.enabled:
+            driver_check.require_optics(config.devices)
+    require_sendable(config.alarms)
 
 
 def _start_service(

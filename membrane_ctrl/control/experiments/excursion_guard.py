@@ -102,6 +102,7 @@ class ExcursionGuard:
         return min(max(back_um_per_s, 0.0), self._around.full_flow_um_per_s)
 
     def _guard_step(self, off_um: float, measurement: BenchSample, dt_s: float) -> float | Finished:
+        # Where it would come to rest if the flow were taken back now
         coming_um = off_um + self._motion.coast_s * self._motion.speed_um_per_s
         if max(abs(off_um), abs(coming_um)) > self._bound_um:
             return Finished(

@@ -87,6 +87,8 @@ class Relay:
         self._motion.update(measurement.displacement_um, dt_s)
         if memory.time_s >= self._duration_s:
             return Finished(ExperimentEnd.COMPLETED, f"{memory.crossings} crossings")
+        # 1. Where the mirror is, and what this half cycle has shown: how far it came past the
+        #    threshold after the last switch, and when it passed the centre
         memory.time_s += dt_s
         memory.since_switch_s += dt_s
         off_um = self._motion.position_um - self._centre_um
@@ -96,6 +98,7 @@ class Relay:
         )
         if math.isnan(memory.at_centre_s) and memory.direction * off_um > 0:
             memory.at_centre_s = memory.time_s
+        # 2. Switch beyond the threshold; a mirror that does not get there ends the experiment
         around = self._around
         if memory.direction * off_um > self._threshold_um:
             self._switch_relay()
@@ -112,6 +115,7 @@ class Relay:
                 f"{remedy}"
             )
             return Finished(ExperimentEnd.NO_RESPONSE, still)
+        # 3. The flow of this half cycle, about the one that holds the mirror
         half = memory.up if memory.rises else memory.down
         return around.within(
             around.holding_flow_um_per_s + memory.direction * half.amplitude_um_per_s
@@ -129,6 +133,7 @@ class Relay:
         fastest_um_per_s = wanted_um / self._motion.coast_s
         if memory.time_s > memory.at_centre_s:
             half.speed_um_per_s = self._threshold_um / (memory.time_s - memory.at_centre_s)
+        # Overshoot is proportional to the amplitude: scale it to the wanted one, in bounded steps
         if memory.crossings > 0:
             by_overshoot = wanted_um / max(memory.overshoot_um, _OVERSHOOT_LEAST_UM)
             factor = min(by_overshoot, fastest_um_per_s / before.speed_um_per_s)
