@@ -289,6 +289,8 @@ class ActuatorTest:
         memory.total_s += dt_s
         if memory.part_s < part.wait_s + part.measure_s - 1e-9:
             return
+        # From the shortest time of a part on, each tick judges it: it passes, fails, or continues
+        # to its longest time
         match part.name:
             case "off":
                 self._judge_off(part)
@@ -302,6 +304,7 @@ class ActuatorTest:
     def _judge_off(self, part: Part) -> None:
         """Measure the film's own speed, and the noise of a reading."""
         memory = self.memory
+        # Differences of successive readings show the noise without the film's motion
         values_um = memory.readings[:, 1]
         steps_um = np.diff(values_um)
         noise_um = float(np.sqrt(np.mean(steps_um**2) / 2)) if steps_um.size else math.inf
@@ -316,6 +319,7 @@ class ActuatorTest:
             memory.off_repeats += 1
             self._begin_part(memory.part)
             return
+        # A noisy laser needs longer for the same error of the speed
         is_last = memory.part_s >= part.longest_s - 1e-9
         if speed.sigma_um_per_s > _OFF_SIGMA_MOST_UM_PER_S and not is_last:
             return
@@ -354,6 +358,8 @@ class ActuatorTest:
         return lets_down
 
     def _judge_pump(self, part: Part, dt_s: float) -> None:
+        """Compare the rise of the mirror with that by the pump's curve."""
+        # 1. The speed over the newest readings, and the pump's share of it
         memory = self.memory
         is_last = memory.part_s >= part.longest_s - 1e-9
         late = self._assumed and memory.part_s > part.longest_s
@@ -380,6 +386,8 @@ class ActuatorTest:
             found += f": more than {_ASSUMED_MOST_SHARE:g} times as fast as a usual pump"
         else:
             found += ": less than the readings show clearly"
+        # 2. Clear and straight: much too fast is a wrong curve, unless the curve is only assumed;
+        #    fast enough passes. A jump of the laser looks like either, and is waited for
         if is_clear:
             most_share = _ASSUMED_MOST_SHARE if self._assumed else _PUMP_MOST_SHARE
             jumped = share > _PUMP_MOST_SHARE and _has_step(self._choose_readings(from_s))
@@ -389,14 +397,17 @@ class ActuatorTest:
             if share >= least_share and not jumped:
                 self._begin_response()
                 return
+        # 3. At the end, a pump of unknown size need only lift the mirror
         if is_last and self._assumed and self._lifts_mirror(speed, from_s):
             self._begin_response()
             return
+        # 4. A mirror that sinks clearly is behind a reversed pump
         memory.reversed_s = memory.reversed_s + dt_s if is_clear and share < 0.0 else 0.0
         # Noise may look like a reversed pump for a moment.
         if memory.reversed_s > 1.2 * part.measure_s:
             self._fail(found)
             return
+        # 5. Too slow: a pump that is just coming gets more time, all others fail at the end
         is_coming = (
             share >= _PUMP_LATE_SHARE and rises_um_per_s >= _PUMP_LATE_SIGMAS * sigma_um_per_s
         )
@@ -482,6 +493,8 @@ class ActuatorTest:
         chosen = self._choose_readings(from_s)
         if len(chosen) < 3:
             return None
+        # Least squares of a line; the sigma by the noise of the part "off", because a bent path
+        # would make the residuals of this one too large
         time_s = chosen[:, 0] - chosen[:, 0].mean()
         height_um = chosen[:, 1] - chosen[:, 1].mean()
         spread_s2 = float(time_s @ time_s)

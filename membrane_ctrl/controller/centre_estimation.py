@@ -148,6 +148,7 @@ class CentreEstimation:
         list of Event
             What has changed: sensors in use, jumps, a choice of the process value.
         """
+        # Only while the mirror is held or moved: elsewhere the flow does not explain the motion
         flow_um_per_s, seen_um = last.flow_um_per_s, context.observer.displacement_um
         figures = context.observer.figures
         is_moved = state in state_sets.ESTIMATED or context.config.states.observe
@@ -329,6 +330,7 @@ class CentreEstimation:
 
     def _report_sensors_in_use(self, now_s: float, jumped: Collection[str]) -> list[Event]:
         """Report the sensors once they have stood for a second, and every jump."""
+        # Since when the sensors differ from the reported ones; a jump is reported at once
         seeing = tuple(int(sensor) for sensor in Sensor if self._follows_sensor(sensor))
         memory = self.memory
         if seeing == memory.reported_sensors:

@@ -108,6 +108,7 @@ class ClimatePart:
             air_c,
         )
         self.memory.strain = self._climate.step(readings, dt_s)
+        # The strains count from the beginning of each hold; an experiment does not end it
         held = state == State.HOLD
         if held and not self.memory.referred:
             self._climate.set_reference()
@@ -127,6 +128,8 @@ class ClimatePart:
         }
 
     def _report_figure(self) -> list[Event]:
+        """Open or close the notice of a figure that the climate has changed beyond the limit."""
+        # It ends at a smaller change than it begins with
         memory = self.memory
         share = _OVER_SHARE if memory.reported else 1.0
         beyond = memory.referred and self.figure_um > share * self._most_um

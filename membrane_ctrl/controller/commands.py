@@ -14,7 +14,7 @@ AT_START = "command line"  # sender of the first commands
 AT_END = "duration"  # sender of the last `stop`
 TRIAL_MAX_S = 7200.0  # a longer trial would be unattended
 TURN_MAX_DEG = 360.0  # of a mirror about its axis
-MEMORY_MAX_S = 1e5  # of the shape loop, as in the configuration
+TIME_CONSTANT_MAX_S = 1e5  # of the shape loop, as in the configuration
 
 # People lock the mirror with `lock`; `latch` is the name of that command in the protocol, in the
 # bridges and in the recorded inputs. Either name is accepted wherever a command is named.
@@ -122,9 +122,9 @@ def explain_refusal(command: Command, state: State, config: Config) -> str:
         math.isnan(command.value) or 1.0 <= command.value <= TRIAL_MAX_S
     ):
         return f"gains on trial for {command.value:g} s: a trial takes 1 .. {TRIAL_MAX_S:g} s"
-    memory_s = command.shape_time_constant_s
-    if not (math.isnan(memory_s) or 1.0 <= memory_s <= MEMORY_MAX_S):
-        return f"shape.time_constant_s = {memory_s:g} s is outside 1 .. {MEMORY_MAX_S:g} s"
+    averaged_s = command.shape_time_constant_s
+    if not (math.isnan(averaged_s) or 1.0 <= averaged_s <= TIME_CONSTANT_MAX_S):
+        return f"shape.time_constant_s = {averaged_s:g} s is outside 1 .. {TIME_CONSTANT_MAX_S:g} s"
     if math.isfinite(command.setpoint_step_um) and math.isnan(command.value):
         return "setpoint_step_um is for a trial: give its time as value"
     if (

@@ -433,6 +433,8 @@ class Controller:
         self, command: Command, obeyed: Collection[str], events: list[Event]
     ) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""
+        # The first reason to refuse counts. The experiment comes last: it is begun if nothing
+        # refuses it
         refused = (
             command_precedence.explain_overruled(command, obeyed)
             or locks.refuse_while_locked(command, self._context.locks)
@@ -533,6 +535,7 @@ class Controller:
         return ""
 
     def _set_gains(self, loop: LoopConfig) -> None:
+        """Give the present gains, curve and time constant to every part that uses them."""
         context, pump = self._context, self._gains.present.pump
         if pump != context.pump_config:
             context.loop.set_pump(pump)
@@ -550,6 +553,7 @@ class Controller:
         """Step the setpoint as the trial asks, with the shape loop off; after the trial both are as
         before it.
         """
+        # A setpoint to return to is kept exactly while a step is on trial
         context, step_um = self._context, self._gains.setpoint_step_um
         stepped = math.isfinite(self.memory.setpoint_back_um)
         if math.isfinite(step_um):
@@ -711,6 +715,7 @@ class Controller:
         found = context.found_response
         if found is None:
             return
+        # Loop, estimate and comparison predict with the same dead time and lag
         context.pump_response = found
         estimator = self._estimator
         context.loop.set_pump_lag(estimator)
@@ -732,6 +737,7 @@ class Controller:
 
     def _limit_gains(self, response: PumpResponse, events: list[Event]) -> None:
         """Slow down a loop that is too quick for the pump, unless a person has set its gains."""
+        # Gains that a person has set, or that are on trial, are that person's responsibility
         stated, present = self._config.loop, self._gains.present.loop
         limited = limit_gains(present, response)
         set_by_person = present not in (stated, self._gains.memory.limited)
@@ -789,6 +795,7 @@ class Controller:
 
     def _report_reason(self, events: list[Event]) -> None:
         """Report the operator's line once its reason (not its numbers) has changed durably."""
+        # A reason that changes to and fro within a second would fill the record
         context, memory = self._context, self.memory
         code = context.why.code
         if code != memory.why_code:

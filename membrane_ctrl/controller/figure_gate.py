@@ -128,6 +128,7 @@ class FigureGate:
     def _find_defect(
         self, figure: ShapeEstimate, now_s: float, laser_um: float
     ) -> FigureDefect | None:
+        """Why a figure cannot be used; the first reason that applies."""
         self.memory.defect_detail = ""
         if figure.verdict == "rejected":
             self.memory.defect_detail = figure.reason
@@ -152,7 +153,9 @@ class FigureGate:
         return None
 
     def _accept_figure(self, figure: ShapeEstimate, laser_um: float) -> None:
+        """Keep the figure, and follow the difference of its sag and the laser."""
         self.accepted = figure
+        # A frozen camera gives one sag again and again, to the last bit
         self.memory.repeats = (
             self.memory.repeats + 1 if figure.sag_um == self.memory.newest_sag_um else 0
         )
@@ -161,6 +164,7 @@ class FigureGate:
         self.memory.newest_s = figure.time_s
         if self._by_optics or self.memory.repeats >= _REPEATS or not math.isfinite(laser_um):
             return
+        # Compared with the laser at the time of the exposure, if that was recorded
         at_exposure_um = (
             figure.displacement_um if math.isfinite(figure.displacement_um) else laser_um
         )

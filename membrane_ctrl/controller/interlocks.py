@@ -71,6 +71,7 @@ class Interlocks:
         list of Event
             Of circuits that have opened or closed.
         """
+        # Without a reading nothing is judged: rules on the link and on stale readings act then
         self.seen = reading is not None
         if reading is None:
             self.open_mask = 0
@@ -80,6 +81,8 @@ class Interlocks:
         memory = self.memory
         changed = self.open_mask ^ memory.last_mask
         memory.last_mask = self.open_mask
+        # A circuit that was open in standby is no fault of the way down: a person who works at the
+        # bench has opened it, and may stop the run
         if state == State.STANDBY:
             memory.standby_mask = self.open_mask
         memory.standby_mask &= self.open_mask

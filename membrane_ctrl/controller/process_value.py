@@ -245,7 +245,11 @@ class ProcessValueChoice:
     def _find_reason(
         self, facts: ProcessValueFacts, estimate: CentreEstimate
     ) -> ProcessValueReason:
-        """What is best to follow in this tick."""
+        """What is best to follow in this tick.
+
+        In this order: what cannot work, what is not yet known, what a person or a trial asks for,
+        what the comparison of the loops has shown; else the estimate.
+        """
         if facts.held_by_optics and not estimate.sensors[Sensor.LASER].fresh:
             return ProcessValueReason.LASER_UNUSABLE
         if not facts.response_known:
@@ -262,6 +266,7 @@ class ProcessValueChoice:
 
     def _decide(self, wanted: ProcessValueReason, facts: ProcessValueFacts) -> list[Event]:
         """Take another decision, at once or after it has been wanted for some time."""
+        # Wanted for how long, in a row?
         memory, now_s = self.memory, facts.now_s
         by_estimate = wanted in _BY_ESTIMATE
         if wanted.name == memory.reason_name:
@@ -271,6 +276,8 @@ class ProcessValueChoice:
             memory.wanted_since_s = now_s
         if now_s - memory.wanted_since_s < self._find_wait_s(wanted, facts):
             return []
+        # Another loop: the errors so far are of the former one. A lost sensor that returns soon
+        # must not switch the loops to and fro
         if by_estimate != memory.follows_estimate:
             self._stop_comparing()
         if wanted in _BY_SENSORS:
@@ -408,6 +415,7 @@ class ProcessValueChoice:
     def _end_trial(self, facts: ProcessValueFacts) -> list[Event]:
         """End a trial of the PI once its errors are known: it stays if it is better."""
         memory = self.memory
+        # The error of the PI, measured over some spans, against that of the estimate before
         errors, estimate_error = self._comparison.errors, memory.estimate_error
         if errors is None or estimate_error is None or self._comparison.spans < _TRIAL_SPANS:
             return []

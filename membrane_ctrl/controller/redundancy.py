@@ -82,6 +82,7 @@ class RedundancyWatch:
     def _report_loss(
         self, sensor: FilmSensor, now_s: float, present: Mapping[FilmSensor, bool]
     ) -> list[Event]:
+        # A sensor that was never present (NaN) is not lost
         missing_s = now_s - self.memory.last_present_s.get(sensor, math.nan)
         if sensor in self.memory.reported or not missing_s > self._lost_s[sensor]:
             return []

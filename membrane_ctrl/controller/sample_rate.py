@@ -40,6 +40,7 @@ class SampleRate:
         fresh : bool
             The answer has a sample that no tick had before.
         """
+        # A window without any answer lasts until there is one: it shows nothing of the samples
         memory = self.memory
         if math.isnan(memory.since_s):
             memory.since_s = now_s

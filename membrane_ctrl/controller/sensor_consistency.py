@@ -383,8 +383,8 @@ class SensorConsistency:
         self.memory.sag_um = estimate.sag_um
 
     def _limit_growth(self, inputs: TickInputs) -> float:
-        """Allowed growth of the leak: unlimited while the camera
-        agrees with a laser that is there.
+        """Allowed growth of the leak: unlimited while the camera agrees with a laser that is there,
+        small while the two contradict each other.
         """
         if self._optics_alone or self.memory.repeats >= _REPEATS:
             return self._leak_growth_max
@@ -404,6 +404,7 @@ class SensorConsistency:
         failure = weather_limits.explain_weather_fault(
             reading.ambient_pressure_pa, reading.air_temperature_c
         )
+        # For how long the sensor has been other than reported: a single bad reading is no fault
         self.memory.weather_s = (
             self.memory.weather_s + dt_s
             if bool(failure) != self.memory.weather_fault_reported

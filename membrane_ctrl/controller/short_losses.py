@@ -135,6 +135,8 @@ class ShortLossCounter:
         return events
 
     def _count_loss(self, code: int, now_s: float) -> list[Event]:
+        """Count a short loss; returns the report with which listing ends, at the first too many."""
+        # Only one fault is counted: another one starts its own count, and is listed
         memory = self.memory
         if code != memory.code:
             memory.code = code
@@ -143,6 +145,7 @@ class ShortLossCounter:
         if memory.counts:
             memory.count += 1
             return []
+        # Each has been listed so far; too many within the hour, and from now on they are counted
         memory.recent.add(now_s, _REPEATS)
         if not memory.recent.too_many(now_s, _REPEATS):
             return []

@@ -104,6 +104,8 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -
     row : bytes
         The packed telemetry row of the outputs.
     """
+    # What most ticks have, as a fixed record; what few have, as JSON before it. The figure itself
+    # is in the ring of shapes: its time identifies it
     tail = _pack_tail(inputs)
     reading, estimate = inputs.reading, inputs.estimate
     record = _STRUCT.pack(

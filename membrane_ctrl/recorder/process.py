@@ -99,6 +99,7 @@ def _record_run(
     rings = {
         name: RingReader(address) for name, address in addresses.items() if address is not None
     }
+    # A successor numbers its segments after those of the dead recorder
     first = 0
     if spec.resumes:
         first = sum(1 for _ in spec.run_dir.glob(f"{spec.run_name}-*.rrd"))

@@ -76,6 +76,8 @@ class Recorder:
         report: recorder_errors.Report,
         resumes: int = 0,
     ) -> None:
+        # A recorder that replaces a dead one continues from that one's state file; without it, from
+        # the oldest messages in the rings
         handed_on = load_state(run_dir) if resumes else None
         before = handed_on or RecorderState(Summary.for_config(config))
         self._run_dir = run_dir
@@ -131,6 +133,7 @@ class Recorder:
 
     def add_events(self, new: list[EventLine]) -> None:
         """Take events; an "end" among them ends the run."""
+        # 1. What this recorder follows by itself: summary, status, the end of the run
         for line in new:
             event = event_lines.from_dict(line)
             self._summary.add_event(line)
@@ -139,6 +142,7 @@ class Recorder:
             )
             self.urgent |= event.urgent
             self.ended |= isinstance(event, run_events.Ended)
+        # 2. The files. The table first: `events.jsonl` knows which lines are not written yet
         self._events += new
         self._errors.run_guarded(
             "table of events",
@@ -168,6 +172,7 @@ class Recorder:
         self.urgent = False
         # The exact tables first, then the Rerun recording, which may be omitted.
         guarded = self._errors.run_guarded
+        # Each by itself: a full disk or a fault in one of them must not stop the others
         guarded("summary", lambda: self._summary.add_rows(rows))
         guarded("table of ticks", lambda: self._tables.add_ticks(batch))
         guarded("table of thumbnails", lambda: self._add_thumbnails(now_s))
@@ -179,6 +184,8 @@ class Recorder:
             now_s, rows, new_events, shapes, self._thumbnails, self._housekeeping.detail
         ):
             self._rows_lost += len(rows)
+        # Last: a successor repeats what this second may have written after it, and the tables drop
+        # rows that they have
         guarded("state file", self._write_handover)
 
     def _add_thumbnails(self, now_s: float) -> None:
@@ -233,6 +240,8 @@ class Recorder:
         """Drain once more, close the recording with its footer, write `summary.json`, optimise
         unless `in_haste`.
         """
+        # All that is still in the rings; then what a reader needs to trust the run: the footer, the
+        # sealed tables, and the account of losses in the summary
         self.drain_rings()
         self.write_second()
         guarded = self._errors.run_guarded

@@ -29,6 +29,7 @@ def send_events(recording: rerun_recording.Recording, events: Sequence[EventLine
     """
     if not events:
         return
+    # 1. The log: a sentence and a level each
     timed = [(float(line.get("mono_s") or 0.0), from_dict(line)) for line in events]
     time_s = np.array([at_s for at_s, _ in timed])
     # the log's own column of times is too narrow to read
@@ -39,6 +40,7 @@ def send_events(recording: rerun_recording.Recording, events: Sequence[EventLine
     ]
     levels = [event.level.value for _, event in timed]
     recording.send_columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
+    # 2. Lines across the plots, and the events that are values of a plot
     for stream, marks_s, values in plot_marks.mark_lines(timed):
         recording.send_scalars(stream.path, marks_s, values)
     of_pump = [(at_s, event) for at_s, event in timed if isinstance(event, PumpLearned)]

@@ -63,6 +63,7 @@ class TelemetryStreams:
         # not if sent again after a failure
         fresh = telemetry.get_column(rows, "mono_s") > waiting_s.max(initial=-math.inf)
         self._rest = rows = np.concatenate((self._rest, rows[fresh]))
+        # Whole seconds only, several at a time; the last one may be incomplete, and waits
         time_s = telemetry.get_column(rows, "mono_s")
         second = np.floor(time_s)
         if second[-1] - second[0] < self._overview_every_s and not last:
@@ -73,6 +74,7 @@ class TelemetryStreams:
         self._recording.send_measurements(
             self._band.path, time_s[[0, -1]], np.zeros_like(square), square
         )
+        # A row of means for each second, and of its error also the extremes
         means = np.concatenate([streams.mean_row(part) for part in whole])
         errors_um = np.concatenate([streams.overview_um(part) for part in whole])
         true_um = telemetry.true_error_um(telemetry.get_columns(means))[:, np.newaxis]

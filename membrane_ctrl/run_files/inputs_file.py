@@ -178,6 +178,7 @@ class _TickRows:
 
     def take_until_tick(self, tick: int) -> pa.Table | None:
         """The rows up to a tick that were not handed out before; None without any."""
+        # Read on until the tick is there, hand out what is up to it, and keep the rest
         parts = [] if self._waiting is None else [self._waiting]
         while not parts or int(_record_column(parts[-1], "tick")[-1]) < tick:
             table = next(self._tables, None)

@@ -97,6 +97,7 @@ def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
     """
     if not level["time_s"].size:
         return {name: np.empty(0) for name in level}
+    # Extremes of extremes, means of means by their ticks; the spread needs the new means first
     starts, window = _find_windows(level["time_s"], window_s)
     coarse: Columns = {"time_s": window, "rows": np.add.reduceat(level["rows"], starts)}
     coarse |= _reduce_codes(level, starts)

@@ -338,6 +338,8 @@ class Run:
         # Windows that the table lacks: between its rows, and after the last of them
         time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
         missing = _find_gaps(time_s, window_s, start_s)
+        # Does the table reach the end? A run in progress, or a killed one, has ticks whose windows
+        # no recorder has finished
         until_s = start_s
         if time_s.size:
             until_s = float(time_s[-1]) + window_s
@@ -350,6 +352,7 @@ class Run:
             lacks_end = not self._reaches_end(until_s)
         if lacks_end:
             missing.append((until_s, end_s))
+        # These are computed, and put into their places
         for begins_s, ends_s in missing:
             if begins_s < ends_s:
                 blocks += self._made_level(window_s, begins_s, ends_s, names)

@@ -176,6 +176,7 @@ def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) ->
         joined = {name: np.concatenate([part[name] for part in parts]) for name in names}
     else:
         joined = empty
+    # Cycles and tracked frames are in two tables: by time they are one series
     order = np.argsort(joined["time_s"], kind="stable")
     matrices = [_to_matrix(table.column("covariance_um2"), ZERNIKE_TERMS**2) for table in kept]
     return Shapes(

@@ -103,7 +103,11 @@ class JournalFrame:
 
 
 def find_frames(data: bytes) -> list[JournalFrame]:
-    """All intact frames of a journal, in order."""
+    """All intact frames of a journal, in order.
+
+    After a frame the search continues behind it; after a false start, at the next magic. A magic
+    that a frame holds by chance is thus not found.
+    """
     frames: list[JournalFrame] = []
     place, wasted_bytes = data.find(MAGIC), 0
     while place >= 0:
@@ -124,6 +128,7 @@ def _frame_at(data: bytes, start: int) -> JournalFrame | int:
     body = start + _HEAD.size
     if body > len(data):
         return 0
+    # Sizes first: a damaged head may state anything, and only then is the checksum worth its time
     _, first_row, rows, packed_bytes, unpacked_bytes, crc = _HEAD.unpack_from(data, start)
     end = body + packed_bytes
     if end > len(data) or unpacked_bytes > FRAME_BYTES_MAX:

@@ -118,7 +118,10 @@ class PartReader:
                 yield LostGroup(first_s, last_s, _first_line(error))
 
     def _read_footer(self) -> bytes:
-        """The footer, from the manifest if that of the file differs. Raises PartError."""
+        """The footer, from the manifest if that of the file differs. Raises PartError.
+
+        Without its footer a Parquet file cannot be read at all, so the manifest has a copy.
+        """
         expected = unpack_footer(self._entry.footer) if self._entry else None
         tail = self._bytes_at(max(0, self._size_bytes - TAIL_BYTES), TAIL_BYTES)
         length = int.from_bytes(tail[:4], "little")
@@ -135,6 +138,7 @@ class PartReader:
         return found
 
     def _open_with_footer(self, footer: bytes) -> pq.ParquetFile:
+        # A file that ends with the footer to use: pyarrow reads the metadata from it alone
         limits = {
             "thrift_string_size_limit": FOOTER_BYTES_MAX,
             "thrift_container_size_limit": _THRIFT_ITEMS_MAX,
@@ -156,6 +160,7 @@ class PartReader:
     ) -> pa.Table:
         if group.num_rows > GROUP_ROWS_MAX:
             raise ValueError("more rows than a recorder writes")
+        # What the wanted columns unpack to, before memory is taken for them
         wanted = set(names)
         total_bytes = 0
         for place in range(group.num_columns):

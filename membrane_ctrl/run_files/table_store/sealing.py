@@ -41,6 +41,8 @@ def seal_journal(disk: Disk, folder: Path, number: int, table: spec.TableSpec) -
     """
     source = spec.journal_path(folder, number)
     target = spec.part_path(folder, number)
+    # Killed after the manifest's line was written: only the journal's removal is left to do. A kill
+    # at any earlier step leaves the whole journal, and everything is done again
     if target.exists() and number in read_manifest(folder, []):
         disk.remove(source)
         return
@@ -53,6 +55,7 @@ def seal_journal(disk: Disk, folder: Path, number: int, table: spec.TableSpec) -
         raise OSError(f"{source.name}: cannot be sealed ({error})") from None
     if entry is not None:
         append_entry(disk, folder, entry.model_copy(update={"damage": tuple(rows.damage)}))
+    # A journal without one intact row stays, for `repair` and for people; an empty one goes
     if entry is not None or not rows.damage:
         disk.remove(source)
 

@@ -79,9 +79,11 @@ class TableWriter:
         """
         if not self._waiting:
             return
+        # A full journal is closed before new rows, so that each part begins with rows of its own
         first_s = self._time_s(self._waiting[0], 0)
         if self._journal is not None and self._is_full(self._journal):
             self._close_journal()
+        # All that waits is one frame: it is on the disk whole, or not at all
         batch = pa.Table.from_batches(self._waiting).combine_chunks().to_batches()[0]
         try:
             if self._journal is None:
