@@ -180,6 +180,7 @@ class ConsoleModel:
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Take one measurement cycle."""
+        # The reference is the first usable figure after the mirror has settled in this hold
         self._estimate, row = estimate, self._status.row
         self._cycles += 1
         if estimate.verdict == "rejected":

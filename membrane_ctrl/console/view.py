@@ -192,6 +192,8 @@ class ConsolePage:
         self._link = link
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        # Omit items, the least important first, until the rest fits: lines wrap, so each attempt is
+        # drawn and measured. What is left over goes to a taller trend, then to events
         height = options.height or console.height
         trend_s = options.max_width - _EDGES
 

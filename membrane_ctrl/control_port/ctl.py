@@ -308,6 +308,7 @@ def loop_keys(argument: str) -> dict[str, Any]:
             raise errors.InputError(
                 f"ctl gains: give a .toml or .json file, or loop keys: {error}"
             ) from None
+    # A whole configuration, or `gains.toml` of a session: its table of the loop
     if isinstance(tables, dict) and isinstance(tables.get("loop"), dict):
         tables = tables["loop"]
     for key in KEYS_BESIDE_GAINS[1:]:

@@ -41,6 +41,7 @@ def decode(line: bytes) -> Message:
 
 def _clean_value(value: object, field: str, depth: int, budget: list[int]) -> object:
     """Check a value of any meaning; texts lose what a terminal would execute."""
+    # One budget for the whole message: many small objects cost as much as a large one
     budget[0] -= 1
     if budget[0] < 0:
         raise AnswerError(f"more than {_VALUES_MAX} values")

@@ -197,6 +197,7 @@ class ServiceClient:
         InputError
             The service or its hold refuses.
         """
+        # Safety commands have an address of their own, whose threads serve nothing else
         do = SAME_AS.get(request["do"], request["do"])
         names: tuple[str, ...] = _COMMAND_FIELDS
         path, body = "/api/commands", {"do": do}
@@ -205,6 +206,7 @@ class ServiceClient:
         body |= {
             name: request[name] for name in names if request.get(name) not in (None, "", False)
         }
+        # Both are answers of the hold: it obeyed, or it refused. All else is the service's
         status, answered = self._request("POST", path, body)
         if status in (HTTPStatus.OK, HTTPStatus.CONFLICT):
             answer = self._validate(self._decode(answered), CommandAnswer).answer

@@ -108,6 +108,7 @@ def publish_address(logs: Path, base_url: str, has_link: bool) -> Iterator[None]
         logs.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
     try:
+        # The lock, and not the file, is the sign of a service: it ends with the process
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

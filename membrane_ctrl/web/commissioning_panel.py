@@ -186,6 +186,7 @@ class CommissioningPanel:
 
     def _show(self, seen: SeenSession) -> None:
         """Show what differs from what is shown."""
+        # 1. Plan and head, if they have changed
         before, self._shown = self._shown, seen
         self._start.set_visibility(not seen.is_running)
         self._body.set_visibility(bool(seen.plan))
@@ -195,13 +196,16 @@ class CommissioningPanel:
             self._show_plan(seen)
         if seen.stage != before.stage:
             self._show_head(seen)
-        if seen.dropped + len(seen.messages) < self._count:  # another start
+        # 2. The messages that are new, by their number since the start, of which the oldest are
+        #    dropped. A smaller count means that the session was started again
+        if seen.dropped + len(seen.messages) < self._count:
             self._present.clear()
             self._before.clear()
             self._count = 0
         for message in seen.messages[max(0, self._count - seen.dropped) :]:
             self._show_message(message)
         self._count = seen.dropped + len(seen.messages)
+        # 3. What waits for the viewer
         if seen.question != before.question:
             self._show_question(seen)
         if seen.ended != before.ended:
@@ -235,6 +239,7 @@ class CommissioningPanel:
             with self._present:
                 _show_result(message)
             return
+        # A new stage: the elements of the former one move into a card below
         former = list(self._present.default_slot.children)
         if former and self._former_head:
             with self._before:

@@ -120,6 +120,8 @@ def describe_price(action: ActionButton, row: Mapping[str, Any], config: Config 
     flow_um_per_s = config.loop.flow_most_um_per_s(config.pump)
     if not math.isfinite(leak_um_per_s):
         return ""
+    # What it takes to come back: full flow less the leak, from flat. Down, a vent is quick; without
+    # one, the leak takes its time
     filling_s = find_filling_s(mirror.sag_mm, flow_um_per_s, leak_um_per_s)
     again = (
         f"filling it from flat takes {_format_duration(filling_s)}"

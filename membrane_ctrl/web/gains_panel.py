@@ -192,12 +192,14 @@ class GainsPanel:
             return
         if name != self._choice.value:  # another has been chosen meanwhile
             return
+        # The ranges of the sliders come before their values, which would be cut off
         self._source = source
         self._text.set_text(source.text)
         self._body_visible(True)
         self._speed.set_range(*source.time_constants_s)
         self._damping.set_range(*source.dampings)
         self._filter.set_range(*source.filters_s)
+        # The setting of all viewers, else the proposal
         names = list(source.settings)
         first = "proposed" if "proposed" in names else names[0]
         self._is_placing = True
@@ -277,6 +279,7 @@ class GainsPanel:
             self._is_drawing = False
 
     async def _show_setting(self) -> None:
+        """Compute the present setting, show its figures, and let the browser fetch its charts."""
         name, start, setting = str(self._choice.value), self._shown.start, self._shown.setting
         try:
             found = await self._views.explore(self._hold, name, start, setting)
@@ -294,6 +297,7 @@ class GainsPanel:
         ]
         self._table.update()
         self._show_trial()
+        # `repr` keeps every digit: the charts are those that were made just now, for all viewers
         query = {"hold": self._hold, "name": name, "start": start}
         if setting is not None:
             query["setting"] = ",".join(repr(each) for each in setting)

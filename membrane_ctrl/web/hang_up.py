@@ -21,22 +21,24 @@ class HangUp:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        # Only a web socket shows whether the viewer has left or was cut off here; of an HTTP request
+        # nothing is printed
         left = scope["type"] != "websocket"
         has_gone = False
 
-        async def hear() -> Message:
+        async def receive_message() -> Message:
             nonlocal left, has_gone
             message = await receive()
             has_gone = has_gone or message["type"] == "http.disconnect"
             left = left or message["type"] == "websocket.disconnect"
             return message
 
-        async def tell(message: Message) -> None:
+        async def send_message(message: Message) -> None:
             async with asyncio.timeout(_STUCK_S):  # TimeoutError is an OSError: the connection ends
                 await send(message)
 
         try:
-            await self._app(scope, hear, tell)
+            await self._app(scope, receive_message, send_message)
         except RuntimeError:
             # Starlette's middleware raises it if the browser has gone before its answer
             if not has_gone:

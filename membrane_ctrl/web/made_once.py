@@ -21,6 +21,7 @@ class MadeOnce(Generic[T]):
 
     async def get(self, *key: Hashable) -> T:
         """What `make` returns, or raises, for these arguments."""
+        # What is too old goes, and so does a failure: the next viewer tries again
         now_s = time.monotonic()
         self._made = {k: made for k, made in self._made.items() if _is_current(*made, now_s)}
         if key not in self._made:
@@ -28,7 +29,8 @@ class MadeOnce(Generic[T]):
                 asyncio.create_task(self._pool.run(self._make, *key)),
                 now_s + self._life_s,
             )
-        return await asyncio.shield(self._made[key][0])  # a viewer who leaves takes it from nobody
+        # A viewer who leaves cancels that viewer's wait, and not the task for the others
+        return await asyncio.shield(self._made[key][0])
 
 
 def _is_current(task: asyncio.Task[Any], end_s: float, now_s: float) -> bool:

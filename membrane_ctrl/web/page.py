@@ -410,6 +410,7 @@ class WebPage:
             moment = datetime.fromtimestamp(shown_s, UTC)
         except (TypeError, ValueError, OverflowError, OSError):  # a browser may send anything
             return
+        # The chart's axis is in the viewer's time: the script sends what it shows
         offset = None if self._utc else moment.astimezone().utcoffset()
         self._clicked_s = shown_s - (offset.total_seconds() if offset else 0.0)
         mark = next(action for action in ACTIONS if action.do == "mark")
@@ -424,6 +425,7 @@ class WebPage:
         if is_now(self._clicked_s) or self._logs is None:
             await self._confirm(mark)
             return
+        # A past moment: no hold is asked, so the role is judged here
         given = await self._ask(mark)
         if given is None or not role_includes(self._user.role, mark.role):
             return
@@ -492,6 +494,7 @@ class WebPage:
             await ui.run_javascript(script, timeout=_FETCH_S)
 
     def _show_status(self) -> None:
+        # 1. The state; grey where nothing moves any more, as after a regular end
         seen = self._feed.seen
         status, row = seen.status, seen.status.get("row") or {}
         silent = seen.silent
@@ -506,18 +509,22 @@ class WebPage:
             self._state.props(
                 f"color={colour} text-color={'white' if colour == 'negative' else 'black'}"
             )
+        # 2. Why, by what, and what needs attention
         self._why.set_text(silent or str(status.get("why") or "as it should be"))
         self._holder.set_text("" if silent else describe_holder(status))
         # after the end, the fault is in the panel about it
         has_ended = bool(seen.problem) and seen.ended is not None
         lines = lock_lines(status) if has_ended else alarm_lines(status)
         self._alarm.set_text("; ".join(lines))
+        # 3. The numbers: of a hold that is silent they are not shown, because they may be wrong now
         self._numbers_place.set_visibility(not has_ended)
         for column in PUBLISHED:
             card, label = self._numbers[column.name]
             value = row.get(column.name)
             label.set_text(format_number(column, None if silent else value))
             card.set_visibility(value is not None)
+        # 4. The buttons: by both roles, the state, and whether there is anything to change. The
+        #    hold judges again
         for button, action in self._buttons:
             allowed = (
                 not silent
@@ -583,6 +590,7 @@ class WebPage:
 
     async def _confirm(self, action: ActionButton) -> None:
         """Ask for the input and for a confirmation, send, and show what became of it."""
+        # One dialog at a time, except that STOP may come over any other
         if self._stopping or (self._asking and action is not STOP):
             return
         if action is STOP and self._can_stop_guided:

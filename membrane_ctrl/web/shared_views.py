@@ -150,6 +150,7 @@ class SharedViews:
         return None if folder is None else _read_config(folder)
 
     def _make_chart(self, hold: str, signals: tuple[str, ...], span: str, utc: bool) -> bytes:
+        # The signals, the marks of people, and the faults, as lines over all panels
         feed, span_s = self._feeds[hold], SPANS_S[span]
         found = [(signal, history(feed, feed.logs, signal, span_s)) for signal in signals]
         moments = [ChartLine(utc_s, text) for utc_s, text in marks(feed, feed.logs, span_s)]

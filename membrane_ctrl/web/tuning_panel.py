@@ -174,6 +174,7 @@ class TuningPanel:
         self._seen = seen
         self._head.set_text(seen.head)
         self._said.set_visibility(bool(seen.progress.results))
+        # Another session than before: its log is shown from the beginning
         if before is None or before.path != seen.path:
             self._said.clear()
             before = SessionSeen(seen.path, frozenset(), Progressed())
