@@ -21,8 +21,8 @@ class HangUp:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        # Only a web socket shows whether the viewer has left or was cut off here; nothing is printed
-        # of an HTTP request
+        # Only a web socket shows whether the viewer has left or was cut off here; of HTTP requests
+        # nothing is printed
         left = scope["type"] != "websocket"
         has_gone = False
 
