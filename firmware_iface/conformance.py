@@ -128,7 +128,7 @@ class Conformance(board_under_test.BoardUnderTest):
             ("the same claim may be made again", "Claim", self._check_second_claim),
             ("the claim lapses with the watchdog", "Claim", self._check_lapsed_claim),
             ("without a claim nothing is commanded", "Claim", self._check_without_claim),
-            ("anybody may stop the pump", "Stop", self._check_stop),
+            ("any program may stop the pump", "Stop", self._check_stop),
         ]
         if self._guards:
             checks.append(

@@ -191,7 +191,7 @@ class BenchIdentity:
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """What a bench knows of the links to its single devices; a bench of one device knows nothing.
+    """State of the links to a bench's single devices; empty for a bench of one device.
 
     Attributes
     ----------

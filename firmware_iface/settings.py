@@ -413,7 +413,7 @@ class CameraSection(Section):
 
     @property
     def shows_patterns(self) -> bool:
-        """Whether the camera stands for a screen as well."""
+        """Whether the camera also takes the role of a screen."""
         return False
 
 

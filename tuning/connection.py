@@ -37,7 +37,7 @@ def open_on_hold(
     fresh : bool
         Start a new session, even if the newest one on this hold is not finished.
     again : str
-        The line that tells how to continue; `{}` becomes the session's folder.
+        The line that states how to continue; `{}` becomes the session's folder.
     refusal : callable
         Why the configuration of the hold is not fit for this command; empty if it is.
 

@@ -8,7 +8,7 @@ from membrane_ctrl.sessions import folder
 from tuning.steps.identify import load_identified
 from tuning.steps.observe import load_disturbance
 
-# where the estimate weighs the weather sensors against what it expects of the weather
+# about this frequency the estimate weighs a sensor's reading against its prediction of the weather
 _WALK_RAD_PER_S = 1.0
 
 

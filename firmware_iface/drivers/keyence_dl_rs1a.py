@@ -38,7 +38,7 @@ _STEPS_UM = {3: 1.0, 2: 10.0, 1: 100.0}  # decimals of the millimetre
 
 
 class KeyenceDlRs1a(line_link.LineDriver):
-    """A `DisplacementSensor`; `port` stands in for the configured one. Displacement = direction *
+    """A `DisplacementSensor`; `port` replaces the configured one. Displacement = direction *
     (value - zero).
     """
 

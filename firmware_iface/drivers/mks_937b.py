@@ -23,7 +23,7 @@ _MANOMETER = "CM"
 
 
 class Mks937b(line_link.LineDriver):
-    """A `PressureSensor`; `port` stands in for the configured one."""
+    """A `PressureSensor`; `port` replaces the configured one."""
 
     manual = "937B operation manual, page 86; 946 instruction manual, page 103"
 
@@ -87,7 +87,7 @@ class Mks937b(line_link.LineDriver):
         # Its unit, set and read back.
         await self._query_gauge("U!PASCAL")
         await self._require_pascal()
-        await self._reading_pa()  # the gate wants a second reading to confirm the first
+        await self._reading_pa()  # the gate needs a second reading to confirm the first
         full_pa = math.inf if config.range_pa is None else config.range_pa
         return roles.DeviceIdentity(
             f"MKS {model}", serial, firmware, f"channel {config.channel}", (-full_pa, full_pa)

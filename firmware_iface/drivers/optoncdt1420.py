@@ -106,7 +106,7 @@ def distance_mm(raw: float, range_mm: float) -> float:
 
 
 class Optoncdt1420:
-    """A `DisplacementSensor`; `port` stands in for the configured one.
+    """A `DisplacementSensor`; `port` replaces the configured one.
 
     Displacement = direction * (distance - zero). The sensor is behind the mirror: when the bowl
     deepens the vertex comes nearer, so the default direction is -1. Counter and time are the
@@ -248,7 +248,7 @@ class Optoncdt1420:
         return text
 
     async def _first_readings(self) -> None:
-        """The gate wants a second reading to confirm the first."""
+        """Give the gate two readings: it accepts the first value only if a second confirms it."""
         for _ in range(2):
             await self._wait_for_values()
             values = self._take_batches()

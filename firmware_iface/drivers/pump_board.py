@@ -275,7 +275,7 @@ class PumpBoard:
         turns it off.
         """
         if self._armed and self._link.connected:
-            with contextlib.suppress(roles.LinkError):  # the watchdog then does what it is for
+            with contextlib.suppress(roles.LinkError):  # the watchdog then stops the pump
                 await self._write_settings(arm=0.0)
         self._armed = False
         await self._link.close()

@@ -45,7 +45,7 @@ class BarometerMessage:
 class VaisalaPtb330(line_link.LineDriver):
     """A `Barometer`. A task polls it every `period_s`; the newest value is served.
 
-    `port` stands in for the configured one.
+    `port` replaces the configured one.
     """
 
     manual = "PTB330 user's guide M210855EN, pages 70-88"
@@ -194,7 +194,7 @@ def decode_message(message: re.Match[str], name: str) -> BarometerMessage:
     LinkError
         Wrong checksum, or a pressure that the instrument cannot measure.
     """
-    # The sum of all characters, then what the instrument says of its own state.
+    # The sum of all characters, then the fault flags of the instrument.
     checked, pressure, flags, counter, serial, checksum = message.groups()
     if sum(checked.encode("ascii")) % 2**16 != int(checksum, 16):
         raise roles.LinkError(f"{name}: wrong checksum; noise on the line")

@@ -36,7 +36,7 @@ _STEP_MW = 0.0011  # values are written with three decimals
 
 
 class Ventus(line_link.LineDriver):
-    """A `Pump`: the fraction is that of `power_max_mw`; `port` stands in for the configured one."""
+    """A `Pump`: the fraction is that of `power_max_mw`; `port` replaces the configured one."""
 
     manual = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
 

@@ -1,1 +1,1 @@
-"""Links: how bytes get to a device and back, and which answers are trustworthy."""
+"""Links: how bytes get to a device and back, and which answers are accepted."""

@@ -34,5 +34,5 @@ class LateAnswers:
             return ""
         return (
             f"answers come late, the last one {self._late_s:.2f} s after its question: the device, "
-            "a converter or the network is slow; mend that, or raise timeout_s"
+            "a converter or the network is slow; repair that, or raise timeout_s"
         )

@@ -59,7 +59,7 @@ def rtu_frame(unit_id: int, pdu: bytes) -> bytes:
     Parameters
     ----------
     unit_id : int
-        Address of the device on its bus, 1..247 (0 is a broadcast, which nobody answers).
+        Address of the device on its bus, 1..247 (0 is a broadcast, which no device answers).
     pdu : bytes
         Function code and its data, at most 253 bytes.
     """

@@ -151,8 +151,8 @@ class AlarmBook:
         self._occurrences: dict[str, int] = {}
         self._acknowledged_s = -math.inf
 
-    def note_standing(self, name: str) -> bool:
-        """The condition of this alarm stands."""
+    def is_standing(self, name: str) -> bool:
+        """Whether the condition of this alarm persists."""
         alarm = self._alarms.get(name)
         return alarm is not None and math.isinf(alarm.gone_s)
 
@@ -167,7 +167,7 @@ class AlarmBook:
             Time of the sign, on the clock of `step`.
         """
         # A first condition opens the alarm; nothing is sent before it has persisted. A latched
-        # fault replaces an alarm whose condition is over, even if nobody has been sent its end.
+        # fault replaces an alarm whose condition is over, even if its end was not sent yet.
         alarm = self._alarms.get(sign.name)
         if alarm is None or (sign.bad and sign.always_new and math.isfinite(alarm.gone_s)):
             if sign.bad:
@@ -222,13 +222,13 @@ class AlarmBook:
         alarm = self._alarms.get(name)
         if alarm is not None and _began_later(alarm.sign, first.message):
             return
-        if alarm is None:  # cleared while nobody sent
+        if alarm is None:  # cleared while there was no sender
             sign = Sign(name, True, first.message.severity, first.message.text)
             alarm = self._alarms[name] = _Alarm(sign, now_s, gone_s=now_s)
         alarm.occurrence = newest
         alarm.reported_s = first.at_s
         alarm.reminded_s = of_newest[-1].at_s
-        # the first list may have the message and the second not: each gets what it has not got
+        # the first list may have the message and the second not: each gets what it lacks
         if self._config.escalation_urls_file:
             last_list = ESCALATION
         else:

@@ -1,7 +1,7 @@
 """Sends a message through several services at once, in bounded time and memory.
 
 A mail or web server may answer without end, or a byte a minute; the libraries behind Apprise read
-all of it. So each service has a thread of its own, which is left behind after `SERVICE_S`, and the
+all of it. So each service has a thread of its own, which is abandoned after `SERVICE_S`, and the
 process has a limit of memory.
 """
 

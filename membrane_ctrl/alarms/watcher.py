@@ -121,9 +121,7 @@ class Watcher:
     def _take_row(self, message: bytes, now_s: float) -> None:
         row = TelemetryRow.unpack(message)
         for rule in self._config.rules:
-            sign = sign_of_value(
-                rule, getattr(row, rule.field), self._book.note_standing(rule.name)
-            )
+            sign = sign_of_value(rule, getattr(row, rule.field), self._book.is_standing(rule.name))
             if sign is not None:
                 self._book.take_sign(sign, now_s)
 

@@ -25,7 +25,7 @@ from membrane_ctrl.service.published_signals import Value
 
 # Clients may write the value of a command (level 0) only. EPICS by itself lets them write
 # everything, and the other fields (FLNK, SCAN, ASG) would send commands in chains, again and again,
-# or shut them.
+# or block them.
 _RULES = "ASG(DEFAULT) { RULE(1, READ) }\nASG(COMMAND) { RULE(1, READ) RULE(0, WRITE) }\n"
 _TEXT_BYTES = 512
 _DIGITS = 4

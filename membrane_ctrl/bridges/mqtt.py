@@ -5,9 +5,9 @@ Topics, below `membrane/<name>/`: `values`, `availability` (`online`, `offline`;
 last will), `do/<command>`, `answer`, `owner` (`mqtt_owner`), `order` (`mqtt_barrier`).
 
 There are two connections. The first one has the safety commands and the claim to the name. A broker
-queues messages for each connection apart and drops what a slow one does not take, so no flood of
-other commands can drop a `latch`. The second one publishes the values and has all other commands;
-only its will reports that the bridge has gone.
+queues messages for each connection separately and drops what a slow one does not take, so no flood
+of other commands can drop a `latch`. The second one publishes the values and has all other
+commands; only its will reports that the bridge has gone.
 """
 
 import asyncio

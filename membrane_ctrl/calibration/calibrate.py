@@ -31,13 +31,13 @@ def _judge_sets(
     """
     notes = list(bundle.notes)
     judged = list(findings)
-    if bundle.apart and any(finding.fatal for finding in findings):
-        doubt = f"{bundle.apart}; if it was not: "
+    if bundle.bench_doubt and any(finding.fatal for finding in findings):
+        doubt = f"{bundle.bench_doubt}; if it was not: "
         for k, finding in enumerate(findings):
             if finding.fatal:
                 judged[k] = replace(finding, description=doubt + finding.description)
-    elif bundle.apart:
-        notes.insert(0, bundle.apart)
+    elif bundle.bench_doubt:
+        notes.insert(0, bundle.bench_doubt)
     return (*judged, *(verdict.CalibrationFinding(False, note) for note in notes))
 
 

@@ -158,7 +158,8 @@ def ramp_s(held: HeldMirror, from_um: float, to_um: float, config: schema.Config
     Returns
     -------
     float
-        inf if the mirror does not sink for want of a leak, or does not rise for want of pump.
+        inf if the mirror does not sink because it has no leak, or does not rise because the pump is
+        too weak.
     """
     loop = config.loop
     pump_um_per_s = loop.flow_most_um_per_s(config.pump)

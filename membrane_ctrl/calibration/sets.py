@@ -38,7 +38,7 @@ class Bundle:
         Laser reading at which the vertex is the origin.
     notes : tuple of str
         Defects of single frames, for people.
-    apart : str
+    bench_doubt : str
         Why the sets may be of different benches, though each states the same; else empty.
     edges_px : tuple of (2, n) arrays
         Edges of the rim, in the sets that show it.
@@ -48,7 +48,7 @@ class Bundle:
     optics: OpticsConfig
     reference_um: float
     notes: tuple[str, ...] = ()
-    apart: str = ""
+    bench_doubt: str = ""
     edges_px: tuple[FloatArray, ...] = ()
 
 
@@ -130,16 +130,18 @@ def read_sets(
     # The laser reading at the origin.
     film_sets = [sets[k] for k in films]
     film_benches = [benches[k] for k in films]
-    apart = ""
+    bench_doubt = ""
     if reference_um is None:
-        apart = _explain_other_references(film_benches)
+        bench_doubt = _explain_other_references(film_benches)
     reference_um = _reference_um(film_sets, film_benches, reference_um)
     if not any(math.isfinite(phases.displacement_um) for phases in film_sets):
         # Without a laser, the origin is the vertex of the first set.
         sets[films[0]] = replace(sets[films[0]], displacement_um=reference_um)
     if not edges:
         notes.append("the rim is not seen in any full set: its size is not used")
-    return Bundle(tuple(sets), benches[films[0]], reference_um, tuple(notes), apart, tuple(edges))
+    return Bundle(
+        tuple(sets), benches[films[0]], reference_um, tuple(notes), bench_doubt, tuple(edges)
+    )
 
 
 def _list_omitted_frames(folder: Path, figure: SetFigure) -> list[str]:

@@ -95,7 +95,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     if config.devices is not None:
         bench.require_separate_ports(config.devices)
         driver_check.require_optics(config.devices)
-    # Each device is opened alone and asked what it is; facts of several may contradict each other.
+    # Each device is opened alone and identified; facts of several may contradict each other.
     probes, circuits = probe_all_devices(config)
     for probe in probes:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
@@ -432,7 +432,7 @@ async def _probe_role(
 ) -> DeviceProbe:
     where = device.describe()
     name, notes = where.get("port", ""), where.get("watchdog", "")
-    # Open it, ask what it is, and time its reads; then it is free for a hold again.
+    # Open and identify it, time its reads, and close it: then a hold can have it again.
     try:
         found = await role_bench.answer(role, device.open())
         timed = await _time_reads(lambda: role_bench.answer(role, read()))

@@ -79,7 +79,7 @@ def remove_lock(word: str) -> int:
         raise InputError(f"refused: {unlocking.refused}")
     stored = found[unlocking.lock]
     if stored.file is None:
-        raise DeviceError(f"{stored.lock.text}; mend the folder by hand")
+        raise DeviceError(f"{stored.lock.text}; repair the folder by hand")
     # Only while no hold has the devices, and with a record of who did it.
     with contextlib.ExitStack() as stack:
         _require_no_hold(stored, stack)

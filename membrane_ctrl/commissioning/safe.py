@@ -139,7 +139,7 @@ def _describe_reading(devices: DevicesConfig, reading: BenchReading) -> str:
 
 
 async def _after_a_run(devices: DevicesConfig) -> str:
-    """Make sure that the pump stands after a hold, without a latch; wait for the board's watchdog
+    """Make sure that the pump is off after a hold, without a latch; wait for the board's watchdog
     after a killed hold.
 
     Raises DeviceError.

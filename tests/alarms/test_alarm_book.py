@@ -97,7 +97,7 @@ def test_a_good_sign_of_nothing_is_nothing() -> None:
     book = AlarmBook(CONFIG)
     book.take_sign(GOOD, 0.0)
     assert book.step(1e6) == []
-    assert not book.note_standing("leak")
+    assert not book.is_standing("leak")
 
 
 @given(st.lists(st.tuples(st.booleans(), st.floats(0.1, 100.0)), max_size=60))
@@ -147,7 +147,7 @@ def test_trouble_with_the_disk_is_over_with_the_last_of_it_and_not_with_the_firs
     disk.step(6.0)
     disk.recorder_errors.report_recovered("state file")
     assert disk.step(37.0) == []
-    assert disk.book.note_standing("recorder")
+    assert disk.book.is_standing("recorder")
     assert disk.step(910.0) == [("escalated", LOW)]
     disk.recorder_errors.report_recovered("disk")
     assert disk.step(940.0) == [("cleared", LOW)]
@@ -168,7 +168,7 @@ def test_another_recorder_begins_without_the_formers_trouble_and_reports_its_own
     disk.step(0.0)
     disk.hear(ChildRestarted("recorder", 1))
     disk.step(1.0)
-    assert not disk.book.note_standing("recorder")
+    assert not disk.book.is_standing("recorder")
     RecorderErrors(disk.hear).report_error("disk", "less than 500 MB free", DiskLow)
     assert disk.step(40.0) == [], "the same alarm, not cleared and raised again"
     assert disk.step(900.0) == [("escalated", LOW)]

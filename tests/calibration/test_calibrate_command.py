@@ -296,7 +296,7 @@ def test_a_refusal_of_sets_with_different_references_names_these_first() -> None
         (False, "no rim"),
     ]
     assert found[0].sets == (1,)
-    one = calibrate._judge_sets([crept], replace(bundle, apart=""))
+    one = calibrate._judge_sets([crept], replace(bundle, bench_doubt=""))
     assert [each.description for each in one] == ["camera or screen crept", "no rim"]
 
 

@@ -362,7 +362,7 @@ CLAIMS_BROKEN = [
     (HalfKey, "no other program commands, clears or disarms", "accepts a command with another key"),
     (ShowsKey, "the claim and the period are shown, the key is not", "command_key can be read"),
     (ClaimFeeds, "the same claim may be made again", "claims that are made again"),
-    (StopsForATick, "anybody may stop the pump", "runs the pump at 0.05 after stop"),
+    (StopsForATick, "any program may stop the pump", "runs the pump at 0.05 after stop"),
 ]
 GUARDS_BROKEN = [
     (

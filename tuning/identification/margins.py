@@ -49,7 +49,7 @@ def compute_margins(gains: Gains, model: PlantModel, dt_s: float) -> Margins:
 
     L has two poles at the origin (mirror and integrator) and none to the right, so that the loop is
     stable if and only if the phase at every gain crossing is above -180 deg. Stability is read from
-    the number of turns of 1 + L about 0, which also sees loops with several crossings.
+    the number of turns of 1 + L about 0, which also covers loops with several crossings.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The mirror as tuning sees it: an integrator behind the pump's transport delay and lag.
+"""Model of the mirror for tuning: an integrator behind the pump's transport delay and lag.
 
     dy/dt = k q(t) - leak + disturbance,    T dq/dt = v(t - theta) - q
 

@@ -262,7 +262,7 @@ class PumpSurvey:
             below = self.fit.levels.get(Level(level.fraction))
             if level.rising or below is None:
                 continue
-            # Below its start a pump that stands gives nothing: that is no hysteresis of the curve.
+            # Below its start a pump at rest gives nothing: that is no hysteresis of the curve.
             if start is not None and level.fraction < start[1]:
                 continue
             more = above.flow_um_per_s - below.flow_um_per_s

@@ -44,7 +44,7 @@ class DrivenCentre:
 
     def step(self, pump_fraction: float) -> float:
         """Run one tick; return the way since the start, without the leak's."""
-        # A pump that runs does so down to its stall; one that stands needs more to start.
+        # A pump that runs does so down to its stall; one at rest needs more to start.
         least_fraction = self._pump.start_fraction
         if self._running:
             least_fraction = self._pump.stall_fraction

@@ -19,7 +19,7 @@ _FILTERS_S = (0.03, 0.05, 0.1, 0.2, 0.4)
 _GAIN_RANGE = (0.01, 1.0)
 _TI_RANGE = (2.0, 400.0)
 _STEEP = 1e3  # violating a demand costs more than any variance
-_SHARE_MOST = 100.0  # finite, so that the search knows its way back
+_SHARE_MOST = 100.0  # finite, so that the cost has a slope that leads back
 _PRICE_OF_BROKEN = 10.0  # of the logarithm of the standard deviation, for a figure twice its limit
 _START_CLOSED_LOOP_S = 1.2  # of the SIMC gains at which each search begins
 

@@ -47,8 +47,8 @@ def replay_um(
 ) -> Series:
     """What would have been read, less the setpoint, had another loop held the mirror.
 
-    With the limits of pump and loop: weather that asks for less than no flow is as hard for it as
-    for the one that held.
+    The limits of pump and loop apply: weather that would need a negative flow moves the mirror
+    under either loop.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ _CERTAIN = 4.0
 
 @dataclass(frozen=True, slots=True)
 class MappedPump:
-    """`pump_map.json`: what was measured and applied, and what the pump was taken for before."""
+    """`pump_map.json`: what was measured and applied, and the pump's configuration before."""
 
     found: pump_map.PumpMap
     before: schema.PumpConfig
@@ -108,7 +108,7 @@ def map_pump(
         found = replace(found, pump=found.pump.model_copy(update=watched))
         loop = _make_safe_gains(_free_flow_limit(rig.good[0], before, found.pump), found)
         rig.set_gains(loop, "the measured curve of the pump", _MAP_S, pump=found.pump)
-        # Steps of the flow must move the mirror as the curve says.
+        # Steps of the flow must move the mirror as the curve predicts.
         gain, sigma = _measure_gain(rig, found.delay_s + found.lag_s)
     except (experiments.ExperimentError, ValueError) as error:
         rig.restore_good_gains()
@@ -181,8 +181,8 @@ def _reaches_leak(found: pump_map.PumpMap) -> bool:
 def _free_flow_limit(
     loop: schema.LoopConfig, before: schema.PumpConfig, pump: schema.PumpConfig
 ) -> schema.LoopConfig:
-    """The loop with the flow of the measured pump, unless its limit was below what the pump was
-    taken for.
+    """The loop with the flow of the measured pump, unless its limit was below the configured full
+    flow.
     """
     if loop.flow_max_um_per_s < before.flow_full_um_per_s:
         return loop  # a person has limited it
@@ -216,7 +216,7 @@ def _measure_gain(rig: HoldRig, late_s: float) -> tuple[float, float]:
 
     Steps that contradict the curve, or see little in their weather, are repeated for twice as long.
     Raises ValueError if the longest find a gain far from 1, or one that differs above and below the
-    holding flow; one that they do not know contradicts nothing.
+    holding flow; a gain with a large error contradicts nothing.
     """
     for steps_s in _CHECKS_S:
         _wait_for_return(rig)

@@ -145,7 +145,7 @@ class BenchAccess(Protocol):
         ...
 
     def find_latched_fault(self, folder: Path) -> str:
-        """The fault of an earlier hold that nobody has acknowledged; empty if there is none."""
+        """The fault of an earlier hold that is not acknowledged; empty if there is none."""
         ...
 
     def run_tuning(

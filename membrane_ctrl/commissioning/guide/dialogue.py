@@ -93,7 +93,7 @@ class StageResult(StrEnum):
     OPEN = "open"
     PASSED = "passed"
     FAILED = "failed"  # passed by, with a failed check
-    NOT_NEEDED = "not needed"  # the bench has not what it tests
+    NOT_NEEDED = "not needed"  # the bench lacks what it tests
 
 
 class StageProgress(BaseModel):

@@ -91,8 +91,7 @@ def _ask_relief(context: StageContext) -> float:
 def _ask_front_bulge_mm(context: StageContext, facts: MirrorFacts) -> float:
     """Ask whether the camera looks through the other film, and for the height of that film.
 
-    A front film that the configuration states is the default: an answer that nobody gave must not
-    remove it.
+    A front film that the configuration states is the default: an empty answer must not remove it.
     """
     stated = context.config.optics.mirror.front_film
     seen = context.dialogue.ask_choice(

@@ -132,7 +132,7 @@ HOLD_WORST = Threshold(
 HOLD_MISSED = Threshold(
     "ticks that did not run", 0.001, "of all", "a sound machine misses none; 0.1 % is one in 20 s"
 )
-HOLD_FAULTS = Threshold("faults during the hold", 0, "", "an unattended mirror must need nobody")
+HOLD_FAULTS = Threshold("faults during the hold", 0, "", "an unattended mirror must need no person")
 HOLD_PUMP = Threshold(
     "mean pump command during the hold", 0.75, "of full scale", "the rest is needed for gusts"
 )
