@@ -54,6 +54,33 @@ def pytest_collection() -> Generator[None, object, object]:
     return collected
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Of a test with the mark `fast_cases`, only the cases that it names are fast tests."""
+    mark = item.get_closest_marker("fast_cases")
+    if mark is not None and _case_of(item) not in mark.args:
+        item.add_marker(pytest.mark.campaign)
+
+
+@pytest.hookimpl(tryfirst=True)  # before cases are left out by their marks
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Refuse names in `fast_cases` that are those of no case."""
+    if any("[" in arg for arg in config.args):
+        return
+    named: dict[str, set[str]] = {}
+    for item in items:
+        if mark := item.get_closest_marker("fast_cases"):
+            test = item.nodeid.partition("[")[0]
+            named.setdefault(test, set(mark.args)).discard(_case_of(item))
+    unknown = {test: sorted(names) for test, names in named.items() if names}
+    if unknown:
+        raise pytest.UsageError(f"`fast_cases` names what is no case: {unknown}")
+
+
+def _case_of(item: pytest.Item) -> str:
+    """The name of a case, as it stands in brackets."""
+    return item.nodeid.partition("[")[2].removesuffix("]")
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say so where tests of real frames were skipped."""
     skipped = terminalreporter.stats.get("skipped", [])

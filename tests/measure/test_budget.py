@@ -165,6 +165,7 @@ def test_optics_that_are_off(off: dict[str, float], rim_sigmas: float) -> None:
     assert found.height_um == pytest.approx(row["height_rms_um"], rel=0.15)
 
 
+@pytest.mark.fast_cases("roll", "small roll", "yaw")
 @pytest.mark.parametrize(
     ("off", "by_data_sheets", "by_calibration"),
     [

@@ -60,6 +60,7 @@ def worst_of_ok(found: TrackedErrors) -> float:
     return float(max(figures.max(initial=0.0), np.abs(found.moved_sag[ok]).max(initial=0.0)))
 
 
+@pytest.mark.fast_cases("camera_ry-5.0", "screen_z-10.0", "mirror_x-5.0", "sensor_x-0.1")
 @pytest.mark.parametrize(
     ("part", "amount"),
     [
@@ -82,6 +83,12 @@ def test_a_small_motion_is_within_the_error_bars(
     assert worst_of_ok(found) < 4.0
 
 
+@pytest.mark.fast_cases(
+    "camera_ry-<lambda>-knocked",
+    "camera_rx-<lambda>-camera turned",
+    "screen_x-<lambda>-screen shifted",
+    "camera_rz-<lambda>-rolled",
+)
 @pytest.mark.parametrize(
     ("part", "course", "word"),
     [
@@ -103,6 +110,7 @@ def test_a_large_motion_degrades_the_frames(
     assert np.abs(found.moved_terms[-1, 2:]).max() < 4.0
 
 
+@pytest.mark.fast_cases("60.0-camera_z", "1500.0-screen_z", "1500.0-mirror_z")
 @pytest.mark.parametrize("part", ["camera_z", "screen_z", "mirror_z", "focal"])
 @pytest.mark.parametrize("amount", [60.0, pytest.param(400.0, marks=pytest.mark.campaign), 1500.0])
 def test_a_motion_along_an_axis_is_within_the_bars_or_degraded(
@@ -133,6 +141,7 @@ def clamped(x: Array, y: Array) -> Array:
     return np.asarray(1 - x * x - y * y)
 
 
+@pytest.mark.fast_cases("coma", "vibration", "tilt")
 @pytest.mark.parametrize(
     "film",
     [

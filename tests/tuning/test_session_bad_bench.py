@@ -35,7 +35,7 @@ from tuning.twin_hold import TwinHold
 
 def held(events: Sequence[BenchEvent] = (), **twin: object) -> tuple[TwinHold, HoldRig]:
     settings = TwinConfig.model_validate({"scenario": "quiet", "start_error_um": -3.0, **twin})
-    loop = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
+    loop = LoopConfig(rate_hz=20.0, feedforward_barometer=False, feedforward_temperature=False)
     link = TwinHold(Config(twin=settings, shape=ShapeConfig(enabled=False), loop=loop), events)
     return link, HoldRig(link, "tester")
 

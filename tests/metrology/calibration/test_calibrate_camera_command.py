@@ -165,6 +165,10 @@ def test_invalid_prior_files_are_refused(tmp_path: Path) -> None:
             read_prior(tmp_path / "p.toml")
 
 
+@pytest.mark.fast_cases(
+    "chessboard:10x7-chessboard:9x6---board chessboard:10x7",
+    "charuco:10x7-charuco:9x6---board charuco:10x7",
+)
 @pytest.mark.parametrize(
     ("shown", "stated", "named"),
     [

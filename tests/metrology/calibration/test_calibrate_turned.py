@@ -207,6 +207,7 @@ def bumped_truths(yaw_deg: float) -> tuple[Truth, Truth]:
     return before, after
 
 
+@pytest.mark.fast_cases("3-0.02", "1-0.001")
 @pytest.mark.parametrize(("index", "yaw_deg"), [(3, 0.02), (3, 0.001), (1, 0.001)])
 def test_a_bump_in_the_middle_of_a_set_is_found_with_its_angle(index: int, yaw_deg: float) -> None:
     """17 and 350 µrad, of a turned mirror and of one that stands as usual."""

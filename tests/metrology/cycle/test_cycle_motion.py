@@ -63,6 +63,7 @@ def worst_sigmas(first: ShapeEstimate, later: ShapeEstimate, true_um: Array) -> 
     return float(np.abs(error / np.sqrt(variance))[3:].max())
 
 
+@pytest.mark.fast_cases("camera_ry-5.0", "screen_x-10.0", "camera_z-50.0")
 @pytest.mark.parametrize(
     ("part", "amount"),
     [
@@ -81,6 +82,7 @@ def test_a_small_motion_is_within_the_error_bars(
     assert worst_sigmas(first, later, np.zeros(36)) < 4.0
 
 
+@pytest.mark.fast_cases("camera_ry-50.0-tilted", "screen_rz-400.0-rolled")
 @pytest.mark.parametrize(
     ("part", "amount", "word"),
     [("camera_ry", 50.0, "tilted"), ("camera_rz", 400.0, "rolled"), ("screen_rz", 400.0, "rolled")],

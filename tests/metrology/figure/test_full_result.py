@@ -137,6 +137,7 @@ def test_motion_is_removed_from_the_phase() -> None:
     assert without > 4 * with_laser
 
 
+@pytest.mark.fast_cases("rest", "turning")
 @pytest.mark.parametrize(
     ("motion_um", "most_um", "most_left_um"),
     [

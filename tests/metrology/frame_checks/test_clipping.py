@@ -108,6 +108,15 @@ SOUND = {
 }
 
 
+@pytest.mark.fast_cases(
+    "plain-8",
+    "gamma-12",
+    "steep gamma-8",
+    "no vignetting-12",
+    "dark camera-8",
+    "bright-8",
+    "low noise-12",
+)
 @pytest.mark.parametrize("bits", [8, 12])
 @pytest.mark.parametrize("name", SOUND)
 def test_sound_pictures_are_not_clipped(name: str, bits: int) -> None:

@@ -51,6 +51,7 @@ def named(
     return {stack.patterns[f.frame].name for f in flags}, [f.reason for f in flags], wrong
 
 
+@pytest.mark.fast_cases("repeated-x_sin_3", "repeated-white", "stale-x_gray_1", "stale-y_sin_0")
 @pytest.mark.parametrize("frame", EVERY[1:])
 @pytest.mark.parametrize("kind", ["repeated", "stale"])
 def test_a_stale_frame_is_reported_and_left_out(kind: str, frame: str) -> None:
@@ -88,6 +89,9 @@ def test_a_twentieth_of_the_frame_before_is_seen(frame: str) -> None:
     assert error_um(checked.state.surface) < 0.05
 
 
+@pytest.mark.fast_cases(
+    "dark-dark-x_sin_3", "dark-dark-white", "flicker-flicker-x_gray_1", "saturated--y_sin_0"
+)
 @pytest.mark.parametrize("frame", EVERY[:-1])
 @pytest.mark.parametrize(
     ("kind", "word"), [("dark", "dark"), ("flicker", "flicker"), ("saturated", "")]
@@ -137,6 +141,7 @@ def test_three_steps_have_nothing_to_spare(kind: str, frame: str) -> None:
     assert wrong is None
 
 
+@pytest.mark.fast_cases("x_sin_1")
 @pytest.mark.parametrize(
     "frame",
     [
@@ -184,6 +189,7 @@ def test_a_wrong_picture_in_place_of_a_gray_frame_without_an_edge_is_reported() 
     assert [flag.frame for flag in check_set(stack, _coarse(4)).flags] == [frame]
 
 
+@pytest.mark.fast_cases("1.0-3", "1.0-5", "2.2-4", "2.2-8")
 @pytest.mark.parametrize("steps", [3, 4, 5, 8])
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_no_alarm_for_any_number_of_steps_and_gamma(steps: int, gamma: float) -> None:
@@ -207,6 +213,7 @@ def test_no_alarm_for_any_light(light: Light) -> None:
     assert check_set(good_set(optics, light=light), optics).flags == ()
 
 
+@pytest.mark.fast_cases("12-4.0", "16-0.0", "16-100.0")
 @pytest.mark.parametrize(("bits", "noise_adu"), [(8, 4.0), (12, 4.0), (16, 0.0), (16, 100.0)])
 def test_no_alarm_for_any_depth_and_noise(bits: int, noise_adu: float) -> None:
     optics = bench(bits=bits, noise_adu=noise_adu)

@@ -61,6 +61,7 @@ CASES = {
 }
 
 
+@pytest.mark.fast_cases("1 %", "10 %", "relaxing", "rising faster, gamma")
 @pytest.mark.parametrize("name", CASES)
 def test_held_light_is_found_and_removed(name: str) -> None:
     """The figure would be off by 3.6 µm at 1 %; no frame is flagged, and the rest is in the bar."""

@@ -71,6 +71,14 @@ def with_axes_exchanged(stack: FrameStack) -> FrameStack:
     return replace(stack, frames=stack.frames[order])
 
 
+@pytest.mark.fast_cases(
+    "3-the pictures are rotated by 180 degrees",
+    "4-the pictures are mirrored left to right",
+    "4-the pictures are mirrored top to bottom",
+    "4-the pictures are rotated by 90 degrees counter-clockwise",
+    "4-the pictures are rotated by 90 degrees clockwise",
+    "4-the pictures are shown with columns and rows exchanged",
+)
 @pytest.mark.parametrize("what", TURNED)
 @pytest.mark.parametrize("steps", [3, 4])
 def test_turned_pictures_are_reported_and_rejected(what: str, steps: int) -> None:

@@ -35,6 +35,14 @@ QUICK = (
 )
 
 
+@pytest.mark.fast_cases(
+    "alpha_deg 0.3",
+    "camera_pitch_deg 0.1",
+    "k1 0.02",
+    "air_k_per_m 0.5",
+    "gamma 2.2",
+    "film 5 \\xb5m deeper in y, no laser, bench known to a hundredth",
+)
 @pytest.mark.parametrize("name", QUICK)
 def test_a_stated_sigma_is_the_error_that_its_cause_plants(name: str) -> None:
     found = compare(BY_DESCRIPTION[name], EIGHTH)

@@ -85,6 +85,18 @@ def measured(effects: Effects, folder: Path) -> MeasuredErrors:
     return measured_errors(folder, world.mirror, truth, POINTS_MM)
 
 
+@pytest.mark.fast_cases(
+    "nothing",
+    "panel darker to one side",
+    "blur behind a dark edge",
+    "overexposed, 12 of 16 bits",
+    "cut at black",
+    "camera gamma",
+    "camera gamma and panel gamma",
+    "slow panel, 3 %",
+    "slow panel, 10 %",
+    "second image and slow panel",
+)
 @pytest.mark.parametrize("name", CAUSES)
 def test_the_cause_of_wrong_light_is_reported_and_no_other(name: str, tmp_path: Path) -> None:
     cause = CAUSES[name]

@@ -68,6 +68,7 @@ def test_a_camera_that_turns_by_5_urad_is_within_the_bars(reference: Path) -> No
     assert worst_of_ok(track, true_um) < 4.0
 
 
+@pytest.mark.fast_cases("screen-effects1")
 @pytest.mark.parametrize(
     ("name", "effects"),
     [
@@ -83,6 +84,7 @@ def test_a_motion_along_an_axis_is_within_the_bars(
     assert worst_of_ok(track, true_um) < 4.0
 
 
+@pytest.mark.fast_cases("yaw-effects0-camera turned")
 @pytest.mark.parametrize(
     ("name", "effects", "word"),
     [
