@@ -86,7 +86,7 @@ class ArtefactTable(Section):
 
 
 class ScreenMovedTable(Section):
-    """The `[screen_moved]` table: the screen stood elsewhere than `[geometry]` says."""
+    """The `[screen_moved]` table: the screen was elsewhere than `[geometry]` states."""
 
     shift_mm: tuple[float, float, float]  # along s_x, along s_y, towards the mirror, as measured
     shift_sigma_mm: _Length = 1.0  # of its length

@@ -83,6 +83,8 @@ def _write_zygo_dat(seen: ExportedMap) -> Written:
             f"--format zygo-dat: holds heights up to 166 mm, not {largest_mm:.0f} mm"
         )
     code = fitting[0]
+
+    # Fields of the header by their place in bytes; all others are 0. The heights follow.
     rows, columns = seen.height_mm.shape
     header = bytearray(834)
     fields: tuple[tuple[int, str, Any], ...] = (
@@ -129,7 +131,7 @@ def _write_zygo_xyz(seen: ExportedMap) -> Written:
         "#",
     )
 
-    # One line a cell: column, row and height.
+    # One line a cell: column, row and height; row 0 is at the top.
     height_um = 1e3 * seen.height_mm[::-1]
     points = []
     for row, values in enumerate(height_um.tolist()):
@@ -145,6 +147,7 @@ def _write_codev_int(seen: ExportedMap) -> Written:
     """Code V's grid interferogram of a surface: whole numbers of 16 bits, SSZ of them a wavelength
     of 1 µm.
     """
+    # The largest height takes the largest number, if it is not 0.
     per_um = _CODEV_MOST / max(1e3 * float(np.nanmax(np.abs(seen.height_mm))), 1e-6)
     scale = float(f"{per_um:.9g}")  # as the file states it
     rows, columns = seen.height_mm.shape

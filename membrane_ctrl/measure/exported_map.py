@@ -142,6 +142,7 @@ def remove_parts(seen: ExportedMap, names: list[str]) -> ExportedMap:
     names : list of str
         Keys of `REMOVABLE`, or "sphere".
     """
+    # The best sphere first: the deviation is along its normal.
     height = seen.height_mm
     measured = seen.is_measured
     if "sphere" in names:
@@ -149,6 +150,9 @@ def remove_parts(seen: ExportedMap, names: list[str]) -> ExportedMap:
         points = np.stack([seen.x_mm[columns], seen.y_mm[rows], height[measured]])
         height = np.full(height.shape, np.nan)
         height[measured] = best_sphere.best_sphere(points).deviation(points)[0]
+
+    # All removable terms are fitted together, since over a part of the disc they are not
+    # independent; only the named ones are subtracted.
     places = [place for name in names for place in REMOVABLE.get(name, ())]
     if places:
         fit = fit_fringe_terms(seen, _REMOVABLE_TERMS)

@@ -261,6 +261,7 @@ def write_figure_maps(path: Path, found: MeasuredFigure) -> None:
 
 def figure_lines(found: MeasuredFigure) -> list[str]:
     """The numbers as lines of text; +- is 1 sigma of noise and geometry together."""
+    # Noise and geometry are independent: their sigmas add in squares.
     numbers = found.figure.numbers
 
     def quantity(name: str, unit: str) -> str:
@@ -279,6 +280,8 @@ def figure_lines(found: MeasuredFigure) -> list[str]:
         f"          rotationally invariant PV {quantity('rotational_pv_um', 'µm')}, "
         f"the rest {quantity('asymmetry_rms_um', 'µm')} RMS",
     ]
+
+    # A convex mirror has no light at a focus.
     if numbers.best_focus_mm > 0:
         lines.append(
             f"spot      {quantity('best_focus_mm', 'mm')} from the vertex: 80 % of the rays within "

@@ -331,7 +331,9 @@ def _list_constants(table: dict[str, Any] | None) -> list[str]:
     """Elastic constants by direction as lines of text."""
     if table is None:
         return []
-    ratio, shear = table["ratio"], table["g12_over_e1"]
+    # Ratios are known without a gauge; moduli only with one.
+    ratio = table["ratio"]
+    shear = table["g12_over_e1"]
     direction = "no stiff direction is seen"
     if table["direction_deg"] is not None:
         found = table["direction_deg"]
@@ -363,6 +365,7 @@ def _make_fit_table(
 ) -> dict[str, Any]:
     """The content of `film.json`."""
     law = fit.law
+    # The stiffness of the fit is relative: its sigma is a share.
     strain, poisson, relative = fit.sigmas
     gauged = any(np.isfinite(figure.pressure_pa) for figure in figures)
     edge = [float(profile[-1]) for profile in departure.from_hencky_mm]
@@ -420,6 +423,7 @@ def _make_fit_table(
 
 def _paper_prestrain(poisson: float, stiffness: FloatArray | float) -> float:
     """The pre-strain that makes this film 3 mm less deep than the paper's Hencky film at 600 Pa."""
+    # Sag by pre-strain, in steps that a straight line joins.
     strains = np.linspace(-2e-4, 5e-3, 200)
     hencky = FilmLaw(0.0, _POISSON, _STIFFNESS_N_PER_M, 500.0).under_pressure(_PRESSURE_PA)
     sags = (
@@ -432,6 +436,7 @@ def _paper_prestrain(poisson: float, stiffness: FloatArray | float) -> float:
 
 def _format_fit(table: dict[str, Any], figures: list[film_figure.FilmFigure]) -> list[str]:
     """The result as lines of text."""
+    # What determines the law, then its constants.
     strain = table["prestrain"]
     poisson = table["poisson"]
     stiffness = table["stiffness_n_per_m"]
@@ -448,6 +453,8 @@ def _format_fit(table: dict[str, Any], figures: list[film_figure.FilmFigure]) ->
         )
     lines += _list_constants(table["orthotropy"])
     lines += [_wave_line(wave) for wave in table["ring"]]
+
+    # The departure from the paper's film, and what the law leaves of it.
     edges = [one["edge_from_hencky_mm"] for one in table["sets"]]
     departure = table["departure"]
     return [

@@ -44,12 +44,16 @@ def check_sofast_file(path: Path, as_json: bool) -> int:
         measurement = read_sofast_file(path)
     except (ValueError, OSError) as error:
         raise errors.InputError(str(error)) from None
+
+    # Pixels that see fringes, and what their frames contradict.
     mask = lit_pixels(measurement)
     if np.count_nonzero(mask) < _LEAST_PIXELS:
         raise errors.InputError(f"{path}: only {np.count_nonzero(mask)} pixels see fringes")
     found = check_series(
         axis_series(measurement, mask), measurement.black[mask], measurement.white[mask]
     )
+
+    # The verdict with the flagged frames by name.
     flagged = [
         {"file": _frame_name(measurement, flag), "reason": flag.reason} for flag in found.flags
     ]

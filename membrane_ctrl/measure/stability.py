@@ -463,6 +463,7 @@ def common_size(folders: Iterable[Path]) -> tuple[tuple[int, int], float]:
     Raises InputError for two sizes in one run, naming a set of each; RejectedError if no
     description is readable.
     """
+    # The first set decides; sets that differ are named with it.
     first: tuple[Path, tuple[int, int], float] | None = None
     reason = ""
     for folder in folders:

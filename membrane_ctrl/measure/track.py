@@ -149,6 +149,8 @@ def track_command(
         given = read_geometry(geometry)
     track = track_set(folder, given, geometry)
     passed_s = time.perf_counter() - begin_s
+
+    # The result; reading the frames counts in the rate.
     out = out.resolve() if out else folder / "result"
     table = _make_track_table(track)
     with errors.convert_write_errors(out):

@@ -199,6 +199,7 @@ def _compute_spread(
     motion: MotionFinding | None,
 ) -> Spread:
     """Spread of the only set, or of the first minus the second, trial by trial."""
+    # The parameters, or their change: a trial has one geometry, whose common effect cancels.
     own = parameters[:, 0]
     if len(benches) > 1:
         own = own - parameters[:, 1]
@@ -228,12 +229,15 @@ def _make_comparison_table(
         sigma_um = 1e3 * grid.sigma(covariance_mm2)
         return {"mean": float(sigma_um.mean()), "max": float(sigma_um.max())}
 
+    # Motions of the bench between two sets, if there are two.
     motion_um = None
     moved = ""
     if result.motion is not None:
         motion_um = summarise(result.motion.covariance_mm2)
         if result.motion.is_proven:
             moved = result.motion.describe()
+
+    # Standard deviations of the sag, g^T C g, and of the Noll terms.
     sag = sag_gradient()
     to_coeffs = parameter_to_coeffs()
     coeffs_mm = np.sqrt(np.diag(to_coeffs @ result.covariance @ to_coeffs.T))

@@ -1,5 +1,5 @@
 """Colours of quantities in every plot: the palette of Okabe and Ito, which colour-blind readers can
-tell apart.
+distinguish.
 """
 
 Colour = tuple[int, int, int]  # red, green, blue: 0 to 255

@@ -385,7 +385,7 @@ class PumpStronger(
     "loop takes it as a straight line until `tune pump` measures it",
     notable=True,
 ):
-    """A pump whose curve nobody has stated is much stronger than the default one."""
+    """A pump whose curve is not stated is much stronger than the default one."""
 
     flow_full_um_per_s: float
     assumed_um_per_s: float

@@ -80,6 +80,7 @@ class PaperOptions:
 
 def find_prestrain() -> float:
     """The pre-strain that makes the film 3 mm less deep than Hencky's at the paper's pressure."""
+    # The sag that each of many pre-strains costs, and the one that costs the paper's 3 mm.
     ideal = FilmLaw(0.0, POISSON, STIFFNESS_N_PER_M, 500.0).under_pressure(PRESSURE_PA)
     strained = FilmLaw(_STRAINS[:, None], POISSON, STIFFNESS_N_PER_M, 500.0).under_pressure(
         PRESSURE_PA

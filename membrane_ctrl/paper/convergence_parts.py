@@ -7,6 +7,7 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction.surface_fit import fit_surface
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.paper import pictures
+from membrane_ctrl.paper.aperture_grid import ApertureGrid
 from membrane_ctrl.paper.bench import MeasuredBench
 from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult, judge_within
 from membrane_ctrl.paper.reference_iteration import (
@@ -22,6 +23,7 @@ from membrane_ctrl.paper.reference_iteration import (
 _THRESHOLD_MM = 1e-6  # the paper's
 _ITERATIONS = 12
 _STARTS_MM = (10.0, 20.0, 40.0, 60.0, 80.0, 100.0)  # depths of paraboloids
+_PAPER_START = "paraboloid 40 mm"  # equation 20
 _LAST_CHANGE_MM = 1e-9  # that `measure` leaves to come
 _NINE = 9  # iterations after which the paper compares the starting shapes
 _POINTS = 4000  # determine the 36 terms; more only cost time
@@ -78,7 +80,8 @@ def compare_convergence(bench: MeasuredBench) -> PartResult:
     radius_mm = bench.optics.mirror.radius_mm
     reference = solve_by_paper(bench, make_parabola(40.0, radius_mm), _ITERATIONS)
     needed = _count_iterations(reference.changes_mm)
-    # `changes_mm` of `measure`: its bins from the start, and then its pixels from the bins' surface
+
+    # `changes_mm` of `measure`: its bins from the start, then its pixels from the bins' surface.
     ours_mm = list(bench.full.fit.changes_mm)
     comparisons = [
         PaperStatement(
@@ -105,7 +108,7 @@ def compare_convergence(bench: MeasuredBench) -> PartResult:
     )
     numbers = {
         "iterations_to_threshold": needed,
-        # what is below the rounding of the heights differs between machines
+        # What is below the rounding of the heights differs between machines.
         "changes_mm": [change for change in reference.changes_mm if change > _ROUNDING_MM],
         "measure_changes_mm": [change for change in ours_mm if change > _ROUNDING_MM],
     }
@@ -115,17 +118,13 @@ def compare_convergence(bench: MeasuredBench) -> PartResult:
 def compare_starts(bench: MeasuredBench) -> PartResult:
     """Paraboloids of 10 to 100 mm, a cone and a V-fold, each to its solution."""
     radius_mm = bench.optics.mirror.radius_mm
-    reach_mm = bench.optics.mirror.analysis_radius_mm
     starts = {f"paraboloid {depth:g} mm": make_parabola(depth, radius_mm) for depth in _STARTS_MM}
     starts |= {"cone": make_cone(40.0, radius_mm), "V-fold": make_v_fold(40.0, radius_mm)}
-    axis_mm = np.linspace(-reach_mm, reach_mm, _SIDE)
-    x_mm, y_mm = np.meshgrid(axis_mm, axis_mm)
-    inside = np.hypot(x_mm, y_mm) <= reach_mm
+    grid = ApertureGrid.over_disc(bench.optics.mirror.analysis_radius_mm, _SIDE)
+    x_mm = grid.x_mm
+    y_mm = grid.y_mm
 
-    def on_map(values: FloatArray) -> FloatArray:
-        return np.where(inside, values, np.nan)
-
-    # Each start to its solution, by the paper's iteration and by that of `measure`
+    # Each start to its solution, by the paper's iteration and by that of `measure`.
     heights_mm = {}
     ours_mm = {}
     curves = {}
@@ -134,12 +133,13 @@ def compare_starts(bench: MeasuredBench) -> PartResult:
         heights_mm[name] = found.surface.height_mm(x_mm.ravel(), y_mm.ravel()).reshape(x_mm.shape)
         curves[name] = (np.arange(1.0, _NINE + 1), np.array(found.changes_mm))
         ours_mm[name] = _solve_by_measure(bench, start.height_mm).height(x_mm, y_mm)
-    # The largest difference between the solutions
-    reference = heights_mm["paraboloid 40 mm"]
-    own = ours_mm["paraboloid 40 mm"]
-    spread_mm = max(_find_largest(on_map(each - reference)) for each in heights_mm.values())
-    own_spread_mm = max(_find_largest(on_map(each - own)) for each in ours_mm.values())
-    largest_mm = _find_largest(on_map(reference))
+
+    # The largest difference between the solutions.
+    reference = heights_mm[_PAPER_START]
+    own = ours_mm[_PAPER_START]
+    spread_mm = max(_find_largest(grid.clip_map(each - reference)) for each in heights_mm.values())
+    own_spread_mm = max(_find_largest(grid.clip_map(each - own)) for each in ours_mm.values())
+    largest_mm = _find_largest(grid.clip_map(reference))
     comparisons = [
         PaperStatement(
             "largest difference between the solutions after nine iterations, mm",
@@ -158,17 +158,19 @@ def compare_starts(bench: MeasuredBench) -> PartResult:
             "it ends where the change that is still to come is below 1e-9 mm",
         ),
     ]
+
+    # Pictures: starting shapes, solutions and convergence.
     shapes = {
-        name: on_map(starts[name].height_mm(x_mm, y_mm))
-        for name in ("paraboloid 40 mm", "cone", "V-fold")
+        name: grid.clip_map(starts[name].height_mm(x_mm, y_mm))
+        for name in (_PAPER_START, "cone", "V-fold")
     }
     residuals = {
-        f"{name}, solution less that of the paraboloid": on_map(heights_mm[name] - reference)
+        f"{name}, solution less that of the paraboloid": grid.clip_map(heights_mm[name] - reference)
         for name in ("cone", "V-fold")
     }
     drawn = {
-        "starting shapes": pictures.draw_maps(shapes, axis_mm, "mm"),
-        "solutions": pictures.draw_maps(residuals, axis_mm, "mm"),
+        "starting shapes": pictures.draw_maps(shapes, grid.axis_mm, "mm"),
+        "solutions": pictures.draw_maps(residuals, grid.axis_mm, "mm"),
         "convergence from each start": pictures.draw_curves(
             curves, "iteration", "largest change of height, mm", logarithmic=True
         ),

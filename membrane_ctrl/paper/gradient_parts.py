@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.paper import pictures
+from membrane_ctrl.paper.aperture_grid import ApertureGrid
 from membrane_ctrl.paper.bench import PaperBench
 from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult
 from membrane_ctrl.paper.reference_pmd import Reflection, YReading, compute_slopes
@@ -37,8 +38,9 @@ class _TrueRays:
 
 def compare_gradients(bench: PaperBench) -> PartResult:
     """Slopes by the paper's equations for a known film, less the film's own."""
-    axis_mm, inside, x_mm, y_mm = _make_aperture_grid(bench)
-    true = _trace(bench, x_mm, y_mm)
+    # Points over the aperture, with their true slopes and what the camera sees there.
+    grid = ApertureGrid.over_disc(bench.optics.mirror.analysis_radius_mm, _SIDE)
+    true = _trace(bench, *grid.places_mm)
 
     # Error of the slopes in each reading of the equations, and without their correction
     rows: dict[str, FloatArray] = {}
@@ -97,37 +99,28 @@ def compare_gradients(bench: PaperBench) -> PartResult:
         }
         for name, error in rows.items()
     }
-    # Maps of the errors that are not rounding
-    maps = {}
-    for title, values in (
-        ("x without delta theta", rows["NO_CORRECTION"][0]),
-        ("y without delta theta", rows["NO_CORRECTION"][1]),
-        ("y with b sin(alpha)", rows[YReading.HEIGHT_OF_CENTRE.name][1]),
-    ):
-        picture = np.full(inside.shape, np.nan)
-        picture[inside] = values
-        maps[title] = picture
-    drawn = {"errors of the slope over the aperture": pictures.draw_maps(maps, axis_mm, "µrad")}
+
+    # Maps of the errors that are not rounding.
+    maps = {
+        "x without delta theta": grid.fill_map(rows["NO_CORRECTION"][0]),
+        "y without delta theta": grid.fill_map(rows["NO_CORRECTION"][1]),
+        "y with b sin(alpha)": grid.fill_map(rows[YReading.HEIGHT_OF_CENTRE.name][1]),
+    }
+    title = "errors of the slope over the aperture"
+    drawn = {title: pictures.draw_maps(maps, grid.axis_mm, "µrad")}
     return PartResult(comparisons, numbers, drawn)
-
-
-def _make_aperture_grid(bench: PaperBench) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-    """Axis (m,) of a map, points inside the analysed radius (m, m), and their x and y (n,)."""
-    reach_mm = bench.optics.mirror.analysis_radius_mm
-    axis_mm = np.linspace(-reach_mm, reach_mm, _SIDE)
-    x_mm, y_mm = np.meshgrid(axis_mm, axis_mm)
-    inside = np.hypot(x_mm, y_mm) <= reach_mm
-    return axis_mm, inside, x_mm[inside], y_mm[inside]
 
 
 def _trace(bench: PaperBench, x_mm: FloatArray, y_mm: FloatArray) -> _TrueRays:
     """Reflect the camera's rays at points of the film, and follow them to the screen's plane."""
+    # Slopes by central differences: the film's formulas are not used.
     film = bench.film
     height_mm = film.height_mm(x_mm, y_mm)
     slope_x = film.height_mm(x_mm + _STEP_MM, y_mm) - film.height_mm(x_mm - _STEP_MM, y_mm)
     slope_y = film.height_mm(x_mm, y_mm + _STEP_MM) - film.height_mm(x_mm, y_mm - _STEP_MM)
     slopes = np.stack([slope_x, slope_y]) / (2 * _STEP_MM)
 
+    # The law of reflection: v = u - 2 (u n) n with the normal n ~ (-dh/dx, -dh/dy, 1).
     points_mm = np.stack([x_mm, y_mm, height_mm])
     normal = np.stack([-slopes[0], -slopes[1], np.ones_like(x_mm)], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -136,13 +129,15 @@ def _trace(bench: PaperBench, x_mm: FloatArray, y_mm: FloatArray) -> _TrueRays:
     towards = np.sum(incident * normal, axis=1, keepdims=True)
     reflected = incident - 2.0 * towards * normal
 
-    # O', and the directions on the screen
+    # O' = b (-cos alpha, 0, sin alpha), and the directions on the screen, which stands across O O'.
     alpha_rad = bench.geometry.alpha_rad
     to_centre = np.array([-math.cos(alpha_rad), 0.0, math.sin(alpha_rad)])
     centre_mm = bench.geometry.b_mm * to_centre
     along_x = np.array([-math.sin(alpha_rad), 0.0, -math.cos(alpha_rad)])
     along_y = np.array([0.0, 1.0, 0.0])
     face = np.cross(along_x, along_y)
+
+    # Where the reflected ray meets the screen's plane, from O'.
     reach_mm = ((centre_mm - points_mm.T) @ face) / (reflected @ face)
     on_screen_mm = points_mm.T + reach_mm[:, None] * reflected - centre_mm
     screen_mm = np.stack([on_screen_mm @ along_x, on_screen_mm @ along_y])

@@ -29,6 +29,7 @@ from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.terminal import track_progress
 from membrane_ctrl.paper import pictures
+from membrane_ctrl.paper.aperture_grid import ApertureGrid
 from membrane_ctrl.paper.bench import PIXEL_NOISE_ADU, MeasuredBench, PaperOptions
 from membrane_ctrl.paper.comparison import Agreement, PaperStatement, PartResult, judge_within
 from membrane_ctrl.paper.convergence_parts import make_seen_points, solve_by_paper
@@ -53,6 +54,7 @@ _START_ITERATIONS = 8
 _BATCH = 10  # trials per job: the bar moves, and no worker waits for long
 # From the nominal solution: each contracts fifty-fold, so that 50 µm become 1e-5 µm.
 _TRIAL_ITERATIONS = 4
+_RAY_STEPS = 6  # from a ray to the nominal surface: 1e-6 mm are left
 _X_SQUARED = POWERS.index((2, 0))
 _Y_SQUARED = POWERS.index((0, 2))
 # The paper's 100 trials scatter by 7 %; three of these.
@@ -111,10 +113,10 @@ class _Trial:
 
 def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
     """RMSE maps of the height, in each reading."""
+    # What the trials vary: geometry and screen points, from the solution of the bench.
     mirror = bench.optics.mirror
     seen = make_seen_points(bench, _POINTS)
     start = make_parabola(40.0, mirror.radius_mm)
-    # What the trials vary: geometry and screen points, from the solution of the bench
     inputs = TrialInputs(
         seen,
         solve_by_paper(bench, start, _START_ITERATIONS, _POINTS).surface,
@@ -124,15 +126,16 @@ def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
         mirror.analysis_radius_mm,
         bench.options.seed,
     )
-    axis_mm = np.linspace(-mirror.analysis_radius_mm, mirror.analysis_radius_mm, _SIDE)
-    x_mm, y_mm = np.meshgrid(axis_mm, axis_mm)
-    inside = np.hypot(x_mm, y_mm) <= mirror.analysis_radius_mm
-    to_height = make_height_matrix(x_mm[inside], y_mm[inside], mirror.radius_mm)
+    grid = ApertureGrid.over_disc(mirror.analysis_radius_mm, _SIDE)
+    x_mm, y_mm = grid.places_mm
+    to_height = make_height_matrix(x_mm, y_mm, mirror.radius_mm)
 
-    # RMSE over the trials, and as a check the sum of the single effects
+    # RMSE over the trials: the height is linear in the coefficients.
     coeffs_mm = _run_everywhere(inputs, bench.options)
     heights_um = 1e3 * coeffs_mm @ to_height.T
     rmse_um = dict(zip(AngleReading, np.std(heights_um, axis=0, ddof=1), strict=True))
+
+    # The same without the scatter of trials: the effects of one sigma, summed in squares.
     effects_um = {
         reading: _compute_effects_um(inputs, to_height, reading) for reading in AngleReading
     }
@@ -144,38 +147,16 @@ def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
         name: float(np.mean(np.abs(change)))
         for name, change in effects_um[AngleReading.PIXEL_RAYS].items()
     }
-    # Between two sets the geometry cancels
-    pair_um = compute_pair_rmse_um(inputs, to_height, bench.options.trials)
+
+    # Between two sets the geometry cancels.
+    pair_um = float(np.mean(compute_pair_rmse_um(inputs, to_height, bench.options.trials)))
 
     comparisons = [
         compare_with_paper(reading, rmse_um[reading], expected_um[reading], bench.options.trials)
         for reading in AngleReading
     ]
-    comparisons.append(
-        PaperStatement(
-            "RMSE of the change between two sets, mean over the mirror, µm",
-            "4 to 5",
-            f"{np.mean(pair_um):.2g}",
-            judge_within(float(np.mean(pair_um)), *PAPER_PAIR_UM),
-            f"{bench.options.trials} trials; the centre moves by {_PAIR_UM:g} µm between the sets; "
-            "the geometry cancels, and the paper's 0.4 ADU of white noise average out",
-        )
-    )
-    comparisons += [
-        PaperStatement(
-            f"part of {name}, mean over the mirror, µm (pixels keep their rays)",
-            "",
-            f"{value:.3g}",
-            Agreement.UNSTATED,
-            "by a change of one standard uncertainty",
-        )
-        for name, value in budget_um.items()
-    ]
-    maps = {}
-    for reading in AngleReading:
-        picture = np.full(inside.shape, np.nan)
-        picture[inside] = rmse_um[reading]
-        maps[str(reading)] = picture
+    comparisons.append(_state_pair(pair_um, bench.options.trials))
+    comparisons += [_state_part(name, value) for name, value in budget_um.items()]
     numbers = {
         "trials": bench.options.trials,
         "mean_um": {reading.name: float(np.mean(rmse_um[reading])) for reading in AngleReading},
@@ -183,11 +164,34 @@ def compare_monte_carlo(bench: MeasuredBench) -> PartResult:
         "expected_mean_um": {
             reading.name: float(np.mean(expected_um[reading])) for reading in AngleReading
         },
-        "pair_mean_um": float(np.mean(pair_um)),
+        "pair_mean_um": pair_um,
         "budget_mean_um": budget_um,
     }
-    return PartResult(
-        comparisons, numbers, {"RMSE of the height": pictures.draw_maps(maps, axis_mm, "µm")}
+    maps = {str(reading): grid.fill_map(rmse_um[reading]) for reading in AngleReading}
+    drawn = {"RMSE of the height": pictures.draw_maps(maps, grid.axis_mm, "µm")}
+    return PartResult(comparisons, numbers, drawn)
+
+
+def _state_pair(pair_um: float, trials: int) -> PaperStatement:
+    """The mean RMSE of the change between two sets."""
+    return PaperStatement(
+        "RMSE of the change between two sets, mean over the mirror, µm",
+        "4 to 5",
+        f"{pair_um:.2g}",
+        judge_within(pair_um, *PAPER_PAIR_UM),
+        f"{trials} trials; the centre moves by {_PAIR_UM:g} µm between the sets; "
+        "the geometry cancels, and the paper's 0.4 ADU of white noise average out",
+    )
+
+
+def _state_part(name: str, value_um: float) -> PaperStatement:
+    """The mean effect of one input of the geometry."""
+    return PaperStatement(
+        f"part of {name}, mean over the mirror, µm (pixels keep their rays)",
+        "",
+        f"{value_um:.3g}",
+        Agreement.UNSTATED,
+        "by a change of one standard uncertainty",
     )
 
 
@@ -264,7 +268,7 @@ def _compute_effects_um(
         "b": _Trial(b_mm=b_mm),
         "alpha": _Trial(alpha_rad=alpha_rad),
     }
-    # errors that the nominal solution has itself cancel
+    # Errors that the nominal solution has itself cancel.
     nominal_mm = _solve_trial(inputs, _Trial(), reading)
     return {
         name: 1e3 * to_height @ (_solve_trial(inputs, trial, reading) - nominal_mm)
@@ -289,6 +293,7 @@ def compute_pair_rmse_um(inputs: TrialInputs, to_height: FloatArray, trials: int
     (points,) array
         Standard deviation of the change over the trials, µm.
     """
+    # The bench sees two bowls: the nominal one, and one whose centre moved.
     moved_mm = inputs.nominal.coeffs_mm.copy()
     moved_mm[[_X_SQUARED, _Y_SQUARED]] += _PAIR_UM / 1e3
     surfaces = (inputs.nominal, PolynomialSurface(moved_mm, inputs.nominal.radius_mm))
@@ -298,10 +303,11 @@ def compute_pair_rmse_um(inputs: TrialInputs, to_height: FloatArray, trials: int
         )
         for surface in surfaces
     ]
+
+    # Both are solved with the same wrong geometry; the second set has noise of its own.
     changes_mm = []
     for number in range(trials):
         trial = _draw(inputs, number)
-        # the second set has noise of its own
         noise_mm = _draw(inputs, trials + number).screen_mm
         before_mm = _solve_trial(pair[0], trial, AngleReading.PIXEL_RAYS)
         later = replace(trial, screen_mm=noise_mm)
@@ -314,6 +320,8 @@ def _screen_sigma_mm(bench: MeasuredBench, seen: SeenPoints) -> float:
 
     A point stands for several pixels: its noise is that of their mean.
     """
+    # Noise of one pixel's phase (section 1 of docs/explanation/metrology.md), averaged over the
+    # pixels of the bench's camera that one point stands for.
     swing_adu = bench.full.quality.modulation_share * (2**bench.optics.camera.bits - 1)
     shifts_rad = equal_shifts(bench.optics.pattern.steps)
     of_pixel_rad = phase_sigma_rad(shifts_rad, PIXEL_NOISE_ADU, swing_adu)
@@ -337,12 +345,16 @@ def _solve_trial(inputs: TrialInputs, trial: _Trial, reading: AngleReading) -> F
         inputs.geometry.b_mm + trial.b_mm,
         inputs.geometry.alpha_rad + trial.alpha_rad,
     )
+
+    # A wrong angle turns the camera with its rays, or leaves the points where they were.
     rays = inputs.seen.rays
     fixed_mm: FloatArray | None = None
     if reading is AngleReading.PIXEL_RAYS:
         rays = _turn_about_y(rays, trial.alpha_rad)
     else:
         fixed_mm = _intersect_surface(inputs.geometry, rays, nominal)
+
+    # In the y equations the angle acts as the geometry has it, not at all, or as in those of x.
     y_geometry: PaperGeometry | None = None
     y_change: SlopeChange | None = None
     if reading in (AngleReading.ANGLE_IN_X, AngleReading.ANGLE_AS_IN_X):
@@ -375,7 +387,8 @@ def _change_y(
 
 def _turn_about_y(rays: FloatArray, angle_rad: float) -> FloatArray:
     """Rays (3, n) of a camera that stands higher by an angle, and still looks at the vertex."""
-    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    cosine = math.cos(angle_rad)
+    sine = math.sin(angle_rad)
     turn = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
     return turn @ rays
 
@@ -384,9 +397,11 @@ def _intersect_surface(
     geometry: PaperGeometry, rays: FloatArray, surface: PolynomialSurface
 ) -> FloatArray:
     """Places (2, n) where rays meet a surface."""
+    # To the level of the last height, then the height there; each step contracts by slope times
+    # inclination.
     pinhole_mm = geometry.pinhole_mm[:, None]
     height_mm: FloatArray | float = 0.0
-    for _ in range(6):
+    for _ in range(_RAY_STEPS):
         place_mm = pinhole_mm + (height_mm - pinhole_mm[2]) / rays[2] * rays
         height_mm = surface.height_mm(place_mm[0], place_mm[1])
     return np.asarray(place_mm[:2])

@@ -36,6 +36,7 @@ def make_screen(bench: MeasuredBench) -> ScreenRaster:
 
 def compare_patterns(bench: MeasuredBench) -> PartResult:
     """Displayed patterns of x, and the frames that show them."""
+    # The patterns of x, as the paper's screen shows them and as the camera saw them.
     slots = FullSlots(bench.optics.pattern.steps)
     of_x = [*range(*slots.sinusoids[0].indices(99)), *range(*slots.gray[0].indices(99))]
     raster = make_screen(bench)
@@ -52,6 +53,8 @@ def compare_patterns(bench: MeasuredBench) -> PartResult:
             Agreement.REPRODUCED if count == 18 else Agreement.DIFFERS,
         ),
     ]
+
+    # The stated pitch against the height that eight periods need, and against a screen of 16:9.
     side_mm = bench.optics.pattern.periods * bench.optics.pattern.period_mm
     pitch_mm = _DIAGONAL_MM / math.hypot(16, 9) * 9 / _SCREEN_ROWS
     comparisons.append(
@@ -84,6 +87,7 @@ def compare_phases(bench: PaperBench) -> PartResult:
     true_mm = np.stack([bench.truth.s_x_mm, bench.truth.s_y_mm]).reshape(2, *white.shape)
     seen = _sees_pattern(bench, white, black)
 
+    # Axis by axis: equation 1 on the sinusoids, both orders of the Gray code, equation 2.
     wrong = {}
     error_rad = {}
     drawn: dict[str, bytes] = {}
@@ -92,7 +96,9 @@ def compare_phases(bench: PaperBench) -> PartResult:
         wrapped_rad = np.angle(phasor)
         k1, k2 = gray_orders(frames[slots.gray[axis]], white, black)
         phase_rad = absolute_phase(wrapped_rad, k1, k2)
-        # from -pi at the pattern's low edge
+
+        # The true phase, from -pi at the pattern's low edge; an order is wrong if it is half a
+        # period off or more.
         half_mm = pattern.periods * pattern.period_mm / 2
         true_rad = 2 * math.pi * (true_mm[axis] + half_mm) / pattern.period_mm - math.pi
         difference_rad = (phase_rad - true_rad)[seen]
@@ -121,9 +127,12 @@ def compare_phases(bench: PaperBench) -> PartResult:
 
 def compare_gray_table(bench: MeasuredBench) -> PartResult:
     """The Gray-code table: bits, K1 and K2 of each half period, and one bit changes at a time."""
+    # The code as it is displayed, and the orders that it decodes to.
     gray = FullSlots(bench.optics.pattern.steps).gray[0]
     bits = _displayed_bits(make_screen(bench), bench.patterns[gray])
     k1, k2 = code_orders(bits)
+
+    # Bits that change from one half period to the next, and the reflected binary code itself.
     changed = np.sum(bits[:, 1:] != bits[:, :-1], axis=0)
     half_periods = np.arange(2**GRAY_BITS)
     code = half_periods ^ (half_periods >> 1)
@@ -163,6 +172,7 @@ def compare_gray_table(bench: MeasuredBench) -> PartResult:
 
 def _displayed_bits(raster: ScreenRaster, patterns: Sequence[Pattern]) -> BoolArray:
     """Bits (patterns, half periods) of displayed codes of x, in the middle of each half period."""
+    # The column of the screen in the middle of each half period, from the pattern's low edge.
     middle_mm = (np.arange(2**GRAY_BITS) + 0.5) * raster.period_mm / 2
     columns = np.searchsorted(raster.from_low_edge_mm("x"), middle_mm)
     row = raster.height_px // 2

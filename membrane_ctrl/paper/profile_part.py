@@ -5,6 +5,7 @@ import numpy as np
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.paper import pictures
+from membrane_ctrl.paper.aperture_grid import ApertureGrid
 from membrane_ctrl.paper.bench import (
     EDGE_BELOW_HENCKY_MM,
     POISSON,
@@ -26,15 +27,17 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
     mirror = bench.optics.mirror
     reach_mm = mirror.analysis_radius_mm
     surface = bench.full.surface
-    # Mean of the measured height over the azimuth
+
+    # Mean of the measured height over the azimuth, and its scatter.
     radius_mm = np.linspace(0.0, reach_mm, _RINGS)
     angle_rad = 2 * np.pi * np.arange(_ANGLES)[:, None] / _ANGLES
-    x_mm, y_mm = radius_mm * np.cos(angle_rad), radius_mm * np.sin(angle_rad)
+    x_mm = radius_mm * np.cos(angle_rad)
+    y_mm = radius_mm * np.sin(angle_rad)
     height_mm = surface.height(x_mm, y_mm)
     profile_mm = height_mm.mean(axis=0)
     spread_mm = height_mm.std(axis=0)
 
-    # Hencky's film without and with a pre-strain
+    # Hencky's film without pre-strain, and with that which explains the paper's edge.
     rho = radius_mm / mirror.radius_mm
     hencky = FilmLaw(0.0, POISSON, STIFFNESS_N_PER_M, mirror.radius_mm).under_pressure(PRESSURE_PA)
     hencky_mm = hencky.height_mm(rho).ravel()
@@ -85,13 +88,12 @@ def compare_profile(bench: MeasuredBench) -> PartResult:
                 "with the exact geometry: what phases and reconstruction add",
             )
         )
-    # The pictures
-    axis_mm = np.linspace(-reach_mm, reach_mm, _SIDE)
-    grid_x, grid_y = np.meshgrid(axis_mm, axis_mm)
-    inside = np.hypot(grid_x, grid_y) <= reach_mm
-    sag_map = np.where(inside, surface.height(grid_x, grid_y), np.nan)
+
+    # The pictures.
+    grid = ApertureGrid.over_disc(reach_mm, _SIDE)
+    sag_map = grid.clip_map(surface.height(grid.x_mm, grid.y_mm))
     drawn = {
-        "surface height": pictures.draw_maps({"height": sag_map}, axis_mm, "mm"),
+        "surface height": pictures.draw_maps({"height": sag_map}, grid.axis_mm, "mm"),
         "radial profile": pictures.draw_curves(
             {"measured": (radius_mm, profile_mm), "Hencky": (radius_mm, hencky_mm)},
             "radius, mm",

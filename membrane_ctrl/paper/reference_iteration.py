@@ -132,7 +132,8 @@ def make_height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> 
     (n, terms) array
         In the order of `POWERS`.
     """
-    x, y = x_mm / radius_mm, y_mm / radius_mm
+    x = x_mm / radius_mm
+    y = y_mm / radius_mm
     return np.stack([x**i * y**j for i, j in POWERS], axis=1)
 
 
@@ -153,14 +154,16 @@ def make_slope_matrices(
     along_x, along_y : (n, terms) array
         Per mm, in the order of `POWERS`.
     """
-    x, y = x_mm / radius_mm, y_mm / radius_mm
+    # The slopes of a term are i x^(i-1) y^j / R and j x^i y^(j-1) / R.
+    x = x_mm / radius_mm
+    y = y_mm / radius_mm
     along_x = np.stack([i * x ** max(i - 1, 0) * y**j for i, j in POWERS], axis=1)
     along_y = np.stack([j * x**i * y ** max(j - 1, 0) for i, j in POWERS], axis=1)
     return along_x / radius_mm, along_y / radius_mm
 
 
 def make_parabola(depth_mm: float, radius_mm: float) -> StartShape:
-    """Make the paper's starting shape: a paraboloid with its vertex at the origin.
+    """Make the paper's starting shape (equation 20): a paraboloid with its vertex at the origin.
 
     Parameters
     ----------
@@ -249,19 +252,22 @@ def reconstruct(
     """
     if iterations < 1:
         raise ValueError("iterations must be at least 1")
+    # The change of height is compared at points of the analysed disc.
     probe = _probe_matrix(radius_mm, analysis_radius_mm)
     probe_x_mm, probe_y_mm = _probe_points(analysis_radius_mm)
     last_mm = start.height_mm(probe_x_mm, probe_y_mm)
     shape: StartShape | PolynomialSurface = start
     changes_mm: list[float] = []
     for _ in range(iterations):
-        # Points on the last shape, their slopes by the paper's equations, and the shape with these
-        # slopes.
+        # Step 1: points on the last shape, and their slopes (equations 3 to 14).
         points_mm = _place_points(geometry, seen, shape, fixed_mm)
         rays = _reflect(geometry, points_mm, shape)
         slopes = compute_slopes(geometry, points_mm, seen.screen_mm, rays, reading, y_geometry)
         if y_change is not None:
             slopes[1] += y_change(points_mm, slopes[1])
+
+        # Steps 2 and 3: the shape with these slopes (equations 19 and 21), and the largest change
+        # of height (equation 22).
         shape = _fit_slopes(points_mm, slopes, radius_mm)
         height_mm = probe @ shape.coeffs_mm
         changes_mm.append(float(np.max(np.abs(height_mm - last_mm))))
@@ -289,11 +295,17 @@ def predict_seen(
     SeenPoints
         The points of the screen that each ray reaches.
     """
+    # From the points of the surface, the reflected rays.
     points_mm = _place_points(geometry, SeenPoints(rays, np.zeros((2, 0))), surface, None)
     reflected = _reflect(geometry, points_mm, surface).reflected
-    cosine, sine = math.cos(geometry.alpha_rad), math.sin(geometry.alpha_rad)
+
+    # The screen's plane through O' = b (-cos alpha, 0, sin alpha), across O O'.
+    cosine = math.cos(geometry.alpha_rad)
+    sine = math.sin(geometry.alpha_rad)
     face = np.array([-cosine, 0.0, sine])
     centre_mm = np.asarray(geometry.b_mm)[..., None] * face
+
+    # Where they meet it, from O', along the screen's own x and y.
     reach_mm = ((centre_mm - points_mm.T) @ face) / (reflected @ face)
     on_screen_mm = points_mm.T + reach_mm[:, None] * reflected - centre_mm
     along_x = np.array([-sine, 0.0, -cosine])
@@ -307,8 +319,11 @@ def _place_points(
     fixed_mm: FloatArray | None,
 ) -> FloatArray:
     """Points (3, n) on the last surface."""
+    # Fixed x_0 and y_0: only the height follows the surface.
     if fixed_mm is not None:
         return np.stack([*fixed_mm, shape.height_mm(*fixed_mm)])
+
+    # Along the ray to the level of the last height, then the height there, and so on.
     pinhole_mm = geometry.pinhole_mm[:, None]
     height_mm: FloatArray | float = 0.0
     points_mm = pinhole_mm
@@ -323,6 +338,7 @@ def _reflect(
     geometry: PaperGeometry, points_mm: FloatArray, shape: StartShape | PolynomialSurface
 ) -> Reflection:
     """Normal, incident and reflected ray at points (3, n) of the last surface."""
+    # n ~ (-dh/dx, -dh/dy, 1), u from F to P, v = u - 2 (u n) n.
     slope_x, slope_y = shape.slopes(points_mm[0], points_mm[1])
     normal = np.stack([-slope_x, -slope_y, np.ones_like(slope_x)], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -333,7 +349,7 @@ def _reflect(
 
 
 def _fit_slopes(points_mm: FloatArray, slopes: FloatArray, radius_mm: float) -> PolynomialSurface:
-    """The paper's equation 19: least squares of both slopes."""
+    """The paper's equation 19: least squares of both slopes, without the singular piston."""
     along_x, along_y = make_slope_matrices(points_mm[0], points_mm[1], radius_mm)
     design = np.concatenate([along_x, along_y])
     coeffs_mm, *_ = np.linalg.lstsq(design, np.concatenate(slopes), rcond=None)

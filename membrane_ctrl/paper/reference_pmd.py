@@ -159,6 +159,7 @@ def predict_screen(
     (n,) array
         O'A, mm.
     """
+    # Equation 11 gives AE from the angle 2 theta, equation 8 then O'A.
     path = _Path.of(geometry, across_mm, height_mm)
     tangent = np.tan(-2.0 * np.arctan(slope))
     tilted_mm = path.reach_mm * tangent
@@ -221,6 +222,7 @@ def compute_projection_correction(rays: Reflection, axis: int) -> FloatArray:
     (n,) array
         Angle of the arriving ray less that of the leaving one, rad.
     """
+    # Normal and rays in the plane; the incident ray is turned round to leave the point.
     in_plane = [axis, 2]
     normal = rays.normal[:, in_plane]
     arriving_rad = _signed_angle(normal, -rays.incident[:, in_plane])
@@ -271,7 +273,9 @@ def compute_slopes(
         correction_x_rad = compute_projection_correction(rays, 0)
         correction_y_rad = compute_projection_correction(rays, 1)
     slope_x = compute_slope(geometry, x_mm, height_mm, screen_x_mm, correction_x_rad)
+
+    # The y equations see the bench in the plane that the reading of the text means.
     upright = (y_geometry or geometry).project_onto_yz(screen_x_mm, reading)
-    # O'A of the equations grows towards negative x; the screen's y coordinate grows with y
+    # O'A of the equations grows towards negative x; the screen's y coordinate grows with y.
     slope_y = compute_slope(upright, y_mm, height_mm, -screen_y_mm, correction_y_rad)
     return np.stack([slope_x, slope_y])

@@ -22,6 +22,7 @@ def compare_timings(bench: MeasuredBench) -> PartResult:
     stack = bench.stack
     # The unit that makes machines comparable: the time to copy the frames of a set.
     copy_s = min(_measure_time(stack.frames.copy) for _ in range(3))
+
     # The steps of `measure` alone: checks, phases, surface.
     check_s = _measure_time(lambda: check_set(stack, bench.optics, None))
     pixels_s = _measure_time(lambda: measure_pixels(bench.optics, bench.checked))
@@ -40,6 +41,7 @@ def compare_timings(bench: MeasuredBench) -> PartResult:
         _measure_time(lambda: live.measure_fringes(fringes, time_s[:count], readings_um[:count]))
         for _ in range(3)
     )
+
     # What the paper states of each step, and the seconds here.
     rows = {
         "frame checks and phases of the bins": ("", check_s),

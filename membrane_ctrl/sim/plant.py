@@ -217,7 +217,7 @@ class Plant:
         if self._room.is_steady:
             return
 
-        # The room's climate: warmer air, and films whose strain changes sag and volume alike.
+        # The room's climate: warmer air, and films whose strain scales sag and volume.
         time_s = np.asarray(block.time_s, dtype=np.float64)
         weather = self._room.make_block(time_s)
         self._climate = weather

@@ -111,7 +111,7 @@ def test_the_report_states_the_turn_that_was_found(
     [
         ("angle_deg = 1200.0", 2, "mirror_turned.angle_deg"),
         ("angle_deg = 120.0\nangle_sigma_deg = 0.0", 2, "mirror_turned.angle_sigma_deg"),
-        ("angle_deg = 240.0", 3, "degrees, mirror_turned says 240"),
+        ("angle_deg = 240.0", 3, "degrees, mirror_turned states 240"),
     ],
 )
 def test_a_turn_that_cannot_be_is_refused(

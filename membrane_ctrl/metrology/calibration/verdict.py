@@ -174,7 +174,7 @@ def _judge_screen_positions(solution: Solution) -> list[Cause]:
     causes = []
     for k, fall in model_tests.find_moved_screens(solution):
         description = (
-            "the screen was not where screen_moved says beside "
+            "the screen was not where screen_moved states, beside "
             f"{solution.problem.sets[k].name}: correct shift_mm, or its sigmas"
         )
         explained = fall - 2 * bench_poses.SCREEN_MOVE
@@ -220,7 +220,8 @@ def _describe_angle(problem: Problem, index: int, found_deg: float) -> str:
         stated_deg = phases.turned.angle_deg
     return (
         f"{phases.name}: the film's figure is turned by {found_deg:.4g} degrees, mirror_turned "
-        f"says {stated_deg:g} (counter-clockwise as the camera sees the mirror): correct angle_deg"
+        f"states {stated_deg:g} (counter-clockwise as the camera sees the mirror): correct "
+        "angle_deg"
     )
 
 

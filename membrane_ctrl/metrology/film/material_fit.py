@@ -158,7 +158,7 @@ def fit_film(
     """
     if len(figures) < 2:
         raise ValueError(
-            "one set cannot tell pre-strain from Poisson ratio: two or more pressures are needed"
+            "one set cannot separate pre-strain and Poisson ratio: two or more pressures are needed"
         )
     reach = analysis_mm / radius_mm
 

@@ -21,7 +21,7 @@ _BRIGHTEST_PERCENTILE = 95  # the swing that `CONTRAST_SHARE` refers to
 
 
 class NoFigureError(Exception):
-    """The frames give no figure; the message says why."""
+    """The frames give no figure; the message states why."""
 
 
 @dataclass(frozen=True)

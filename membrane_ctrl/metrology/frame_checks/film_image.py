@@ -1,4 +1,4 @@
-"""A second reflection of the screen in a part of the mirror: a film in front that nobody stated.
+"""A second reflection of the screen in a part of the mirror: a film in front that is not stated.
 
 A convex film in front shows the whole screen in a small part of the mirror. There white is brighter
 by a fifth, with sharp edges, but the fringes hardly swing more: the added light comes from other

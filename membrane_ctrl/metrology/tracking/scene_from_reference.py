@@ -80,7 +80,7 @@ def make_scene(
     if fringes < _LEAST_FRINGES:
         seen = f"only {fringes:.0f} fringes across the mirror"
         raise ValueError(
-            f"{seen}, {_LEAST_FRINGES} at least tell light from shape: use a shorter period"
+            f"{seen}, but {_LEAST_FRINGES} or more separate light and shape: use a shorter period"
         )
 
     # What the reference shows, in its bins, and then in the larger bins of the scene.

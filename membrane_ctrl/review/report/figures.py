@@ -274,7 +274,7 @@ def _draw_overview(analysis: Analysis, width_in: float, height_in: float) -> Mar
             plot.plot(
                 time, level["mean_true_error_um"], color=GREEN, lw=0.9, label="true centre (twin)"
             )
-        # The scale is that of the band; a title says how far the error goes beyond it.
+        # The scale is that of the band; the title states how far the error goes beyond it.
         most_um = _SHOWN_BANDS * band_um
         plot.set_ylim(-most_um, most_um)
         largest_um = float(np.nanmax(np.abs(ends), initial=0.0))

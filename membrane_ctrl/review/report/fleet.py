@@ -156,8 +156,8 @@ def _make_fleet_entry(analysis: Analysis, table: dict[str, Any]) -> dict[str, An
 
 
 def list_fleet_folders(given: Sequence[Path]) -> list[Path]:
-    """The runs that are named, or lie in a named folder, each once; a folder without a run stands
-    for itself.
+    """The runs that are named, or lie in a named folder, each once; a folder without a run
+    is listed itself.
     """
     found: list[Path] = []
     for each in given:

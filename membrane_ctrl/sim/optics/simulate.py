@@ -335,6 +335,8 @@ def simulate_track(
     noise_um = np.random.default_rng(spec.seed + 1).normal(0.0, spec.laser_noise_um, frames)
     rows = []
     for k in range(frames):
+        # The first frames step the pattern, x once and y twice around: five steps separate both
+        # phases and the mean.
         shift_x_rad = 0.0
         shift_y_rad = 0.0
         if k < _STEPS:
@@ -343,6 +345,8 @@ def simulate_track(
         pattern = optical_roles.Pattern(
             "crossed", "", _CROSSED_PERIODS, shift_x_rad, shift_y_rad=shift_y_rad
         )
+
+        # Its row of `capture.toml`, and its picture.
         row: dict[str, Any] = {
             "file": f"t_{k:05d}.png",
             "role": "crossed",
@@ -374,7 +378,7 @@ def simulate_track(
     }
     (target / "capture.toml").write_bytes(tomli_w.dumps(table).encode())
 
-    # Their truth.
+    # Their truth: sag and displacement without vibrations, which have columns of their own.
     sag_um = np.array([1e3 * spec.film.sag_at_mm(float(d)) for d in displacement_um])
     truth: dict[str, Any] = {"time_s": time_s, "displacement_um": displacement_um, "sag_um": sag_um}
     coeffs = [spec.film.coeffs_um(float(d)) for d in displacement_um]
@@ -402,11 +406,14 @@ class _SeenDirectly(OpticsRenderer):
         self, directions: FloatArray, displacement_um: float, film: Any = None
     ) -> Trace:
         """The rays meet the screen's plane, and then its face."""
+        # In the screen's own frame, with its normal as third axis.
         screen = self._screen_pose
         axes = np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)])
         start = axes @ (self._camera_pose.position_mm - screen.origin_mm)
         along = directions @ axes.T
         tangents = along[:, :2].T / along[:, 2]
+
+        # Where a ray crosses the plane, then the face along the ray.
         on_plane_mm = start[:2, None] - start[2] * tangents
         seen_mm = project_onto_face(on_plane_mm, tangents, screen.bow_per_mm, screen.height_map)
         zeros = np.zeros(len(along))
@@ -468,6 +475,7 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
 
 def _list_exposures(spec: SimulationSpec) -> list[_Exposure]:
     """The true pattern, film position and exposure time of each frame."""
+    # As intended, then changed by the faults in their order.
     exposures = [
         _Exposure(pattern, spec.displacement_um(frame), spec.time_s(frame))
         for frame, pattern in enumerate(spec.patterns)

@@ -262,6 +262,7 @@ class SimulationSpec:
     stiffness_n_per_m: float = gas_film.MODULUS_PA * gas_film.MIRROR_FILM.thickness_um * 1e-6
 
     def __post_init__(self) -> None:
+        # What belongs to one kind of set alone.
         if self.kind == "fringes" and not self.reference:
             raise ValueError(
                 "reference: a fringes set needs the full set that anchors it, as ../0000"
@@ -282,6 +283,8 @@ class SimulationSpec:
             )
         if len(set(self.coarser_mm)) < len(self.coarser_mm):
             raise ValueError("coarser_mm: a period occurs twice")
+
+        # One number for each phase step and each frame, all finite.
         if self.shifts_rad and len(self.shifts_rad) != self.optics.pattern.steps:
             raise ValueError(
                 f"shifts_rad: {len(self.shifts_rad)} shifts for steps = {self.optics.pattern.steps}"
@@ -302,6 +305,8 @@ class SimulationSpec:
         ):
             if not (isfinite(value) and value >= 0):
                 raise ValueError(f"{name} = {value} must be 0 or more")
+
+        # Faults of frames that the set has; a stale frame needs one before it, a swapped one after.
         for fault in self.faults:
             if fault.frame not in names:
                 raise ValueError(

@@ -139,7 +139,7 @@ def test_a_mirror_that_was_turned_otherwise_is_named_before_anything_is_solved(
     assert finding.fatal
     found_deg = float(finding.description.split("turned by ")[1].split()[0])
     assert found_deg == pytest.approx(120.0, abs=5.0)
-    assert f"mirror_turned says {stated_deg:g}" in finding.description
+    assert f"mirror_turned states {stated_deg:g}" in finding.description
 
 
 def test_a_mirror_that_was_turned_a_little_otherwise_is_named_with_its_angle() -> None:
