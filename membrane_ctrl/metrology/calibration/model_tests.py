@@ -213,6 +213,7 @@ def find_suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
 
 def laser_scale(solution: solver.Solution) -> LaserScale:
     """The laser's scale without a prior."""
+    # One step from the solution, with a wide sigma instead of the prior.
     k = bench_parameters.NAMES.index(bench_parameters.LASER.name)
     free = solution.problem.sigmas.copy()
     free[k] = _LASER_SIGMA

@@ -90,11 +90,14 @@ class Bands:
 
         `clear` is the power of each frequency over what a wave must have.
         """
+        # Its frequency, which must be farther from the known ones than a line is wide.
         rows = self._place.size
         found_rad = 2 * np.pi * int(np.argmax(clear)) / (FREQUENCIES_PER_BIN * rows)
         is_other = np.abs(self._rad_per_row - found_rad) > 2 * np.pi * WAVE_WIDTH / rows
         if len(self._rad_per_row) == MOST_BANDS or not is_other.all() or np.max(clear) < 1:
             return False
+
+        # The mean power is that of other waves from now on: begin again.
         self._mean *= 0
         self._rad_per_row = np.append(self._rad_per_row, found_rad)
         self._determined = np.append(self._determined, 0.0)

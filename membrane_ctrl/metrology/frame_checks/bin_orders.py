@@ -90,8 +90,11 @@ def _follow_anchor(view: bin_view.BinView, anchor: Anchor) -> FloatArray:
     """Absolute phases nearest to the anchor's. Raises NoFigureError if the film moved so far that
     the orders are not certain.
     """
+    # The change modulo 2 pi, which is the change itself while it is below half a period.
     change_rad = np.angle(np.exp(1j * (view.phase_rad - anchor.phase_rad)))
     seen = view.mask & np.isfinite(anchor.phase_rad).all(axis=0)
+
+    # A field of changes that passes half a period anywhere shows points just below it.
     lost = 1.0
     if seen.any():
         largest_rad = np.abs(change_rad[:, seen]).max(axis=0)

@@ -224,6 +224,7 @@ def _average_bins(
     """Means of values (n,) over squares of bins, of those that have one."""
     if side == 1:
         return values
+    # Mean over a square of values and zeros, divided by the share of bins that have one.
     sums = np.zeros(shape)
     known = np.zeros(shape)
     sums.reshape(-1)[index] = values

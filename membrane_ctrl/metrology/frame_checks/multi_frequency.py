@@ -203,6 +203,8 @@ def _all_series(
                 )
                 named = tuple(Flag(n, FrameDefect.LEFT_OUT, "left out", np.inf) for n in left_out)
                 raise RejectedSetError(reason, named) from None
+
+            # The light of the bins in these steps.
             seen = binned.means[frames][:, mask].astype(float)
             yield _Series(k, period_mm, frames, shifts, seen)
 

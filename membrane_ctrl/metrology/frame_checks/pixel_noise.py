@@ -38,9 +38,12 @@ def estimate_pixel_noise_adu(
     float
         In ADU; NaN for three steps, which leave nothing.
     """
+    # N steps leave N - 3 numbers of a pixel that level, contrast and phase do not explain.
     freedom = sum(len(frames) - 3 for frames in used)
     if freedom == 0 or index.size == 0:
         return math.nan
+
+    # Squares of what the steps leave, of some pixels; the median is robust to dust and motion.
     some = index[:: max(1, index.size // _SAMPLES)]
     row, column = np.divmod(some, stack.size_px[1])
     squares = np.zeros(some.size)

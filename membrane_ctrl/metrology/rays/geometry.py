@@ -100,6 +100,8 @@ class Geometry:
         columns, rows = np.broadcast_arrays(
             np.asarray(columns_px, float), np.asarray(rows_px, float)
         )
+
+        # Tangents to the axis, without the lens' distortion; z forward, then turned into world.
         x = (columns - self.principal_px[0]) / self.focal_px
         y = (rows - self.principal_px[1]) / self.focal_px
         if any(self.distortion):

@@ -118,6 +118,7 @@ def _wave_tables() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def _flatten_tables(table: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Polynomials (k, degree + 1, degree + 1) and their derivatives along x and y, (k, terms)."""
+    # Terms x^p y^q with p + q up to the degree, one column each.
     degree = table.shape[1] - 1
     powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p)]
     p, q = np.array(powers).T

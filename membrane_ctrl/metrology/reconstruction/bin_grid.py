@@ -27,6 +27,7 @@ class BinGrid:
     def __init__(self, geometry: Geometry, camera: CameraConfig, bin_px: int) -> None:
         self._geometry = geometry
         self._bin_px = bin_px
+        # Centres of the bins: pixel centres are integers. Pixels that fill no bin are left out.
         middle = (bin_px - 1) / 2
         columns = np.arange(camera.width_px // bin_px) * bin_px + middle
         rows = np.arange(camera.height_px // bin_px) * bin_px + middle

@@ -86,6 +86,7 @@ def image_lag_of_cycles(bench: TrialBench, shifts_rad: FloatArray, lag: ImageLag
     (parameters,) array
         Change of the surface's parameters by 1 sigma, mm.
     """
+    # The steps of a fringes-only cycle; only their patterns are needed, not their frames.
     patterns = fringe_sequence(bench.optics.pattern)
     shifted = tuple(
         replace(pattern, shift_rad=float(shift))
@@ -94,8 +95,12 @@ def image_lag_of_cycles(bench: TrialBench, shifts_rad: FloatArray, lag: ImageLag
     count = len(shifted)
     stack = FrameStack(np.empty((count, 0, 0), np.uint8), shifted, np.full(count, np.nan), {})
     used = (stack.sinusoids(AXES[0]), stack.sinusoids(AXES[1]))
-    sigma = lag.remaining_sigma if math.isfinite(lag.remaining_sigma) else 0.0
-    return sigma * image_lag_effect(bench, stack, used)
+
+    # The effect of a share of 1, times what is not known of the share.
+    effect_mm = image_lag_effect(bench, stack, used)
+    if not math.isfinite(lag.remaining_sigma):
+        return 0.0 * effect_mm
+    return lag.remaining_sigma * effect_mm
 
 
 def image_lag_effect(

@@ -39,6 +39,7 @@ def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
         if sigma == 0:
             columns.append(np.zeros(PARAMETERS))
             continue
+        # The surface solved on benches that are one sigma off to either side.
         step = np.zeros(len(spread.names))
         step[k] = sigma
         above = bench.solve(bench.geometry(spread.names, step), linear=True)

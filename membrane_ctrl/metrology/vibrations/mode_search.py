@@ -472,6 +472,7 @@ def _aliases_hz(rates_hz: list[float], frequency_hz: float, most_hz: float) -> t
     """
     if not _have_one_rate(rates_hz):
         return ()
+    # At a rate r a frequency shows as |f - n r|, and so do all |m r +- alias|.
     rate_hz = float(np.mean(rates_hz))
     alias_hz = abs(frequency_hz - rate_hz * round(frequency_hz / rate_hz))
     every = {
@@ -543,6 +544,7 @@ def _scatter_hz(lines: list[FloatArray], grid_hz: FloatArray, k: int) -> float:
     """
     if len(lines) < 2:
         return 0.0
+    # The largest power of each piece within the distance of two lines, refined between the grid.
     reach = round(_APART_HZ * _GRID * PIECE_S)
     first = max(k - reach, 0)
     last = min(k + reach + 1, grid_hz.size)

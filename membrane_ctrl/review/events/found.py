@@ -266,11 +266,14 @@ def _select_held(level: found_event.Level) -> found_event.Level:
 
 def _fill_missing_seconds(level: found_event.Level) -> found_event.Level:
     """The level with a row for every second; NaN for missing ones."""
+    # The row of each second, counted from the first one.
     second = np.rint(level["time_s"]).astype(np.int64)
     place = second - second[0]
     size = int(place[-1]) + 1
     if size == second.size:
         return level
+
+    # All columns on these rows. Missing seconds have their time, and no ticks.
     even: found_event.Level = {}
     for name, values in level.items():
         even[name] = np.full(size, np.nan)

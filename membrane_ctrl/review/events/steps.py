@@ -73,6 +73,8 @@ def mean_differences(values: Column, half: int, skip: int) -> Column:
     span = 2 * half + skip
     if values.size < span:
         return result
+
+    # The mean of each group that begins at a place; those after a step begin `half + skip` later.
     windows = np.lib.stride_tricks.sliding_window_view(
         np.asarray(values, dtype=np.float64), half
     ).mean(axis=1)

@@ -136,7 +136,9 @@ def make_timeline(analysis: Analysis) -> list[LoggedEvent]:
     """Notable events, in order; without events, states from the telemetry."""
     notable = [each for each in analysis.run.log if each.event.notable]
     if not any(isinstance(each.event, events.StateEntered) for each in notable):
-        time_s, codes = analysis.level["time_s"], analysis.level["state"]
+        # A line where the state differs from that of the window before.
+        time_s = analysis.level["time_s"]
+        codes = analysis.level["state"]
         lines = (
             {
                 "mono_s": float(time_s[row]),

@@ -160,9 +160,15 @@ def _find_events_and_shape(
 
 
 def _compute_benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
-    second, counts, sums = ticks.seconds[TRUE if true else READING]
+    # Sums of each second: the error, and what the feed-forward has kept away from it.
+    signal = READING
+    if true:
+        signal = TRUE
+    second, counts, sums = ticks.seconds[signal]
     if not np.isfinite(sums[KEPT_AWAY]).any():
         return None
+
+    # 1 s means of the error as it was, and as it would have been without.
     error = sums[ERROR]
     _, held = window_means(second, counts, error, 1, run.config.loop.rate_hz)
     without = np.stack(

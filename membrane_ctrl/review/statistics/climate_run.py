@@ -80,7 +80,8 @@ def read_minutes(run: Run) -> dict[str, FloatArray]:
     names = [f"mean_{name}" for name in _SENSORS]
     level = run.level(_WINDOW_S, names=names)
     time_s = np.asarray(level["time_s"])
-    # Means of the figures of each minute.
+
+    # Means of the figures of each minute; NaN in a minute without one.
     minute = np.searchsorted(time_s, shape_s, side="right") - 1
     counts = np.bincount(np.clip(minute, 0, None), minlength=time_s.size)[: time_s.size]
     sums = np.bincount(np.clip(minute, 0, None), spherical_um, time_s.size)[: time_s.size]

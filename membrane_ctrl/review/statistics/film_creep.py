@@ -107,8 +107,11 @@ def _average_blocks(time_s: FloatArray, y: FloatArray) -> tuple[FloatArray, Floa
     span_s = float(np.ptp(time_s)) if time_s.size else 0.0
     if time_s.size <= _BLOCKS or span_s == 0:
         return time_s, y
+    # The block of each reading; the last reading belongs to the last block.
     block = ((time_s - time_s[0]) / span_s * _BLOCKS).astype(int)
     block = np.minimum(block, _BLOCKS - 1)
+
+    # Means over the blocks that have readings.
     count = np.bincount(block)
     full = count > 0
     mean_time_s = np.bincount(block, time_s)[full] / count[full]
@@ -136,13 +139,16 @@ def _fit_law(t: FloatArray, y: FloatArray, onset: float, bend: float, lasting: f
         Correlation of the noise from one reading to the next.
     """
     u = np.log(t + onset) - math.log(onset)
-    # Covariance of W, an integrated random walk from u = 0
+
+    # Covariance of W, an integrated random walk from u = 0.
     earlier = np.minimum.outer(u, u)
     later = np.maximum.outer(u, u)
     curve = bend**2 * earlier**2 * (3 * later - earlier) / 6
+
     # Covariance of the noise, in its own variance: a first-order autoregressive process
     number = np.arange(y.size)
     noise = lasting ** np.abs(np.subtract.outer(number, number))
+
     # Whiten the line's two columns, the readings, and the covariance of the drift with the readings
     root = np.linalg.cholesky(curve[:-1, :-1] + noise)
     line_columns = np.stack([np.ones(y.size), u[:-1] - u[-2]], axis=1)
@@ -151,6 +157,7 @@ def _fit_law(t: FloatArray, y: FloatArray, onset: float, bend: float, lasting: f
     columns = whitened[:, :2]
     readings = whitened[:, 2]
     gain = whitened[:, 3]
+
     # Least squares for the line a + b u; its residual carries W
     normal = columns.T @ columns
     inverse = np.linalg.inv(normal)
@@ -158,13 +165,16 @@ def _fit_law(t: FloatArray, y: FloatArray, onset: float, bend: float, lasting: f
     residual = readings - columns @ line
     freedom = y.size - 2
     variance = max(float(residual @ residual), 1e-30) / freedom
+
     # Drift from the last reading to the time ahead: of the line, and of W
     step = np.array([0.0, u[-1] - u[-2]])
     drift = float(step @ line + gain @ residual)
+
     # Its variance: of W given the readings, and of the line that is estimated from them
     of_curve = curve[-1, -1] + curve[-2, -2] - 2 * curve[-1, -2] - gain @ gain
     untaken = step - columns.T @ gain
     of_line = untaken @ inverse @ untaken
+
     # Marginal likelihood, with the line and the noise's variance integrated out
     evidence = (
         -np.sum(np.log(np.diag(root)))

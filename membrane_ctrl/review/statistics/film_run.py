@@ -99,13 +99,17 @@ def film_run_command(
 
 def _read_cycles(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
     """UTC in s, sag in mm and gauge pressure in Pa of the cycles of a run that gave a figure."""
-    shapes, level = run.shapes(), run.level(_LEVEL_S, names=(_GAUGE,))
+    # Figures of the cycles, and minute means of the gauge.
+    shapes = run.shapes()
+    level = run.level(_LEVEL_S, names=(_GAUGE,))
     known = np.isfinite(level[_GAUGE])
     good = np.isfinite(shapes.sag_um) & np.isin(shapes.verdict, ("ok", "degraded"))
     if not (known.any() and good.any()):
         raise errors.RejectedError(
             f"{run.folder}: without figures and a gauge a run shows nothing of its film"
         )
+
+    # The pressure at the time of each figure, between the middles of the minutes.
     time_s = np.asarray(shapes.time_s[good], float)
     middle_s = level["time_s"][known] + _LEVEL_S / 2
     pressure_pa = np.interp(time_s, middle_s, level[_GAUGE][known])

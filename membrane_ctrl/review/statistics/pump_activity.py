@@ -70,10 +70,12 @@ def _flow_limits(run: Run) -> tuple[Column, Column]:
     """Times from which a largest flow applied, and those flows: they change with a curve of
     the pump.
     """
+    # The configuration at the start, and after each event that changed the loop's settings.
     found = [(-math.inf, run.config)]
     status = RunStatus()
     for each in run.log:
-        before, status = status.loop, status.after_event(each.event, each.mono_s)
+        before = status.loop
+        status = status.after_event(each.event, each.mono_s)
         if status.loop is not before:
             found.append((each.mono_s, run.config.with_gains(status.loop)))
     since_s, most = np.array(

@@ -49,14 +49,14 @@ def window_means(
     """
     if not second.size:
         return np.empty(0), np.empty(0)
+    # Sums over the seconds of each window; windows with too few ticks or a gap do not count.
     number = second // window_s
     starts = group_starts(number)
     ticks = np.add.reduceat(counts, starts)
     total = np.add.reduceat(sums, starts)
     whole = (ticks >= count_least_ticks(window_s, rate_hz)) & np.isfinite(total)
-    return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[
-        whole
-    ] / ticks[whole]
+    middles_s = np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64)
+    return middles_s, total[whole] / ticks[whole]
 
 
 def describe_windows(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:

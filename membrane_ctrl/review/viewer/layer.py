@@ -250,6 +250,7 @@ class Layer:
     def _send_found_lines(self, found: Sequence[FoundEvent]) -> None:
         """Send a vertical line at each detected event; those of a kind have one name and colour."""
         for kind in dict.fromkeys(each.kind for each in found):
+            # Its name: how many there are, and the range of their sizes.
             of_kind = sorted((f for f in found if f.kind == kind), key=lambda f: f.size)
             smallest, largest = (_format_size(f.size, f.unit) for f in (of_kind[0], of_kind[-1]))
             sizes = smallest
@@ -258,6 +259,8 @@ class Layer:
             name = f"{kind}, {sizes}"
             if len(of_kind) > 1:
                 name = f"{len(of_kind)} of {kind}, {sizes}"
+
+            # One line series for all of them.
             colour = _FOUND_COLOURS.get(kind, _OTHER_FOUND)
             path = f"/found/lines/{kind.replace(' ', '_')}"
             self._send_style(path, [(name, colour)], 1.0, vertical=True)

@@ -141,6 +141,7 @@ class Disturber:
 
     def _dust_at(self, time_s: float) -> FloatArray:
         """Share of light that passes; the spots change their places every 25 s."""
+        # Computed when the spots have moved; their places follow from seed and number of the move.
         nodes = self._nodes
         change = math.floor(time_s / _DUST_S)
         if self._wanted.dust and self._dust[0] != change:

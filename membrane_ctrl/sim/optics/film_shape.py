@@ -260,6 +260,7 @@ def typical_film(
     prestrain, poisson : float
         The film's pre-strain and Poisson ratio.
     """
+    # Pairs of a cosine and a sine term, each pair in a direction of its own.
     rng = np.random.default_rng(seed)
     coeffs_um = np.zeros(_TYPICAL_TERMS)
     for amplitude_um, sine, cosine in ((300.0, 5, 6), (100.0, 7, 8), (50.0, 9, 10)):

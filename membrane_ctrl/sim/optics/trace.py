@@ -111,6 +111,7 @@ def find_film_distance(
     """
     t = guess_mm
     for _ in range(_MAX_STEPS):
+        # Height of the point above the film there, and the step that makes it 0.
         x = start[0] + t * direction[0]
         y = start[1] + t * direction[1]
         h, hx, hy = height_and_slopes(film, sag_mm, x, y)
