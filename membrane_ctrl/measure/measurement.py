@@ -29,7 +29,9 @@ class Measurement:
     head : CaptureHead
         The set.
     verdict : "ok", "degraded" or "rejected"
-        The worst finding; `reason` names it.
+        By the worst finding.
+    reason : str
+        That finding, for people; empty if the verdict is "ok".
     flags : tuple of Flag
         Frames that do not belong to the set.
     checked, full : Checked, FullResult or None
@@ -230,7 +232,9 @@ class SetFigure:
     checked, figure : Checked, BinFigure
         Its frames and its surface.
     verdict : "ok" or "degraded"
-        The verdict; `reason` explains it.
+        The verdict.
+    reason : str
+        Why it is degraded; empty if it is not.
     time_s, displacement_um : float
         Means over the sinusoids; NaN where the set states none.
     """

@@ -22,7 +22,9 @@ class SetStatement:
     Attributes
     ----------
     verdict : "ok" or "degraded"
-        How good the set is; `reason` explains it.
+        How good the set is.
+    reason : str
+        Why it is degraded; empty if it is not.
     geometry : GeometryStatement
         How well its geometry is known.
     budget : Budget

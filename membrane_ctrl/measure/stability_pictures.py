@@ -152,15 +152,29 @@ def log_stability(
     lines: Sequence[str],
     pictures: Sequence[Path],
 ) -> None:
-    """Write a stability run to a recording `path` (.rrd), overwriting it. Raises OSError if it
-    cannot be written.
+    """Write a stability run as a Rerun recording.
 
     Parameters
     ----------
+    path : Path
+        The file (.rrd), replaced if it exists.
+    points : sequence of str
+        Names of the followed points.
+    time_s : (n,) array
+        Time of each set with a figure.
     heights_um, coeffs_um : (n, points), (n, terms) arrays
         Shown relative to their means, without piston.
     sd_um : (m, m) array
         Map of standard deviations, rows along y, NaN outside.
+    lines : sequence of str
+        The result as lines of text.
+    pictures : sequence of Path
+        PNG files.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
     """
     terms = zernike_labels(first=2)
     with open_recording(path, "membrane_ctrl_stability", _make_blueprint(pictures)) as recording:

@@ -54,11 +54,10 @@ def export_run(
 ) -> list[Path]:
     """Write a run's columns.
 
-    Raises InputError if the format or a stream is unknown, h5py is missing, the run has none of the
-    requested data, or the folder belongs to a run; DeviceError if the folder cannot be written.
-
     Parameters
     ----------
+    run : Run
+        The run; notes on missing parts are added to it.
     to : str
         One of `FORMATS`.
     out : str or Path
@@ -68,7 +67,20 @@ def export_run(
         Rerun paths (`/loop/error`), fields (`error_um`), `shapes` or `events`; everything by
         default.
     start_s, end_s : float
-        Part of the run.
+        Part of the run, s from its start.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+
+    Raises
+    ------
+    InputError
+        The format or a stream is unknown, h5py is missing, the run has none of the requested data,
+        or the folder belongs to a run.
+    DeviceError
+        The folder cannot be written.
     """
     if to not in FORMATS:
         raise errors.InputError(f"--format {to}: known: {', '.join(FORMATS)}")

@@ -27,10 +27,18 @@ class SetBench:
 
     Attributes
     ----------
+    optics : OpticsConfig
+        The stated bench.
+    geometry : Geometry
+        Its poses and lens.
+    grid : BinGrid
+        Bins of the sensor and their rays.
     near : (bins,) bool array
         Bins whose rays may meet the mirror.
     reflecting : (bins,) bool array
         Bins in which a front film may show the pattern again: the surface is fitted without them.
+    anchor : Anchor or None
+        Fringe orders of another set, for a set of fringes alone.
     """
 
     optics: OpticsConfig

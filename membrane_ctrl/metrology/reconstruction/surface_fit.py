@@ -79,6 +79,8 @@ def fit_surface(
         A matrix to keep instead of recomputing it each step (the solution is the same).
     tolerance_mm : float
         Stop when the largest change of height, after the contraction still to come, is below this.
+    max_iterations : int
+        Steps after which the fit ends anyway.
 
     Returns
     -------

@@ -159,10 +159,12 @@ def _variances_p(a: Column, b: Column) -> float:
 
 
 def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> float:
-    """Probability of means this different between equal series (times and values); NaN: too short.
+    """Probability of means this different between equal series; NaN: too short.
 
     Parameters
     ----------
+    a, b : (2, n), (2, m) arrays
+        Times in s and values of both series.
     window_s : float
         Length of a value's window.
     offset : float

@@ -62,6 +62,8 @@ def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) 
     ----------
     values : (n,) array
         NaN in gaps: segments with gaps are omitted.
+    rate_hz : float
+        Values a second.
     length : int, optional
         Length of a segment; by default an eighth of the series, at most 32768.
     """

@@ -196,6 +196,8 @@ def make_review(
     ----------
     runs : sequence of Run
         One run, or several to overlay.
+    options : ReviewOptions
+        For the requested part, the cursor, and how several runs are aligned.
     file : Path
         File to write.
 

@@ -118,6 +118,8 @@ class Layer:
 
         Parameters
         ----------
+        run : Run
+            The run.
         label : str
             Name among several runs; empty for a single one.
         zero_s : float
