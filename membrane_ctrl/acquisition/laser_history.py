@@ -12,10 +12,6 @@ from collections import deque
 from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes.ring import RingAddress, RingReader
 
-# One reading has 1 µm of noise, ten times the held centre's motion between frames: a frame gets the
-# mean of the readings around it. 0.2 s to each side are 20 readings at 50 Hz (0.22 µm), symmetric
-# in time so that a steady motion cancels; in these 0.4 s the held centre moves less than the
-# remaining noise.
 HALF_WINDOW_S = 0.2
 HALF_WINDOW_TICKS = 2.0  # below 10 Hz there would be too few readings for a mean
 LEAST_READINGS = 3

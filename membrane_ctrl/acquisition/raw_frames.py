@@ -102,6 +102,7 @@ class RawFrames:
         self._reported = ""  # the reason of the last event
         self._in_fault = False
         self._kept: dict[int, Path] = {}  # folders by the number of the cycle
+        self._removed: set[Path] = set()  # folders that are free once the writer comes to them
         self._reference: Path | None = None  # the newest accepted full cycle
         self._reference_needed = False  # a set refers to it, or a person requested it
         self.left_out = 0
@@ -123,7 +124,7 @@ class RawFrames:
         if is_reference and kept is not None:
             # It replaces the former reference, which is removed unless a set refers to it.
             if self._reference is not None and not self._reference_needed:
-                self._writer.submit(shutil.rmtree, self._reference, ignore_errors=True)
+                self._remove_set(self._reference)
             self._reference = kept
             self._reference_needed = is_due
 
@@ -211,6 +212,12 @@ class RawFrames:
         self._writing.append(_Write(cycle, path, found.size_bytes, done))
         return path
 
+    def _remove_set(self, folder: Path) -> None:
+        """Remove a set to which no other refers; its cycle may be kept again."""
+        self._writer.submit(shutil.rmtree, folder, ignore_errors=True)
+        self._kept = {cycle: path for cycle, path in self._kept.items() if path != folder}
+        self._removed.add(folder)
+
     def _find_objection(self, found: _Set) -> str:
         """Why a set cannot be written now; empty if it can."""
         if len(self._writing) >= _WAITING_SETS:
@@ -253,9 +260,10 @@ class RawFrames:
         """A free name for the set; a replacement acquisition counts its cycles from 1 again."""
         path = self._folder / f"cycle-{cycle:06d}"
         number = 1
-        while path.exists():
+        while path.exists() and path not in self._removed:
             number += 1
             path = path.with_name(f"cycle-{cycle:06d}-{number}")
+        self._removed.discard(path)
         return path
 
     def _copy_frames(self, cycle: int) -> _Set | None:

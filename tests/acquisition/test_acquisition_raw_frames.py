@@ -27,8 +27,10 @@ OPTICS = OpticsConfig(camera=CameraConfig(width_px=16, height_px=8))
 class Keeping:
     """The ring of frames, the telemetry, and the keeper of frames."""
 
-    def __init__(self, stack: ExitStack, folder: Path, **recording: int | float) -> None:
-        frames = FrameRing.for_optics(OPTICS, 2)
+    def __init__(
+        self, stack: ExitStack, folder: Path, ring_cycles: int = 2, **recording: int | float
+    ) -> None:
+        frames = FrameRing.for_optics(OPTICS, ring_cycles)
         stack.callback(frames.close)
         telemetry = stack.enter_context(open_ring(64, ROW_BYTES))
         self._frames = stack.enter_context(closing(FrameWriter(frames.address)))
@@ -100,6 +102,16 @@ def test_the_last_cycles_before_a_fault(stack: ExitStack, tmp_path: Path) -> Non
         keeping.take()
     keeping.fault(7)
     assert keeping.kept() == ["cycle-000001", "cycle-000004", "cycle-000005"]
+
+
+def test_a_former_anchor_that_made_room_is_kept_before_a_fault(
+    stack: ExitStack, tmp_path: Path
+) -> None:
+    keeping = Keeping(stack, tmp_path, ring_cycles=5, raw_before_fault_cycles=5)
+    keeping.take("full")
+    keeping.take("full")
+    keeping.fault(7)
+    assert keeping.kept() == ["cycle-000001", "cycle-000002"]
 
 
 def test_a_fault_is_kept_once_and_a_new_one_again(stack: ExitStack, tmp_path: Path) -> None:

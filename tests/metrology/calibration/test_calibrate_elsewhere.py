@@ -229,7 +229,9 @@ def test_a_screen_at_another_place_than_stated_is_reported() -> None:
         replace(problem, sets=(seen_directly(values, (0.0, 25.0), 4), first, moved))
     )
     (finding,) = (each for each in check_solution(solution) if each.fatal)
-    assert finding.description.startswith("the screen was not where screen_moved states, beside set1")
+    assert finding.description.startswith(
+        "the screen was not where screen_moved states, beside set1"
+    )
 
 
 @pytest.mark.campaign
