@@ -107,10 +107,8 @@ class Block:
         """Values by name to words, big word first. Raises ValueError
         if one does not fit its type.
         """
-        packed = self.layout.pack(
-            *(register.to_raw(values[register.name]) for register in self.registers)
-        )
-        return list(struct.unpack(f">{self.count}H", packed))
+        raws = [register.to_raw(values[register.name]) for register in self.registers]
+        return list(struct.unpack(f">{self.count}H", self.layout.pack(*raws)))
 
     def decode(self, words: Sequence[int]) -> dict[str, float]:
         """Words, big word first, to values by name. Raises ValueError if there are not `count` of

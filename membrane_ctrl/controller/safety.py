@@ -465,7 +465,12 @@ class SafetyTable:
         memory: SafetyState | None = None,
     ) -> None:
         self._limits = limits
-        self._table = table
+        self._applying = {
+            state: tuple(rule for rule in table if state in rule.states) for state in State
+        }
+        self._codes = {
+            state: {rule.code for rule in rules} for state, rules in self._applying.items()
+        }
         self.memory = memory or SafetyState()
 
     def judge(self, state: State, observation: Observation) -> Verdict:
@@ -488,11 +493,11 @@ class SafetyTable:
         tripped: Rule | None = None
         deepest = SafeLevel.NONE
         histories = self.memory.history
-        for rule in self._table:
-            # A rule that does not apply forgets.
-            if state not in rule.states:
-                histories.pop(rule.code, None)
-                continue
+        # A rule that does not apply forgets.
+        for code in list(histories):
+            if code not in self._codes[state]:
+                del histories[code]
+        for rule in self._applying[state]:
             broken = rule.broken(observation, self._limits)
             if not broken and rule.code not in histories:
                 continue  # nearly always

@@ -177,14 +177,11 @@ class Plant:
         """
         gas_step = self._gas.step
         gas = self._gas
-        pump_step = self._pump.step
-        pump = self._pump_fraction
         leak = self._leak_ml_per_s_per_pa
         vent = self._vent_ml_per_s_per_pa * self._vent_fraction
         follow = -math.expm1(-STEP_S / GAS_FOLLOWS_AIR_S)
-        inflow = self._inflow_ml_per_s
-        for i in range(start, stop):
-            inflow = pump_step(pump)
+        inflows = self._pump.run_steps(self._pump_fraction, stop - start)
+        for i, inflow in enumerate(inflows, start):
             outflow = (leak * self._leak[i] + vent) * gas.root_pa**3
             gas_step(
                 (inflow - outflow) * STEP_S,
@@ -193,7 +190,7 @@ class Plant:
                 self._air_k[i],
                 self._volume[i],
             )
-        self._inflow_ml_per_s = inflow
+        self._inflow_ml_per_s = inflows[-1]
         self._steps += stop - start
         self._index = stop - 1
 

@@ -68,8 +68,22 @@ class PumpModel:
         self._tube = deque([self._flow_ml_per_s] * len(self._tube))
         return command if self._running else 0.0
 
-    def step(self, command: float) -> float:
-        """One time step with the command 0..1; the flow that reaches the films in it, mL/s."""
+    def run_steps(self, command: float, steps: int) -> list[float]:
+        """Run some time steps with one command.
+
+        Parameters
+        ----------
+        command : float
+            From 0 to 1.
+        steps : int
+            How many.
+
+        Returns
+        -------
+        list of float
+            The flow that reaches the films in each step, mL/s.
+        """
+        # A second step changes neither whether the pump runs nor the play.
         self._running = command >= (self._stall if self._running else self._start)
         if self._branches is None:
             delivers = self._running and command > self._dead
@@ -83,9 +97,14 @@ class PumpModel:
             if self._running:
                 target = min(max(self._play_ml_per_s, rising[level]), falling[level])
             self._play_ml_per_s = target
-        self._flow_ml_per_s += (target - self._flow_ml_per_s) * self._follow
-        self._tube.append(self._flow_ml_per_s)
-        return self._tube.popleft()
+        flow_ml_per_s = self._flow_ml_per_s
+        reached = []
+        for _ in range(steps):
+            flow_ml_per_s += (target - flow_ml_per_s) * self._follow
+            self._tube.append(flow_ml_per_s)
+            reached.append(self._tube.popleft())
+        self._flow_ml_per_s = flow_ml_per_s
+        return reached
 
 
 def _make_branches(

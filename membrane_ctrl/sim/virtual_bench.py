@@ -108,16 +108,17 @@ class VirtualBench:
         interlocks_open = self.interlocks.open_mask(reading.interlock_inputs, self.plant.time_s)
         # Instruments beside the board, which has no registers for the climate
         sample = self._sample
-        reading = replace(
+        pump_fraction = reading.pump_fraction
+        if not math.isnan(self.wrong.readback_fraction):
+            pump_fraction = self.wrong.readback_fraction
+        return replace(
             reading,
+            pump_fraction=pump_fraction,
             interlocks_open=interlocks_open,
             film_temperature_c=sample.film_temperature_c,
             ring_temperature_c=sample.ring_temperature_c,
             humidity_percent=sample.humidity_percent,
         )
-        if math.isnan(self.wrong.readback_fraction):
-            return reading
-        return replace(reading, pump_fraction=self.wrong.readback_fraction)
 
     def write(self, command: roles.BenchCommand) -> None:
         """Write pump and vent, and feed the watchdog. Raises LinkError."""

@@ -19,9 +19,7 @@ def pump() -> PumpModel:
 
 
 def settle(pump: PumpModel, command: float) -> float:
-    for _ in range(1000):
-        flow = pump.step(command)
-    return flow
+    return pump.run_steps(command, 1000)[-1]
 
 
 def test_flow_against_command_once_running(pump: PumpModel) -> None:
@@ -48,11 +46,11 @@ def test_never_takes_gas_away() -> None:
     )  # dead above stall and start
     assert settle(pump, 0.25) == 0.0
     settle(pump, 1.0)
-    assert all(pump.step(0.2) >= 0 for _ in range(2000))
+    assert all(flow >= 0 for flow in pump.run_steps(0.2, 2000))
 
 
 def test_answers_after_transport_and_lag(pump: PumpModel) -> None:
-    flows = [pump.step(1.0) for _ in range(200)]
+    flows = pump.run_steps(1.0, 200)
     dead = round(TwinConfig().pump_delay_s / STEP_S)
     assert flows[:dead] == [0.0] * dead
     assert flows[dead] > 0
@@ -62,13 +60,13 @@ def test_answers_after_transport_and_lag(pump: PumpModel) -> None:
 
 def test_hold_is_where_the_pump_stays(pump: PumpModel) -> None:
     command = pump.settle_at_flow(1.4)
-    assert [pump.step(command) for _ in range(100)] == pytest.approx([1.4] * 100)
+    assert pump.run_steps(command, 100) == pytest.approx([1.4] * 100)
 
 
 @pytest.mark.parametrize("flow_ml_per_s", [0.2, 7.0])
 def test_hold_of_a_flow_it_cannot_keep_leaves_it_off(pump: PumpModel, flow_ml_per_s: float) -> None:
     assert pump.settle_at_flow(flow_ml_per_s) == 0.0
-    assert pump.step(0.2) == 0.0
+    assert pump.run_steps(0.2, 1) == [0.0]
 
 
 def test_refuses_a_pump_that_never_delivers() -> None:
@@ -147,3 +145,11 @@ def test_the_twin_follows_a_measured_curve() -> None:
     pump = PumpModel(config, 4.0, STEP_S)
     assert [settle(pump, command) for command in (0.5, 1.0)] == pytest.approx([1.0, 4.0], rel=1e-3)
     assert pump.settle_at_flow(1.0) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_steps_in_one_call_are_steps_one_by_one() -> None:
+    together = PumpModel(PumpConfig(), FULL_ML_PER_S, STEP_S)
+    single = PumpModel(PumpConfig(), FULL_ML_PER_S, STEP_S)
+    for command in (0.3, 0.18, 0.1, 0.18, 1.0):
+        one_by_one = [single.run_steps(command, 1)[0] for _ in range(40)]
+        assert together.run_steps(command, 40) == one_by_one
