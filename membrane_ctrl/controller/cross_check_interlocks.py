@@ -22,7 +22,8 @@ def judge_interlocks(config: Config, findings: ConfigFindings) -> None:
     config : Config
         Whose `[[devices.interlocks]]` are judged.
     findings : ConfigFindings
-        Gets what is wrong. The fields have the interlock's index: `devices.interlocks.0.period_s`.
+        Gets the errors and warnings. The fields have the interlock's index, such as
+        `devices.interlocks.0.period_s`.
     """
     for index, interlock in enumerate(config.interlocks):
         field = f"devices.interlocks.{index}"
@@ -89,7 +90,7 @@ def judge_interlock_board(config: Config, board: BenchIdentity, findings: Config
         As read at the start; one without a watchdog and without a kind stands for "not read yet",
         and is not judged.
     findings : ConfigFindings
-        Gets what is wrong.
+        Gets the errors and warnings.
     """
     if math.isnan(board.watchdog_s) and not board.kind:
         return  # no board has answered yet

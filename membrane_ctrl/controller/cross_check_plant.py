@@ -101,7 +101,7 @@ def judge_pump(config: Config, findings: ConfigFindings) -> None:
     config : Config
         `[pump]`, `[loop]`, and the scales of the devices that take the commands.
     findings : ConfigFindings
-        Gets what is wrong.
+        Gets the errors and warnings.
     """
     pump, loop = config.pump, config.loop
     least = 0.0 if pump.curve_fraction else pump.dead_fraction  # of the straight line only
@@ -227,7 +227,7 @@ def judge_loop(config: Config, findings: ConfigFindings) -> None:
         `[loop]` on the nominal pump: peak sensitivity, signs and sizes against physics, and what
         the pump can follow.
     findings : ConfigFindings
-        Gets what is wrong.
+        Gets the errors and warnings.
     """
     loop, full_um_per_s = config.loop, flow_um_per_s(config)
     severity, why = weak_gains(loop) or ("", "")
@@ -274,7 +274,7 @@ def judge_shape(config: Config, findings: ConfigFindings) -> None:
     config : Config
         `[shape]`, and `loop.holds`.
     findings : ConfigFindings
-        Gets what is wrong.
+        Gets the errors and warnings.
     """
     shape = config.shape
     holds = config.loop.holds
@@ -355,7 +355,7 @@ def judge_alarms(config: Config, findings: ConfigFindings) -> None:
     config : Config
         `[alarms]`; the largest values follow from limits, pump and safety table.
     findings : ConfigFindings
-        Gets what is wrong.
+        Gets the errors and warnings.
     """
     alarms, tick_s = config.alarms, 1.0 / config.loop.rate_hz
     findings.error(
@@ -389,7 +389,7 @@ def judge_gauge(config: Config, findings: ConfigFindings) -> None:
         The limits of pressure, of a gauge that repeats itself, and of laser against gauge: each
         must be able to trip, and must not trip by weather or noise alone.
     findings : ConfigFindings
-        Gets what is wrong.
+        Gets the errors and warnings.
     """
     limits, pressure_pa, tick_s = (
         config.limits,
@@ -454,7 +454,7 @@ def judge_film(config: Config, findings: ConfigFindings) -> None:
     config : Config
         `optics.mirror`, and the limits of leak and range.
     findings : ConfigFindings
-        Gets what is wrong.
+        Gets the errors and warnings.
     """
     limits, mirror = config.limits, config.optics.mirror
     # The growth of the leak that is a fault: within what the pump gives, and beyond what weather
@@ -515,7 +515,7 @@ def judge_ranges(config: Config, board: BenchIdentity, findings: ConfigFindings)
         The ranges that the devices themselves state, in µm and Pa; infinite before they are read.
         The narrower of both counts.
     findings : ConfigFindings
-        Gets what is wrong.
+        Gets the errors and warnings.
     """
     limits, devices = config.limits, config.devices
     laser = devices.displacement if devices is not None else None

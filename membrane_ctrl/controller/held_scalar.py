@@ -104,7 +104,7 @@ class HeldScalar:
             distrust=distrust if distrust != NO_REASON else _distrust_figures(figures),
         )
         context.held_offset_um = offset.step(given)
-        # 3. What is news
+        # 3. The events of a change
         memory = offset.memory
         events: list[Event] = []
         if (memory.state, memory.reason.code) != before:

@@ -197,6 +197,8 @@ class ChildProcesses:
         """
         if self._acquisition is not None:
             self._acquisition.child.stop(_CHILD_STOPS_S)
+        # The recorder ends by itself with the event `end`. One that hangs is killed; without a
+        # summary, another one reads what the rings still have
         recorder = self._recorder.child
         if not recorder.join(_RECORDER_CLOSES_S):
             recorder.stop(0.0)  # recorder or disk hangs
@@ -219,8 +221,10 @@ class ChildProcesses:
 
 
 def _make_child_factory(name: str, package: str, nice: int, spec: Callable[[int], object]) -> Make:
-    """Return a maker of a room's children; `spec` maps the number of earlier children to the next
-    one's argument.
+    """Return a function that makes children of one kind.
+
+    `spec` maps the number of earlier children to the next one's argument: a recorder that replaces
+    another one must know that, a console begins at the present.
     """
 
     def make(count: int) -> tuple[Child, Connection]:

@@ -83,6 +83,7 @@ class FaultLatch:
 
     def handle_tick(self, outputs: tick.TickOutputs) -> None:
         """After a tick: latch a fault; clear an acknowledged one."""
+        # A fault that only holds the flow is not latched: the state `fault` latches the newest one
         self._report_failure()
         for event in outputs.events:
             match event:

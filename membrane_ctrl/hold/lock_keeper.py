@@ -101,7 +101,11 @@ class LockKeeper:
         """
         if self._storage is None:
             return
+        # 1. What the disk thread has found since the last tick becomes events and commands here:
+        #    only this thread may record them
         self._report_failure()
+        # 2. New locks and removals, in the order of the events. A lock without a number is of
+        #    the start, or of another program: it is stored already if its word is known
         for event in outputs.events:
             match event:
                 case events.LockSet() if event.number or event.word not in self._files:
@@ -110,6 +114,7 @@ class LockKeeper:
                 case events.LockRemoved():
                     act = partial(self._remove_file, self._storage, event.word)
                     self._start_write(event.number, event.word, act)
+        # 3. Now and then: what has failed, and what other programs have stored
         if time.monotonic() >= self._retry_at_s:
             self._retry_at_s = time.monotonic() + _RETRY_S
             self._disk.submit(self._retry_write)
@@ -150,7 +155,11 @@ class LockKeeper:
         self._files.pop(word, None)
 
     def _try_write(self, word: str, act: Callable[[], None]) -> str:
-        """Run an action of the disk thread; returns why it failed, or an empty text."""
+        """Run an action of the disk thread; returns why it failed, or an empty text.
+
+        Of several actions on one lock only the newest is tried again: after a removal the lock must
+        not be stored.
+        """
         try:
             act()
         except Exception as error:  # nothing else would see an exception of this thread

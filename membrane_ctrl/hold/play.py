@@ -130,6 +130,7 @@ def _record_ticks(
                 "the twin in virtual time", "ordinary", "", program.program_identity()
             )
         )
+        # The rings hold two rounds: a round is written before the next is full
         due_s = round_s
         for _ in ticks:
             if virtual.now_s >= due_s:

@@ -52,6 +52,7 @@ class SystemdNotify:
             return
         # Ready with the first tick; each message also feeds the watchdog.
         ready = "READY=1\n" if math.isinf(self._next_s) else ""
+        # The line of `systemctl status`: state, error, and what needs attention
         self._next_s = row.mono_s + _NOTIFY_S
         self._state = row.state
         error = ""

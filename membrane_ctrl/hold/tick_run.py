@@ -66,6 +66,7 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
     from membrane_ctrl.metrology.figure.held_quantities import find_held_weights
     from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 
+    # 1. Controller, supervisor, and those who follow the ticks
     bench, config, options = parts.bench, parts.config, parts.options
     clock, children = parts.clock, parts.children
     assert config.devices is not None
@@ -101,6 +102,7 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
             "control port": port.note_report,
             "systemd": systemd.note_report,
         }
+        # 2. The record begins, and the first tick gets its commands
         started = (
             config.devices.name,
             priority.raise_priority(),
@@ -116,9 +118,10 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
             gc.collect()
             gc.freeze()  # the collector need not visit objects that live for the whole run
             supervisor.record_event(_lock_memory())
+            # 3. Clients and signals, and then the bench: from its first write on, the board's
+            #    watchdog requires ticks
             async with port.open():
                 with _stop_on_signals(supervisor), latch, keeper, systemd:
-                    # last: the board's watchdog runs from here on
                     if (await connect_bench(bench, config.devices)).map_version == 1:
                         supervisor.record_event(run_events.NoClaim(NO_CLAIM))
                     finished = await supervisor.run(options.duration_s)
@@ -130,6 +133,7 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
         except LinkError as error:
             supervisor.record_event(run_events.Link(str(error), up=False))
             raise errors.DeviceError(str(error)) from None
+        # 4. The event `end` is the last message: recorder and console end with it
         finally:
             await bench.close()
             ticks, missed_ticks = supervisor.ticks, supervisor.missed_ticks

@@ -281,6 +281,7 @@ class TruthShape:
         wrong = self._bench.wrong
         if wrong.camera_lost:
             return None
+        # The true sag with the noise of a cycle, and the laser as the mean over the exposures
         self._cycle += 1
         truth = self._bench.plant.truth()
         sag_noise, laser_noise = self._rng.standard_normal(2).tolist()
@@ -308,6 +309,8 @@ class TruthShape:
 @cache
 def _find_terms(change: FigureChange) -> FloatArray:
     """Terms (terms,) of a change of the film: means over the disc of height times term."""
+    # Terms are orthonormal over the disc: each is the mean of height times term. Gauss nodes in
+    # radius squared and even azimuths make that mean exact for polynomials
     nodes, weights = np.polynomial.legendre.leggauss(_RADII)
     radius = np.sqrt((nodes + 1) / 2)
     angle = 2 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS

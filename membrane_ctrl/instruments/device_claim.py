@@ -30,6 +30,9 @@ def claim_devices(devices: Iterable[str]) -> Iterator[None]:
 
     Raises DeviceError, naming the device, the program that uses it and the remedy in one line.
     """
+    # An abstract socket for each name: the kernel frees it however the process ends, and knows
+    # which process has it. In sorted order, so that two programs with common devices do not each
+    # get one of them
     with contextlib.ExitStack() as stack:
         for device in sorted(set(devices)):
             held = stack.enter_context(socket.socket(socket.AF_UNIX))

@@ -117,6 +117,8 @@ class LockStore:
         OSError
             If no folder can be written; it names the first.
         """
+        # A name of its own for each lock: two programs never write the same file. The first folder
+        # that can be written has it; all are read
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%f")
         name = f"{stamp}-{lock.word}-{secrets.token_hex(4)}{_SUFFIX}"
         table = {**file_origin(SCHEMA), "devices": sorted(devices), **asdict(lock)}

@@ -166,6 +166,7 @@ class FrameReader:
         (rows, columns) array or None
             None once the frame has been overwritten.
         """
+        # The number behind the pixels before the copy, that before them afterwards: as in a ring
         slots = self._slots
         if slots.after(head.index) != head.index + 1:
             return None

@@ -57,11 +57,13 @@ class ManagedChild:
         """Return reports and fate of the child since the last call; start the next one when due
         (some ms).
         """
+        # 1. A child that lives reports, or is killed if it is silent for longer than it stated
         reports = self._read_reports(now_s)
         if self.child.alive:
             if now_s > self._expected_s and not self._silent:
                 reports.append(self._kill_silent(now_s))
             return reports
+        # 2. One that has ended is reported once, then replaced, up to some times an hour
         name = self.child.name
         if self._ended_s is None:
             self._ended_s = now_s

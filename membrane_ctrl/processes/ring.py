@@ -127,6 +127,8 @@ class RingWriter:
         length = len(message)
         if length > self.slot_bytes:
             raise ValueError(f"message of {length} bytes in a ring of {self.slot_bytes}-byte slots")
+        # The order matters: the first number claims the slot, the last one and the counter release
+        # it. A reader that finds two different numbers has met a slot that is being written
         words = self._slots.words
         first, last = self._slots.span(self._next)
         sequence = self._next + 1
@@ -207,6 +209,7 @@ class RingReader:
         return again
 
     def _read_slot(self, index: int) -> bytes | None:
+        # In the opposite order of the writer: the last number before the copy, the first one after
         slots = self._slots
         first, last = slots.span(index)
         after = slots.words[last]

@@ -117,8 +117,8 @@ def alarm_process_main(spec: AlarmProcessSpec, line: Connection) -> None:
         Folders and heartbeat; pickled by `multiprocessing`, so plain data.
     line : Connection
         Both ways: the service writes `SERVICE_WORKS` while it works, this process reports `Alive`.
-        Silence of the service for 30 s stops the heartbeats, so that whoever waits for them
-        notices.
+        Silence of the service for 30 s stops the heartbeats: the program that expects them reports
+        it.
     """
     child.leave_at_stop()
     heartbeat = make_heartbeat(spec.heartbeat)

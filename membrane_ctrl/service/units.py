@@ -120,7 +120,7 @@ def install_units(root: Path, program: Path) -> list[Path]:
     if is_system:
         _run(["systemctl", "daemon-reload"])
         _apply_device_rules()
-        # Restarted, so that an upgrade takes effect: holds are units of their own and go on, and a
+        # Restarted, so that an upgrade takes effect: holds are other units and continue, and a
         # guided session stops safely.
         for name in (SESSION_LISTENER, SERVICE_UNIT):
             _run(["systemctl", "enable", name])

@@ -99,6 +99,7 @@ class LiveHold:
         run_dir = Path(run_dir)
         self._client = client
         self._take_over = take_over
+        # 1. Is this the run of the client? Its settings are those in use, not those of its folder
         if client.greeting["run"] != run_dir.resolve().name:
             raise errors.InputError(f"{run_dir}: is not running; {client.greeting['run']} is")
         answer = client.status()
@@ -108,6 +109,7 @@ class LiveHold:
         self.config = config.model_copy(update={"loop": loop, "pump": pump})
         self.name = run_dir.name
         self.run_dir = run_dir
+        # 2. Command, for as long as the session takes; then the rings, at their newest messages
         if session:
             self._claim_command(session)
         try:
@@ -127,7 +129,10 @@ class LiveHold:
             raise errors.InputError(f"{session}: refused: {answer['refused']}")
 
     def send_command(self, command: Command) -> None:
-        """Send a command through the port, which determines our name."""
+        """Send a command through the port, which determines our name. Raises HoldError if it is
+        refused, or there is no answer.
+        """
+        # Only what the command has: the port refuses a key that it does not need
         request: dict[str, object] = {
             "do": command.kind,
             "why": command.why,

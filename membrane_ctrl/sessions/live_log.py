@@ -94,6 +94,8 @@ class LiveLog:
         PageAnswer or None
             None if there is none, or it is to another question.
         """
+        # Read, then removed, whatever it holds: an answer that does not fit must not wait for the
+        # next question
         path = self._path.with_name(ANSWER)
         try:
             text = files.read_text(path, _ANSWER_BYTES_MAX, "replace")
@@ -203,6 +205,7 @@ class LiveReader:
             data = files.read_bytes(files.resolve_user_path(self.session / NAME), _BYTES_MAX)
         except OSError:
             return points
+        # Up to the last whole line: the session may be in the middle of the next one
         whole = data.rfind(b"\n") + 1
         for line in data[self._offset : whole].splitlines():
             try:

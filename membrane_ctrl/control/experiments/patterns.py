@@ -70,7 +70,7 @@ def make_multisine(
     Parameters
     ----------
     around : OperatingPoint
-        Room of the pump, and limit of the excursion.
+        Range of the pump, and limit of the excursion.
     gain : float
         Speed of the centre over the flow.
     slowest_rad_per_s, fastest_rad_per_s : float
@@ -89,7 +89,7 @@ def make_multisine(
     time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
     flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
     way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
-    # As large as the pump's room and the limit of the excursion allow
+    # As large as the pump's range and the limit of the excursion allow
     scale = min(
         min(operating_point.require_room(around)) / np.abs(flow).max(),
         _SHARE * around.limit_um / (gain * np.abs(way).max()),
