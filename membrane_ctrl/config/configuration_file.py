@@ -42,6 +42,8 @@ def parse_configuration(text: str, path: Path) -> schema.Config:
 
 
 def _resolve_files(config: schema.Config, path: Path) -> schema.Config:
+    # Every key that names a file of the user's; the folder of the runs is relative to where the
+    # hold is started
     config = schema.leave_to_start(config)
     optics, port, alarms = config.optics, config.port, config.alarms
     folder = path.resolve().parent

@@ -184,10 +184,11 @@ def _make_table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
     required = table.get("required", ())
     keys = []
     for name, field in table["properties"].items():
-        if "$ref" in json.dumps({**field, "items": None}) or (
-            name == "driver" and "const" in field
-        ):
-            continue  # a table of its own, or the name of this one
+        # Another table, or the name of this one
+        is_table = "$ref" in json.dumps({**field, "items": None})
+        if is_table or (name == "driver" and "const" in field):
+            continue
+        # The docstring of a key: what it means, then when to change it
         meaning, *advice = _ADVICE.split(" ".join(field.get("description", "").split()), maxsplit=1)
         default = "required"
         if name not in required:
@@ -209,6 +210,7 @@ def find_explained(word: str) -> tuple[TableHelp, ...]:
 
     Raises InputError with the nearest names.
     """
+    # A table has each of its places and its driver as names; a key those with its own behind them
     wanted, found, known = word.strip("[]` "), [], []
     for table in list_tables():
         prefixes = [name for name in (*table.places, table.driver) if name]
@@ -223,6 +225,7 @@ def find_explained(word: str) -> tuple[TableHelp, ...]:
             keys = tuple(key for key in table.keys if wanted in names[key.name])
         if keys or wanted in prefixes:
             found.append(replace(table, keys=keys))
+    # A driver of another package is loaded only if it is asked for; then the nearest names
     found = found or _of_other_packages(wanted)
     if not found:
         inside = sorted({name for name in known if wanted and wanted in name}, key=len)[:3]

@@ -227,6 +227,7 @@ def find_lens_doubt(optics: OpticsConfig) -> Doubt | None:
     fold_px = find_lens_fold_px(camera)
     if math.isinf(fold_px):
         return None
+    # The mirror's rim as the camera sees it
     pinhole, rotation, *_ = compute_poses(optics.geometry)
     spoke = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
     rim = mirror.analysis_radius_mm * np.stack([np.cos(spoke), np.sin(spoke), 0 * spoke], axis=1)
@@ -264,6 +265,7 @@ def find_doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
     -------
     Doubt or None
     """
+    # A folded lens makes every other judgement wrong
     fold = find_lens_doubt(optics)
     if fold is not None:
         return fold
@@ -295,7 +297,7 @@ def find_doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
             hopeless, "alpha_deg", why, _find_angle_hint(optics, geometry.alpha_deg, depths_mm)
         )
     if math.isinf(best.centre_off_mm):
-        why += ": the camera's ray by the vertex meets the screen never"
+        why += ": the camera's ray by the vertex never meets the screen"
     elif best.centre_off_mm > half_mm:
         place = f"{best.centre_off_mm:.0f} mm from O'"
         why += f": the camera's ray by the vertex meets the screen {place}"

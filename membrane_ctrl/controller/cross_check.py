@@ -214,6 +214,8 @@ def _check_watchdog(config: Config, findings: cross_check_plant.ConfigFindings) 
 
 
 def _check_stale(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
+    # Each window: longer than what a sound sensor shows by chance, shorter than what a mirror may
+    # be left to without a reading
     limits, tick_s = config.limits, 1.0 / config.loop.rate_hz
     why, least = (
         f"shorter than 1.5 ticks of {tick_s:g} s: every late tick would be a fault",
@@ -365,6 +367,7 @@ def _check_board(
     config: Config, board: BenchIdentity, findings: cross_check_plant.ConfigFindings
 ) -> None:
     """Check the limits that the board enforces itself."""
+    # A limit here beyond the board's own would never trip: the board acts first, and latches
     own_pa = board.gauge_pressure_limit_pa
     above = config.limits.gauge_pressure_max_pa > own_pa
     findings.error(
@@ -408,6 +411,8 @@ def _board_guards(
         why,
         "store gauge_fitted = true in the board",
     )
+    # The ramp down of the rule on the gauge must be over before the board stops the pump by itself:
+    # a board that has latched needs a person
     noticed_s = _PRESSURE_MISSING.window / config.loop.rate_hz
     ramp_s = noticed_s + config.states.ramp_down_s
     cut = guarded and board.gauge_fitted and ramp_s >= board.gauge_timeout_s

@@ -132,6 +132,7 @@ class Observer:
         # 1. Age of the last answer, and of the last one with a new sample
         if reading is not None:
             memory.last_read_s = now_s
+            # Counter and device time must both advance: a device that hangs may still count
             stamp = (reading.sample_counter, reading.device_time_s)
             if memory.stamp is None or (
                 stamp[0] != memory.stamp[0] and stamp[1] != memory.stamp[1]
@@ -200,9 +201,8 @@ class Observer:
         return self.figures.waited_s if self._by_optics else 0.0
 
     def make_observation(self, inputs: tick.TickInputs, error_um: float) -> Observation:
-        """Return what the inputs show, after `observe_inputs`; the control code fills in what
-        it knows
-        itself.
+        """Return what the inputs show, after `observe_inputs`; the controller adds what its parts
+        have found.
 
         Parameters
         ----------

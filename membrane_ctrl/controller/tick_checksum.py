@@ -24,6 +24,7 @@ def output_crc(outputs: TickOutputs, row: bytes) -> int:
     row : bytes
         Doubles: the values of the columns that the run records (`ColumnChoice`).
     """
+    # Command and row, events, answers; an end only in the tick that has it
     command = outputs.command
     crc = zlib.crc32(row, zlib.crc32(_DRIVEN.pack(command.pump_fraction, command.vent_fraction)))
     for event in outputs.events:

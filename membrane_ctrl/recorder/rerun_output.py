@@ -139,6 +139,7 @@ class RerunOutput:
         self._recording.send_page(summary_page.SUMMARY_PATH, now_s, self._summary())
 
     def _begin_segment(self, now_s: float) -> bool:
+        # After a failure, not in every second: a full disk stays full for a while
         if now_s < self._retry_s:
             return False
         before = self._recording.path
@@ -153,6 +154,7 @@ class RerunOutput:
             self.closed.append(before)
         self._alive = True
         self._segment_until_s = now_s + self._segment_s
+        # A viewer may open this file alone: states, reference and summary are sent again
         self._telemetry.start_segment()
         self.shapes.start_segment()
         self._next_summary_s = -math.inf

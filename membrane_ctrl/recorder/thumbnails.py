@@ -42,6 +42,7 @@ class Thumbnails:
 
         if now_s < self._next_s:
             return []
+        # The newest frame of each pattern, if it is newer than the last set
         newest: dict[str, FrameHead] = {head.pattern: head for head in self._reader.heads()}
         fresh = [head for head in newest.values() if head.index > self._newest_index]
         if not fresh:
@@ -49,6 +50,7 @@ class Thumbnails:
         self._next_s = now_s + THUMBNAIL_INTERVAL_S
         self._newest_index = max(head.index for head in fresh)
         made = []
+        # A frame that is overwritten meanwhile is left out
         for head in fresh:
             pixels = self._reader.copy(head, self._step)
             if pixels is not None:

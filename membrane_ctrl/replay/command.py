@@ -233,7 +233,9 @@ def _replay_ticks(
 def _make_report(
     run: RecordedRun, found: replays.Replay, begin: int, to_s: float
 ) -> dict[str, Any]:
-    # make no claim about the time after the log or the inputs end
+    # 1. Decisions. No claim is made about the time after the log or the inputs end. A recorded
+    #    decision just behind the end may be one that the replay took just before it: it counts only
+    #    if the replay has as many
     end_s = min(to_s, run.log_end_s, found.last_s)
     today = [decision for decision in found.decisions if decision.time_s <= end_s]
     recorded = [d for d in run.decisions if found.begin_s <= d.time_s <= end_s + DECISION_SLACK_S]
@@ -241,6 +243,7 @@ def _make_report(
     decisions = replays.find_unmatched(
         recorded[: max(in_time, len(today))], today, DECISION_SLACK_S
     )
+    # 2. Rows and states: the first that differs, and in which fields
     first = found.first_different
     first_different = None
     fields = None
@@ -438,7 +441,8 @@ def _make_input_rows(records: Records) -> telemetry.Rows:
 def _select_between(
     frames: inputs_file.InputsReader, begin: int, to_s: float
 ) -> Iterator[inputs_file.InputsFrame]:
-    # a shape may arrive a frame before the tick that used it
+    # Whole frames up to the end, of which only the wanted ticks are kept. A figure may be recorded
+    # a frame before the tick that used it
     before: dict[float, shape_estimate.ShapeEstimate] = {}
     for frame in frames:
         if len(frame.records) and frame.records["now_s"][0] > to_s:

@@ -94,7 +94,7 @@ BEHIND = general(everything=turned(0, 180.0)).model_copy(
             "the camera's ray by the vertex meets the screen 500 mm from O'",
         ),
         (general(screen=turned(1, 180.0)), "screen.origin_mm", "of the mirror"),
-        (general(flip=-1.0), "screen.origin_mm", "meets the screen never"),
+        (general(flip=-1.0), "screen.origin_mm", "never meets the screen"),
         (BEHIND, "screen.origin_mm", "is seen in 0% of the mirror"),
     ],
 )
