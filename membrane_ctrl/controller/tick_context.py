@@ -179,8 +179,8 @@ def apply_command(context: TickContext, command: Command, state: telemetry.State
     state : State
         Of the controller.
     """
-    # Wishes, on which the state's handler acts in this tick if the safety table lets it. In a fault a
-    # vent is the deepest safe level
+    # Wishes, on which the state's handler acts in this tick if the safety table lets it. In a fault
+    # a vent is the deepest safe level
     match command.kind:
         case "hold":
             context.hold_wanted = True
