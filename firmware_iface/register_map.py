@@ -292,6 +292,7 @@ def _parse_register(entry: Mapping[str, Any], access: str) -> Register:
 
 
 def _check_register(register: Register) -> None:
+    # A name ends in its unit, so that no reader of the registers can mistake it.
     name = register.name
     if register.type not in _TYPES:
         raise RegisterMapError(f"{name}: type {register.type!r} is none of {', '.join(_TYPES)}")

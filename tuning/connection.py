@@ -144,6 +144,8 @@ def find_session(options: TuneOptions, link: HoldLink | None, fresh: bool = Fals
         )
     if options.session is not None:
         return same_bench.continue_on_hold(open_session(options.session), link)
+    # The newest session continues if it is one of this hold and name, and not finished: so the
+    # single steps of `tune`, given one after the other, belong to one session.
     begun: SessionFolder | None = None
     if not fresh:
         with contextlib.suppress(InputError):

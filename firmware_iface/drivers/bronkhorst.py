@@ -106,6 +106,8 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
     DeviceRefusedError
         Another type of instrument, or another serial number.
     """
+    # Type and serial number before anything else: the meaning of the other parameters, and whether
+    # they may be written, follows from them.
     await port.connect()
     found = await port.text(DEVICE_TYPE)
     number = await port.text(SERIAL_NUMBER)

@@ -200,6 +200,8 @@ class VaisalaPtb330Emulator(LineDevice):
         if not self.frozen:
             self._counter = int(asyncio.get_running_loop().time() / _PERIOD_S)
             self._pressure_pa = self._ambient_pressure_pa()
+        # A number format such as 4.2 holds for the quantities after it; CS4 is the checksum of the
+        # text so far.
         text, digits, decimals = "", 4, 2
         for word in _WORD.findall(self._format):
             if number := re.fullmatch(r"(\d)\.(\d)", word):

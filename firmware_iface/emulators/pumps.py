@@ -181,6 +181,8 @@ class Instrument:
         return struct.pack(_FORMATS[parameter.kind], self._read_parameter(parameter))
 
     def _read_parameter(self, parameter: bronkhorst_parameter.InstrumentParameter) -> float:
+        # `measure` is a signed number in 16 bits: below zero down to what is left above the largest
+        # count (manual 9.17.023, "measure").
         if parameter in self._settings:
             return self._settings[parameter]
         if self._measured is None:

@@ -64,6 +64,8 @@ def resolve_port_path(
     wanted = _USB_NAME.fullmatch(name)
     if wanted is None:
         return name
+    # Vendor and product always count, the serial number only if the name states one: many cheap
+    # adapters have none.
     vid = int(wanted[1], 16)
     pid = int(wanted[2], 16)
     serial = wanted[3]

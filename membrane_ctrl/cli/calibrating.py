@@ -183,6 +183,8 @@ def calibrate(
         film=film,
         radius_sigma_mm=radius_sigma_mm,
     )
+    # Two uses of one command: sets that are there, or sets taken from a running hold. Options of
+    # the other use are refused, not ignored: `--yes` without `--live` shows a misunderstanding.
     if not live:
         if not folders:
             raise InputError(

@@ -29,12 +29,16 @@ def explore(path: Path) -> int:
     DeviceError
         There is no service, and none could be started.
     """
+    # The page finds a session by `tuning/NAME` and a run by `NAME`, below the folder of the runs
+    # that its service follows.
     folder = path.resolve()
     is_session = (folder / "session.json").exists()
     logs = folder.parent.parent if is_session else folder.parent
     name = f"{_SESSIONS}/{folder.name}" if is_session else folder.name
     if is_session and folder.parent.name != _SESSIONS:
         raise errors.InputError(f"{path}: a session is in a folder {_SESSIONS}/ beside its runs")
+    # Read it here once, so that data that cannot be explored are reported on the terminal, and not
+    # on a page that a browser has already opened.
     can_be_explored = not is_session or open_session(folder).is_done("observe")
     if can_be_explored:
         terminal.print_progress(f"reading {path}")

@@ -98,12 +98,14 @@ def _run_steps(
 ) -> None:
     """Run steps in their order, until one is refused or a person wants no new gains."""
     for number, step in enumerate(steps):
+        # A loop on the estimate has no gains: the session ends with what it has measured.
         if step in _OF_GAINS and not folder.config.has_pi:
             no_gains = _NO_GAINS.format(folder.path)
             if steps == [step]:
                 raise RejectedError(f"{step}: {no_gains}")
             progress.print_line(no_gains)
             return
+        # Before the gains change a person chooses a candidate, unless an option does.
         candidate = ""
         if step == "apply":
             chosen = choose.choose_candidate(folder, options.yes, options.choose, progress)

@@ -108,6 +108,8 @@ def recognise_actuator(record: Record, identified: Identified) -> ActuatorKind:
         (_PLAY_LEAST * swing, _PLAY_MOST * swing),
     )
 
+    # Both kinds have one parameter more than the plain model. A second lag that is short beside the
+    # first is dead time to any loop, and needs no name.
     size = len(record) - 1
     of_lag, of_play = (size * math.log(plain.cost / each.cost) for each in (lagged, played))
     if max(of_lag, of_play) < _LEAST_RATIO or abs(of_lag - of_play) < _LEAST_LEAD:

@@ -1,9 +1,10 @@
 """The closed loop in the frequency domain, with its exact delay.
 
-    L = C F P,   P = k exp(-j w (theta + h / 2 + write)) / (j w (1 + j w T)),
+    L = C F P,   P = k exp(-j w (theta + h / 2)) / (j w (1 + j w T)),
     C = K (1 + 1 / (j w Ti) + j w Td),   F = 1 / (1 + j w Tf)
 
-h / 2 is the mean delay of a command held for a sample. A Pade approximation would shift the margins
+theta is the dead time from a reading to the first gas, h / 2 the mean delay of a command held for a
+sample. A Pade approximation would shift the margins
 by as much as the designs differ; a frequency response needs none.
 """
 

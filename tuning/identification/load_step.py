@@ -59,7 +59,7 @@ def simulate_load_step(
     # In time, and from when on it stays near.
     used = _SAMPLES // 2
     answer = np.fft.irfft(spectrum, _SAMPLES)[:used]
-    away_um = np.abs(answer) / _SAMPLE_S
+    away_um = np.abs(answer) / _SAMPLE_S  # the transform of samples is that of time over their step
     is_away = np.flatnonzero(away_um > RECOVERED_UM)
     recovery_s = 0.0
     if is_away.size:

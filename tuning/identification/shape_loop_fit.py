@@ -77,6 +77,8 @@ def run_step_experiment(rig: HoldRig) -> list[list[ShapeEstimate]]:
 
     Each level is a trial, after which the hold itself restores setpoint and shape loop.
     """
+    # Low, high, low: a drift of the figure during the experiment cancels in the mean of the two low
+    # levels, which lie evenly before and after the high one.
     levels: list[list[ShapeEstimate]] = []
     why = "shape loop: sag sensitivity"
     try:

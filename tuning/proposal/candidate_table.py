@@ -76,7 +76,7 @@ def format_terminal(rows: tuple[Candidate, ...], title: str, leak_um_per_s: floa
 
 
 def describe_change(row: Candidate, present: Candidate | None) -> str:
-    """Say what gets better and what worse than with the present gains, as factors.
+    """Describe which figures get better and which worse than with the present gains, as factors.
 
     Parameters
     ----------
@@ -95,6 +95,8 @@ def describe_change(row: Candidate, present: Candidate | None) -> str:
         return f"not offered: {why}"
     if present is None or present.predicted is None:
         return "the present gains are unstable"
+    # For every figure a smaller value is better. A factor is given only between two finite values:
+    # a recovery that never ended before has none.
     better: list[str] = []
     worse: list[str] = []
     for name, word in _WORDS.items():

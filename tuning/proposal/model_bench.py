@@ -86,6 +86,8 @@ class ModelBench:
 
     def _read_sample(self) -> BenchSample:
         """The sensors' readings, with their noise; NaN for a sensor that was not identified."""
+        # The true centre: gas that the pump has given, less what has leaked, plus the weather. The
+        # sensors of the weather show the same states with their own noise.
         disturbance = self._disturbance
         walks = self._walks
         moved_um = self._driven.way_um - self._leaked_um
@@ -93,6 +95,7 @@ class ModelBench:
         self.true_um.append(true_um)
         self._ticks += 1
 
+        # Always three numbers, so that the sensors present do not change the random course.
         laser, pressure, temperature = self._rng.standard_normal(3).tolist()
         pressure_pa = math.nan
         if disturbance.barometer is not None:

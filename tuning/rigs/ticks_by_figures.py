@@ -32,11 +32,10 @@ class TicksByFigures:
 
     @property
     def interval_s(self) -> float:
-        """Time between figures: as asked for, or the median so far if that is longer."""
-        return max(
-            self._figure_interval_s,
-            float(np.median(self._intervals_s)) if self._intervals_s else 0.0,
-        )
+        """Time between figures: as configured, or the median so far if that is longer."""
+        if not self._intervals_s:
+            return self._figure_interval_s
+        return max(self._figure_interval_s, float(np.median(self._intervals_s)))
 
     def add_rows(
         self, rows: Sequence[telemetry.TelemetryRow], shapes: Sequence[shape_estimate.ShapeEstimate]
@@ -57,28 +56,38 @@ class TicksByFigures:
         """
         self._waiting.extend(rows)
         for shape in shapes:
-            newest_s = self._shown[-1][0]
-            if shape.verdict != "rejected" and shape.kind != "full" and shape.time_s > newest_s:
-                self._shown.append((shape.time_s, shape.sag_um - self._zero_um))
-                self._intervals_s += [shape.time_s - newest_s] if math.isfinite(newest_s) else []
+            self._add_figure(shape)
+        # A tick is complete once a figure of a later time is there, or when none can come any more.
         done: list[telemetry.TelemetryRow] = []
-        while self._waiting and (
-            self._waiting[0].mono_s <= self._shown[-1][0]
-            or self._waiting[-1].mono_s - self._waiting[0].mono_s > _FIGURE_LATE_S
-        ):
+        while self._waiting and self._is_complete(self._waiting[0]):
             row = self._waiting.popleft()
             done.append(replace(row, displacement_um=self._figure_at(row.mono_s)))
         return done
 
+    def _add_figure(self, shape: shape_estimate.ShapeEstimate) -> None:
+        """Add a figure that may be used and is newer than the last one."""
+        newest_s = self._shown[-1][0]
+        if shape.verdict == "rejected" or shape.kind == "full" or not shape.time_s > newest_s:
+            return
+        self._shown.append((shape.time_s, shape.sag_um - self._zero_um))
+        if math.isfinite(newest_s):
+            self._intervals_s.append(shape.time_s - newest_s)
+
+    def _is_complete(self, row: telemetry.TelemetryRow) -> bool:
+        """Whether the displacement of the oldest waiting tick is known, or never will be."""
+        has_later_figure = row.mono_s <= self._shown[-1][0]
+        is_too_late = self._waiting[-1].mono_s - row.mono_s > _FIGURE_LATE_S
+        return has_later_figure or is_too_late
+
     def _figure_at(self, time_s: float) -> float:
+        """Displacement at a time, on the line between the figures before and after it; NaN without
+        such figures. Times must not fall from call to call.
+        """
         while len(self._shown) > 1 and self._shown[1][0] <= time_s:
             self._shown.popleft()
-        (before_s, before_um), (after_s, after_um) = (
-            self._shown[0],
-            self._shown[min(1, len(self._shown) - 1)],
-        )
+        before_s, before_um = self._shown[0]
+        after_s, after_um = self._shown[min(1, len(self._shown) - 1)]
         if not before_s <= time_s <= after_s or after_s - before_s > _FIGURES_APART_S:
             return math.nan
-        return before_um + (after_um - before_um) * (time_s - before_s) / max(
-            after_s - before_s, 1e-9
-        )
+        share = (time_s - before_s) / max(after_s - before_s, 1e-9)
+        return before_um + (after_um - before_um) * share

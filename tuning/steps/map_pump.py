@@ -218,6 +218,8 @@ def _measure_gain(rig: HoldRig, late_s: float) -> tuple[float, float]:
     Raises ValueError if the longest find a gain far from 1, or one that differs above and below the
     holding flow; a gain with a large error contradicts nothing.
     """
+    # Each attempt lasts twice as long as the one before. It ends the check if the gain agrees with
+    # the curve and is known well enough; otherwise the weather may have been the cause.
     for steps_s in _CHECKS_S:
         _wait_for_return(rig)
         rig.hold(_CHECK_AFTER_S)

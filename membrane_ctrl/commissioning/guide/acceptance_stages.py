@@ -121,6 +121,7 @@ def hold_hour(context: StageContext) -> None:
 
 
 def _judge_hold(context: StageContext, figures: HoldFigures, faults: list[str]) -> None:
+    # Ticks that a hold of this duration has at its rate; the first tick begins the duration.
     expected = max(1.0, figures.duration_s * context.config.loop.rate_hz)
     if not math.isfinite(expected):
         expected = 1.0

@@ -140,6 +140,8 @@ def _ask_table(
     ]
     if optional:
         choices.insert(0, Choice(name=_NONE, meaning="not on this bench"))
+    # The driver first, then what its table cannot do without: a preset of a register map replaces
+    # most of its keys. A refused table is asked again, with the answers as defaults.
     while True:
         default = _NONE if optional else ""
         driver = dialogue.ask_choice(f"{key}.driver", f"{name}: which driver?", choices, default)

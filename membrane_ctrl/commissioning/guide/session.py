@@ -155,6 +155,8 @@ class CommissioningSession:
             return index + 1
         self._dialogue.display.show_stage(make_stage_head(stage))
         context = StageContext(self._folder, self._state, self._dialogue, self._access, self._plan)
+        # A stage ends in one of three ways: the person goes back; it cannot be finished, and the
+        # bench has then been made safe; or it has made its checks, passed or failed.
         problem = ""
         try:
             stage.run(context)

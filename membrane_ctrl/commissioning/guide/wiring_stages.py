@@ -231,6 +231,8 @@ def test_laser(context: StageContext) -> None:
     if not (math.isfinite(before_um) and math.isfinite(after_um)):
         context.require("laser sees the card", False, "no reading", "check aim and range")
         return
+    # Displacement rises when the bowl deepens. The sign is judged first: with the wrong one, the
+    # loop would drive the mirror away, and the scale means nothing.
     ratio = (after_um - before_um) / (1e3 * moved_mm)
     is_right = context.require(
         "laser's sign",
