@@ -76,6 +76,18 @@ def test_tomorrow_is_within_its_interval(
     assert (tmp_path / "film" / "creep.png").stat().st_size > 5_000
 
 
+def test_figures_without_a_gauge_are_left_out(tmp_path: Path) -> None:
+    run = run_of(tmp_path, 48.0)
+    level = run.level(60.0, names=())
+    level["mean_gauge_pressure_pa"][20:40] = np.nan
+    time_s, _, pressure_pa = film_run._read_cycles(run)  # type: ignore[arg-type]
+    assert time_s.size == 40
+    assert np.isfinite(pressure_pa).all()
+    level["mean_gauge_pressure_pa"][:] = np.nan
+    with pytest.raises(RejectedError, match="a gauge"):
+        film_run._read_cycles(run)  # type: ignore[arg-type]
+
+
 def test_an_hour_does_not_predict_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film_run, "open_run", lambda folder: run_of(folder, 1.0))
     with pytest.raises(RejectedError, match="do not predict 24 h ahead"):

@@ -103,21 +103,35 @@ def _read_cycles(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
     shapes = run.shapes()
     level = run.level(_LEVEL_S, names=(_GAUGE,))
     known = np.isfinite(level[_GAUGE])
+    middle_s = level["time_s"][known] + _LEVEL_S / 2
     good = np.isfinite(shapes.sag_um) & np.isin(shapes.verdict, ("ok", "degraded"))
-    if not (known.any() and good.any()):
+    good &= _find_distance_s(shapes.time_s, middle_s) <= _LEVEL_S
+    if not good.any():
         raise errors.RejectedError(
             f"{run.folder}: without figures and a gauge a run shows nothing of its film"
         )
 
     # The pressure at the time of each figure, between the middles of the minutes.
     time_s = np.asarray(shapes.time_s[good], float)
-    middle_s = level["time_s"][known] + _LEVEL_S / 2
     pressure_pa = np.interp(time_s, middle_s, level[_GAUGE][known])
     return (
         time_s + run.origin_utc.timestamp(),
         np.asarray(shapes.sag_um[good], float) / 1e3,
         pressure_pa,
     )
+
+
+def _find_distance_s(time_s: FloatArray, known_s: FloatArray) -> FloatArray:
+    """Distance (n,) of times (n,) to the nearest known one (m,), increasing; infinite without one.
+
+    Over hours without a gauge the weather changes the pressure: no straight line bridges them.
+    """
+    if not known_s.size:
+        return np.full(time_s.size, np.inf)
+    place = np.searchsorted(known_s, time_s)
+    before_s = known_s[np.maximum(place - 1, 0)]
+    after_s = known_s[np.minimum(place, known_s.size - 1)]
+    return np.minimum(np.abs(time_s - before_s), np.abs(time_s - after_s))
 
 
 def _make_table(
