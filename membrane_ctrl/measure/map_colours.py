@@ -37,7 +37,9 @@ def choose_map_colours(values: FloatArray, shown: FloatArray, even: bool) -> Axi
 
 
 def describe_map(values: FloatArray) -> str:
-    """Peak to valley of a map, and its RMS about its mean, in its own unit."""
+    """Peak to valley of a map (rows, columns), and its RMS about its mean, in its own unit; NaN
+    cells do not count.
+    """
     known = values[np.isfinite(values)]
     return f"PV {np.ptp(known):.3g}\nRMS {np.std(known):.3g}"
 

@@ -136,6 +136,7 @@ def write_picture(path: Path, figure: Figure, dpi: int = 110) -> Path:
 
 
 def number_or_null(value: float) -> float | None:
+    """The number, or None (null in JSON) if it is NaN or infinite."""
     if math.isfinite(value):
         return value
     return None

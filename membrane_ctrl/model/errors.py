@@ -41,6 +41,7 @@ class FindingsError(InputError):
 
     @property
     def lines(self) -> tuple[str, ...]:
+        """The printed text: one line for each problem."""
         return self._lines
 
 

@@ -115,6 +115,7 @@ def list_entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]
 
 
 def require_folder(logs_dir: Path) -> None:
+    """Raise InputError if the folder of the runs does not exist."""
     if not logs_dir.is_dir():
         raise errors.InputError(
             f"{logs_dir}: no such folder; give the folder of the runs with --logs"

@@ -44,7 +44,9 @@ class Film:
         )
 
     def volume_m3_per_root_pa(self, age_s: float | FloatArray) -> FloatArray:
-        """Volume under the film over the cube root of the pressure: V = 0.5214 pi a^2 w."""
+        """Volume under the film over the cube root of the pressure, V = 0.5214 pi a^2 w, at an age,
+        or at each of an array (n,).
+        """
         return (
             solve_hencky().volume * math.pi * RADIUS_MM**2 * 1e-9 * self.sag_mm_per_root_pa(age_s)
         )

@@ -173,6 +173,7 @@ class MemoryLink:
         self.connected = False
 
     async def connect(self) -> None:
+        """Connect; raises LinkDownError while a scenario makes the board unreachable."""
         if self._bench.wrong.unreachable:
             raise roles.LinkDownError(f"{self.name}: no connection")
         self.connected = True
@@ -238,6 +239,7 @@ class MemoryLink:
         self._answer()
 
     async def close(self) -> None:
+        """Disconnect."""
         self.connected = False
 
     def _begin(self) -> None:

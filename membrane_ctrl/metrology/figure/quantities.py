@@ -218,7 +218,7 @@ class _Rings:
         return np.bincount(self._low, values, self._knots).astype(np.float64)
 
     def round_part(self, values: FloatArray) -> FloatArray:
-        """That part at the same cells."""
+        """That part of values (cells,) at the same cells."""
         right = self._sum_by_knot((1 - self._share) * values)
         right[1:] += self._sum_by_knot(self._share * values)[:-1]
         knots = self._solver @ right

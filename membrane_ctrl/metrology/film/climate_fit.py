@@ -251,7 +251,9 @@ class _ClimateModel:
         return np.column_stack([constant, _smooth(share, self._width)])
 
     def find_time_constant(self, wanted_um: FloatArray) -> float:
-        """T_m with the least misfit to the smoothed figures, s; NaN without humidity."""
+        """T_m with the least misfit to the smoothed figures (n - width + 1,), s; NaN without
+        humidity.
+        """
         if "humidity" not in self._causes:
             return float("nan")
 

@@ -249,18 +249,20 @@ class Bowl:
         return np.asarray(self.radius_mm * np.cbrt(self.load) * _normalised_sag(self.slackness))
 
     def height_mm(self, rho: FloatArray) -> FloatArray:
-        """Height above the vertex at rho = r / a."""
+        """Height above the vertex at rho = r / a, an array whose shape fits that of the films'."""
         _, _, integral = _universal_series()
         return np.asarray(self._scale_mm * series.polyval(self.slackness * rho**2, integral))
 
     def rise_mm(self, rho: FloatArray) -> FloatArray:
-        """dh / drho."""
+        """dh / drho, mm, at rho = r / a; shapes as those of `height_mm`."""
         force, _, _ = _universal_series()
         force_there = series.polyval(self.slackness * rho**2, force)
         return np.asarray(2 * rho * self.slackness * self._scale_mm / force_there)
 
     def stresses(self, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Radial and hoop force per length, in E t, at rho = r / a."""
+        """Radial and hoop force per length, in E t, at rho = r / a; shapes as those of
+        `height_mm`.
+        """
         # N_r = E t q^(2/3) n, and N_theta = d(r N_r) / dr = N_r + 2 v dN_r/dv.
         force, slope, _ = _universal_series()
         x = self.slackness * rho**2

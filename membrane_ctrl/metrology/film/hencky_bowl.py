@@ -83,5 +83,7 @@ def excess_rms() -> float:
 
 
 def bowl_profile(rho: FloatArray) -> FloatArray:
-    """Depth of a bowl of unit sag at rho = r / R, 0 at the vertex and 1 at the rim."""
+    """Depth of a bowl of unit sag at rho = r / R, an array of any shape: 0 at the vertex, 1 at the
+    rim.
+    """
     return np.asarray(profile_legendre()(np.square(rho)))

@@ -40,7 +40,7 @@ class SampledBins:
         return self.select_bins(slice(None, None, max(1, self.index.size // enough)))
 
     def select_bins(self, which: slice | BoolArray) -> "SampledBins":
-        """Return some of the bins."""
+        """Return some of the bins: a range, or those where an array (n,) is True."""
         return SampledBins(
             self.index[which],
             self.light[which],

@@ -64,7 +64,7 @@ class Points:
         return cls(rays, screen_mm, weights, np.zeros(count))
 
     def subset(self, keep: BoolArray | IntArray) -> "Points":
-        """Those points where `keep` is set, or those at these places."""
+        """Those points where `keep` (n,) is True, or those at these places (k,)."""
         place = np.flatnonzero(keep) if keep.dtype == bool else keep
         return Points(
             np.take(self.rays, place, axis=1),  # a twentieth of the time of rays[:, place]
@@ -74,7 +74,7 @@ class Points:
         )
 
     def keep(self, place: IntArray) -> None:
-        """Drop all points but those at these places, one array after the other: a copy of all
+        """Drop all points but those at these places (k,), one array after the other: a copy of all
         would be the largest memory of a measurement.
         """
         self.rays = np.take(self.rays, place, axis=1)

@@ -75,7 +75,7 @@ class SetPhases:
         return self.subset(slice(None, None, stride))
 
     def subset(self, keep: slice | BoolArray) -> "SetPhases":
-        """Some of the bins."""
+        """Some of the bins: a range, or those where an array (n,) is True."""
         parts = {name: getattr(self, name)[..., keep] for name in _PER_POINT}
         screen = self.screen
         if screen is not None:

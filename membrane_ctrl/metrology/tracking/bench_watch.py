@@ -84,7 +84,9 @@ class _FirstSaddle:
         return saddle_mm - self.mean_mm
 
     def end_first_frames(self, moved_mm: FloatArray) -> None:
-        """Take no more frames; the first five steps have moved their figures."""
+        """Take no more frames: the first five steps have moved the saddles (2,) of their figures by
+        `moved_mm`.
+        """
         if not self.is_settled:
             self.mean_mm = self.mean_mm + moved_mm
             self.is_settled = True

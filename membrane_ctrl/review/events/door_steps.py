@@ -83,7 +83,9 @@ def find_door_steps(
 
 
 def update_s(mean_pa: Column) -> int:
-    """Seconds for which the barometer repeats a value; 1 if most seconds have a new one."""
+    """Seconds for which the barometer repeats a value, from its 1 s means (n,); 1 if most seconds
+    have a new one.
+    """
     changes = np.nan_to_num(np.diff(mean_pa))
     new = np.concatenate(([False], changes != 0))
     if np.count_nonzero(new) > _ALWAYS_NEW * np.count_nonzero(np.isfinite(mean_pa)):
@@ -101,7 +103,7 @@ def update_s(mean_pa: Column) -> int:
 
 
 def reading_resolution_pa(reading_pa: Column) -> float:
-    """The resolution of the readings, Pa: about the smallest change; almost 0 for a fine
+    """The resolution of readings (n,), Pa: about the smallest change; almost 0 for a fine
     barometer.
     """
     change = np.abs(np.diff(reading_pa))

@@ -75,7 +75,7 @@ def fit_slope(time_s: Column, values: Column) -> FittedSlope:
 
 
 def correlation_time(residual: Column) -> float:
-    """1 + 2 sum of the autocorrelation, in samples; at least 1."""
+    """1 + 2 sum of the autocorrelation of a series (n,), in samples; at least 1."""
     return correlation_times(residual)[0]
 
 

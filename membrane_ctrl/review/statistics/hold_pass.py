@@ -120,7 +120,7 @@ class _Collector:
         self._span = (math.nan, math.nan)
 
     def add(self, block: Mapping[str, Column]) -> None:
-        """Add the next block of ticks."""
+        """Add the next block of ticks: columns (n,) by name, as `Run.tick_blocks` reads them."""
         time_s = block["mono_s"]
         parts = self._parts.classify_block(block)
         is_held = parts["held"]

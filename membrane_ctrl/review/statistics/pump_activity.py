@@ -38,6 +38,9 @@ class PumpSums:
         self._starts = self._running = self._saturated = 0
 
     def add(self, held: Mapping[str, Column]) -> None:
+        """Add the held ticks of the next block: columns (n,) by name, with `mono_s`,
+        `pump_fraction` and `flow_wanted_um_per_s`.
+        """
         pump = np.nan_to_num(held["pump_fraction"])
         self._fraction.add(pump)
         running = pump > 0
@@ -52,6 +55,7 @@ class PumpSums:
         self._saturated += int(is_saturated.sum())
 
     def result(self, period_s: float) -> PumpActivity:
+        """The activity over all ticks added; `period_s` is the time from one tick to the next."""
         count = self._fraction.count
         hours = count * period_s / 3600
         per_hour = 1 / hours if hours else math.nan

@@ -11,7 +11,7 @@ SecondsOf = tuple[Seconds, Counts, Column]
 
 
 def group_starts(number: AnyArray) -> IntArray:
-    """Starts of the runs of equal numbers."""
+    """Places (k,) where the runs of equal numbers begin in an array (n,) that is not empty."""
     return np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
 
 

@@ -336,4 +336,7 @@ def _run_viewer(
 
 
 def viewer_environment() -> dict[str, str]:
+    """The environment of the viewer's process: only errors are logged, unless RUST_LOG
+    states more.
+    """
     return {**os.environ, "RUST_LOG": os.environ.get("RUST_LOG", "error")}

@@ -33,7 +33,7 @@ class DrumMode:
     amplitude_nm: float = 1.0
 
     def swing_um(self, time_s: FloatArray) -> FloatArray:
-        """Displacement, RMS over the mirror, at a time, or at each of an array."""
+        """Displacement, RMS over the mirror, at a time, or at each of an array of any shape."""
         phase_rad = 2 * math.pi * self.frequency_hz * time_s + self.lobes
         return np.asarray(1e-3 * self.amplitude_nm * np.sin(phase_rad))
 
