@@ -16,8 +16,14 @@ _U32_MAX = 2**32 - 1
 
 
 class BoardUnderTest:
-    """A connected board, the test's claim on it, and its heartbeat; times are those of the board's
-    clock.
+    """A connected board, the test's claim on it, and its heartbeat.
+
+    Parameters
+    ----------
+    link : ModbusLink
+        To the board, connected.
+    sleep : callable
+        Waits for seconds of the board's clock; another one lets tests run in virtual time.
     """
 
     def __init__(

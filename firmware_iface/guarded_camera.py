@@ -20,9 +20,23 @@ _CLOCK_TOLERANCE_S = 0.005
 
 
 class GuardedCamera:
-    """The role ExposingCamera on a driver; `name` begins its messages.
+    """The role ExposingCamera on a driver.
 
-    Raises ValueError if the driver is no camera.
+    Parameters
+    ----------
+    driver : OpticalDevice
+        With `grab`, or with `expose` and `fetch`.
+    sensor : SensorFormat
+        Size and type that every frame must have.
+    now : callable
+        The run's clock, on which the frames' times must be.
+    name : str
+        Begins its messages.
+
+    Raises
+    ------
+    ValueError
+        The driver is no camera.
     """
 
     def __init__(

@@ -22,7 +22,15 @@ from firmware_iface.role_bench import answer
 
 
 class CircuitMemory:
-    """The newest answer on each circuit of a source, and when it was asked for."""
+    """The newest answer on each circuit of a source, and when it was asked for.
+
+    Parameters
+    ----------
+    circuits : int
+        How many the source has.
+    age_max_s : float
+        An answer older than this no longer counts: its circuits are open.
+    """
 
     def __init__(self, circuits: int, age_max_s: float) -> None:
         self._age_max_s = age_max_s
@@ -74,7 +82,15 @@ class PolledSource:
 
 
 class CircuitPoller:
-    """Reads one source again and again, and opens it again after a loss."""
+    """Reads one source periodically, and opens it again after a loss.
+
+    Parameters
+    ----------
+    polled : PolledSource
+        The source, with its period and age limit.
+    clock : callable
+        Monotonic time, s.
+    """
 
     def __init__(self, polled: PolledSource, clock: roles.Clock = time.monotonic) -> None:
         self.polled = polled

@@ -20,9 +20,28 @@ SETTLE_S = 0.3  # until it is measured
 class PatternScreen:
     """The role Screen on a display, from `open` to `close`.
 
-    `response` makes the patterns' light linear; `wait` lasts for `settle_s` from the command on,
-    which may be set. Whatever the display's driver raises becomes a LinkError that begins with
-    `name`, and the display is opened again by the next picture.
+    Whatever the display's driver raises becomes a LinkError, and the display is opened again by the
+    next picture.
+
+    Parameters
+    ----------
+    display : Display
+        The driver.
+    raster : ScreenRaster
+        Where the display's pixels are on the pattern, mm.
+    patterns : sequence of Pattern
+        Prepared at `open`, so that none is computed between two frames.
+    clock : DriverClock
+        Of the wait for the display to settle.
+    name : str
+        Begins the messages.
+
+    Attributes
+    ----------
+    settle_s : float
+        How long `wait` lasts from the command on; may be set, for example as measured.
+    response : DisplayResponse
+        By which the levels are chosen so that the patterns' light is linear.
     """
 
     def __init__(

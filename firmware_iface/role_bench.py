@@ -60,8 +60,16 @@ class RoleDevices:
 
 
 class RoleBench:
-    """Reads all sensors at once and drives pump and vent; no `write` for `watchdog_s` sets the pump
-    to 0.
+    """Reads all sensors at once and drives pump and vent.
+
+    Parameters
+    ----------
+    devices : RoleDevices
+        One for each role, not yet open.
+    watchdog_s : float
+        Without a `write` for so long this program sets the pump to 0.
+    clock : callable
+        Monotonic time, s.
     """
 
     def __init__(

@@ -40,7 +40,12 @@ class DeviceRefusedError(LinkError):
 class DeviceBusyError(LinkError):
     """Another program holds the device, or the device is busy; it may be free later.
 
-    `lapses_in_s`: time until the other's claim ends unless its watchdog is fed; 0 if unknown.
+    Parameters
+    ----------
+    message : str
+        One line for people.
+    lapses_in_s : float
+        Time until the other's claim ends unless its watchdog is fed; 0 if unknown.
     """
 
     def __init__(self, message: str, lapses_in_s: float = 0.0) -> None:

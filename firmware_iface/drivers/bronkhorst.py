@@ -130,10 +130,16 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
 
 
 class BronkhorstFlow:
-    """An EL-FLOW as the pump: fraction 1 is its capacity. Only the instrument `serial` is accepted;
-    empty: any.
+    """An EL-FLOW as the pump: fraction 1 is its capacity.
 
     It has no watchdog: without a host it continues with its last setpoint.
+
+    Parameters
+    ----------
+    port : ParameterPort
+        Its parameters, over Modbus or ProPar.
+    serial : str
+        Serial number of the only instrument that is accepted; empty: any.
     """
 
     def __init__(self, port: ParameterPort, serial: str = "") -> None:
@@ -182,8 +188,14 @@ class BronkhorstFlow:
 
 
 class BronkhorstPressure:
-    """An EL-PRESS as the gauge pressure sensor. Only the instrument `serial` is accepted; empty:
-    any.
+    """An EL-PRESS as the gauge pressure sensor.
+
+    Parameters
+    ----------
+    port : ParameterPort
+        Its parameters, over Modbus or ProPar.
+    serial : str
+        Serial number of the only instrument that is accepted; empty: any.
     """
 
     # slightly below zero (noise), above full scale up to the sensor's limit (131.07 % of 32000 is

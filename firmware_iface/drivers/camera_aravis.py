@@ -51,7 +51,19 @@ class FrameCounts:
 class AravisCamera:
     """The camera; opened by the first exposure, and again by the next one after its link was lost.
 
-    A sensor of another size is refused; `counts` has the results of the triggers.
+    Parameters
+    ----------
+    config : AravisCameraConfig
+        Which camera, and its exposure, gain and format.
+    sensor : SensorFormat
+        Size of the sensor in `[optics.camera]`; a camera of another size is refused.
+    clock : DriverClock
+        Of the frames' times; the run's clock in a hold.
+
+    Attributes
+    ----------
+    counts : FrameCounts
+        Results of the triggers so far.
     """
 
     def __init__(

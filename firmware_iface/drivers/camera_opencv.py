@@ -60,7 +60,16 @@ class VideoCapture(Protocol):
 class UvcCamera:
     """The camera; opened by the first exposure, and again by the next one after it went away.
 
-    A sensor of another size is refused; `capture` makes the capture from the port.
+    Parameters
+    ----------
+    config : UvcCameraConfig
+        Port (a number, or a path such as `/dev/video0`), exposure and gain.
+    sensor : SensorFormat
+        Size of the sensor in `[optics.camera]`; a camera of another size is refused.
+    clock : DriverClock
+        Of the frames' times; the run's clock in a hold.
+    capture : callable
+        Makes the capture from the port.
     """
 
     def __init__(
@@ -162,6 +171,15 @@ class FolderCamera:
 
     The pictures are 8 or 16 bit grey and of one size; `x_sin_0.png` is the picture of the pattern
     `x_sin_0`.
+
+    Parameters
+    ----------
+    config : FolderCameraConfig
+        The folder; `~` is the home folder.
+    sensor : SensorFormat
+        Size in `[optics.camera]`; pictures of another size are refused.
+    clock : DriverClock
+        Of the frames' times, which are those of reading.
     """
 
     def __init__(

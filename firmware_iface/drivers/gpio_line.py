@@ -56,7 +56,17 @@ class GpioCircuit:
 
 
 class GpioLines:
-    """Circuits at the lines of one GPIO chip; `gpiod` is the package, or a simulation of it."""
+    """Circuits at the lines of one GPIO chip.
+
+    Parameters
+    ----------
+    chip : str
+        Its device, such as `/dev/gpiochip0`.
+    circuits : sequence of GpioCircuit
+        In the order in which `closed_circuits` answers.
+    gpiod : module or None
+        A simulation of the package `gpiod`; None is the package, or ValueError without it.
+    """
 
     def __init__(self, chip: str, circuits: Sequence[GpioCircuit], gpiod: Any = None) -> None:
         self._gpiod = load_gpiod() if gpiod is None else gpiod

@@ -38,8 +38,14 @@ _STEPS_UM = {3: 1.0, 2: 10.0, 1: 100.0}  # decimals of the millimetre
 
 
 class KeyenceDlRs1a(line_link.LineDriver):
-    """A `DisplacementSensor`; `port` replaces the configured one. Displacement = direction *
-    (value - zero).
+    """A `DisplacementSensor`: displacement = direction * (value - zero).
+
+    Parameters
+    ----------
+    config : KeyenceDlRs1aConfig
+        Port, amplifier, zero and direction.
+    port : SerialPort or None
+        Replaces the configured one, for tests.
     """
 
     manual = "DL-RS1A user's manual, IL edition, pages 7-16"

@@ -23,7 +23,15 @@ _MANOMETER = "CM"
 
 
 class Mks937b(line_link.LineDriver):
-    """A `PressureSensor`; `port` replaces the configured one."""
+    """A `PressureSensor`.
+
+    Parameters
+    ----------
+    config : Mks937bConfig
+        Port, address of the controller and channel of the manometer.
+    port : SerialPort or None
+        Replaces the configured one, for tests.
+    """
 
     manual = "937B operation manual, page 86; 946 instruction manual, page 103"
 

@@ -144,7 +144,16 @@ def _check_raw(made: ValueMap, raw_limits: list[float] | None) -> None:
 class ModbusValue:
     """One value of a Modbus device, in the role that the configuration gives it.
 
-    `rest` is an actuator's value after opening and closing; None leaves it unchanged.
+    Parameters
+    ----------
+    link : ModbusLink
+        To the device, not yet connected.
+    value_map : ValueMap
+        Register, type and scale of the value, in the role's unit.
+    rest : float or None
+        An actuator's value after opening and closing, in the role's unit; None for a sensor.
+    clock : callable
+        Monotonic time of the samples, s.
     """
 
     def __init__(

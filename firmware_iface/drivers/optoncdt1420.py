@@ -106,12 +106,18 @@ def distance_mm(raw: float, range_mm: float) -> float:
 
 
 class Optoncdt1420:
-    """A `DisplacementSensor`; `port` replaces the configured one.
+    """A `DisplacementSensor`: displacement = direction * (distance - zero).
 
-    Displacement = direction * (distance - zero). The sensor is behind the mirror: when the bowl
-    deepens the vertex comes nearer, so the default direction is -1. Counter and time are the
-    driver's: trusted values so far, time of arrival. A sensor that repeats a value repeats its
-    counter too, so the value is not new.
+    The sensor is behind the mirror: when the bowl deepens the vertex comes nearer, so the default
+    direction is -1. Counter and time are the driver's: trusted values so far, time of arrival. A
+    sensor that repeats a value repeats its counter too, so the value is not new.
+
+    Parameters
+    ----------
+    config : Optoncdt1420Config
+        Port, rate, range, zero and direction.
+    port : SerialPort or None
+        Replaces the configured one, for tests.
     """
 
     def __init__(

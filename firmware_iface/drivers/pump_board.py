@@ -35,10 +35,23 @@ class PumpBoard:
     and obeys every program. Boards before map version 3 do not stop the pump when their gauge
     fails, and have no interlock inputs: readings show none closed.
 
-    The board turns the pump off when it gets no `write` for `watchdog_s`. The URL is
-    `tcp://HOST:PORT` (502 when left out) or `rtu:///dev/ttyUSB0?baud=115200`; an existing `link`
-    replaces it. Raises ValueError (an invalid URL, or a watchdog period that the board cannot
-    have).
+    Parameters
+    ----------
+    url : str
+        `tcp://HOST[:PORT]` (502 when left out) or `rtu:///dev/ttyUSB0?baud=115200`.
+    unit_id : int
+        Modbus unit.
+    timeout_s : float
+        Of one exchange.
+    watchdog_s : float
+        The board turns the pump off when it gets no `write` for so long.
+    link : ModbusLink or None
+        Replaces the URL, for tests and emulated boards.
+
+    Raises
+    ------
+    ValueError
+        The URL is invalid, or the board cannot have this watchdog period.
     """
 
     def __init__(

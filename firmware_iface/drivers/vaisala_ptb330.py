@@ -45,7 +45,12 @@ class BarometerMessage:
 class VaisalaPtb330(line_link.LineDriver):
     """A `Barometer`. A task polls it every `period_s`; the newest value is served.
 
-    `port` replaces the configured one.
+    Parameters
+    ----------
+    config : VaisalaPtb330Config
+        Port, period of the requests, and age at which a value no longer counts.
+    port : SerialPort or None
+        Replaces the configured one, for tests.
     """
 
     manual = "PTB330 user's guide M210855EN, pages 70-88"

@@ -36,7 +36,15 @@ _STEP_MW = 0.0011  # values are written with three decimals
 
 
 class Ventus(line_link.LineDriver):
-    """A `Pump`: the fraction is that of `power_max_mw`; `port` replaces the configured one."""
+    """A `Pump`: the fraction is that of `power_max_mw`.
+
+    Parameters
+    ----------
+    config : VentusConfig
+        Port, and the power of full drive.
+    port : SerialPort or None
+        Replaces the configured one, for tests.
+    """
 
     manual = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
 

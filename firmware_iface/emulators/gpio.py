@@ -79,7 +79,17 @@ class EmulatedGpio:
 
 
 class EmulatedRequest:
-    """Requested lines."""
+    """Requested lines, as `EmulatedGpio.request_lines` returns them.
+
+    Parameters
+    ----------
+    gpio : EmulatedGpio
+        With the present state of the contacts.
+    chip : str
+        Device of the chip.
+    config : mapping of int to LineSettings
+        By number of the line.
+    """
 
     def __init__(
         self, gpio: EmulatedGpio, chip: str, config: Mapping[int, EmulatedGpio.LineSettings]

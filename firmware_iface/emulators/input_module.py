@@ -18,6 +18,12 @@ Bits = Mapping[int, Callable[[], bool]]
 class InputModule:
     """Bits by address, each from a function of its present state.
 
+    Parameters
+    ----------
+    discrete, coils : mapping of int to callable
+        By address on the wire, from 0: whether the bit is 1 now. An address that is missing is
+        answered with exception 2.
+
     Attributes
     ----------
     powered : bool

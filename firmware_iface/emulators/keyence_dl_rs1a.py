@@ -8,10 +8,25 @@ _WRITABLE = ("001",)
 
 
 class KeyenceDlRs1aEmulator(LineDevice):
-    """One amplifier that measures the mirror (NaN: it is in error), and others that measure nothing
-    of interest.
+    """One amplifier that measures the mirror, and others that measure nothing of interest.
 
-    `error_state` is data number 033 of all amplifiers, `zero_shift_mm` that of the judgment value.
+    Parameters
+    ----------
+    displacement_um : callable
+        Of the mirror's centre; NaN: the amplifier is in error.
+    direction : int
+        1 or -1: sign of the measured value over the displacement.
+    baud, parity : int, str
+        Of the line.
+    amplifiers : int
+        How many; the first one measures the mirror.
+
+    Attributes
+    ----------
+    error_state : int
+        Data number 033 of all amplifiers.
+    zero_shift_mm : float
+        Taken off the judgment value.
     """
 
     end = b"\r"

@@ -28,8 +28,16 @@ class Answer:
 
 
 class ModbusTcpServer:
-    """Serves any number of clients, each request answered by
-    `handler` as soon as it is complete.
+    """Serves any number of clients.
+
+    Parameters
+    ----------
+    handler : callable
+        Answers each request as soon as it is complete; it must not block.
+    host : str
+        Address to listen on.
+    port : int
+        TCP port; 0 takes any free one.
     """
 
     def __init__(self, handler: Handler, host: str, port: int) -> None:

@@ -27,8 +27,20 @@ _CHOICES = {
 
 
 class Optoncdt1420Emulator(LineDevice):
-    """Measures the mirror from behind, displacement 0 in the middle of its range (NaN:
-    no target).
+    """Measures the mirror from behind, with displacement 0 in the middle of its range.
+
+    Parameters
+    ----------
+    displacement_um : callable
+        Of the mirror's centre; NaN: no target.
+    range_mm : int
+        Measuring range.
+    direction : int
+        1 or -1: sign of the distance over the displacement.
+    baud : int
+        Of the line.
+    name : str
+        Of the sensor; empty: `ILD1420-` with the range.
     """
 
     def __init__(

@@ -20,7 +20,24 @@ _DEFAULT_FORMAT = '"P= " 4.2 P " " U3 #r #n'
 
 
 class Mks937bEmulator(LineDevice):
-    """Measures the gauge pressure in Pa (NaN: over range); `unit` is what its front panel shows."""
+    """Measures the gauge pressure.
+
+    Parameters
+    ----------
+    gauge_pa : callable
+        The pressure; NaN: over range.
+    baud, parity : int, str
+        Of the line.
+    address : int
+        Of the controller, 1..254.
+    channel : int
+        That of the capacitance manometer, 1..6; the others have other sensors.
+
+    Attributes
+    ----------
+    unit : str
+        As chosen at its front panel, or by a command.
+    """
 
     end = b";FF"
 
@@ -89,8 +106,23 @@ class Mks937bEmulator(LineDevice):
 
 
 class VaisalaPtb330Emulator(LineDevice):
-    """Measures the air (NaN: it cannot); `running`: it was left sending. `error_flags` are its
-    three modules'.
+    """Measures the air pressure.
+
+    Parameters
+    ----------
+    ambient_pressure_pa : callable
+        The pressure; NaN: it cannot be measured.
+    baud : int
+        Of the line.
+    running : bool
+        Whether an earlier program left it sending without requests.
+    model : str
+        As it identifies itself.
+
+    Attributes
+    ----------
+    error_flags : str
+        A digit for each of its three modules; 1 is a fault.
     """
 
     end = b"\r"

@@ -75,11 +75,24 @@ class StoredSettings:
 
 
 class BoardState:
-    """The board between two requests, of the map version of `registers`; it reports `map_version`.
+    """The board between two requests.
 
     `advance` is called before every request and every few milliseconds: the watchdog, the pressure
-    limit and the guard of the gauge depend only on the time passed in. Boards of map versions 1 and
-    2 ignore `stored`.
+    limit and the guard of the gauge depend only on the time passed in.
+
+    Parameters
+    ----------
+    registers : RegisterMap
+        Of the board's map version, which decides whether it has claims and guards.
+    sample : BoardSample
+        What the sensors measure at power-up.
+    stored : StoredSettings
+        Settings kept without power; boards of map versions 1 and 2 ignore them.
+
+    Attributes
+    ----------
+    map_version : int
+        As it reports it; a test may set another one.
     """
 
     def __init__(
@@ -402,12 +415,24 @@ class BoardPlant(Protocol):
 
 
 class PumpBoardEmulator:
-    """Serves `plant` on Modbus TCP, from the event loop's thread.
+    """Serves a plant on Modbus TCP, from the event loop's thread.
 
-    Port 0 takes any free one (see `port` after `start`). The watchdog runs on `clock`, by default
-    the event loop's. Requests to other units get exception 11, as from a gateway. `registers` may
-    be those of an earlier map version; `stored` are the settings that the board keeps without
-    power.
+    Parameters
+    ----------
+    plant : BoardPlant
+        On the board's wires.
+    host : str
+        Address to listen on.
+    port : int
+        TCP port; 0 takes any free one (see `port` after `start`).
+    clock : callable or None
+        Of the watchdog, s; None is the event loop's.
+    unit_id : int
+        Requests to other units get exception 11, as from a gateway.
+    registers : RegisterMap or None
+        Those of an earlier map version; None is the newest.
+    stored : StoredSettings
+        Settings that the board keeps without power.
     """
 
     def __init__(

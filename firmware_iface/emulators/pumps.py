@@ -54,9 +54,16 @@ _BUFFER_BYTES_MAX = 4096  # of messages that have not ended
 
 
 class VentusEmulator(LineDevice):
-    """Drives gas: `drive` is called with the fraction of `power_max_mw` whenever it changes.
+    """Drives gas.
 
-    `streaming`: it was left streaming.
+    Parameters
+    ----------
+    drive : callable
+        Gets the power as a fraction of `power_max_mw`, 0..1, whenever it changes.
+    power_max_mw : float
+        Power of full drive, as the driver is configured.
+    streaming : bool
+        Whether an earlier program left it streaming.
     """
 
     def __init__(self, drive: Drive, power_max_mw: float = 1000.0, streaming: bool = False) -> None:
@@ -131,11 +138,22 @@ class VentusEmulator(LineDevice):
 
 
 class Instrument:
-    """The instrument behind its interfaces: "DMFC" (EL-FLOW) or "DEPC" (EL-PRESS).
+    """The instrument behind its interfaces.
 
-    100 % is `capacity`, in `unit` ("mln/min", "mbar(g)"). `measured` gives the sensor's value in
-    `unit`; without it a flow controller measures its own setpoint. `actuate` gets the flowing
-    fraction 0..1 whenever it changes.
+    Parameters
+    ----------
+    device_type : str
+        "DMFC" (EL-FLOW) or "DEPC" (EL-PRESS).
+    serial : str
+        Serial number.
+    capacity : float
+        100 %, in `unit`.
+    unit : str
+        Such as "mln/min" or "mbar(g)".
+    measured : callable or None
+        The sensor's value in `unit`; None: a flow controller that measures its own setpoint.
+    actuate : callable or None
+        Gets the flow over the capacity, 0..1, whenever it changes.
     """
 
     def __init__(
@@ -284,7 +302,17 @@ class BronkhorstRegisters:
 
 
 class ProparDevice(serial_device.SerialDevice):
-    """The instrument on a serial line; answers in the form of the question, binary or ASCII."""
+    """The instrument on a serial line; answers in the form of the question, binary or ASCII.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        What it answers for.
+    settings : SerialSettings
+        Of the line.
+    node : int
+        Its address; it also answers to 128, which is any.
+    """
 
     def __init__(self, instrument: Instrument, settings: SerialSettings, node: int = 3) -> None:
         super().__init__(settings)

@@ -18,9 +18,17 @@ PduHandler = Callable[[bytes], bytes]
 
 
 class RtuBusEmulator(SerialDevice):
-    """All slaves of one bus, by unit id with what answers them (`lambda pdu: respond(pdu, table)`).
+    """All slaves of one bus.
 
-    Without `echo_test` function 8 ("return query data") is refused.
+    Parameters
+    ----------
+    settings : SerialSettings
+        Of the line.
+    slaves : mapping of int to callable
+        By unit id: makes the PDU of the answer from that of the request; empty for no answer.
+    echo_test : bool
+        Whether function 8 ("return query data") is answered; else it goes to the slave, which
+        refuses it.
     """
 
     def __init__(

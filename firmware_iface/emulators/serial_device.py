@@ -97,7 +97,13 @@ class SerialDevice:
 
 
 class LineDevice(SerialDevice):
-    """A device that answers lines of text; a device overrides `line`."""
+    """A device that answers lines of text; a device overrides `line`.
+
+    Parameters
+    ----------
+    baud, data_bits, parity : int, int, str
+        Of the line, as in `SerialSettings`.
+    """
 
     end = b"\n"
 
@@ -122,11 +128,17 @@ class LineDevice(SerialDevice):
 
 
 class PtyWire:
-    """An emulated device behind a pseudo-terminal, to be opened at `path` like any serial port.
+    """An emulated device behind a pseudo-terminal, which is opened like any serial port.
 
-    `path` is a link to the pseudo-terminal, to another one after every replug. A program that opens
-    it with another baud rate than the device's gets garbage and is not understood, as on a real
-    line. A pseudo-terminal has no character size or parity.
+    A program that opens it with another baud rate than the device's gets garbage and is not
+    understood, as on a real line. A pseudo-terminal has no character size or parity.
+
+    Parameters
+    ----------
+    device : SerialDevice
+        The device's end of the line.
+    path : Path
+        Where a link to the pseudo-terminal is made, to another one after every replug.
     """
 
     def __init__(self, device: SerialDevice, path: Path) -> None:

@@ -112,7 +112,15 @@ _G_TYPE_INT, _G_TYPE_DOUBLE = 6 << 2, 15 << 2  # gobject/gtype.h
 
 
 class AravisError(LinkError):
-    """The library's message, with its code (ArvDeviceError, or NOT_OF_THE_DEVICE)."""
+    """An error that the library reported.
+
+    Parameters
+    ----------
+    message : str
+        As the library states it.
+    code : int
+        An ArvDeviceError of this module, or NOT_OF_THE_DEVICE.
+    """
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)

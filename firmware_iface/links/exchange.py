@@ -68,12 +68,18 @@ class _Abandoned:
 
 
 class SerialExchange:
-    """Questions and answers on one line, for one device or several that take turns; its port's only
-    user.
+    """Questions and answers on one line, for one device or several that take turns.
 
-    Devices need the silence `gap_s` between an answer and the next question. After a loss it is
-    `quiet_s`, the usual upper limit of late answers; the fence covers the rest. Bytes of `blank`
-    mean nothing between answers, like the LF after a CR that already ended one.
+    Parameters
+    ----------
+    port : SerialPort
+        The line; this is its only user.
+    gap_s : float
+        Silence that the devices need between an answer and the next question.
+    quiet_s : float
+        Silence after a loss: the usual upper limit of late answers; the fence covers the rest.
+    blank : bytes
+        Bytes that mean nothing between answers, like the LF after a CR that already ended one.
     """
 
     def __init__(self, port: SerialPort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:

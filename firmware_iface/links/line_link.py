@@ -24,7 +24,18 @@ class LineFence:
 class LineLink:
     """Commands out, lines of text back, each checked as a whole against its expected form.
 
-    A command ends in `end`. The device has `timeout_s`, plus the time on the wire.
+    Parameters
+    ----------
+    port : SerialPort
+        The line.
+    end : str
+        Ends each command, such as CR LF.
+    timeout_s : float
+        Of the device; the time on the wire is added.
+    fence : LineFence
+        Question that shows, after a loss, that no earlier answer is still to come.
+    quiet_s : float
+        Silence after a loss, before the fence.
     """
 
     def __init__(
@@ -110,7 +121,13 @@ class LineLink:
 
 
 class LineDriver:
-    """Base of a driver for a device that answers lines of text on its own serial port."""
+    """Base of a driver for a device that answers lines of text on its own serial port.
+
+    Parameters
+    ----------
+    port, end, timeout_s, fence
+        As for `LineLink`.
+    """
 
     manual = ""
 

@@ -96,7 +96,12 @@ def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
 class RtuBus:
     """A serial bus with any number of Modbus devices, served in turn.
 
-    After a loss it is silent for `quiet_s`, the usual upper limit of late answers.
+    Parameters
+    ----------
+    port : SerialPort
+        The line.
+    quiet_s : float
+        Silence after a loss: the usual upper limit of late answers.
     """
 
     def __init__(self, port: serial_port.SerialPort, quiet_s: float = 0.2) -> None:
@@ -144,8 +149,21 @@ class GuardedModbusRtu:
     """One Modbus RTU device of a bus: the first to connect opens the bus, any of them closes it for
     all.
 
-    The device has `timeout_s`, plus the time on the wire. `fence` is False for a device that
-    ignores function 8 instead of refusing it.
+    Parameters
+    ----------
+    bus : RtuBus
+        Shared with the other devices of the line.
+    unit_id : int
+        From 1 to 247.
+    timeout_s : float
+        Of the device; the time on the wire is added.
+    fence : bool
+        False for a device that ignores function 8 instead of answering or refusing it.
+
+    Raises
+    ------
+    ValueError
+        The unit id is none.
     """
 
     def __init__(self, bus: RtuBus, unit_id: int, timeout_s: float, fence: bool = True) -> None:

@@ -49,12 +49,23 @@ _REMEMBERED_REQUESTS = 16
 
 
 class GuardedModbusTcp:
-    """One Modbus TCP device; `timeout_s` is for connecting and for each reply.
+    """One Modbus TCP device.
 
     One request is in flight at a time. After its caller is cancelled, a sent request still runs to
     its reply or timeout, so that nothing is abandoned on the wire. Nothing is sent twice or
     reconnects automatically: the owner calls `connect`, which refuses to try before its back-off
     (0.1 s, doubling to 5 s, until the device can be read) is over.
+
+    Parameters
+    ----------
+    host, port : str, int
+        Of the device or its gateway.
+    unit_id : int
+        Modbus unit behind the address.
+    timeout_s : float
+        For connecting, and for each reply.
+    clock : callable
+        Monotonic time of back-off and late replies, s.
     """
 
     def __init__(

@@ -120,8 +120,20 @@ class Receiver(Protocol):
 class SerialPort:
     """A serial port of this machine.
 
-    It is a path or `usb:VID:PID[:SERIAL]`, looked up at every `open`, so that a replug in another
-    socket works. Raises ValueError if the name is neither.
+    Parameters
+    ----------
+    port : str
+        A path, or `usb:VID:PID[:SERIAL]`, which is looked up at every `open`, so that a replug in
+        another socket works.
+    settings : SerialSettings
+        Of the line.
+    clock : callable
+        Monotonic time of the back-off, s.
+
+    Raises
+    ------
+    ValueError
+        The name is neither.
     """
 
     def __init__(self, port: str, settings: SerialSettings, clock: Clock = time.monotonic) -> None:

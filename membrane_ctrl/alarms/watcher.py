@@ -17,8 +17,16 @@ _STARTS_S = 30.0
 
 
 class Watcher:
-    """Turns rows and events into alarm messages; the first outbox gets all, the second only the
-    escalated ones.
+    """Turns rows and events into alarm messages.
+
+    Parameters
+    ----------
+    config : AlarmsConfig
+        Rules, and the times of escalation, reminders and silence.
+    outboxes : sequence of Outbox
+        The first gets all messages, the second (if there is one) only the escalated ones.
+    now_s : float
+        Second of the run, as for all methods.
 
     Attributes
     ----------

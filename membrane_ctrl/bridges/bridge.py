@@ -35,6 +35,14 @@ TABLE = (*SIGNAL_TABLE, _ANSWER)
 class Bridge:
     """The values that bridges publish and the commands that they may send, by role; shared by all
     bridges of the process.
+
+    Parameters
+    ----------
+    feed : HoldFeed
+        The hold that is published, with its signals; the caller opens and closes it.
+    config : Config
+        `[bridges]` sets name, role and period; limits and pump set the bounds of the numbers that a
+        client may send.
     """
 
     def __init__(self, feed: HoldFeed, config: Config) -> None:

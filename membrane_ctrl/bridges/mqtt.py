@@ -118,7 +118,20 @@ def _list_exceptions(group: BaseExceptionGroup[BaseException]) -> list[BaseExcep
 
 
 class Broker:
-    """How to connect to the configured broker. Raises InputError for a wrong file."""
+    """How to connect to the configured broker.
+
+    Parameters
+    ----------
+    config : MqttConfig
+        Address, account and certificate authority; its files are read once, here.
+    name : str
+        Of the mirror in topics and identifiers (`bridges.name`).
+
+    Raises
+    ------
+    InputError
+        A file cannot be used.
+    """
 
     def __init__(self, config: MqttConfig, name: str) -> None:
         self._config = config

@@ -39,7 +39,14 @@ class CaptureLink(HoldLink, Protocol):
 class Sweep:
     """Moves and observes; every wait has a time-out.
 
-    `progress` gets the elapsed seconds of the hold, and may raise KeyboardInterrupt.
+    Parameters
+    ----------
+    link : CaptureLink
+        The hold, and where its sets are.
+    limits : LimitsConfig
+        Of the hold: its band decides when the mirror has settled.
+    progress : callable
+        Gets the seconds of hold since its last call, and may raise KeyboardInterrupt.
     """
 
     def __init__(

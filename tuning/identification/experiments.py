@@ -122,9 +122,14 @@ class Characterised:
 
 
 class ExperimentError(Exception):
-    """No relay could be completed; the message is the last one's reason.
+    """No relay could be completed.
 
-    `pump_suspected`: the pump may not match its configured curve.
+    Parameters
+    ----------
+    reason : str
+        Why the last one ended, for people.
+    pump_suspected : bool
+        The pump may not match its configured curve: the remedy is to map it.
     """
 
     def __init__(self, reason: str, pump_suspected: bool = False) -> None:

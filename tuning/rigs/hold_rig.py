@@ -38,8 +38,16 @@ _REFUSALS_MOST = 5  # of an experiment, while the safety table holds the mean fl
 
 
 class HoldRig:
-    """Runs holds and experiments and sets gains on a running hold; every command is recorded with
-    `who`.
+    """Runs holds and experiments and sets gains on a running hold.
+
+    Parameters
+    ----------
+    link : HoldLink
+        To the hold, whose command this session has.
+    who : str
+        Recorded with every command.
+    progress : callable
+        Gets the seconds of hold recorded since its last call.
     """
 
     def __init__(self, link: HoldLink, who: str, progress: Progress = lambda seconds: None) -> None:
