@@ -82,6 +82,8 @@ class Checked:
         Response of panel and camera, and how even the light is.
     image : FilmImage
         A part of the mirror that shows the screen a second time.
+    blur_px : float
+        Sigma of the picture's blur.
     """
 
     stack: frame_stack.FrameStack
@@ -104,6 +106,7 @@ class Checked:
         default_factory=light_response.LightResponse.unknown
     )
     image: film_image.FilmImage = film_image.NO_FILM_IMAGE
+    blur_px: float = 0.0
 
     @property
     def verdict(self) -> tuple[Verdict, str]:

@@ -1,11 +1,16 @@
-"""What the frames of an accepted set show of second images, and of the response to light."""
+"""What the frames of an accepted set show of blur, second images and the response to light."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.frame_checks import film_image, light_response, second_reflection
+from membrane_ctrl.metrology.frame_checks import (
+    film_image,
+    light_response,
+    picture_blur,
+    second_reflection,
+)
 from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, Checked
 from membrane_ctrl.metrology.frame_checks.sampled_bins import SampledBins
 from membrane_ctrl.model.arrays import FloatArray
@@ -18,7 +23,7 @@ def measure_light_path(
     optics: OpticsConfig,
     anchor: Anchor | None,
 ) -> Checked:
-    """Measure what an accepted set shows of second images, and of the response to light.
+    """Measure what an accepted set shows of blur, second images and the response to light.
 
     Parameters
     ----------
@@ -36,10 +41,16 @@ def measure_light_path(
     Returns
     -------
     Checked
-        The set with its `second`, `response` and `image`.
+        The set with its `second`, `response`, `image` and `blur_px`.
     """
+    # Blur carries light across the edges of the Gray bits: a second image is searched beyond it.
+    rows, columns = checked.view.mask.shape
+    bin_px = checked.binned.bin_px
+    gradients = picture_blur.phase_gradients(scene.phase_rad, scene.index, (rows, columns), bin_px)
+    swings = checked.view.swing_adu.reshape(2, -1)[:, scene.index]
+    blur_px = picture_blur.estimate_blur_px(gradients, swings, bin_px)
     second = second_reflection.find_second_reflection(
-        checked.stack, checked.binned, scene, excluded, optics.pattern
+        checked.stack, checked.binned, scene, excluded, optics.pattern, blur_px * gradients
     )
     position_mm = np.array(checked.tracer.position_mm(checked.state.points))
     response = light_response.estimate_response(
@@ -51,7 +62,7 @@ def measure_light_path(
         checked.view.used,
     )
     image = _find_film_image(checked, excluded, optics, anchor)
-    return replace(checked, second=second, response=response, image=image)
+    return replace(checked, second=second, response=response, image=image, blur_px=blur_px)
 
 
 def _find_film_image(

@@ -37,7 +37,11 @@ class SampledBins:
 
     def thin_to(self, enough: int = _ENOUGH_BINS) -> "SampledBins":
         """Return every k-th bin, so that at least `enough` of them stay."""
-        return self.select_bins(slice(None, None, max(1, self.index.size // enough)))
+        return self.select_bins(self.thinning(enough))
+
+    def thinning(self, enough: int) -> slice:
+        """The bins that `thin_to` takes."""
+        return slice(None, None, max(1, self.index.size // enough))
 
     def select_bins(self, which: slice | BoolArray) -> "SampledBins":
         """Return some of the bins: a range, or those where an array (n,) is True."""

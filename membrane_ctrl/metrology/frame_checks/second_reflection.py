@@ -27,8 +27,10 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 _BINS = 800  # number of bins that are compared
 _LEAST_SURE = 0.2  # share of these bins in which a Gray frame must show its bit
-# Phase from the edge of a Gray bit within which blur and the size of a bin hide a second image.
+# Phase from the edge of a Gray bit within which the size of a bin hides a second image.
 HIDDEN_RAD = 0.4
+# Sigmas of the blur from such an edge within which it hides one: 0.02 % of the light is beyond.
+_BLUR_SIGMAS = 3.5
 
 # The places that are searched: scales a, and shifts d in steps.
 _SCALES = (1.0, 0.95, 1.05, 0.9, 1.1, 0.75, 1.25, 0.5, 1.5, -0.5, -0.75, -1.0, -1.3)
@@ -128,6 +130,7 @@ def find_second_reflection(
     scene: SampledBins,
     excluded: Collection[int],
     pattern: PatternConfig,
+    blur_rad: FloatArray,
 ) -> SecondReflection:
     """Search the Gray frames of a fitted set for a second image.
 
@@ -141,6 +144,8 @@ def find_second_reflection(
         Frames that do not belong to the set.
     pattern : PatternConfig
         The pattern on the screen.
+    blur_rad : (2, n) array
+        Sigma of the picture's blur in the bins, in phases of x and y; NaN counts as 0.
 
     Returns
     -------
@@ -149,9 +154,12 @@ def find_second_reflection(
     """
     # The best place along each axis, by itself.
     centre_rad = screen_scale.centre_phase_rad(pattern)
-    scene = scene.thin_to(_BINS)
+    hidden_rad = np.fmax(HIDDEN_RAD, _BLUR_SIGMAS * blur_rad)
+    some = scene.thinning(_BINS)
+    scene = scene.select_bins(some)
     places = [
-        _search_axis(stack, binned, scene, excluded, axis, centre_rad) for axis in range(len(AXES))
+        _search_axis(stack, binned, scene, excluded, axis, centre_rad, hidden_rad[axis, some])
+        for axis in range(len(AXES))
     ]
     known = [place for place in places if place is not None]
     if not known:
@@ -202,8 +210,12 @@ def _search_axis(
     excluded: Collection[int],
     axis: int,
     centre_rad: float,
+    hidden_rad: FloatArray,
 ) -> _Place | None:
-    """The place that explains the Gray frames of an axis best; None without usable frames."""
+    """The place that explains the Gray frames of an axis best; None without usable frames.
+
+    `hidden_rad` (n,) is the phase from the edge of a bit within which a second image is hidden.
+    """
     phase_rad = scene.phase_rad[axis]
     smooth = scene.smooth_columns()
     frames = []
@@ -214,7 +226,7 @@ def _search_axis(
         bit = stack.patterns[k].index
         shown, from_edge_rad = gray_bit(phase_rad, bit)
         saturated = binned.saturated[k].reshape(-1)[scene.index]
-        sure = (from_edge_rad > HIDDEN_RAD) & ~saturated
+        sure = (from_edge_rad > hidden_rad) & ~saturated
         if np.count_nonzero(sure) < _LEAST_SURE * _BINS:
             continue
         # The frame's own pattern: level and contrast, which vary smoothly over the mirror.

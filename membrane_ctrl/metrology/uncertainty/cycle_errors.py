@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
+from membrane_ctrl.metrology.frame_checks import picture_blur
 from membrane_ctrl.metrology.frame_checks.image_lag import ImageLag
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.rays import ray_tracing
@@ -467,9 +468,10 @@ class ErrorWatch:
         ]
         light = np.stack(levels) / self._bin_px**2 / swings
         predicted_rad = tracer.predict_screen(state.points, fit.surface) / self._mm_per_rad
-        blur_px = image_blur.estimate_blur_px(
-            predicted_rad, swings, state.index, self._shape, self._bin_px
+        gradients = picture_blur.phase_gradients(
+            predicted_rad, state.index, self._shape, self._bin_px
         )
+        blur_px = picture_blur.estimate_blur_px(gradients, swings, self._bin_px)
 
         # The bench with the examined points, and with as many as waves of light need.
         width_px = self._optics.camera.width_px

@@ -9,7 +9,6 @@ from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
 from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
-from membrane_ctrl.metrology.phase import screen_scale
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.uncertainty import (
@@ -24,7 +23,6 @@ from membrane_ctrl.metrology.uncertainty.film_motion_rows import find_film_motio
 from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_sources
 from membrane_ctrl.metrology.uncertainty.front_film_error import front_film_sources
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
-from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.image_lag_error import image_lag_sources
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_changes
@@ -126,7 +124,7 @@ def assemble_budget(
 
     # Blur. It follows from the contrast and the slopes of the fitted surface: if these are not
     # those of a surface, the contrast shows no blur.
-    blur = image_blur.blur_source(bench, _estimate_blur_px(optics, checked))
+    blur = image_blur.blur_source(bench, checked.blur_px)
     is_blurred = budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM
     if is_blurred and not slopes.contradicts:
         doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
@@ -183,17 +181,6 @@ def _make_bench(optics: OpticsConfig, checked: Checked) -> TrialBench:
         np.zeros((2, state.index.size)),
         trial_bench.TRIAL_POINTS,
     )
-
-
-def _estimate_blur_px(optics: OpticsConfig, checked: Checked) -> float:
-    """Sigma of the image's blur, from the contrast of the set's bins."""
-    state = checked.state
-    _, rows, columns = checked.phase_rad.shape
-    screen_mm = checked.tracer.predict_screen(state.points, state.surface)
-    predicted_rad = screen_mm / screen_scale.mm_per_rad(optics.pattern)
-    swings = checked.view.swing_adu.reshape(2, -1)[:, state.index]
-    bin_px = checked.binned.bin_px
-    return estimate_blur_px(predicted_rad, swings, state.index, (rows, columns), bin_px)
 
 
 def _vertex_source(

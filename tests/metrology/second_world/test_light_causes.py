@@ -48,6 +48,7 @@ CAUSES = {
     "gamma 2.2": Cause(Effects(panel=Panel(gamma=2.2))),
     "gamma by angle": Cause(Effects(panel=Panel(gamma=1.6, gamma_by_angle=0.3))),
     "blur": Cause(Effects(psf_px=2.5), "focus"),
+    "blur that crosses the edges of Gray bits": Cause(Effects(psf_px=1.4), "focus"),
     "blur behind a dark edge": Cause(Effects(psf_px=2.5, panel=Panel(falloff=0.15)), "focus"),
     "overexposed": Cause(Effects(sensor=Sensor(exposure=1.6)), "saturated"),
     "overexposed, 12 of 16 bits": Cause(

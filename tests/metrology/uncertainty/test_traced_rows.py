@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.metrology.frame_checks.phase_drift import PhaseShifts
+from membrane_ctrl.metrology.frame_checks.picture_blur import estimate_blur_px, phase_gradients
 from membrane_ctrl.metrology.rays import bench_motions
 from membrane_ctrl.metrology.rays.bench_motions import group_columns
 from membrane_ctrl.metrology.rays.geometry import Geometry
@@ -22,7 +23,7 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
 from membrane_ctrl.metrology.uncertainty.cycle_errors import LiveErrors
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
-from membrane_ctrl.metrology.uncertainty.image_blur import blur_source, estimate_blur_px
+from membrane_ctrl.metrology.uncertainty.image_blur import blur_source
 from membrane_ctrl.metrology.uncertainty.motion_evidence import ring_tilt_urad
 from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_changes
 from membrane_ctrl.metrology.uncertainty.phase_drift_error import phase_drift_source
@@ -93,7 +94,8 @@ def test_a_blur_is_found_by_the_swings_of_its_fringes(sigma_px: float) -> None:
     variance = sigma_px**2 + (bin_px**2 - 1) / 12
     swings = np.stack([90.0 * np.exp(-variance * square / 2).ravel() for square in squares])
     index = np.arange(rows * columns)
-    found = estimate_blur_px(phases.reshape(2, -1), swings, index, (rows, columns), bin_px)
+    gradients = phase_gradients(phases.reshape(2, -1), index, (rows, columns), bin_px)
+    found = estimate_blur_px(gradients, swings, bin_px)
     assert found == pytest.approx(sigma_px, abs=1e-3)
 
 
