@@ -6,7 +6,7 @@ motions (`motion_evidence`); slopes that no surface has are not compared. Hidden
 to be within their allowances.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from membrane_ctrl.metrology.uncertainty.motion_evidence import (
     MotionTest,
     ring_tilt,
 )
+from membrane_ctrl.metrology.uncertainty.tilt_causes import find_tilt_causes
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, traced_points
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -78,7 +79,12 @@ class PairMotion:
         test = MotionTest(self.effects, ring @ covariance_mm2 @ ring.T, None, None)
         moved_mm = self.parameters_mm - earlier.parameters_mm
         none = np.zeros(bench_motions.COMPONENTS)
-        return test.find_motions(ring @ moved_mm, np.zeros(2), none)
+        finding = test.find_motions(ring @ moved_mm, np.zeros(2), none)
+        # The bar of the change: the causes of the tilt, weighted by how likely they are.
+        causes = find_tilt_causes(
+            self.effects.figure_mm, ring, ring @ moved_mm, ring @ covariance_mm2 @ ring.T
+        )
+        return replace(finding, found_mm2=causes.knocked_mm2, allowed_mm2=causes.allowed_mm2)
 
 
 def motion_changes(bench: TrialBench) -> FloatArray:

@@ -27,6 +27,7 @@ from membrane_ctrl.metrology.uncertainty.motion_evidence import (
     find_motion_doubt,
     ring_tilt,
 )
+from membrane_ctrl.metrology.uncertainty.tilt_causes import find_tilt_causes
 
 Array = NDArray[np.float64]
 GRID = 40  # points along the picture
@@ -120,6 +121,21 @@ class Bench:
         errors = (to_coeffs @ moved_mm) / np.sqrt(np.diag(covariance_mm2))
         return found, doubt, errors[FIGURE]
 
+    def draw_change(self, motion: Array, rng: np.random.Generator) -> Array:
+        """A later set after a motion (components,): errors of the change's terms in sigmas, by the
+        causes of the ring's tilt.
+        """
+        change_mm2 = 2 * self.own_mm2
+        moved_mm = factor(change_mm2) @ rng.standard_normal(PARAMETERS)
+        moved_mm += self.effects.figure_mm @ motion
+        ring = ring_tilt()
+        tilt_mm2 = ring @ change_mm2 @ ring.T
+        causes = find_tilt_causes(self.effects.figure_mm, ring, ring @ moved_mm, tilt_mm2)
+        by_motion_mm2 = causes.knocked_mm2 + causes.allowed_mm2
+        to_coeffs = parameter_to_coeffs()
+        covariance_mm2 = to_coeffs @ (change_mm2 + by_motion_mm2) @ to_coeffs.T
+        return np.asarray((to_coeffs @ moved_mm / np.sqrt(np.diag(covariance_mm2)))[FIGURE])
+
 
 @pytest.fixture(scope="module")
 def benches() -> list[Bench]:
@@ -184,3 +200,40 @@ def test_a_large_motion_is_doubted(benches: list[Bench], number: int) -> None:
         found, doubt, _ = bench.draw(moved_by(group, columns, 100.0, rng), rng)
         assert found.is_beyond_chance
         assert "moved" in doubt or "knocked" in doubt
+
+
+def test_bars_of_a_change_are_as_wide_as_motions_within_the_allowances(
+    quiet_benches: list[Bench],
+) -> None:
+    """With the worst body as the only cause, they were up to 1.8 times as wide; and if two bodies
+    had tilted the ring in opposite directions, 3.7 sigma too narrow.
+    """
+    allowances = np.zeros(bench_motions.COMPONENTS)
+    for group, columns in zip(GROUPS, group_columns(), strict=True):
+        allowances[columns] = group.allowance
+    rng = np.random.default_rng(3)
+    for bench in quiet_benches[:2]:
+        errors = np.array(
+            [
+                bench.draw_change(allowances * rng.standard_normal(allowances.size), rng)
+                for _ in range(250)
+            ]
+        )
+        assert 0.93 < np.mean(np.abs(errors) < 1.96) < 0.97
+        rms = np.sqrt(np.mean(errors**2, axis=0))
+        assert rms.min() > 0.8
+        assert rms.max() < 1.2
+
+
+@pytest.mark.parametrize("number", [0, 2, 4, 6, 8, 12])
+def test_a_knock_between_two_sets_is_in_the_bars_of_their_change(
+    quiet_benches: list[Bench], number: int
+) -> None:
+    group, columns = GROUPS[number], group_columns()[number]
+    rng = np.random.default_rng(number)
+    errors = [
+        bench.draw_change(moved_by(group, columns, 150.0, rng), rng)
+        for bench in quiet_benches
+        for _ in range(8)
+    ]
+    assert np.abs(errors).max() < 5.0

@@ -232,12 +232,12 @@ def test_a_drift_that_the_film_explains_is_none(bench: TrialBench) -> None:
 def test_a_drift_that_scatters_over_the_picture_is_stated_beyond_its_scatter(
     bench: TrialBench,
 ) -> None:
-    """Half of the drift's square is scatter: half of the square of its effects is left."""
+    """Twice the scatter explains half of the drift's square: half of its effects' is left."""
     changes_mm = motion_changes(bench)
     x, y = drift_of(bench, changes_mm[group_columns()[CAMERA_TURN]][0])
     sure = phase_drift_source(bench, changes_mm, (x, y)).known_mm
     drift_rad2 = x.drift_rad**2 + y.drift_rad**2
-    of_patch_rad = x.frames[:, None] * math.sqrt(drift_rad2 / 2)
+    of_patch_rad = x.frames[:, None] * math.sqrt(drift_rad2 / 8)
     scattered = phase_drift_source(bench, changes_mm, (replace(x, patches_rad=of_patch_rad), y))
     assert np.sum(scattered.known_mm**2) == pytest.approx(np.sum(sure**2) / 2, rel=1e-6)
 
