@@ -16,6 +16,7 @@ class PageLink:
     Parameters
     ----------
     logs : Path
+        Folder of the runs, in which a service names its address.
     """
 
     def __init__(self, logs: Path) -> None:

@@ -160,7 +160,9 @@ class ConsolePage:
     Parameters
     ----------
     view : ConsoleView
+        What the model shows at this moment.
     config : Config
+        Of the run, for the band.
     run : str
         The run folder.
     foot : str

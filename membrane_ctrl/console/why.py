@@ -55,12 +55,15 @@ def explain_state(
     Parameters
     ----------
     row : TelemetryRow
+        The newest tick.
     reported : str
         The controller's last reason.
     fault : str
         Describes the standing fault, or is empty.
     config : Config
+        Of the run, for limits and band.
     paused : bool
+        Whether a person has paused the hold.
     """
     state = State(int(row.state))
     safe_level = SafeLevel(int(row.safe_level))
@@ -115,6 +118,7 @@ def explain_next_step(
     row : TelemetryRow
         The newest tick.
     paused : bool
+        Whether a person has paused the hold.
     ctl : str
         Begin of a command to this run.
     keys : bool

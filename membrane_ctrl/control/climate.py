@@ -134,6 +134,7 @@ class Climate:
         Parameters
         ----------
         given : ClimateReadings
+            Those that may be used; NaN without one.
         dt_s : float
             Since the last tick, above 0.
 

@@ -69,6 +69,7 @@ class ClimateSensors:
         Parameters
         ----------
         sensor : ClimateSensor
+            Each has its own possible range and history.
         value : float
             °C or per cent; NaN without one.
         dt_s : float

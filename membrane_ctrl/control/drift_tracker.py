@@ -58,6 +58,7 @@ class DriftTracker(StateNode):
         Parameters
         ----------
         reading_um : float
+            Relative to the reference, at which the drift was 0.
         time_s : float
             Later than that of the last reading.
         time_constant_s : float

@@ -46,6 +46,7 @@ class ErrorCorrelation:
     loop, estimator
         The tick rate; the wanted pole, dead time and lag.
     memory : ErrorCorrelationState, optional
+        From the snapshot of an earlier controller; else nothing has been seen.
     """
 
     def __init__(

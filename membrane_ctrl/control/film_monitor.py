@@ -169,10 +169,13 @@ class FilmMonitor:
     Parameters
     ----------
     limits : LimitsConfig
+        How far sensor and gauge may move apart within minutes, an hour and a day.
     mirror : MirrorConfig
+        Sag and pressure at displacement 0, by which both are compared.
     sensor : str
         The displacement's sensor, for the message.
     memory : FilmMonitorState, optional
+        From the snapshot of an earlier controller; else the first means are the reference.
     """
 
     def __init__(

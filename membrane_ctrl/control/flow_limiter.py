@@ -38,6 +38,7 @@ class FlowLimiter:
         Parameters
         ----------
         wanted_um_per_s : float
+            Any, also negative or beyond the pump.
         dt_s : float
             Time since the last flow, which bounds the change.
         """

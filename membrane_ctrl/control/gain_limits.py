@@ -36,7 +36,9 @@ def limit_gains(loop: LoopConfig, response: PumpResponse) -> LoopConfig:
     Parameters
     ----------
     loop : LoopConfig
+        Its gains are the upper limit: they are never raised.
     response : PumpResponse
+        Dead time and lag of the pump, with their errors.
 
     Returns
     -------

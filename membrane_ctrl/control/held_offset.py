@@ -114,7 +114,9 @@ class HeldOffset:
         Time constant of the tracker, rate of the offset, age up to which a figure is used, largest
         jump.
     limits : HeldLimits
+        How far the offset may go, and for how long the last one is worth keeping.
     weights : HeldWeights
+        Of the vertex and of the held scalar, (terms,) each, in µm of sag per µm of a term.
     reference_um : (terms,) array, optional
         Terms of a stored figure that the setpoint 0 stands for; else the first figures of the run
         are the reference at the setpoint of that moment.

@@ -168,6 +168,7 @@ class InnerLoop:
         Parameters
         ----------
         displacement_um : float
+            The reading of this tick.
         flow_um_per_s : float
             The pump's present flow, or the mean it is known to need.
         """

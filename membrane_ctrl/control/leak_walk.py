@@ -135,6 +135,7 @@ class LeakWalk(StateNode):
         Parameters
         ----------
         dt_s : float
+            Time since the last tick.
         centre_walk, leak_walk : float
             Variances per second of the centre's walk, and of the leak's as configured.
         """

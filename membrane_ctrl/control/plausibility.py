@@ -153,11 +153,13 @@ class PlausibilityCheck:
     Parameters
     ----------
     limit_um : float
+        How far laser and camera may be from each other, see above.
     sag_um : float
         Of the mirror at displacement 0, by which a change of pressure is a change of sag.
     figure_lag_s : float
         By how much a figure may be older than the laser's reading of the same tick.
     memory : PlausibilityState, optional
+        From the snapshot of an earlier controller; else nothing has been compared yet.
     """
 
     def __init__(

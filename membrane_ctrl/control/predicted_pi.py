@@ -49,6 +49,7 @@ class PredictedPi:
     loop, pump, estimator
         Gains, the pump's range, its dead time and lag.
     memory : PredictedPiState, optional
+        From the snapshot of an earlier controller; else it waits for `start`.
     """
 
     def __init__(

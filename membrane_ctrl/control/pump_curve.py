@@ -192,6 +192,7 @@ class PumpCurve:
         Parameters
         ----------
         flow_um_per_s : float
+            Within the range of the pump; less than half of its smallest flow stops it.
         dt_s : float
             Time until the next command, for the duration of the pulse.
 

@@ -207,6 +207,7 @@ def apply_response(estimator: EstimatorConfig, response: PumpResponse | None) ->
     Parameters
     ----------
     estimator : EstimatorConfig
+        As configured, with dead time and lag that may only be assumed.
     response : PumpResponse or None
         Found by the test of the actuators; None without one.
     """

@@ -53,6 +53,7 @@ class SetpointRamp:
         Parameters
         ----------
         target_um : float
+            Where the setpoint is to go.
         mean_flow_um_per_s : float
             The flow that balances the leak.
         dt_s : float

@@ -69,9 +69,11 @@ class ShapeLoop:
     Parameters
     ----------
     config : ShapeConfig
+        Time constant, age of a usable figure, limits of the trim and of its rate.
     sensitivity : (terms,) array
         As for `sag_change`.
     memory : ShapeLoopMemory, optional
+        From the snapshot of an earlier controller; else the loop is off, with a trim of 0.
     rim_weights : (terms,) array, optional
         Height of the rim above the vertex per term. Where another scalar than the vertex is held,
         the change of sag is that of this height: along `sensitivity` a change of the figure would

@@ -115,6 +115,7 @@ class ServiceClient:
     Parameters
     ----------
     address : ServiceAddress
+        URL, token, the authority of its certificate, and the name of the hold there.
     answer_s : float
         For a whole request, from the connection to the last byte.
 

@@ -182,6 +182,7 @@ class ActuatorTest:
     Parameters
     ----------
     pump : PumpConfig
+        The curve by which the rise of the mirror is judged.
     test_vent : bool
         Whether the bench has a vent and the mirror pressure to release.
     rate_hz : float

@@ -79,6 +79,7 @@ class ClimatePart:
         Parameters
         ----------
         reading : BenchReading or None
+            None in a tick without an answer: nothing changes.
         state : State
             The strains count from the moment at which `hold` begins.
         dt_s : float

@@ -12,6 +12,7 @@ def make_command_event(command: Command, refused: str) -> CommandTaken:
     Parameters
     ----------
     command : Command
+        As the tick got it, executed or not.
     refused : str
         Why it was refused; empty: it was not.
     """

@@ -24,6 +24,7 @@ def explain_overruled(command: Command, obeyed: Collection[str]) -> str:
     Parameters
     ----------
     command : Command
+        The next one in the order of `sort_commands`.
     obeyed : collection of str
         Names of the commands that the tick has accepted before.
 

@@ -80,6 +80,7 @@ def explain_refusal(command: Command, state: State, config: Config) -> str:
     Parameters
     ----------
     command : Command
+        Any, also one that no state allows.
     state : State
         Of the controller.
     config : Config

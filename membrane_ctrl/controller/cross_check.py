@@ -49,6 +49,7 @@ def cross_check(
     Parameters
     ----------
     config : Config
+        Valid in each of its fields.
     board : BenchIdentity, optional
         The devices' limits and ranges, if they are known.
     """
@@ -91,6 +92,7 @@ def require_sound(
     Parameters
     ----------
     config : Config
+        Valid in each of its fields.
     source : str
         Name of the file, for the messages.
     board : BenchIdentity, optional

@@ -108,6 +108,7 @@ class FigureGate:
         Parameters
         ----------
         now_s : float
+            Time of the tick, by which the figure's age counts.
         figure : ShapeEstimate or None
             None without a new one.
         laser_um : float

@@ -55,6 +55,7 @@ class GainsTrial:
         command : Command
             Its value is the duration of the trial in s; NaN: permanently.
         now_s : float
+            Time of the tick, from which the trial counts.
         """
         memory = self.memory
         tried = replace(memory.tried, loop=loop)

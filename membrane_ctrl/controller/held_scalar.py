@@ -71,7 +71,9 @@ class HeldScalar:
         Parameters
         ----------
         context : TickContext
+            Figures, setpoint and safe level of the tick; gets `held_offset_um`.
         state : State
+            Of the controller: figures count in `hold`, with the mirror at rest.
         shape_on : bool
             Whether the shape loop is switched on.
         distrust : Reason

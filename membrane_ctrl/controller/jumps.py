@@ -24,6 +24,7 @@ class JumpGate(StateNode):
         Parameters
         ----------
         value : float
+            Compared with the last value that was none.
         step_max : float
             Largest step between two values, in their unit.
         """

@@ -67,12 +67,15 @@ def refuse_while_locked(command: Command, locks: Sequence[Lock]) -> str:
     Parameters
     ----------
     command : Command
+        Refused may be those that lift the mirror (`LIFTING`), an `unlock`, and a `latch` beyond the
+        most locks; all others never are.
     locks : sequence of Lock
         Those set.
 
     Returns
     -------
     str
+        With the locks in words, and how to continue.
     """
     if command.kind == "unlock":
         return decide_unlock(command, locks).refused
@@ -132,7 +135,9 @@ def is_author(command: Command, lock: Lock) -> bool:
     Parameters
     ----------
     command : Command
+        Its `account` is the sender's login, as the port has verified it.
     lock : Lock
+        Its `account` is the login of the one who has set it; empty without a login.
 
     Returns
     -------

@@ -33,6 +33,7 @@ class Repeats(StateNode):
         value : float
             NaN changes nothing.
         now_s : float
+            Time of the value.
         """
         if math.isfinite(value) and value != self.value:
             self.value = value
@@ -119,6 +120,7 @@ class Observer:
         Parameters
         ----------
         inputs : TickInputs
+            Reading, figure and link of the tick.
         may_follow_optics : bool
             Whether the estimate uses the figures; otherwise they replace no laser.
         """
@@ -207,6 +209,7 @@ class Observer:
         Parameters
         ----------
         inputs : TickInputs
+            Those of `observe_inputs`.
         error_um : float
             Setpoint less process value; NaN without one.
         """

@@ -177,6 +177,7 @@ class ProcessValueChoice:
     loop, pump, estimator
         Present gains, curve, dead time and lag.
     memory : ProcessValueState, optional
+        From the snapshot of an earlier controller; else nothing is known of the loops.
     """
 
     def __init__(

@@ -56,8 +56,11 @@ def find_protections(process_value: ProcessValue, activity: Activity, duty: Duty
     Parameters
     ----------
     process_value : ProcessValue
+        What the loop follows.
     activity : Activity
+        What the controller does with the mirror.
     duty : Duty
+        What must be detected, or limited.
 
     Returns
     -------
@@ -141,8 +144,11 @@ def find_bound(
     Parameters
     ----------
     process_value : ProcessValue
+        What the loop follows.
     failed : FilmSensor
+        The sensor that shows something wrong.
     failure : Failure
+        How it fails: by a step, a drift, or a drift that climate could explain.
     config : Config
         Its limits and the trim's range.
     laser_and_optics : bool

@@ -54,6 +54,7 @@ class RedundancyWatch:
         Parameters
         ----------
         now_s : float
+            Time of the tick.
         pump_may_run : bool
             In other states a lost sensor is no loss of protection.
         present : mapping of FilmSensor to bool

@@ -67,6 +67,7 @@ class ResumeRule:
         observation : Observation
             Of this tick.
         now_s : float
+            Time of the tick: the absence of the cause must last.
 
         Returns
         -------

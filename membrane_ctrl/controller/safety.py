@@ -484,6 +484,7 @@ class SafetyTable:
         state : State
             Of the controller: each rule states in which ones it applies.
         observation : Observation
+            What this tick shows; each rule keeps the history that its window needs.
 
         Returns
         -------

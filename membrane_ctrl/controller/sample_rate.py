@@ -35,6 +35,7 @@ class SampleRate:
         Parameters
         ----------
         now_s : float
+            Time of the tick.
         answered : bool
             The device answered, and its samples advance: a fault reports it otherwise.
         fresh : bool

@@ -98,7 +98,9 @@ class SensorConsistency:
     Parameters
     ----------
     config : Config
+        Limits, mirror, and which sensors there are.
     memory : SensorConsistencyState, optional
+        From the snapshot of an earlier controller; else nothing has been compared yet.
 
     Attributes
     ----------
@@ -172,6 +174,7 @@ class SensorConsistency:
         Parameters
         ----------
         inputs : TickInputs
+            Time, weather and figure of the tick.
         state : State
             Before the tick; sensors are compared only in states of `ESTIMATED`.
         dt_s : float

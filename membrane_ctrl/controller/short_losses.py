@@ -57,6 +57,7 @@ class ShortLossCounter:
     Parameters
     ----------
     memory : ShortLossesState, optional
+        From the snapshot of an earlier controller; else every fault is listed.
     """
 
     def __init__(self, memory: ShortLossesState | None = None) -> None:
@@ -68,7 +69,9 @@ class ShortLossCounter:
         Parameters
         ----------
         fault : Fault
+            The event that would list it.
         now_s : float
+            Time of the tick, from which its duration counts.
 
         Returns
         -------
@@ -86,6 +89,7 @@ class ShortLossCounter:
         Parameters
         ----------
         now_s : float
+            Time of the tick: a loss that lasts is listed.
         is_deeper : bool
             Whether the safe level is deeper than that which holds the flow.
         """
@@ -105,6 +109,7 @@ class ShortLossCounter:
         ended : Event
             What to list.
         now_s : float
+            Time of the tick.
 
         Returns
         -------

@@ -142,7 +142,9 @@ class Standstill:
         Parameters
         ----------
         now_s : float
+            Time of the tick.
         reading : BenchReading or None
+            Its read-back of the pump, and its pressure; None in a tick without an answer.
         commanded : (float, float)
             The last two pump commands before it.
         link_up : bool

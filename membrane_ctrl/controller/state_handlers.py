@@ -26,7 +26,9 @@ def run_state(state: State, context: TickContext) -> State:
     Parameters
     ----------
     state : State
+        The present state.
     context : TickContext
+        What the handler reads, and gets: command of pump and vent, and why.
 
     Returns
     -------

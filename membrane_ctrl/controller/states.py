@@ -444,6 +444,7 @@ def drive_pump(context: TickContext, target_um: float) -> inner_loop.LoopOutput:
     Parameters
     ----------
     context : TickContext
+        Readings, estimate and safe level of the tick; gets the pump's command.
     target_um : float
         Displacement to hold.
     """

@@ -33,12 +33,15 @@ def make_telemetry_row(
     context : TickContext
         After the tick.
     state : State
+        Of the controller after the tick.
     fault : int
         Code of the standing fault, 0 for none.
     number : int
         Of the tick.
     inputs : TickInputs
+        Time, lateness, reading and truth of the tick.
     observation : Observation
+        As the safety table has judged it.
     shape : ShapeOutput
         Of the shape loop.
     held : mapping of str to float

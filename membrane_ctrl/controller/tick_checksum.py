@@ -21,6 +21,7 @@ def output_crc(outputs: TickOutputs, row: bytes) -> int:
     Parameters
     ----------
     outputs : TickOutputs
+        Of the tick.
     row : bytes
         Doubles: the values of the columns that the run records (`ColumnChoice`).
     """

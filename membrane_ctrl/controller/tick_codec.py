@@ -100,7 +100,9 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -
     tick : int
         Its number, from 1.
     inputs : TickInputs
+        What the controller got: a replay gets the same, to the last bit.
     outputs : TickOutputs
+        What it decided, for the checksum.
     row : bytes
         The packed telemetry row of the outputs.
     """
@@ -132,7 +134,9 @@ def pack_row(tick: int, row: telemetry.TelemetryRow) -> bytes:
     Parameters
     ----------
     tick : int
+        Its number, from 1.
     row : TelemetryRow
+        Has some of the inputs, such as the sensors' readings.
     """
     record = np.zeros(1, dtype=RECORD)
     for name, field in SAME.items():

@@ -118,6 +118,7 @@ class TickContext(TickContextState):
         Parameters
         ----------
         code : WhyCode
+            Decides whether the reason is another one; the text may change its numbers.
         text : str
             For people.
         details : object
@@ -175,7 +176,9 @@ def apply_command(context: TickContext, command: Command, state: telemetry.State
     Parameters
     ----------
     context : TickContext
+        Gets the request: wanted state, flow, setpoint, way down, and who asked.
     command : Command
+        Accepted: its state and values have been checked.
     state : State
         Of the controller.
     """

@@ -131,10 +131,13 @@ def print_closing_report(
     Parameters
     ----------
     run_dir : path
+        Folder of the run, whose summary has the figures.
     as_json : bool
+        Print one JSON object to stdout instead of lines.
     closing : RunEnd or None
         None if the ticks never ran.
     page : PageAtEnd or None
+        The link of the page, or why there is none; None: not mentioned.
     """
     if closing is not None:
         for line in make_closing_lines(closing):

@@ -87,6 +87,7 @@ class FailureCounter:
     Parameters
     ----------
     report : callable
+        Gets a message, whether the link works again, and how many failures that stands for.
     first : int
         The first report comes with this failure: a single lost answer of a sensor is none.
     """

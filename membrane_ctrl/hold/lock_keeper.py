@@ -98,6 +98,8 @@ class LockKeeper:
         Parameters
         ----------
         outputs : TickOutputs
+            Its events name the locks; called in the tick's thread, which must not wait for the
+            disk.
         """
         if self._storage is None:
             return

@@ -127,6 +127,7 @@ def load_scenario(path: Path, model: type[S]) -> S:
     Parameters
     ----------
     path : path
+        A file of this package, or a stranger's.
     model : type
         Its schema.
 

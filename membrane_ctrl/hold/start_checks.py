@@ -52,8 +52,11 @@ def open_latched_fault(
     Parameters
     ----------
     config : Config
+        Whether the twin latches faults (`states.latch_twin_faults`).
     logs_dir : path
+        Folder of the runs, which has the file: a bench has one.
     options : HoldOptions
+        `--standby`, `--clear-faults`, and whether the bench is simulated.
 
     Returns
     -------
@@ -90,7 +93,9 @@ def find_locks(config: Config, options: HoldOptions) -> LockStorage | None:
     Parameters
     ----------
     config : Config
+        Its devices are what a lock belongs to.
     options : HoldOptions
+        `--standby`, and whether the bench is simulated.
 
     Returns
     -------
@@ -136,14 +141,21 @@ async def identify_board(
     Parameters
     ----------
     bench : Bench
+        Not yet connected; it is closed again.
     config : Config
+        What the devices are judged by: limits and ranges, interlocks, resume rule.
     options : HoldOptions
+        `--standby`, `--clear-faults`, and the name of the file for messages.
     resumes : ResumeLog or None
         Restarts by the resume rule so far.
 
     Raises
     ------
-    DeviceError, InputError
+    DeviceError
+        A device does not answer, is in use or another one; an interlock is open, or the board has
+        latched a fault, unless the run starts in standby.
+    InputError
+        The configuration does not fit the devices: a limit that can never trip, for example.
     """
     devices = config.devices
     assert devices is not None

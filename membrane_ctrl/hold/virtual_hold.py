@@ -22,7 +22,9 @@ class VirtualHold:
     Parameters
     ----------
     config : Config
+        Of the simulated hold.
     bench : VirtualBench
+        Plant and board; the caller may disturb them.
     name : str
         Of the run.
     alter_picture : callable, optional

@@ -76,6 +76,7 @@ class VirtualRun:
     Parameters
     ----------
     config : Config
+        As the controller gets it; rates of ticks and figures.
     bench : VirtualBench
         Plant, board, and their faults.
     sag_sensitivity : (terms,) array

@@ -20,6 +20,7 @@ def make_bench(devices: DevicesConfig, observe: bool = False) -> roles.Bench:
     Parameters
     ----------
     devices : DevicesConfig
+        A pump board, or an instrument for each role; interlocks.
     observe : bool
         Whether it is only to be read.
 

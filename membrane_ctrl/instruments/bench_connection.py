@@ -21,6 +21,7 @@ async def connect_bench(bench: roles.Bench, devices: DevicesConfig) -> roles.Ben
     Parameters
     ----------
     bench : Bench
+        As `make_bench` makes it.
     devices : DevicesConfig
         For the messages.
 

@@ -27,6 +27,7 @@ def check_settings(section: Any, where: str, kind: driver_kind.DriverKind) -> se
     where : str
         Its name, for the messages.
     kind : DriverKind
+        Of the role: which entry points offer such drivers.
 
     Raises
     ------
@@ -58,6 +59,7 @@ def make_driver(section: Any, where: str, kind: driver_kind.DriverKind, *more: A
     where : str
         Its place in the configuration, for messages.
     kind : DriverKind
+        Of the role: which entry points offer such drivers.
     *more : object
         What a driver of this kind gets after its settings.
     """

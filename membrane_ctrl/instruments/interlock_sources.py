@@ -27,6 +27,7 @@ def list_polled_sources(devices: DevicesConfig, links: ModbusLinks) -> list[Poll
     Parameters
     ----------
     devices : DevicesConfig
+        Its interlocks, without those of the pump board's own inputs.
     links : ModbusLinks
         Serial lines that several devices share.
 

@@ -22,6 +22,7 @@ def list_device_keys(devices: DevicesConfig) -> frozenset[str]:
     Parameters
     ----------
     devices : DevicesConfig
+        As configured; nothing is opened.
 
     Returns
     -------
@@ -44,7 +45,9 @@ def modbus_keys(url: str, unit_id: int) -> frozenset[str]:
     Parameters
     ----------
     url : str
+        `tcp://HOST:PORT` or `rtu:///dev/PORT?baud=...`.
     unit_id : int
+        Its address on the line or behind the host.
 
     Returns
     -------

@@ -104,6 +104,7 @@ class LockStore:
         Parameters
         ----------
         lock : Lock
+            With its word, author and time.
         devices : collection of str
             Keys of its devices.
 
@@ -138,6 +139,7 @@ class LockStore:
         Parameters
         ----------
         file : Path
+            As `write_lock` or `find_locks` states it; one that is gone is no error.
 
         Raises
         ------
@@ -170,6 +172,7 @@ def require_unlocked(store: LockStore, devices: Collection[str], remedy: str = "
     Parameters
     ----------
     store : LockStore
+        Of this machine.
     devices : collection of str
         Keys of the devices.
     remedy : str
@@ -191,6 +194,7 @@ def format_locked_line(locks: Sequence[Lock], remedy: str = "") -> str:
     Parameters
     ----------
     locks : sequence of Lock
+        Those on the devices; the text, author, time and word of each are shown.
     remedy : str
         As for `require_unlocked`.
 
@@ -211,6 +215,7 @@ def draw_word(taken: Collection[str]) -> str:
     Parameters
     ----------
     taken : collection of str
+        Words of the locks that are set.
 
     Returns
     -------

@@ -18,6 +18,7 @@ def make_role_devices(
     Parameters
     ----------
     devices : DevicesConfig
+        A table for each role, no pump board.
     links : ModbusLinks, optional
         Serial lines: drivers on one of them share it.
 

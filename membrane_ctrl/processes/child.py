@@ -37,6 +37,7 @@ class Child:
     args : tuple
         Picklable arguments of the function.
     nice : int
+        Niceness of the process: 5 to 10, so that the tick comes first.
     """
 
     def __init__(self, name: str, target: str, args: tuple[Any, ...], nice: int) -> None:

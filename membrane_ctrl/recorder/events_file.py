@@ -22,6 +22,7 @@ class EventsFile:
     Parameters
     ----------
     path : Path
+        `events.jsonl` of the run; made with the first event.
     resumed : bool
         After a killed recorder: remove a torn last line, and do not repeat existing lines.
 

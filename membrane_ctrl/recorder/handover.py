@@ -73,7 +73,9 @@ def save_state(run_dir: Path, state: RecorderState) -> None:
     Parameters
     ----------
     run_dir : path
+        Folder of the run.
     state : RecorderState
+        After a whole second was written: positions in the rings, open windows, counts of losses.
 
     Raises
     ------

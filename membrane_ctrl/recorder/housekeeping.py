@@ -58,6 +58,7 @@ class Housekeeping:
         Parameters
         ----------
         now_s : float
+            The run's clock.
         closed : list of path
             Segments that were closed since, to be optimised.
         """

@@ -29,6 +29,7 @@ class RecorderErrors:
         what : str
             Identifies it in reports.
         action : callable
+            Any exception of it is reported once, and again when it has ended.
         """
         try:
             action()

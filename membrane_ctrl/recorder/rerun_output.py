@@ -71,11 +71,15 @@ class RerunOutput:
         Parameters
         ----------
         now_s : float
+            The run's clock.
         rows : Rows
             Telemetry.
         events : list of EventLine
+            Of this second, in order.
         shapes : list of ShapeEstimate
+            Of this second, in order.
         thumbnails : sequence of Thumbnail
+            Of this second; empty if none are due.
         detail : DetailLevel
             What is left out where the disk is nearly full.
 

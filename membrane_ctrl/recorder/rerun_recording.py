@@ -178,6 +178,7 @@ class Recording:
         time_s : (n,) array
             Times of the run.
         columns : iterable of ComponentColumn
+            As Rerun's archetypes make them, each of n rows.
         """
         nanoseconds = np.round(time_s * 1e9).astype("timedelta64[ns]")
         indexes = [
@@ -196,6 +197,7 @@ class Recording:
         time_s : (n,) array
             Times of the run.
         values : (n, m) array
+            A column for each line of the plot; NaN interrupts a line.
         """
         self.send_columns(path, time_s, rr.Scalars.columns(scalars=values))
 
@@ -211,6 +213,8 @@ class Recording:
         time_s : (n,) array
             Times of the run.
         values, variances : (n, m) arrays
+            A column for each line of the plot; the variances are those of the values, in their unit
+            squared.
         """
         self.send_columns(path, time_s, rr.Measurements.columns(values=values, variances=variances))
 

@@ -77,6 +77,7 @@ class ShapeStreams:
     Parameters
     ----------
     recording : Recording
+        The present segment is written.
     scalars : HeldScalars, optional
         Of the mirror, for focus and RMS.
     """

@@ -21,7 +21,9 @@ class TelemetryStreams:
     Parameters
     ----------
     recording : Recording
+        The present segment is written.
     config : Config
+        Tick rate, band, and how many rows quiet times keep.
     overview_every_s : float
         Seconds whose means are sent together.
     """

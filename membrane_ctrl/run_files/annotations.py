@@ -28,7 +28,10 @@ def add_mark(
     author : str
         Who makes it; by default, the account of this program.
 
-    Raises DeviceError if the folder cannot be written.
+    Raises
+    ------
+    DeviceError
+        The folder cannot be written.
     """
     moment = datetime.fromtimestamp(origin_utc.timestamp() + mono_s, UTC)
     mark = run_events.Mark(

@@ -89,6 +89,7 @@ def make_cycles_dataset(
     Parameters
     ----------
     found : Shapes
+        All figures of the run, by time.
     part_s : (float, float)
         Part of the run, s.
     origin_utc : datetime

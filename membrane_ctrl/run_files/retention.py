@@ -99,6 +99,7 @@ def find_expired(
     keep_gb, keep_days : float or None
         `recording.keep_gb` and `keep_days`; None: no limit.
     now_utc : datetime
+        Ages count until this moment.
     """
     # Oldest first, until age and size are within their limits.
     total = present_bytes + sum(run.size_bytes for run in runs)

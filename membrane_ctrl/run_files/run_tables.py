@@ -30,6 +30,7 @@ class RunTables:
     Parameters
     ----------
     run_dir : Path
+        Folder of the run; each table has a folder in it.
     origin_utc : datetime, optional
         UTC at 0 s of the run, for the times of events.
     resumed : OpenWindows, optional

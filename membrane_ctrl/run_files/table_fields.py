@@ -42,7 +42,9 @@ def make_field(
     Parameters
     ----------
     name : str
+        Of the column; its suffix states the unit, such as `_um`.
     kind : pyarrow.DataType
+        Type of its values.
     description : str
         For people.
     unit : str, optional
@@ -67,7 +69,9 @@ def make_spec(
     Parameters
     ----------
     name : str
+        Of the table and its folder.
     fields : list of pyarrow.Field
+        Its columns, as `make_field` makes them.
     time_name : str
         The field in which rows are in ascending order.
     group_rows : int

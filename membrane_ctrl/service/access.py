@@ -54,6 +54,7 @@ def on_behalf(user: WebUser, session: str) -> dict[str, str]:
     Parameters
     ----------
     user : WebUser
+        The viewer; the hold trusts the name only because this service has verified the login.
     session : str
         Of the viewer.
 

@@ -26,6 +26,7 @@ class AlarmChild:
     folders : sequence of Path
         Folders of runs on this machine.
     heartbeat : HeartbeatConfig
+        Where heartbeats are sent, and how often; empty: nowhere.
     """
 
     def __init__(self, folders: Sequence[Path], heartbeat: HeartbeatConfig) -> None:

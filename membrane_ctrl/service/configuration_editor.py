@@ -57,6 +57,7 @@ class ConfigurationEditor:
     Parameters
     ----------
     folder : Path
+        Its files `NAME.toml` are the configurations; others are left alone.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -116,7 +117,9 @@ class ConfigurationEditor:
         Parameters
         ----------
         name : str
+            Of the configuration, which is that of the file without `.toml`.
         text : str
+            The whole file, with comments, as the viewer has edited it.
         digest : str
             Of the text that was edited; empty for a new configuration.
         who : str

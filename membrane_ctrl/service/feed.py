@@ -388,11 +388,13 @@ def history(
     Parameters
     ----------
     feed : HoldFeed
+        Has the last hour, or as much of it as the service has followed.
     logs : Path or None
         Folder of the runs; None if it is on another machine: then only the last hour is known.
     signal : str
         One of `SIGNALS`.
     span_s : float
+        How many seconds; more than an hour is read from the levels of the runs.
     now_s : float, optional
         UTC at which they end.
 

@@ -36,6 +36,7 @@ class Heartbeat:
     Parameters
     ----------
     every_s : float
+        Between two heartbeats of one place.
     senders : dict
         Functions that send a text, by their names in messages; they raise OSError.
     """

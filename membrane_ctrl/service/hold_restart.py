@@ -32,6 +32,7 @@ async def begin_restart(
     feed : HoldFeed
         Of the running hold; without one, the next is started at once.
     starter : HoldStarter
+        Of the folder of that hold.
     name : str
         Of the configuration to start with.
     who : str

@@ -160,6 +160,7 @@ class HoldStarter:
         who : str
             For the service's log.
         options : StartOptions
+            Whether it waits in standby, and clears latched faults.
 
         Returns
         -------

@@ -42,6 +42,7 @@ def check_service(page: ServiceConfig, send: bool) -> list[str]:
     Parameters
     ----------
     page : ServiceConfig
+        As read from the file; nothing of it has been started.
     send : bool
         Send one heartbeat to each configured place, and wait for the answers.
 

@@ -79,6 +79,7 @@ class SessionFolder:
         Parameters
         ----------
         step : str
+            Name of the step that makes the file, for the error.
         name : str
             Of its file.
         kind : type
@@ -124,6 +125,7 @@ def restart_session(
     Parameters
     ----------
     session : SessionFolder
+        Its later steps are not done any more.
     before : LoopConfig
         The gains from which it starts.
     pump : PumpConfig
@@ -195,9 +197,11 @@ def begin_session(
     parent : path
         Folder of the sessions.
     name : str
+        1 to 64 letters, digits, dots, dashes and underscores; the folder gets the time in front.
     head : Head
         Content of its `session.json`.
     config : Config
+        As the hold has it, stored beside the head.
     head_schema : str
         Format of that file, with its version.
 
@@ -221,6 +225,7 @@ def read_session(path: Path, kind: type[H], head_schema: str = SCHEMA) -> tuple[
     Parameters
     ----------
     path : path
+        Folder of the session.
     kind : type
         Of the head.
     head_schema : str
@@ -255,9 +260,11 @@ def create_session(
     logs : path
         Folder of the runs.
     name, author : str
+        Of the session's folder, and who tunes.
     source : str
         Name of the hold, or "twin".
     config : Config
+        As the hold, or the twin, has it.
     before : LoopConfig
         The gains in use.
 

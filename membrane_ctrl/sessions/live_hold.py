@@ -89,8 +89,13 @@ class LiveHold:
         Claim command for a session of this name, until `close`; empty: only watch, or command like
         any client.
 
-    Raises InputError if `run_dir` is not the folder of the client's run or has no rings, or if
-    another session or client has command; DeviceError if the peer is not a hold.
+    Raises
+    ------
+    InputError
+        `run_dir` is not the folder of the client's run or has no rings, or another session or client
+        has command.
+    DeviceError
+        The peer is not a hold.
     """
 
     def __init__(

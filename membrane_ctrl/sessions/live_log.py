@@ -86,6 +86,7 @@ class LiveLog:
         Parameters
         ----------
         question : str
+            As it was asked: an answer to an earlier one does not count.
         among : sequence of str
             The answers that count.
 

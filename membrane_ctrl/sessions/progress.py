@@ -38,6 +38,7 @@ class Progress:
         Parameters
         ----------
         step : str
+            Its name, on the terminal and on the page.
         planned_s : float
             Its expected duration.
         after_s : float
@@ -110,6 +111,7 @@ class Progress:
         Parameters
         ----------
         question : str
+            In one line, with the answers that count.
         among : sequence of str
             The answers that the page offers; empty: it does not ask.
 

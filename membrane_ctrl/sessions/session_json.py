@@ -106,7 +106,10 @@ def write_session_file(path: Path, value: Any, schema: str = SCHEMA) -> None:
     Parameters
     ----------
     path : Path
+        In the folder of the session.
     value : dataclass or dict
+        Becomes plain JSON (`to_plain`): a dataclass of numbers, texts, arrays and other
+        dataclasses.
     schema : str
         Format with version, which the file states beside the program that writes it.
     """
@@ -122,6 +125,7 @@ def read_session_file(path: Path, kind: type[T], schema: str = SCHEMA) -> T:
     Parameters
     ----------
     path : Path
+        In the folder of the session, which may come from elsewhere.
     kind : type
         Of the dataclass that was written.
     schema : str

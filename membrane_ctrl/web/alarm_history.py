@@ -94,6 +94,7 @@ def find_alarms(
     began_s, end_s : float
         UTC of the run's start and end; NaN while it runs.
     run : str
+        Name of the run folder, for the table.
     """
     standing: dict[object, PastAlarm] = {}
     ended: list[PastAlarm] = []

@@ -15,6 +15,7 @@ def make_axis(name: str, gap_px: int) -> Options:
     Parameters
     ----------
     name : str
+        Title beside the axis, with its unit; empty for none.
     gap_px : int
         Between the axis and its name.
     """

@@ -32,6 +32,7 @@ def mark_past(logs: Path, utc_s: float, text: str, who: str) -> Outcome:
     utc_s : float
         The moment.
     text : str
+        What the viewer has typed; an empty one is refused.
     who : str
         The viewer, whom the mark names.
     """

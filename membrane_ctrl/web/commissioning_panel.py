@@ -73,7 +73,9 @@ class CommissioningPanel:
     Parameters
     ----------
     session : GuidedSession
+        The one session of this service, which all viewers see.
     user : WebUser
+        Needs the role `COMMISSIONS`; the name is logged with each answer.
     """
 
     def __init__(self, session: GuidedSession, user: WebUser) -> None:

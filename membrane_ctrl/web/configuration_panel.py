@@ -40,9 +40,13 @@ class ConfigurationPanel:
     Parameters
     ----------
     feed : HoldFeed
+        Of the hold that a restart stops.
     user : WebUser
+        Needs the role `EDITS`.
     editor : ConfigurationEditor
+        Reads, checks and saves the files.
     starter : HoldStarter
+        Starts the hold again with what was saved.
     on_behalf : callable
         Returns who asks, for the stop before a restart.
     """

@@ -19,6 +19,7 @@ async def confirm(
     Parameters
     ----------
     title : str
+        The question.
     lines : sequence of str
         What it does.
     yes : str

@@ -70,6 +70,7 @@ def make_figure_map(
     Parameters
     ----------
     figure, reference : ShapeEstimate
+        The figure that is shown, and the one that it is compared with; None: the height is shown.
     removed : collection of str
         Names of `REMOVABLE`.
     config : Config or None

@@ -52,10 +52,14 @@ class GainsPanel:
     Parameters
     ----------
     views : GainsViews
+        Common to all viewers: what can be explored, and how the sliders are set.
     feed : HoldFeed
+        Of the hold on which gains are tried.
     hold : str
         Name of the hold in addresses.
     user : WebUser
+        Trying, keeping and saving need the role `tune`; without it the sliders are the viewer's
+        own.
     on_behalf : callable
         Returns who asks, for commands.
     wanted : str

@@ -144,6 +144,7 @@ class GainsViews:
     Parameters
     ----------
     feeds : mapping of HoldFeed
+        By the name of the hold on the page; their folders of runs are read.
     """
 
     def __init__(self, feeds: Mapping[str, HoldFeed]) -> None:
@@ -216,6 +217,7 @@ class GainsViews:
         Parameters
         ----------
         hold, name : str
+            Name of the hold on the page, and of a session or run as `list_sources` returns it.
         start : str
             Of `GainsSource.settings`.
         setting : Setting or None

@@ -28,9 +28,11 @@ class NoHoldPanel:
     Parameters
     ----------
     feed : HoldFeed
+        Knows whether a hold runs, and how the newest run has ended.
     hold : str
         Name of the hold in addresses.
     user : WebUser
+        Starting needs the role `operate`.
     starter : HoldStarter or None
         None: holds of this folder cannot be started here.
     """

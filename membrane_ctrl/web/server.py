@@ -70,6 +70,7 @@ def serve(holds: dict[str, Where], page: ServiceConfig, idle_s: float = math.inf
     holds : dict of Where
         The one with its runs in `page.logs` can be started here.
     page : ServiceConfig
+        Address, certificate, folders and users, from the service's file.
     idle_s : float
         Time without viewers and holds after which the service ends.
 

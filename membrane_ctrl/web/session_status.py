@@ -20,11 +20,13 @@ def describe_session(
     Parameters
     ----------
     progress : Progressed
+        By the session's log until now.
     done : collection of str
         Its steps that are done.
     silent_s : float
         How long its log has not grown.
     session : Path
+        Folder of the session, for the command that resumes it.
     """
     again = f"resume it with: membrane-ctrl tune run --resume {session}"
     if set(done) == set(folders.STEPS):

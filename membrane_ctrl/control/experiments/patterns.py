@@ -74,6 +74,7 @@ def make_multisine(
     gain : float
         Speed of the centre over the flow.
     slowest_rad_per_s, fastest_rad_per_s : float
+        The lowest and the highest frequency.
     tones : int
         Number of sines.
 

@@ -42,6 +42,7 @@ def begin_trial(
     Parameters
     ----------
     spec : ExperimentSpec
+        Kind, duration, excursion and operating point, as a session sends them.
     loop, pump : LoopConfig, PumpConfig
         Range and rate of the flow.
     centre_um : float

@@ -19,6 +19,7 @@ def shuffle_batch(batch: pa.RecordBatch) -> pa.RecordBatch:
     Parameters
     ----------
     batch : pyarrow.RecordBatch
+        Rows of a journal's frame; it is not changed.
 
     Returns
     -------

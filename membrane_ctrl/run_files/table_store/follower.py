@@ -22,7 +22,9 @@ class TableFollower:
     Parameters
     ----------
     run_dir : Path
+        Folder of the run, which is in progress.
     table : TableSpec
+        Columns and limits.
     after : float
         Rows up to this value of the table's time column are left out.
     """

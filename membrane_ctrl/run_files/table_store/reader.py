@@ -29,6 +29,7 @@ class TableReader:
     Parameters
     ----------
     run_dir : Path
+        Folder of the run, which may be in progress, or come from elsewhere.
     table : TableSpec
         Columns of another type than here are not read.
     notes : list of str

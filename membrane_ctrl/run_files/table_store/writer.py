@@ -30,7 +30,9 @@ class TableWriter:
     Parameters
     ----------
     run_dir : Path
+        Folder of the run; the table has a folder in it.
     table : TableSpec
+        Columns, time and limits of the files.
     resumed : bool
         Continue after a recorder that died: with its journals, and without repeating rows that it
         wrote.
