@@ -81,7 +81,7 @@ class LeakEstimate(StateNode):
         Parameters
         ----------
         loss_um_per_s : float
-            Mean rate at which the film lost gas in the step, as the estimate of the centre states it.
+            Mean rate at which the film lost gas in the step, by the estimate of the centre.
         centre_um : float
             Displacement at its end.
         dt_s : float

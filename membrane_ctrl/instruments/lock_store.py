@@ -144,6 +144,7 @@ class LockStore:
         Raises
         ------
         OSError
+            The folder cannot be written: the lock stays.
         """
         with files.folder_handle(file.parent) as folder:
             with contextlib.suppress(FileNotFoundError):

@@ -80,6 +80,7 @@ def save_state(run_dir: Path, state: RecorderState) -> None:
     Raises
     ------
     OSError
+        The disk is full, or the folder is gone; the former state stays.
     """
     part = run_dir / f"{_NAME}.part"
     with files.fresh_file(part) as file:

@@ -92,8 +92,8 @@ class LiveHold:
     Raises
     ------
     InputError
-        `run_dir` is not the folder of the client's run or has no rings, or another session or client
-        has command.
+        `run_dir` is not the folder of the client's run or has no rings, or another client has
+        command.
     DeviceError
         The peer is not a hold.
     """

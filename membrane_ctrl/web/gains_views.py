@@ -228,6 +228,7 @@ class GainsViews:
         InputError
             Unknown names, or a setting beyond the sliders.
         PoolFullError
+            Too many viewers explore at once.
         """
         return await self._explored.get(hold, name, start, setting)
 

@@ -45,7 +45,10 @@ def write_part(
     PartEntry or None
         The manifest's line; None if there are no rows, and no file.
 
-    Raises OSError; a file of that name is then as before.
+    Raises
+    ------
+    OSError
+        The disk is full; a file of that name is then as before.
     """
     scratch = path.with_name(f".{path.name}.part")
     disk.remove(scratch)
