@@ -35,6 +35,7 @@ def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
     Returns
     -------
     (n,) complex array
+        Without unit: the measured centre over the error, around the loop.
     """
     dt_s = 1 / loop.rate_hz
     z = np.exp(1j * omega * dt_s)

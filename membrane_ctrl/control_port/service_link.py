@@ -52,6 +52,7 @@ def read_or_make_secret(name: str) -> str:
     Returns
     -------
     str
+        The content of the file, which only this user can read; made at the first call.
 
     Raises
     ------

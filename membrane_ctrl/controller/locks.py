@@ -103,6 +103,7 @@ def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
     Returns
     -------
     Unlocking
+        The lock to remove and by which right, or why none is.
     """
     if not command.from_person:
         return Unlocking(

@@ -293,6 +293,7 @@ def without_terms(height: AnyArray, terms: int) -> AnyArray:
     Returns
     -------
     (m, m) array
+        In the unit of the map, and NaN where it is.
     """
     finite = np.isfinite(height)
     x, y = (axis[finite] for axis in _disc_grid(len(height)))
@@ -318,6 +319,7 @@ def without_noll_terms(height: AnyArray, indices: Sequence[int]) -> AnyArray:
     Returns
     -------
     (m, m) array
+        In the unit of the map, and NaN where it is.
     """
     there = np.isfinite(height)
     inside = _inside_disc()

@@ -31,8 +31,12 @@ def write_part(
 
     Parameters
     ----------
+    disk : Disk
+        The system calls.
     path : Path
         The final name.
+    number : int
+        Of the part, for its line in the manifest.
     first_row : int
         Number of the part's first row in its table.
     groups : iterable of pyarrow.Table

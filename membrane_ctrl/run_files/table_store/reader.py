@@ -84,6 +84,8 @@ class TableReader:
         ----------
         names : sequence of str, optional
             Columns, all by default; those that a file lacks are left out of its tables.
+        start_s, end_s : float
+            Part of the run by the table's time column; the end does not belong to it.
         """
         wanted = tuple(self._table.schema.names if names is None else names)
         with_time = tuple(dict.fromkeys((*wanted, self._table.time_name)))
