@@ -45,6 +45,7 @@ class CameraBench:
     Attributes
     ----------
     sensor : SensorFormat
+        Size and depth of the emulated sensor.
     exposure_s : float
         Exposure of the driver that `make` makes; 0 if it is unknown.
     clock : DriverClock

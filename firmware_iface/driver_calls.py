@@ -22,8 +22,11 @@ def call_driver(
     name : str
         Kind and name of the device, such as "camera acme".
     driver : object
+        Perhaps of another package: anything may be raised.
     method : str
+        Name of the method.
     *arguments : object
+        For the method, in their order.
     returns : type
         What the result must be an instance of.
     """

@@ -200,6 +200,7 @@ class InterlockBench:
     sources : iterable of PolledSource
         Everything else that reads circuits.
     clock : callable
+        Monotonic time, s.
     """
 
     def __init__(

@@ -60,6 +60,7 @@ class Role:
     Attributes
     ----------
     name : str
+        As in the configuration and in messages.
     reads : str
         The driver's method that is asked in every tick. Of a sensor also the quantity that it
         measures: a simulated mirror has an attribute of this name.

@@ -71,7 +71,9 @@ def save_gains(path: Path, gains: GainsFile) -> None:
     Parameters
     ----------
     path : path
+        The file, TOML; replaced as a whole.
     gains : GainsFile
+        With the plant and the data that they are for.
     """
     origin = program.file_origin(SCHEMA)
     excluded = {"loop": set(KEYS_BESIDE_GAINS)}
@@ -90,6 +92,7 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     Parameters
     ----------
     gains : GainsFile
+        With the plant that they were designed for.
     where : str
         Name of the file, for the message.
     running : LoopConfig

@@ -55,6 +55,7 @@ def apprise_senders(config: AlarmsConfig, run: str) -> list[Send]:
     Parameters
     ----------
     config : AlarmsConfig
+        Names the files with the addresses.
     run : str
         Name of the run, which every message names.
 

@@ -44,6 +44,7 @@ def signs_of(changes: NoticeChanges, condition_s: float = math.nan) -> list[Sign
     Parameters
     ----------
     changes : NoticeChanges
+        What the event closes and opens.
     condition_s : float
         Time of the event.
     """
@@ -70,6 +71,7 @@ def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:
     Parameters
     ----------
     rule : AlarmRule
+        Field, limits and delay; `raise_at` above `clear_at` means a largest value.
     value : float
         NaN changes nothing: missing values are the safety table's task.
     standing : bool
@@ -201,6 +203,7 @@ class AlarmBook:
         sent : sequence of SentMessage
             All of the run, oldest first.
         now_s : float
+            Second of the run.
         """
         # The conditions that this book has followed stay; what it has noted as sent is
         # replaced by what the log states. An alarm that is over, and was never sent, is dropped.

@@ -68,6 +68,7 @@ def watch_run(
     Parameters
     ----------
     spec : AlarmsSpec
+        Clock, rings, configuration and folder of the run.
     senders : sequence of Send
         The one for all messages, and the one for escalated ones.
     report : callable

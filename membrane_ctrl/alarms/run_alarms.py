@@ -19,6 +19,7 @@ class RunAlarms:
     Parameters
     ----------
     config : AlarmsConfig
+        Rules, and the times of escalation and reminders.
     sent_log : SentLog
         Of the run's folder.
     senders : sequence of callable

@@ -68,6 +68,7 @@ def send_to_all(services: Sequence[Service], title: str, body: str, kind: str) -
     Parameters
     ----------
     services : sequence of Service
+        Each gets the message; one that still hangs is left out.
     title, body, kind : str
         As for `Service.begin_sending`.
 

@@ -116,10 +116,13 @@ class SentLog:
         Parameters
         ----------
         message : AlarmMessage
+            That was sent, or not.
         to : str
             Name of the list of services.
         at_s : float
+            Second of the run.
         accepted : bool
+            Whether a service of the list accepted it.
         """
         fields = asdict(message)
         if math.isnan(message.condition_s):

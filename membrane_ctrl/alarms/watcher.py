@@ -56,6 +56,7 @@ class Watcher:
         sent : sequence of SentMessage
             Those of the others.
         now_s : float
+            Second of the run.
         """
         self.is_sender = True
         self._book.adopt_sent(sent, now_s)
@@ -68,6 +69,7 @@ class Watcher:
         rows, events : sequence of bytes
             As they were in the rings.
         now_s : float
+            Second of the run.
         """
         self.take_news(rows, events, now_s)
         self.send_due(now_s)

@@ -28,6 +28,7 @@ class CalibrateOptions:
     laser_sigma_um : float
         Standard uncertainty of a set's mean reading.
     as_json : bool
+        Print the report as JSON.
     pictures : bool
         Draw the residuals of the screen points next to the geometry.
     reference_um : float, optional
@@ -36,6 +37,7 @@ class CalibrateOptions:
     priors : Sequence[Path]
         Results of auxiliary calibrations; the last one wins.
     film : set_state.FilmModel
+        `free`, `prestressed` or `hencky`: the law that the film follows.
     radius_sigma_mm : float
         Standard uncertainty of the radius of the ring, whose edge is seen.
     """

@@ -99,6 +99,7 @@ def take_sets(
     session : CalibrationSession or None
         The session to continue; None begins a new one.
     options : LiveOptions
+        Range and number of the sets, and whether to ask before the mirror moves.
 
     Raises
     ------

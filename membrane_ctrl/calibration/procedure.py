@@ -26,11 +26,13 @@ class Procedure:
     Attributes
     ----------
     link : CaptureLink
+        The hold, and its run folder with the sets that it takes.
     sweep : Sweep
         The hold under control.
     held : HeldMirror
         The mirror before the first move.
     progress : Progress
+        Shows steps and their durations; knows of a Ctrl-C.
     """
 
     link: CaptureLink

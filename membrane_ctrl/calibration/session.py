@@ -20,6 +20,7 @@ class CalibrationHead:
     source : str
         The run on which the session began.
     created_utc : str
+        When the session began, ISO 8601.
     start_um : float
         Setpoint to return to; the measurements by hand are assumed valid there.
     shape_on : bool

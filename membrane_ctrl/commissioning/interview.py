@@ -79,6 +79,7 @@ def hold_interview(path: Path, display: SessionDisplay, ask: Callable[[Dialogue]
     path : Path
         Of the answers; an existing file is continued. It is removed at the end.
     display : SessionDisplay
+        Shows the questions and returns what is typed.
     ask : callable
         Asks; it is called again after each `back`.
 

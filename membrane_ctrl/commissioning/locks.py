@@ -24,6 +24,7 @@ def list_locks(as_json: bool) -> int:
     Parameters
     ----------
     as_json : bool
+        Print JSON instead of a line for each lock.
 
     Returns
     -------

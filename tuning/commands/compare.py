@@ -16,6 +16,7 @@ def compare_sessions(a: SessionFolder, b: SessionFolder) -> str:
     Parameters
     ----------
     a, b : SessionFolder
+        Both with a design.
 
     Returns
     -------

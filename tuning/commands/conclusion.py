@@ -15,6 +15,7 @@ def conclude(folder: SessionFolder, options: TuneOptions) -> int:
     Parameters
     ----------
     folder : SessionFolder
+        Whose results decide the exit code.
     options : TuneOptions
         `json` prints the finished steps on stdout.
 

@@ -29,10 +29,13 @@ def measure_pump(
     Parameters
     ----------
     folder : SessionFolder
+        It restarts on the measured curve.
     rig : HoldRig
+        Holds the mirror.
     limit_um : float
         How far the mirror may move from its setpoint.
     progress : Progress
+        Shows the step and its results.
     after_s : float
         What the session takes after it, to announce it.
 

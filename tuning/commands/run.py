@@ -68,6 +68,7 @@ def run_step(step: str, options: TuneOptions) -> int:
     step : str
         One of `STEPS`; `characterise` starts a new session.
     options : TuneOptions
+        Of the command: session, hold or twin, answers.
 
     Returns
     -------

@@ -16,9 +16,11 @@ class Crossing:
     Attributes
     ----------
     hertz : float
+        Frequency.
     gain : float
         |L| there.
     phase_deg : float
+        Of L there, without jumps.
     """
 
     hertz: float

@@ -18,8 +18,11 @@ def save_gains(of: Workpiece, gains: Gains, author: str) -> str:
     Parameters
     ----------
     of : Workpiece
+        Its session's file is replaced.
     gains : Gains
+        As set on the page.
     author : str
+        For the file.
 
     Returns
     -------

@@ -44,6 +44,7 @@ class ActuatorKind:
     Attributes
     ----------
     kind : str
+        `one lag` if no other kind explains the record much better.
     lags_s : tuple of float
         The two lags, the longer one first; empty for other kinds.
     play_um_per_s : float

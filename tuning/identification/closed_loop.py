@@ -128,7 +128,9 @@ def compute_loop_response(
     Parameters
     ----------
     gains : Gains
+        Of the PID and its filter.
     model : PlantModel
+        The plant, P.
     w_rad_per_s : (n,) array
         Angular frequencies.
     dt_s : float

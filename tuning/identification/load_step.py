@@ -37,7 +37,9 @@ def simulate_load_step(
     Parameters
     ----------
     gains : Gains
+        Of a stable loop.
     model : PlantModel
+        The plant.
     step_um_per_s : float
         Step D of the leak.
     dt_s : float

@@ -28,6 +28,7 @@ class Margins:
     gain_margin : float
         Factor on the gain at which the loop oscillates.
     phase_margin_deg : float
+        Additional phase at which the loop oscillates.
     delay_margin_s : float
         Additional dead time at which the loop oscillates.
     disk_margin : float

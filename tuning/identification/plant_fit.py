@@ -98,11 +98,13 @@ class Identified:
     Attributes
     ----------
     model : PlantModel
+        The plant.
     sigma : Sigma
         Standard errors of its parameters.
     covariance : (4, 4) array
         Of gain, dead time, lag and leak.
     noise : NoiseModel
+        The zeros that made the prediction errors white.
     pressure_gain_um_per_pa : float
         Effect of the barometer's pressure, 0 without one; a nuisance parameter, which the
         barometer's noise makes too small.
@@ -142,7 +144,9 @@ def compute_prediction_errors(
     record : Record
         n samples.
     model : PlantModel
+        The plant.
     noise : NoiseModel
+        Makes the errors white if it is right.
     pressure_gain_um_per_pa : float
         The barometer's effect on the centre; 0 omits it.
 

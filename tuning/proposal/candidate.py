@@ -74,6 +74,7 @@ def evaluate_candidate(
     name : str
         Of the candidate.
     gains : Gains
+        Of the candidate.
     model : PlantModel
         The identified plant.
     disturbance : DisturbanceModel

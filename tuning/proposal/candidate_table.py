@@ -53,7 +53,9 @@ def format_terminal(rows: tuple[Candidate, ...], title: str, leak_um_per_s: floa
     Parameters
     ----------
     rows : tuple of Candidate
+        The present gains among them, if they are to be compared.
     title : str
+        Above the table.
     leak_um_per_s : float
         What the mirror loses now, for the caption.
     """
@@ -81,6 +83,7 @@ def describe_change(row: Candidate, present: Candidate | None) -> str:
     Parameters
     ----------
     row : Candidate
+        The candidate.
     present : Candidate or None
         The present gains; None if they are not in the table.
 

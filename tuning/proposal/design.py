@@ -84,6 +84,7 @@ def compute_relay_ultimate(model: plant_model.PlantModel, dt_s: float) -> tuple[
     Parameters
     ----------
     model : PlantModel
+        The plant; its gain and delay matter.
     dt_s : float
         Sample time.
 
@@ -204,6 +205,7 @@ def propose_gains(
     quality : FitQuality
         Verdict on the fit.
     demands : Demands, optional
+        What the searched designs must keep; the defaults without it.
 
     Returns
     -------
@@ -266,6 +268,7 @@ def _add_error_bars(
     Parameters
     ----------
     candidate : Candidate
+        Evaluated on the fitted plant.
     plants : sequence of PlantModel
         Drawn from the covariance of the fit.
     disturbance : DisturbanceModel

@@ -24,7 +24,9 @@ def compute_loop_figures(
     Parameters
     ----------
     gains : Gains
+        Of the loop.
     model : PlantModel
+        The plant, perhaps drawn from the fit.
     disturbance : DisturbanceModel
         Noise of the readings, and weather.
     loop : LoopConfig

@@ -60,7 +60,9 @@ def bound_load_peak_um(
     Parameters
     ----------
     gains : Gains
+        K, Ti and the filter.
     model : PlantModel
+        Gain and delay.
     step_um_per_s : float
         D.
 
@@ -90,6 +92,7 @@ def search_max_ki(
     Parameters
     ----------
     model : PlantModel
+        The identified plant.
     dt_s, filter_s : float
         Sample time, and the filter of the reading.
     ms : float

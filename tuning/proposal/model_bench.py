@@ -26,7 +26,9 @@ class ModelBench:
     Parameters
     ----------
     model : PlantModel
+        The plant.
     disturbance : DisturbanceModel
+        Noise of the sensors, and the weather that is simulated.
     pump : PumpConfig
         The pump's curve.
     seed : int

@@ -62,6 +62,7 @@ def evaluate_robustness(
     Parameters
     ----------
     gains : Gains
+        Judged on each plant.
     identified : Identified
         The fit, whose covariance the plants are drawn from.
     disturbance : DisturbanceModel

@@ -29,6 +29,7 @@ def make_simc_gains(
     Parameters
     ----------
     model : PlantModel
+        Its gain and effective delay.
     dt_s, filter_s : float
         Sample time, and the filter of the reading.
     closed_loop_s : float, optional
@@ -65,6 +66,7 @@ def make_lambda_gains(
     Parameters
     ----------
     model : PlantModel
+        Its gain and effective delay.
     dt_s, filter_s : float
         Sample time, and the filter of the reading.
     factor : float

@@ -355,6 +355,7 @@ def explain_no_benefit(stage: Stage, trial: VerificationTrial) -> str:
     stage : Stage
         The last one.
     trial : VerificationTrial
+        Previous and new gains, and whether a person accepted their price.
     """
     if math.isinf(stage.growth_sigma):
         return ""

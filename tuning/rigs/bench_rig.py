@@ -30,7 +30,9 @@ class Rig:
     Parameters
     ----------
     bench : DrivenBench
+        A simulated bench, or one that waits for real ticks.
     loop : LoopConfig
+        Gains, rate and bleed.
     pump : PumpConfig
         Its curve turns flows into commands.
     leak_um_per_s : float
@@ -62,6 +64,7 @@ class Rig:
         Parameters
         ----------
         duration_s : float
+            Rounded to whole ticks.
         target_um : float
             Displacement to hold.
         """

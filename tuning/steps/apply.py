@@ -59,6 +59,7 @@ def run_apply(
     Parameters
     ----------
     session : SessionFolder
+        With a design.
     rig : HoldRig
         The hold that receives them.
     candidate : str

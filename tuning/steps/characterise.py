@@ -36,7 +36,9 @@ def run_characterise(
     Parameters
     ----------
     session : SessionFolder
+        Gets the record and the results.
     rig : HoldRig
+        Holds the mirror.
     limit_um : float
         How far the mirror may move from its setpoint.
     plan : Plan

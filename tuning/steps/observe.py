@@ -38,6 +38,7 @@ def run_observe(
     session : SessionFolder
         With an identified plant.
     rig : HoldRig
+        Holds the mirror.
     duration_s : float
         Of the hold, unless it was recorded before the experiments.
 

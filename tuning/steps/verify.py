@@ -126,9 +126,11 @@ class _WatchedHold:
     Attributes
     ----------
     record : Record or None
+        All samples so far; None before the first stage.
     setpoint_um : (n,) array
         Setpoint at each of its samples.
     stages : list of Stage
+        Judged so far.
     """
 
     record: Record | None = None

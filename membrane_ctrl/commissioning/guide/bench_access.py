@@ -48,7 +48,9 @@ class OpenBench:
     Attributes
     ----------
     bench : Bench
+        Opened; its watchdog runs, so it must be written to while the pump runs.
     identity : BenchIdentity
+        What its devices state, with the watchdog's period.
     sleep : callable
         Waits, in the bench's time.
     now : callable

@@ -52,11 +52,13 @@ class Question(BaseModel):
     key : str
         Of the answer in the session's state.
     kind : QuestionKind
+        Which form of answer is expected.
     text : str
         For people; of a readiness what they are to do.
     default : str
         The answer if none is typed; empty without one.
     choices : tuple of Choice
+        Of a choice; empty for other kinds.
     unit : str
         Of a number.
     low, high : float
@@ -136,6 +138,7 @@ class Dialogue:
     Parameters
     ----------
     display : SessionDisplay
+        Shows the questions and returns what is typed.
     remembered : dict
         Typed answers by key: each becomes the default when its question is asked again.
     remember : callable

@@ -55,6 +55,7 @@ class EmulatedBench:
     laser_sign : int
         -1: the laser is mounted or configured the wrong way round.
     lens : EmulatedLens
+        Of the rendered camera, which a hand can turn out of focus.
     """
 
     simulated = True

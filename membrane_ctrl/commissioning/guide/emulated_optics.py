@@ -78,7 +78,9 @@ class EmulatedOptics:
     config : Config
         With a screen.
     mirror : Plant
+        Whose true shape the camera sees.
     lens : EmulatedLens
+        Its focus, which blurs the rendered pictures.
     """
 
     def __init__(self, config: Config, mirror: Plant, lens: EmulatedLens) -> None:

@@ -25,6 +25,7 @@ def measure_rim_edge_px(pictures: MirrorPictures) -> float:
     Parameters
     ----------
     pictures : MirrorPictures
+        Of the lit mirror, with the screen white and black, counts.
 
     Returns
     -------

@@ -53,10 +53,13 @@ class CommissioningSession:
     folder : path
         Of the session: `session.json`, `lab.toml`, runs, report.
     access : BenchAccess
+        The bench: devices, or the emulated one.
     display : SessionDisplay
+        Terminal or page.
     plan : SessionPlan, optional
         The durations of a full session by default.
     stages : sequence of CommissioningStage, optional
+        All stages by default; tests run some of them.
     """
 
     def __init__(

@@ -65,6 +65,7 @@ class EndMessage(BaseModel):
     Attributes
     ----------
     code : int
+        As in `errors.Exit`.
     problem : str
         Of an end by an error, in one line.
     """

@@ -200,6 +200,7 @@ def restore_lent_keys(
     folder : Path
         Of the session.
     state : SessionState
+        Holds the lent keys with their former values; changed and stored.
     names : tuple of str, optional
         Of the keys; all by default.
 

@@ -12,6 +12,7 @@ class Threshold:
     name : str
         What is limited.
     value : float
+        The limit, in `unit`.
     unit : str
         Empty for a ratio or a count.
     reason : str
