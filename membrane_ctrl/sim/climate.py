@@ -82,8 +82,11 @@ class Room:
 
     def make_block(self, time_s: FloatArray) -> ClimateBlock:
         """The climate at plant times, (steps,)."""
+        # The room's waves, and film and ring that follow them.
         zero_c = REFERENCE_K - _ZERO_C_K
         air_k, film_k, ring_k, humidity, moisture = self._waves(time_s)
+
+        # A lamp warms a patch of the film while it is on; the patch cools with the same lag.
         patch_k = np.zeros_like(time_s)
         if self._kind == "lamp":
             lit = time_s % LAMP_EVERY_S
@@ -94,10 +97,14 @@ class Room:
             )
             patch_k = LAMP_K * warming
             film_k = film_k + LAMP_SHARE * patch_k
+
+        # The excess strain of the film over its ring changes the sag at equal pressure (sections 1
+        # and 3 of docs/explanation/climate.md).
         film_ppm = FILM_PPM_PER_K * film_k + FILM_PPM_PER_PERCENT * moisture
         excess_ppm = film_ppm - RING_PPM_PER_K * ring_k
         mirror_factor = 1.0 + compute_sag_change_per_ppm() * excess_ppm
-        # A thinner film is strained more by the pressure, and therefore less by this
+
+        # The back film is thinner: the pressure strains it more, and this therefore less.
         back = compute_sag_change_per_ppm() / _THICKNESS_RATIO ** (2 / 3)
         return ClimateBlock(
             air_k,
@@ -114,19 +121,28 @@ class Room:
         self, time_s: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Deviations of air, film, ring, humidity and moisture: waves, and what follows them."""
+        # Period and amplitudes of the kind.
+        period_s = DAY_S
+        kelvin = 0.0
+        percent = 0.0
         if self._kind == "day":
-            period_s, kelvin, percent = DAY_S, 2.0, 10.0
+            kelvin = 2.0
+            percent = 10.0
         elif self._kind == "hvac":
-            period_s, kelvin, percent = HVAC_S, 0.5, -2.0
-        else:
-            period_s, kelvin, percent = DAY_S, 0.0, 0.0
+            period_s = HVAC_S
+            kelvin = 0.5
+            percent = -2.0
+
+        # Temperature, and humidity, which over a day has two waves: air is exchanged twice.
+        rate = 2 * math.pi / period_s
         angle = 2 * math.pi * time_s / period_s + self._phase
         humid = angle
+        humid_rate = rate
         if self._kind == "day":
-            humid = angle * 2  # a second wave: air that is exchanged twice a day
-        rate, humid_rate = 2 * math.pi / period_s, 2 * math.pi / period_s
-        if self._kind == "day":
-            humid_rate *= 2
+            humid = angle * 2
+            humid_rate = rate * 2
+
+        # What follows a wave with a lag is a smaller and later wave.
         return (
             kelvin * np.cos(angle),
             kelvin * _follow(angle, rate * FILM_FOLLOWS_AIR_S),

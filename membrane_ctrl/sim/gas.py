@@ -40,9 +40,6 @@ class Gas:
         one Newton step from the last u is exact to 1e-11 in the twin's small steps; the next step
         removes the error of a sudden jump.
 
-        `added_ml` is reference mL in minus out, `follow` the share of the difference to the air
-        temperature that this step closes, `volume` the c of both films in m^3 per Pa^(1/3).
-
         Parameters
         ----------
         added_ml : float
@@ -59,6 +56,8 @@ class Gas:
         amount_ml = self.amount_ml + added_ml
         self.amount_ml = amount_ml if amount_ml > 0.0 else 0.0  # a third of the time of max()
         self.temperature_k += (air_k - self.temperature_k) * follow
+
+        # f(u) = u (ambient + u^3) - P V / c, f'(u) = ambient + 4 u^3.
         pv = self.amount_ml * JOULE_PER_ML * self.temperature_k / REFERENCE_K
         u = self.root_pa
         u3 = u * u * u

@@ -63,14 +63,16 @@ def solve_hencky(poisson: float = POISSON_PET) -> Hencky:
     """
     if not 0 <= poisson <= 0.5:
         raise ValueError(f"poisson = {poisson:g} is outside 0 .. 0.5")
+    # The series of the radial force is known from b_0; the rim, which does not move, decides b_0.
     k = np.arange(_TERMS)
 
     def rim_condition(b0: float) -> float:
         return float(np.dot(2.0 * k + 1.0 - poisson, _force_series(b0)))
 
-    slope = _reciprocal_series(
-        _force_series(brentq(rim_condition, 0.40, 0.60, xtol=1e-15))
-    )  # 4 dW/du, without q^(1/3)
+    b0 = brentq(rim_condition, 0.40, 0.60, xtol=1e-15)
+
+    # The vertical balance gives the slope, 4 dW/du without q^(1/3); its integral is the depth.
+    slope = _reciprocal_series(_force_series(b0))
     fall = slope / (k + 1)
     profile = np.concatenate(([0.0], fall)) / fall.sum()
     return Hencky(float(fall.sum()) / 4, float(np.dot(k + 1, profile[1:] / (k + 2))), profile)

@@ -32,6 +32,7 @@ class Sensors:
         """A new sample; the counter advances by one. Without light the displacement is NaN, its
         quality not 0.
         """
+        # Five random numbers each time, whatever is lost: a fault does not change the other noises.
         config = self._config
         laser, gauge, ambient, air, gas = self._rng.standard_normal(5).tolist()
         lost = truth.laser_lost > 0 or not config.laser
@@ -42,6 +43,8 @@ class Sensors:
             reading_um = truth.displacement_um + truth.laser_bias_um + noise_um
             displacement_um = _quantise_value(reading_um, config.laser_resolution_um)
             quality = LASER_GOOD
+
+        # Sensors of the climate, with a generator of their own.
         self._counter += 1
         film_c = ring_c = humidity_percent = math.nan
         if math.isfinite(truth.humidity_percent):

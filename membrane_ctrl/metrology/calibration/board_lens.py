@@ -204,6 +204,8 @@ def _plane_misfit(view: BoardView) -> float:
     plane, _ = cv2.findHomography(view.place[:, :2], view.seen_px)
     if plane is None or not np.isfinite(plane).all():
         return math.inf
+
+    # A plane seen by a pinhole is a homography of its places; what is left is distortion.
     expected = cv2.perspectiveTransform(view.place[:, None, :2].astype(float), plane)[:, 0]
     off_px = np.sqrt(np.mean(np.sum((expected - view.seen_px) ** 2, axis=1)))
     return float(off_px) / square_px

@@ -41,6 +41,7 @@ def seat_rows(turned: TurnedMirror | None, state: SetState) -> FloatArray:
     (3, LOCAL + COMMON + 1) array
         Weighted rows [derivatives, miss] of x, y and angle.
     """
+    # Each number is 0 within its sigma: (step) = -(present value).
     rows = np.zeros((3, LOCAL + COMMON + 1))
     rows[:, SEAT] = np.eye(3)
     rows[:, -1] = -np.array(state.seat)

@@ -147,6 +147,7 @@ class FigureOf:
         smooth_map_um = self._pvr.values(self._pvr.coefficients(deviation_map_um))
         smooth_um = smooth_map_um[mask]
 
+        # All numbers; a flat has no radius.
         radius_mm = np.nan
         if sphere.curvature_per_mm != 0:
             radius_mm = 1 / sphere.curvature_per_mm

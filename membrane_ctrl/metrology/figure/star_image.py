@@ -225,6 +225,7 @@ def _is_resolved(paths_um: FloatArray, mask: FloatArray, wavelength_um: float) -
     """Whether nearly all neighbouring cells differ by less than half a wavelength."""
     small = []
     for axis in (0, 1):
+        # Neighbours along this axis that are both inside the aperture.
         both = np.logical_and(
             np.take(mask, range(len(mask) - 1), axis), np.take(mask, range(1, len(mask)), axis)
         )
@@ -244,10 +245,13 @@ def _sum_energy(spread: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Radii (n,) of all samples around the middle of the energy, in order, and the share (n,) of
     the energy up to each.
     """
+    # The middle is the centre of gravity.
     axis = np.arange(len(spread))
     total = spread.sum()
     row = float(spread.sum(axis=1) @ axis / total)
     column = float(spread.sum(axis=0) @ axis / total)
+
+    # Energy summed from the middle outwards.
     radius = np.hypot(axis[:, None] - row, axis[None, :] - column).ravel()
     order = np.argsort(radius)
     energy = np.cumsum(spread.ravel()[order]) / total

@@ -120,6 +120,8 @@ def _invert_for_slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatAr
     start = _TAUTEST
     if np.all(falls(np.asarray(_USUAL)) > wanted):
         start = _USUAL
+
+    # f(s + i e) = f(s) + i e f'(s): value and derivative in one evaluation, exact to rounding.
     s = np.full(np.shape(wanted), start)
     for _ in range(_NEWTON_STEPS):
         value = falls(s + 1j * COMPLEX_STEP)

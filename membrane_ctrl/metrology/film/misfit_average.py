@@ -55,9 +55,13 @@ def misfit_covariances(figures: Sequence[FilmFigure]) -> FloatArray:
     """Covariance (growths, n, n) over n sets of a misfit of size 1 that grows with the powers
     `GROWTHS` of the sag.
     """
+    # A misfit g that all sets share grows as (sag / mean sag)^power: g g^T of each power.
     sags = np.array([each.sag_mm for each in figures])
     relative = sags / sags.mean()
     grown = relative[:, None] ** GROWTHS
+
+    # Beside it a part that is linear in the sag's change, and one of each set alone, as large as
+    # the sags differ.
     off = relative - 1
     follows_sag = _UNRELATED**2 * np.outer(off, off)
     of_each_set = _DIFFERS**2 * np.var(relative) * np.eye(sags.size)
@@ -163,6 +167,7 @@ def average_over_misfits(
 
 def average_models(found: Sequence[Solved]) -> Solved:
     """Average models, each with the weight of its evidence."""
+    # Evidence as weights, relative to the largest one: the exponentials do not overflow.
     logs = np.array([solved.log_evidence for solved in found])
     weight = np.exp(logs - logs.max())
     total = float(weight.sum())

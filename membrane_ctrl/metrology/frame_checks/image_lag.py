@@ -190,9 +190,14 @@ def add_image_lag(removed: ImageLag, found: ImageLag) -> ImageLag:
     """
     if not removed.corrected and not is_worth_removing(found):
         return found
+    # The frames were corrected by P = I + f / (1 - f) (I - I_before): what is found is a share of
+    # what the correction has left.
     rise = removed.rise + found.rise * (1 - removed.rise)
     fall = removed.fall + found.fall * (1 - removed.fall)
     share = (rise + fall) / 2
+
+    # What no frame shows: transitions between greys, a rise that differs from the fall, and the
+    # second order of the share.
     model_sigma = math.hypot(
         _TRANSITIONS * share, _ASYMMETRY * (rise - fall), _SECOND_ORDER * share**2
     )

@@ -318,9 +318,13 @@ class _Images:
     def __init__(
         self, phase_rad: FloatArray, frames: list[_GrayFrame], bright: FloatArray, centre_rad: float
     ) -> None:
+        # Phases that any scale and shift of the search reaches.
         self._phase_rad = phase_rad
         largest_rad = float(np.max(np.abs(phase_rad))) + _SHIFT_RANGE * centre_rad
         self._reach_rad = 3 * largest_rad
+
+        # What each Gray frame shows at cells of the phase, dark beside the pattern: a look-up for
+        # every bin, scale and shift.
         cells_rad = np.arange(-self._reach_rad, self._reach_rad, _CELL_RAD)
         inside = np.abs(cells_rad) < centre_rad + np.pi
         shown = [gray_bit(cells_rad + centre_rad, frame.bit)[0] & inside for frame in frames]

@@ -43,6 +43,8 @@ def crossed_phasors(
         raise ValueError(
             f"{len(design)} pairs of phase steps do not determine the phases of crossed fringes"
         )
+
+    # Least squares for all pixels at once; C + i S is B e^(i phi).
     solved = np.tensordot(np.linalg.pinv(design), stack, axes=1)
     _mean, x_cos, x_sin, y_cos, y_sin = solved
     return np.stack([x_cos + 1j * x_sin, y_cos + 1j * y_sin])

@@ -239,6 +239,8 @@ def height_probe() -> FloatArray:
     theta = k * np.pi * (3 - np.sqrt(5))
     x = rho * np.cos(theta)
     y = rho * np.sin(theta)
+
+    # Heights of the Zernike terms, and of the excess, which is the last parameter.
     terms = zernike.evaluate_terms(x, y)
     excess = series.polyval(rho**2, hencky_bowl.excess_series()) / hencky_bowl.excess_rms()
     by_excess = np.outer(excess, np.eye(PARAMETERS)[-1])

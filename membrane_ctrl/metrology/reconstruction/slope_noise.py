@@ -64,6 +64,7 @@ def slope_per_screen(geometry: Geometry, radius_mm: float, sag_mm: float) -> Flo
     reach_mm = (screen_normal @ to_origin) / (screen_normal @ u)
 
     # Change of the bisector's direction and of its slopes per mm along each of the screen's axes.
+    # d u is the part of the axis across the ray over the way; g = -n_xy / n_z.
     bisector = u - d
     negative_slopes = bisector[:2] / bisector[2]
     squares = np.empty((2, 2))

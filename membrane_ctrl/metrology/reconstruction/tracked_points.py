@@ -161,6 +161,7 @@ def select_points(
     fields = smooth_fields.interpolate_fields(trace_some, index, grid.columns)
     offset_mm = fields[:2] + screen_scale.centre_phase_rad(pattern) * mm_per_rad
 
+    # The phases that fringes-only cycles continue from, with their cosines and sines.
     accepted = np.zeros((2, bin_sums.FOLLOWED_ROWS, index.size))
     accepted[:, 0] = phase_rad
     # Within a period, single precision holds an angle to 1e-7 rad, in a tenth of the time.

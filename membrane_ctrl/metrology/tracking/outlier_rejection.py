@@ -75,10 +75,12 @@ class RobustFitter:
         -------
         FrameFit
         """
-        # Light wanders in proportion to itself: bright fringes in a bright patch are no outliers.
+        # Changes of the light are in proportion to it: bright fringes in a bright patch are no
+        # outliers.
         brightness = np.maximum(seen_adu / self.fitter.light_adu[0], np.float32(1)) * ~left_out
         fit = start
         for first_scale_adu in filter(None, (last_scale_adu, _FIRST_REACH_ADU)):
+            # Fits until the scale that decided the weights is the one that the fit leaves.
             fit = start
             scale_adu = first_scale_adu
             for _ in range(_REPEATS):

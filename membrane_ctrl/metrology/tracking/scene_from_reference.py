@@ -91,6 +91,8 @@ def make_scene(
     rows = camera.height_px // bin_px
     columns = camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(len(fine), -1)
+
+    # Bins that are wholly known, in the order of the fit's cells.
     known = np.isfinite(coarse).all(axis=0)
     index, counted, cells = Cells.from_bins(np.flatnonzero(known), columns)
 

@@ -594,6 +594,7 @@ class Tracker:
         """
         to_coeffs = surface.parameter_to_coeffs()
         gradient = surface.sag_gradient()
+
         # Covariance of a change, and that against the reference.
         change_mm2 = covariance_mm2 + motion.found_mm2
         total_mm2 = change_mm2 + motion.allowed_mm2

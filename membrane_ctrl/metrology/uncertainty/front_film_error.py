@@ -44,10 +44,14 @@ def front_film_sources(bench: TrialBench) -> list[Source]:
     by_turn_mm = _WAYS * reach_mm * geometry.screen_axes[:2, :2, None]
     unit = point[:2] / cushion.radius_mm
 
+    # The film one sigma off in its bulge, its gas and its thickness.
     bulged = replace(cushion, bulge_mm=cushion.bulge_mm + front.bulge_sigma_mm)
     denser = replace(cushion, gas_excess=cushion.gas_excess * (1 + front.gas_sigma_relative))
     thicker_mm = cushion.thickness_mm * (1 + front.thickness_sigma_relative)
     thicker = replace(cushion, thickness_mm=thicker_mm)
+
+    # Form and evenness turn the rays by the slopes that they add: by the gas as a prism of its
+    # excess, by the film as one of its index.
     return [
         _row(
             bench,

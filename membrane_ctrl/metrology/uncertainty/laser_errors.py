@@ -43,6 +43,7 @@ def left_by_laser_um(readings_um: FloatArray, within_um: float, laser_noise_um: 
     laser_noise_um : float
         Noise of a reading.
     """
+    # Noise of the difference of two means of N readings: sigma sqrt(2 / N).
     noise_um = laser_noise_um * math.sqrt(4 / readings_um.size)
     if film_motion.is_worth_correcting(readings_um, laser_noise_um):
         return noise_um

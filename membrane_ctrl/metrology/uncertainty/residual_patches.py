@@ -82,9 +82,12 @@ class Patches:
         reach_mm : float
             Half the side of the square that the patches cover.
         """
+        # The patch of each point: the square from -reach to reach has _PATCHES a side.
         in_patches = (places_mm / reach_mm + 1) / 2 * _PATCHES
         column, row = np.clip(in_patches.astype(int), 0, _PATCHES - 1)
         patch = row * _PATCHES + column
+
+        # Sums of weight, places and slopes over each patch, and their means.
         sums = [
             np.bincount(patch, count * part, _PATCHES**2)
             for part in (np.ones_like(count), *places_mm, *slopes)

@@ -356,6 +356,8 @@ class OpticsRenderer:
         """
         if self.exact:
             return self._trace_nodes(displacement_um)
+
+        # Between the traced displacements below, at and above the nearest one.
         nearest = float(np.floor(displacement_um / _CELL_UM + 0.5))
         f = displacement_um / _CELL_UM - nearest
         below, here, above = (self._trace_nodes((nearest + k) * _CELL_UM) for k in (-1, 0, 1))

@@ -166,6 +166,7 @@ class Disturber:
             whole = np.floor(turns)
             return np.asarray(whole * _LIT_SHARE + np.minimum(turns - whole, _LIT_SHARE))
 
+        # Lit part of the exposure, from its begin to its end, over that of a steady light.
         half_s = _EXPOSURE_S / 2
         lit = lit_turns(hz * (middle_s + half_s)) - lit_turns(hz * (middle_s - half_s))
         return np.asarray(lit / (_LIT_SHARE * hz * _EXPOSURE_S))

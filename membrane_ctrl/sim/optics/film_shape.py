@@ -48,6 +48,8 @@ def bowl_series(bowl: _Form, sag_mm: float, radius_mm: float) -> FloatArray:
         return hencky.solve_hencky().profile
     if bowl == "paraboloid":
         return np.array([0.0, 1.0])
+
+    # 1 - sqrt(1 - z) = sum of C(2k, k) / (4^k (2k - 1)) z^k, with z = x rho^2.
     x = (2 * sag_mm * radius_mm / (radius_mm**2 + sag_mm**2)) ** 2
     terms = np.zeros(_SPHERE_TERMS)
     for k in range(1, _SPHERE_TERMS):

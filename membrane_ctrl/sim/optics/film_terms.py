@@ -60,7 +60,8 @@ def height_and_slopes(
     hx = 2.0 * X * sag_mm * bowl_u
     hy = 2.0 * Y * sag_mm * bowl_u
 
-    # The polynomial in x and y, too.
+    # The Zernike terms, a polynomial in x and y: each row is one in y, and the rows are the
+    # coefficients of one in x. Value and both derivatives in one pass.
     degree = terms.poly_mm.shape[0] - 1
     value = 0.0
     value_x = 0.0
@@ -83,16 +84,17 @@ def height_and_slopes(
         amplitude = terms.wrinkles[n, 0]
         order = int(terms.wrinkles[n, 1])
         phase = terms.wrinkles[n, 2]
+        # d/dx of Re(z^m w) is Re(m z^(m-1) w), d/dy is -Im of that: `below` is z^(m-1) w.
         below = complex(cos(phase), sin(phase))
         for _ in range(order - 1):
             below *= complex(X, Y)
         h += amplitude * (below * complex(X, Y)).real
         hx += amplitude * order * below.real
         hy -= amplitude * order * below.imag
+
+    # Slopes per mm; ripples and bumps have their places in mm, too.
     hx = hx / terms.radius_mm
     hy = hy / terms.radius_mm
-
-    # Ripples and bumps, in mm.
     for n in range(terms.ripples.shape[0]):
         amplitude, kx, ky, phase = terms.ripples[n]
         angle = kx * x_mm + ky * y_mm + phase

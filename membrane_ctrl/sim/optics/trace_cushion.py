@@ -58,6 +58,7 @@ def trace_cushion(
     -------
     CushionTrace
     """
+    # Where the rays meet the mirror and, by three ways, the plane of the screen.
     bulge_mm = front.bulge_at_mm(sag_mm)
     hits = _trace_kernel(
         camera.position_mm,
@@ -72,6 +73,8 @@ def trace_cushion(
         screen.origin_mm,
         np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)]),
     )
+
+    # From the plane to the screen's face: the main image, and both others.
     on_face = [
         project_onto_face(
             hits[k : k + 2], hits[k + 2 : k + 4], screen.bow_per_mm, screen.height_map
@@ -90,10 +93,13 @@ def _front_distance(
 
     It begins where the ray is as high as the face over its start.
     """
+    # Where to begin.
     h, _hx, _hy = height_and_slopes(front, bulge_mm, start[0], start[1])
     t = (top_mm - h - start[2]) / direction[2]
     if direction[2] < 0.0:  # from the camera, far away: begin in the film's plane
         t = (top_mm - bulge_mm - start[2]) / direction[2]
+
+    # Newton's method on f(t) = z(t) - top + h(x(t), y(t)).
     for _ in range(_MAX_STEPS):
         x = start[0] + t * direction[0]
         y = start[1] + t * direction[1]
@@ -191,6 +197,7 @@ def _lowered_face(
 
     A film of one thickness along its normal is thicker by sqrt(1 + slope^2) along z.
     """
+    # At the point, then a little to the left, right, below and above it: central differences.
     distances = np.empty(5)
     for k in range(5):
         x = p[0]
