@@ -183,8 +183,7 @@ class PumpBoard:
         """One sample of everything, in one transaction.
 
         Raises LinkError (no valid answer), LinkDownError (no connection, or the board restarted and
-        lost its
-        settings: call `open` again).
+        lost its settings: call `open` again).
         """
         values = await self._read_sensors()
         # A board that restarts has its watchdog off: its pump would run without a guard.

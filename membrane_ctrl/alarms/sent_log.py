@@ -4,10 +4,10 @@ Several processes can send: the service, and the alarm process of the hold. One 
 *sender*. It holds a lock on `alarms.lock`, which ends with the process, and writes the time into
 that file while it works; a sender that has not done so for `STALE_S` hangs and is replaced.
 
-`alarms.jsonl` has a line for each sender and for each attempt to send a message. A new sender
-reads it first, so a message is sent once. Before each message a sender checks that
-no other has taken its place. Only if a sender dies or hangs between sending a message and
-recording it, the next one sends it again: a lost alarm would be worse.
+`alarms.jsonl` has a line for each sender and for each attempt to send a message. A new sender reads
+it first, so a message is sent once. Before each message a sender checks that no other has taken its
+place. Only if a sender dies or hangs between sending a message and recording it, the next one sends
+it again: a lost alarm would be worse.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
     C = K (1 + 1 / (j w Ti) + j w Td),   F = 1 / (1 + j w Tf)
 
 theta is the dead time from a reading to the first gas, h / 2 the mean delay of a command held for a
-sample. A Pade approximation would shift the margins
-by as much as the designs differ; a frequency response needs none.
+sample. A Pade approximation would shift the margins by as much as the designs differ; a frequency
+response needs none.
 """
 
 from __future__ import annotations
