@@ -46,13 +46,13 @@ def explain_checkerboard(seen: ArrayLike, white: ArrayLike, black: ArrayLike) ->
     if high - low > _LARGEST_BAND:
         return (
             f"a one-pixel checkerboard shows bands ({100 * low:.0f} .. {100 * high:.0f} % of "
-            "white): the screen "
-            "rescales; set the panel's own resolution and switch off overscan and scaling"
+            "white): the screen rescales; set the panel's own resolution and switch off overscan "
+            "and scaling"
         )
     if not _HALF_RANGE[0] < middle < _HALF_RANGE[1]:
         return (
-            f"a one-pixel checkerboard gives {100 * middle:.0f} % of white instead of 50: "
-            "the screen sharpens or "
-            "mixes pixels; set the panel's own resolution and switch off picture improvements"
+            f"a one-pixel checkerboard gives {100 * middle:.0f} % of white instead of 50: the "
+            "screen sharpens or mixes pixels; set the panel's own resolution and switch off "
+            "picture improvements"
         )
     return ""

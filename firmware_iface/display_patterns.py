@@ -34,10 +34,9 @@ class ScreenRaster:
         )
         if half_px > room_px:
             raise ValueError(
-                f"the pattern of {self.periods} x {self.period_mm:g} mm needs "
-                f"{2 * half_px:.0f} pixels of "
-                f"{self.pixel_mm:g} mm, the screen has {2 * room_px:.0f}; lower period_mm or "
-                "periods"
+                f"the pattern of {self.periods} x {self.period_mm:g} mm needs {2 * half_px:.0f} "
+                f"pixels of {self.pixel_mm:g} mm, the screen has {2 * room_px:.0f}; lower "
+                "period_mm or periods"
             )
 
     @property

@@ -95,9 +95,8 @@ def fit_settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Set
         return Settling(float(delays[0]) * math.log(_LEFT) / math.log(still), math.nan, math.nan)
     if unsettled[-1] == len(delays) - 1:
         raise ValueError(
-            f"{100 * shares[-1]:.0f} % of a step is left after {delays[-1]:.2f} s: does the "
-            "camera see the screen, "
-            "and is its light steady (dynamic backlight, another lamp)?"
+            f"{100 * shares[-1]:.0f} % of a step is left after {delays[-1]:.2f} s: does the camera "
+            "see the screen, and is its light steady (dynamic backlight, another lamp)?"
         )
     seen_s = float(delays[unsettled[-1] + 1])  # the first of the good frames
     falling = (shares < _FIT_FROM) & (shares > floor)

@@ -28,22 +28,20 @@ def explain_exposure(white: Pixels, black: Pixels, full_scale_adu: int, exposure
     dark = float(np.quantile(black, 0.99))
     if saturated > _SATURATED_SHARE:
         return (
-            f"{100 * saturated:.1f} % of the pixels are saturated on white; lower "
-            f"exposure_ms = {exposure_ms:g} "
-            f"to about {_two_digits(exposure_ms / 2)}, or the gain"
+            f"{100 * saturated:.1f} % of the pixels are saturated on white; lower exposure_ms = "
+            f"{exposure_ms:g} to about {_two_digits(exposure_ms / 2)}, or the gain"
         )
     if bright < _LEAST * full_scale_adu:
         wanted_ms = exposure_ms * _TARGET * full_scale_adu / max(bright, 1.0)
         return (
             f"white gives only {bright:.0f} of {full_scale_adu} counts; raise exposure_ms = "
-            f"{exposure_ms:g} to about "
-            f"{_two_digits(wanted_ms)}, open the lens, or is the mirror covered?"
+            f"{exposure_ms:g} to about {_two_digits(wanted_ms)}, open the lens, or is the mirror "
+            "covered?"
         )
     if bright < _LEAST_CONTRAST * dark:
         return (
-            f"black gives {dark:.0f} counts where white gives {bright:.0f}: other light "
-            "reaches the camera; darken "
-            "the room"
+            f"black gives {dark:.0f} counts where white gives {bright:.0f}: other light reaches "
+            "the camera; darken the room"
         )
     return ""
 

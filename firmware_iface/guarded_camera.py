@@ -142,8 +142,7 @@ class GuardedCamera:
             self.close()
             raise roles.LinkError(
                 f"{self._name}: gave {_describe_array(pixels)}, [optics.camera] states "
-                f"{sensor.width_px} x "
-                f"{sensor.height_px} {sensor.dtype}"
+                f"{sensor.width_px} x {sensor.height_px} {sensor.dtype}"
             )
         # A frame from before its trigger shows the pattern before; one from the future has a time
         # of another clock. Both are lost frames: the pattern is shown again.
@@ -152,8 +151,7 @@ class GuardedCamera:
         if not isinstance(frame.time_s, int | float) or not earliest_s <= frame.time_s <= latest_s:
             raise optical_roles.FrameLostError(
                 f"{self._name}: gave a frame of {frame.time_s} s for the trigger at "
-                f"{triggered_s:.3f} s: late, or "
-                "its time is not on the run's clock"
+                f"{triggered_s:.3f} s: late, or its time is not on the run's clock"
             )
 
 

@@ -191,9 +191,8 @@ def _list_used_gains(logs: Path) -> Iterator[GainsEntry]:
 def format_history(found: list[GainsEntry]) -> str:
     """The journal as a Markdown table."""
     lines = [
-        "| time | what | session | author | K 1/s | Ti s | filter s | candidate | std µm | "
-        "load peak µm | recovery s "
-        "| Ms | reason |",
+        "| time | what | session | author | K 1/s | Ti s | filter s | candidate | std µm | load "
+        "peak µm | recovery s | Ms | reason |",
         "|---|---|---|---|---:|---:|---:|---|---:|---:|---:|---:|---|",
     ]
     for line in found:
@@ -209,8 +208,7 @@ def format_history(found: list[GainsEntry]) -> str:
             reason = f"shape loop {before_s:.0f} -> {after_s:.0f} s: {reason}"
         lines.append(
             f"| {line.time_utc} | {line.what} | {line.session} | {line.author} | "
-            f"{loop.kp_per_s:.3f} "
-            f"| {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | {' | '.join(traded)} | "
-            f"{reason} |"
+            f"{loop.kp_per_s:.3f} | {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | "
+            f"{' | '.join(traded)} | {reason} |"
         )
     return "\n".join(lines)

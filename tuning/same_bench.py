@@ -114,7 +114,6 @@ def _require_same_settings(path: Path | str, config: schema.Config, folder: Sess
             now, then = getattr(here, key), getattr(there, key)
             if now != then and key not in (*GAIN_KEYS, *INDEPENDENT_KEYS):
                 raise InputError(
-                    f"{path}: {section}.{key} = {now}, the session had {then}: its gains do "
-                    "not fit; tune with this "
-                    "configuration"
+                    f"{path}: {section}.{key} = {now}, the session had {then}: its gains do not "
+                    "fit; tune with this configuration"
                 )

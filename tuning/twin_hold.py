@@ -70,8 +70,7 @@ class TwinHold:
             if self._run.now_s > _HELD_WITHIN_S:
                 raise HoldError(
                     f"the twin is not held within {_HELD_WITHIN_S:g} s: if it swings, halve "
-                    "loop.kp_per_s and double "
-                    "loop.ti_s; else see `membrane-ctrl check`"
+                    "loop.kp_per_s and double loop.ti_s; else see `membrane-ctrl check`"
                 )
         # The start may have limited the gains, and replaced an assumed curve of the pump
         in_use = {"loop": self._run.loop_config, "pump": self._run.pump_config}

@@ -191,8 +191,7 @@ class AravisCamera:
             "settings": f"{self._size[0]} x {self._size[1]} {config.pixel_format}, "
             f"{config.exposure_ms:g} ms, {config.gain_db:g} dB",
             "frames": f"{counts.taken} taken, {counts.incomplete} incomplete, {counts.missing} "
-            "missing, "
-            f"{counts.reconnects} reconnects",
+            f"missing, {counts.reconnects} reconnects",
             "manual": "GenICam SFNC 2.7; aravis 0.8",
         }
 

@@ -98,8 +98,7 @@ class UvcCamera:
             self.close()
             raise roles.LinkDownError(
                 f"camera {config.port}: cannot be opened; is it plugged in, used by another "
-                "program, "
-                "and are you in the group video?"
+                "program, and are you in the group video?"
             )
         wanted = [
             ("width_px", cv2.CAP_PROP_FRAME_WIDTH, float(self._size[0])),

@@ -87,9 +87,8 @@ class KeyenceDlRs1a(line_link.LineDriver):
         values = every[1][1:].split(",")
         if self._config.amplifier >= len(values):
             raise roles.DeviceRefusedError(
-                f"{self._link.name}: amplifier = {self._config.amplifier}, but there are "
-                f"only {len(values)} "
-                "(0 is the first)"
+                f"{self._link.name}: amplifier = {self._config.amplifier}, but there are only "
+                f"{len(values)} (0 is the first)"
             )
         self._decimals = len(values[self._config.amplifier].partition(".")[2])
         if _STEPS_UM[self._decimals] > self._config.step_max_um:

@@ -89,8 +89,7 @@ class Mks937b(line_link.LineDriver):
         if kind != _MANOMETER:
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: channel {config.channel} has the sensor {kind}, not "
-                f"{_MANOMETER}, "
-                "a capacitance manometer"
+                f"{_MANOMETER}, a capacitance manometer"
             )
         # Its unit, set and read back.
         await self._query_gauge("U!PASCAL")

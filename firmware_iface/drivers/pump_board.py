@@ -12,9 +12,8 @@ from firmware_iface.links import modbus_link, modbus_rtu
 _KIND = "membrane pump board"
 # of a board of map version 1, for people
 NO_CLAIM = (
-    "this board has no claim (register map 1): any program that reaches it can run its pump, "
-    "and two programs on two "
-    "machines are not kept apart; update its firmware"
+    "this board has no claim (register map 1): any program that reaches it can run its pump, and "
+    "two programs on two machines are not kept apart; update its firmware"
 )
 _HEARTBEATS = 2**16
 _U32_MAX = 2**32 - 1
@@ -158,11 +157,9 @@ class PumpBoard:
         as_written = (set_s, settings["watchdog_arm"]) == (self._watchdog_s, 1.0)
         if not as_written or self._find_foreign_settings(sensors):
             raise roles.DeviceRefusedError(
-                f"{self._link.name}: watchdog set to {self._watchdog_s:g} s and armed, read "
-                f"back as {set_s:g} s, "
-                f"armed {settings['watchdog_arm']:g}, claim "
-                f"{int(sensors.get('claim_in_force', 0)):#x}; "
-                "not safe to run"
+                f"{self._link.name}: watchdog set to {self._watchdog_s:g} s and armed, read back "
+                f"as {set_s:g} s, armed {settings['watchdog_arm']:g}, claim "
+                f"{int(sensors.get('claim_in_force', 0)):#x}; not safe to run"
             )
         # continue from the heartbeat that last fed the board: the first write must differ from it
         self._heartbeat = int(sensors["heartbeat_echo"])
@@ -174,8 +171,7 @@ class PumpBoard:
         period_s = sensors["period_in_force_s"]
         return roles.DeviceBusyError(
             f"{self._link.name}: another program holds the board (claim "
-            f"{int(sensors['claim_in_force']):#x}, "
-            f"watchdog {period_s:g} s); stop that one first",
+            f"{int(sensors['claim_in_force']):#x}, watchdog {period_s:g} s); stop that one first",
             lapses_in_s=period_s,
         )
 

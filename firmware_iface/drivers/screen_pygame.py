@@ -98,9 +98,8 @@ class PygameDisplay:
         if tuple(found) != wanted:
             raise DeviceRefusedError(
                 f"{self._name}: {name} is {found[0]} x {found[1]}, [devices.screen] states "
-                f"{wanted[0]} x "
-                f"{wanted[1]}; set the panel's own resolution without scaling, or correct "
-                "the configuration"
+                f"{wanted[0]} x {wanted[1]}; set the panel's own resolution without scaling, or "
+                "correct the configuration"
             )
 
 

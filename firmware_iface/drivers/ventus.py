@@ -126,10 +126,9 @@ class Ventus(line_link.LineDriver):
             await self._link.close()
             raise roles.LinkDownError(
                 f"{self._link.name}: commanded {self._commanded_mw:.3f} mW, the pump has "
-                f"{state[SET_VALUE]:g} mW "
-                f"(on: {state[ENABLE]:g}, mode: {state[MODE]:g}, source: "
-                f"{state[MANUAL_SOURCE]:g}, limit: "
-                f"{state[POWER_LIMIT_MW]:g} mW); noise on the line, or it restarted: open it again"
+                f"{state[SET_VALUE]:g} mW (on: {state[ENABLE]:g}, mode: {state[MODE]:g}, source: "
+                f"{state[MANUAL_SOURCE]:g}, limit: {state[POWER_LIMIT_MW]:g} mW); noise on the "
+                "line, or it restarted: open it again"
             )
         if error := state[ERROR]:
             raise roles.LinkError(

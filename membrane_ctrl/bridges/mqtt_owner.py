@@ -213,6 +213,5 @@ class NameOwnership:
             return True
         raise errors.DeviceError(
             f"mqtt: {self._what} is in use by another bridge (process {rival.pid} on "
-            f"{rival.host}); "
-            "stop that one, or choose another bridges.name"
+            f"{rival.host}); stop that one, or choose another bridges.name"
         )

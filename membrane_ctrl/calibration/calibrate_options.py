@@ -70,8 +70,7 @@ def parse_freed(texts: Sequence[str]) -> dict[str, float]:
             raise errors.InputError(f"--free {text}: {amount} is not a number") from None
         if not (math.isfinite(out[name]) and out[name] > 0):
             raise errors.InputError(
-                f"--free {text}: a sigma must be above 0, as nothing is exact: state how "
-                f"well {name} is known, "
-                "or omit it, and the data sheet's sigma applies"
+                f"--free {text}: a sigma must be above 0, as nothing is exact: state how well "
+                f"{name} is known, or omit it, and the data sheet's sigma applies"
             )
     return out

@@ -261,8 +261,8 @@ def _format_lens(camera: CameraConfig, lens: Lens, out: Path) -> list[str]:
         usual = usual_sigma(name) * scale
         lines.append(f"{label:<16}{before:>10.5g}{value:>13.6g}  {sigma:<11.2g}  {usual:.2g}")
     lines.append(
-        f"corner residuals {lens.rms_px:.3f} px RMS in {len(lens.used)} photographs; "
-        f"with the stated lens {lens.stated_rms_px:.3f} px"
+        f"corner residuals {lens.rms_px:.3f} px RMS in {len(lens.used)} photographs; with the "
+        f"stated lens {lens.stated_rms_px:.3f} px"
     )
     if lens.left_out:
         lines.append(f"omitted, without a board or with a bad fit: {', '.join(lens.left_out)}")

@@ -231,12 +231,10 @@ def _format_plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes:
     low_um = min(head.setpoints_um)
     high_um = max(head.setpoints_um)
     return (
-        f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} µm "
-        f"(sag {held.sag_at_mm(low_um):.1f} to {held.sag_at_mm(high_um):.1f} mm; now "
-        f"{held.setpoint_um:g} µm, "
-        f"{held.pressure_pa:.0f} Pa, leak {held.leak_um_per_s:.1f} µm/s), then back to "
-        f"{head.start_um:g} µm: "
-        f"about {minutes:.0f} min"
+        f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} µm (sag "
+        f"{held.sag_at_mm(low_um):.1f} to {held.sag_at_mm(high_um):.1f} mm; now "
+        f"{held.setpoint_um:g} µm, {held.pressure_pa:.0f} Pa, leak {held.leak_um_per_s:.1f} µm/s), "
+        f"then back to {head.start_um:g} µm: about {minutes:.0f} min"
     )
 
 

@@ -75,9 +75,8 @@ class Procedure:
         reach = setpoint_reach(held, config)
         if low_um < reach.low_um or high_um > reach.high_um:
             raise errors.InputError(
-                f"the sets from {low_um:g} to {high_um:g} µm are beyond {reach.low_um:.0f} "
-                f"to {reach.high_um:.0f}, "
-                f"which {reach.low_why} and {reach.high_why} allow"
+                f"the sets from {low_um:g} to {high_um:g} µm are beyond {reach.low_um:.0f} to "
+                f"{reach.high_um:.0f}, which {reach.low_why} and {reach.high_why} allow"
             )
 
         # And reachable both ways.

@@ -33,8 +33,7 @@ def format_report(report: dict[str, Any]) -> list[str]:
     claim = report["uncertainty"]
     lines.append(
         f"figure with this geometry: sag +- {claim['sag_um']:.2f} µm, figure +- "
-        f"{claim['figure_rms_um']:.2f} µm RMS, "
-        f"with its tilt +- {claim['height_rms_um']:.1f} µm RMS"
+        f"{claim['figure_rms_um']:.2f} µm RMS, with its tilt +- {claim['height_rms_um']:.1f} µm RMS"
     )
     lines += _format_advice(report)
 
@@ -114,9 +113,8 @@ def _format_advice(report: dict[str, Any]) -> list[str]:
         lines.append(
             f"{why} a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
             f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to "
-            f"{sphere['vertex_sigma_mm']:.2g} mm, "
-            f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- "
-            f"{sphere['sag_um']:.2g} µm"
+            f"{sphere['vertex_sigma_mm']:.2g} mm, {2 * sphere['radius_mm']:.0f} mm wide) in the "
+            f"mirror's place: sag +- {sphere['sag_um']:.2g} µm"
         )
 
     for order, each in zip(

@@ -288,6 +288,6 @@ def _same_rig(
                 continue
             if getattr(ours, field) != getattr(theirs, field):
                 raise errors.InputError(
-                    f"{folder / 'capture.toml'}: {section}.{field}: differs from {first}; "
-                    "a calibration needs sets of one rig"
+                    f"{folder / 'capture.toml'}: {section}.{field}: differs from {first}; a "
+                    "calibration needs sets of one rig"
                 )

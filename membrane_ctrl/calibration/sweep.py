@@ -78,8 +78,8 @@ class Sweep:
                     shape = each
             if shape is None and rows and rows[-1].mono_s - rows[0].mono_s > _SHAPE_WITHIN_S:
                 raise errors.DeviceError(
-                    f"{self._link.name}: no shape within {_SHAPE_WITHIN_S:.0f} s; "
-                    "does this run have a camera that sees the mirror? (ctl status)"
+                    f"{self._link.name}: no shape within {_SHAPE_WITHIN_S:.0f} s; does this run "
+                    "have a camera that sees the mirror? (ctl status)"
                 )
         # The mean flow replaces the leak while there is no estimate of it, which needs some minutes
         # of hold.

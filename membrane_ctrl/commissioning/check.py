@@ -240,8 +240,8 @@ def _describe_hold(config: Config) -> dict[str, str]:
     return {
         "devices": devices,
         "hold": f"{loop.setpoint_um:g} µm at {loop.rate_hz:g} Hz, limits "
-        f"{limits.displacement_min_um:g} .. "
-        f"{limits.displacement_max_um:g} µm and {limits.gauge_pressure_max_pa:g} Pa",
+        f"{limits.displacement_min_um:g} .. {limits.displacement_max_um:g} µm and "
+        f"{limits.gauge_pressure_max_pa:g} Pa",
         "gains": run_status.gains_words(loop.model_dump(), None),
         "feed-forward": " and ".join(feedforward) or "off",
         "geometry": _describe_geometry(config),

@@ -12,9 +12,9 @@ from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import bench, interlock_sources
 
 HOW_TO_TEST = (
-    "test each interlock: open its circuit and see that `membrane-ctrl check` lists it as "
-    "open, unplug its signal "
-    "and see the same, then close it again (docs/how-to/operations.md, Interlocks)"
+    "test each interlock: open its circuit and see that `membrane-ctrl check` lists it as open, "
+    "unplug its signal and see the same, then close it again (docs/how-to/operations.md, "
+    "Interlocks)"
 )
 CLOSED, OPEN, NO_SIGNAL = "closed", "open", "no signal"
 

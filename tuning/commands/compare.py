@@ -55,9 +55,9 @@ def _tabulate_plants(
         plant = gains.plant
         lines.append(
             f"| {each.path.name} | {plant.gain:.3f} | {plant.gain_sigma:.3f} | "
-            f"{plant.dead_time_s:.3f} "
-            f"| {plant.lag_s:.3f} | {plant.delay_sigma_s:.3f} | {plant.leak_um_per_s:.2f} "
-            f"| {observe.load_disturbance(each).laser_um:.2f} | {gains.least_std_um:.3f} |"
+            f"{plant.dead_time_s:.3f} | {plant.lag_s:.3f} | {plant.delay_sigma_s:.3f} | "
+            f"{plant.leak_um_per_s:.2f} | {observe.load_disturbance(each).laser_um:.2f} | "
+            f"{gains.least_std_um:.3f} |"
         )
     return lines
 

@@ -136,8 +136,8 @@ def _run_on_hold(
 
     def report_stage(stage: Stage) -> None:
         progress.print_line(
-            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} µm, "
-            f"{stage.growth:.2f} of the previous gains"
+            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} µm, {stage.growth:.2f} of the "
+            "previous gains"
         )
 
     match step:

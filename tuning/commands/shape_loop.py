@@ -40,11 +40,10 @@ def tune_shape_loop(options: TuneOptions) -> int:
             raise RejectedError(f"shape loop: {error}") from None
         session_json.write_session_file(folder.file_path("outer.json"), found)
         progress.print_line(
-            f"optical sag per µm of the laser {found.scale:.3f}, noise {found.sigma_um:.2f} "
-            "µm per cycle of "
-            f"{found.cycle_s:.1f} s, drift {'' if found.drift_seen else 'below '}"
-            f"{found.drift_um_per_sqrt_h:.2f} µm/sqrt(h): shape.time_constant_s = "
-            f"{found.time_constant_s:.0f}"
+            f"optical sag per µm of the laser {found.scale:.3f}, noise {found.sigma_um:.2f} µm per "
+            f"cycle of {found.cycle_s:.1f} s, drift "
+            f"{'' if found.drift_seen else 'below '}{found.drift_um_per_sqrt_h:.2f} µm/sqrt(h): "
+            f"shape.time_constant_s = {found.time_constant_s:.0f}"
         )
         # Nothing to try if the fit is too poor, or the present time constant is as good.
         if not _to_be_tried(

@@ -33,8 +33,8 @@ def watch_hold(options: TuneOptions) -> int:
         print(json.dumps(session_json.to_plain(found)))
     progress.print_line(
         f"std {found.std_um:.3f} µm, {found.ratio:.2f} of the lower bound "
-        f"({found.ratio_designed:.2f} expected); "
-        f"k {found.gain:.2f} +- {found.gain_sigma:.2f}; leak {found.leak_um_per_s:.2f} µm/s"
+        f"({found.ratio_designed:.2f} expected); k {found.gain:.2f} +- {found.gain_sigma:.2f}; "
+        f"leak {found.leak_um_per_s:.2f} µm/s"
     )
     for suggestion in found.suggestions:
         progress.print_line(f"a tuning session is due: {suggestion}")

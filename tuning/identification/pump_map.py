@@ -26,10 +26,8 @@ _FLAT_LOW = 0.005
 _FLAT_HIGH = 0.995
 _ASTRAY = (
     "the mirror did not come back to its setpoint within three minutes, with slow gains: the "
-    "weather is too strong, "
-    "or the pump gives too much as soon as it runs; run `tune pump` again in steadier "
-    "weather, or open the bleed "
-    "(loop.bleed_fraction)"
+    "weather is too strong, or the pump gives too much as soon as it runs; run `tune pump` again "
+    "in steadier weather, or open the bleed (loop.bleed_fraction)"
 )
 
 
@@ -73,9 +71,8 @@ class Surveyed:
         full = float(rising.flows[-1])
         if full < leak:
             raise ValueError(
-                f"the pump gives {full:.2f} µm/s at most and the mirror loses {leak:.2f} "
-                "µm/s: find the leak, or "
-                "take a stronger pump, then run `tune pump` again"
+                f"the pump gives {full:.2f} µm/s at most and the mirror loses {leak:.2f} µm/s: "
+                "find the leak, or take a stronger pump, then run `tune pump` again"
             )
 
         # Commands at which the pump starts from rest, and at which a running one stalls.
@@ -172,10 +169,8 @@ class Surveyed:
             last = int(np.argmin(sigmas[1:])) + 1
             raise ValueError(
                 f"the mirror moves the same at every command ({flows[last]:.2f} +- "
-                f"{sigmas[last]:.2f} µm/s more at "
-                f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not "
-                "arrive: free it, then run "
-                "`tune pump` again"
+                f"{sigmas[last]:.2f} µm/s more at {fractions[last]:.2f} than at 0): the pump is "
+                "stuck, or its gas does not arrive: free it, then run `tune pump` again"
             )
         if not self.held:
             self._refuse_steep(1.0, "the hold does not bring the mirror back")

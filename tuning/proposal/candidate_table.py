@@ -70,9 +70,8 @@ def format_terminal(rows: tuple[Candidate, ...], title: str, leak_um_per_s: floa
     step = gain_search.Demands().load_step_um_per_s
     caption = (
         f"Load peak and recovery: after the leak grows from {leak_um_per_s:.2f} to "
-        f"{leak_um_per_s + step:.2f} µm/s. "
-        "+-: 1 sigma of the fit; for std with ten other minutes of weather like the "
-        "observed, which change every std equally."
+        f"{leak_um_per_s + step:.2f} µm/s. +-: 1 sigma of the fit; for std with ten other minutes "
+        "of weather like the observed, which change every std equally."
     )
     return Group(figures, "", words, "", caption)
 

@@ -230,8 +230,8 @@ def describe_result(session: folder.SessionFolder) -> str:
     gains = load_gains(session.file_path("gains.toml"))
     ratio = gains.predicted_std_um / gains.least_std_um
     return (
-        f"{describe_gains(gains.loop)}: {compare_with_present(session)}; "
-        f"{ratio:.2f} of the lower bound"
+        f"{describe_gains(gains.loop)}: {compare_with_present(session)}; {ratio:.2f} of the lower "
+        "bound"
     )
 
 
@@ -247,11 +247,10 @@ def make_report_part(session: folder.SessionFolder) -> PageSection | None:
     lines = session.read_candidates().splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     text = (
-        f"{traded.candidate} is {by}: K {loop.kp_per_s:.3f} 1/s, Ti {loop.ti_s:.2f} s, "
-        f"filter {loop.measurement_filter_s:.2f} s. Present and new gains: {traded}. "
-        f"Lower bound of the std: {gains.least_std_um:.3f} µm. "
-        "The proposal over plants drawn from the fit: "
-        f"Ms {kept.robustness.ms_p95:.2f}, std {kept.robustness.std_p95_um:.3f} µm at 95 %, "
+        f"{traded.candidate} is {by}: K {loop.kp_per_s:.3f} 1/s, Ti {loop.ti_s:.2f} s, filter "
+        f"{loop.measurement_filter_s:.2f} s. Present and new gains: {traded}. Lower bound of the "
+        f"std: {gains.least_std_um:.3f} µm. The proposal over plants drawn from the fit: Ms "
+        f"{kept.robustness.ms_p95:.2f}, std {kept.robustness.std_p95_um:.3f} µm at 95 %, "
         f"{kept.robustness.stable_fraction:.0%} stable."
     )
     table = PageTable(cells[0], cells[2:])

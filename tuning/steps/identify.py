@@ -73,10 +73,9 @@ def describe_result(session: folder.SessionFolder) -> str:
     lossy = describe_losses(load_experiments(session).record, session.config.by_optics)
     actuator = found.actuator.describe()
     return (
-        f"k {model.gain:.3f} +- {sigma.gain:.3f}, "
-        f"delay {model.delay_s:.3f} +- {sigma.delay_s:.3f} s "
-        f"(dead time {model.dead_time_s:.3f} +- {sigma.dead_time_s:.3f} s), "
-        f"leak {model.leak_um_per_s:.2f} µm/s: {found.quality.verdict}{reasons}"
+        f"k {model.gain:.3f} +- {sigma.gain:.3f}, delay {model.delay_s:.3f} +- {sigma.delay_s:.3f} "
+        f"s (dead time {model.dead_time_s:.3f} +- {sigma.dead_time_s:.3f} s), leak "
+        f"{model.leak_um_per_s:.2f} µm/s: {found.quality.verdict}{reasons}"
         + (f"; {TOO_TIGHT}" if too_tight else "")
         + (f"; {actuator}" if actuator else "")
         + (f"; {lossy}" if lossy else "")
@@ -150,8 +149,8 @@ def _describe_fit(session: folder.SessionFolder) -> list[PageBlock]:
     # White residuals, independent of the flow: the model explains what the pump did.
     tests = (
         f"Residuals: whiteness p = {fit.whiteness_p:.3g}, independence of the flow p = "
-        f"{fit.independence_p:.3g}, largest {fit.largest_residual:.1f} sigma. "
-        f"Data {found.data_sha256[:16]}."
+        f"{fit.independence_p:.3g}, largest {fit.largest_residual:.1f} sigma. Data "
+        f"{found.data_sha256[:16]}."
     )
     remarks = [
         PageText(f"{remark[0].upper()}{remark[1:]}.", TextMark.BAD)

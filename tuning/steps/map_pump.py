@@ -236,10 +236,9 @@ def _measure_gain(rig: HoldRig, late_s: float) -> tuple[float, float]:
     if not contradicted:
         return gain, sigma
     raise ValueError(
-        f"steps of the flow contradict the curve (k = {gain:.2f} +- {sigma:.2f}): the "
-        "weather was too strong, or "
-        "the pump has changed meanwhile; the former curve is back; run `tune pump` again in "
-        "steadier weather"
+        f"steps of the flow contradict the curve (k = {gain:.2f} +- {sigma:.2f}): the weather was "
+        "too strong, or the pump has changed meanwhile; the former curve is back; run `tune pump` "
+        "again in steadier weather"
     )
 
 

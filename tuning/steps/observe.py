@@ -86,9 +86,9 @@ def make_report_part(session: folder.SessionFolder) -> PageSection | None:
         return None
     weather = load_disturbance(session)
     text = (
-        f"Noise of a reading {weather.laser_um:.3f} µm. Every predicted std "
-        "rests on this record: ten other minutes of weather like it change it by "
-        f"{weather.unsteady:.0%} (1 sigma), and its fit has an error."
+        f"Noise of a reading {weather.laser_um:.3f} µm. Every predicted std rests on this record: "
+        f"ten other minutes of weather like it change it by {weather.unsteady:.0%} (1 sigma), and "
+        "its fit has an error."
     )
     return PageSection("Weather", [PageText(text), *embed_picture(session, _PICTURE)])
 

@@ -57,8 +57,8 @@ def describe_result(session: folder.SessionFolder) -> str:
         return f"{present:.{digits}f} -> {proposed:.{digits}f}"
 
     return (
-        f"on the fitted twin std {change('std_um', 3)} µm, "
-        f"load peak {change('load_peak_um', 2)} µm, recovery {change('recovery_s', 1)} s"
+        f"on the fitted twin std {change('std_um', 3)} µm, load peak {change('load_peak_um', 2)} "
+        f"µm, recovery {change('recovery_s', 1)} s"
     )
 
 

@@ -112,8 +112,8 @@ def hold_hour(context: StageContext) -> None:
                 if figures.duration_s - shown_s >= _REPORT_S:
                     shown_s = figures.duration_s
                     context.dialogue.show(
-                        f"  {format_duration(shown_s)}: std {figures.std_um:.3f} µm, "
-                        f"pump {figures.mean_pump:.2f}"
+                        f"  {format_duration(shown_s)}: std {figures.std_um:.3f} µm, pump "
+                        f"{figures.mean_pump:.2f}"
                     )
     except HoldError as error:
         faults.append(str(error))
