@@ -131,7 +131,7 @@ def held_at(level: Mapping[str, Column], time_s: Column) -> BoolArray:
     Returns
     -------
     (n,) bool array
-        False before the first window.
+        Times before the first window count as in it.
     """
     starts_s = level["time_s"]
     if not starts_s.size:
