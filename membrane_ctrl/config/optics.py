@@ -379,5 +379,11 @@ def _or_file(schema: dict[str, Any]) -> None:
 
 def _is_orthonormal(rows: tuple[Vector3, ...]) -> bool:
     """Whether the rows are unit vectors at right angles."""
-    products = [(sum(x * y for x, y in zip(a, b, strict=True)), a is b) for a in rows for b in rows]
-    return all(abs(product - same) <= (_UNIT if same else _SQUARE) for product, same in products)
+    for row in rows:
+        for other in rows:
+            product = sum(x * y for x, y in zip(row, other, strict=True))
+            is_same = row is other
+            wanted, tolerance = (1.0, _UNIT) if is_same else (0.0, _SQUARE)
+            if not abs(product - wanted) <= tolerance:
+                return False
+    return True

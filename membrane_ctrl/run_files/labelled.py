@@ -27,15 +27,14 @@ _TIME = "time"
 
 def labels_of(spec: TableSpec) -> Labels:
     """Unit and description of each column of a table, by the names that xarray shows."""
-    keys = {b"unit": "units", b"description": "long_name"}
-    return {
-        field.name: {
-            keys[key]: text.decode()
-            for key, text in (field.metadata or {}).items()
-            if key in keys and text
-        }
-        for field in spec.schema
-    }
+    # By the key of our metadata: the attribute that xarray shows on axes (CF conventions)
+    attributes = {b"unit": "units", b"description": "long_name"}
+    labels: Labels = {}
+    for field in spec.schema:
+        metadata = field.metadata or {}
+        known = {attributes[key]: text for key, text in metadata.items() if key in attributes}
+        labels[field.name] = {name: text.decode() for name, text in known.items() if text}
+    return labels
 
 
 def make_frame(table: pa.Table) -> pd.DataFrame:

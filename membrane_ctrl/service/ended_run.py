@@ -179,7 +179,12 @@ def read_ended_run(folder: Path) -> EndedRun:
     """
     run = open_run(folder)
     end = _find_end(run.log)
-    end_s = end.mono_s if end is not None else (run.log[-1].mono_s if run.log else 0.0)
+    # Without an end, the last event is the last that is known of the control process
+    end_s = 0.0
+    if end is not None:
+        end_s = end.mono_s
+    elif run.log:
+        end_s = run.log[-1].mono_s
     read_s, pump, vent, state = _read_last_tick(run)
     exit_word = _exit_of(end)
     fault, fault_s = _find_fault(run.log, exit_word)

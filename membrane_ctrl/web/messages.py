@@ -18,8 +18,9 @@ def show_message(text: str, good: bool | None = None) -> None:
     good : bool, optional
         Green for a success, red for a failure, which stays longer; grey if it is neither.
     """
-    kind: Literal["positive", "negative"] | None = (
-        None if good is None else "positive" if good else "negative"
-    )
-    timeout_ms = 5000 if good is None else 8000
+    kind: Literal["positive", "negative"] | None = None
+    timeout_ms = 5000
+    if good is not None:
+        kind = "positive" if good else "negative"
+        timeout_ms = 8000
     ui.notify(text, type=kind, position="bottom", timeout=timeout_ms, classes="membrane-message")

@@ -206,13 +206,11 @@ class TuningPanel:
         self._steps.clear()
         with self._steps:
             for step in folders.STEPS:
-                colour = (
-                    "positive"
-                    if step in seen.done
-                    else "info"
-                    if step == seen.progress.step
-                    else "grey"
-                )
+                colour = "grey"
+                if step in seen.done:
+                    colour = "positive"
+                elif step == seen.progress.step:
+                    colour = "info"
                 ui.badge(step, color=colour)
 
     def _show_choice(self, seen: SessionSeen) -> None:
