@@ -80,6 +80,7 @@ class BridgesConfig(Section):
 
     @model_validator(mode="after")
     def _require_identified_clients(self) -> "BridgesConfig":
+        """Refuse a role beyond `read` for clients elsewhere that do not log in."""
         for name, bridge in (("opcua", self.opcua), ("epics", self.epics)):
             known = isinstance(bridge, OpcuaConfig) and bridge.users_file is not None
             if (
@@ -90,7 +91,7 @@ class BridgesConfig(Section):
             ):
                 remedy = "give users_file, or keep" if name == "opcua" else "keep"
                 raise ValueError(
-                    f"{name}.host = {bridge.host!r}: this bridge cannot tell who acts from "
+                    f"{name}.host = {bridge.host!r}: this bridge does not know who acts from "
                     "another machine; "
                     f"{remedy} role = 'read', or the host {LOCAL}"
                 )

@@ -42,6 +42,7 @@ def parse_configuration(text: str, path: Path) -> schema.Config:
 
 
 def _resolve_files(config: schema.Config, path: Path) -> schema.Config:
+    """Resolve the file names of a configuration, and leave to the start what it does not state."""
     # Every key that names a file of the user's; the folder of the runs is relative to where the
     # hold is started
     config = schema.leave_to_start(config)

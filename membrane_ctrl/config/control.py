@@ -160,6 +160,7 @@ class PumpConfig(Section):
 
     @model_validator(mode="after")
     def _require_rising_curve(self) -> "PumpConfig":
+        """Refuse a measured curve that has no inverse."""
         # What the inverse needs: rising commands, flows that do not fall, and play of one sign
         commands = self.curve_fraction
         flows = self.curve_um_per_s

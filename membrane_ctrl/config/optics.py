@@ -57,6 +57,7 @@ class HeightMapConfig(Section):
 
     @model_validator(mode="after")
     def _check_grid(self) -> "HeightMapConfig":
+        """Refuse a grid that is uneven or has another shape than its heights."""
         # Even steps: the interpolation finds the cell of a point by one division
         for name, axis in (("s_x_mm", self.s_x_mm), ("s_y_mm", self.s_y_mm)):
             steps = [b - a for a, b in pairwise(axis)]

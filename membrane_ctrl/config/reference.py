@@ -180,6 +180,7 @@ def _walk_tables(
 
 
 def _make_table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
+    """The help of a table, from its part of the JSON schema and the places that have it."""
     defaults = next((default for _, default in found if isinstance(default, dict)), {})
     required = table.get("required", ())
     keys = []

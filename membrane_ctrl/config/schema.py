@@ -110,6 +110,7 @@ class DevicesConfig(SensorTables):
 
     @model_validator(mode="after")
     def _require_board_or_roles(self) -> "DevicesConfig":
+        """Require a pump board, or an instrument for each needed role."""
         filled = [role for role in ROLES if getattr(self, role) is not None]
         if self.board is not None and filled:
             raise ValueError(f"give either board or one table per role, not board and {filled[0]}")
@@ -340,6 +341,9 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> "Config":
+        """Refuse tables that contradict each other; `controller.cross_check` judges the finer
+        points.
+        """
         limits = self.limits
         if limits.displacement_min_um >= limits.displacement_max_um:
             raise ValueError("limits.displacement_min_um must be below limits.displacement_max_um")

@@ -113,6 +113,7 @@ class ServiceConfig(Section):
 
     @model_validator(mode="after")
     def _closed_to_strangers(self) -> "ServiceConfig":
+        """Require TLS and a login wherever other machines can reach the service."""
         if (self.certificate_file is None) != (self.key_file is None):
             raise ValueError("certificate and key: give both files, or none")
         if self.host not in LOCAL_HOSTS and not (self.secure and self.users_file):

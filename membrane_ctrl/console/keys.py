@@ -75,6 +75,7 @@ class Desk:
             self._run_command(text[0].lower(), paused)
 
     def _run_command(self, key: str, paused: bool) -> None:
+        """Execute the command of a key; other keys do nothing."""
         match key:
             case "h":
                 self._send_request({"do": "hold"})

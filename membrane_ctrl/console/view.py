@@ -322,6 +322,7 @@ def _make_headline(view: ConsoleView, config: Config) -> Text:
 def _make_figures_table(
     view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]], omitted: Sequence[str]
 ) -> Table:
+    """The items of the console, a line each, without those that are omitted; then the notices."""
     table = Table.grid(padding=(0, 1))
     table.add_column(style="dim", justify="right", min_width=_LABELS, no_wrap=True)
     table.add_column(ratio=1)
@@ -355,6 +356,7 @@ def _make_figures_table(
 
 
 def _format_error(view: ConsoleView, config: Config) -> Text:
+    """The error, and how much of the last minute it was within the band."""
     row = view.row
     assert row is not None
     inside = abs(row.error_um) <= config.limits.band_um
@@ -402,6 +404,7 @@ def _list_other_columns(row: telemetry.TelemetryRow, *groups: columns.Group) -> 
 
 
 def _format_mirror(row: telemetry.TelemetryRow) -> Text:
+    """Reading, setpoint and estimate; with the twin, the truth beside them."""
     text = Text.assemble("reading ", (row.format_quantity("displacement_um", sign=True), "bold"))
     text.append(
         "  "
@@ -456,6 +459,9 @@ def _format_gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
 def _make_shape_items(
     shape: ShapeView, row: telemetry.TelemetryRow
 ) -> list[tuple[str, RenderableType]]:
+    """Two items: the shape loop with trim and change of sag, and the newest cycle with its
+    quality.
+    """
     state = Text(shape.state.name.lower(), style=_SHAPE_STYLES.get(shape.state, "default"))
     trim = row.format_labelled("trim_um", sign=True)
     others = _list_other_columns(row, columns.Group.SHAPE)

@@ -688,6 +688,9 @@ class CentreFilter:
         return now_s - self.memory.watches[sensor].seen_s <= limit_s
 
     def _make_estimate(self, now_s: float) -> CentreEstimate:
+        """The estimate of this tick, in the laser's coordinates, with prediction, leak and
+        sensors.
+        """
         x, row = self.memory.x, self._find_centre_row(now_s)
         # The centre drifts by the leak, and by gas that warms towards the air.
         drift = float(x[_LEAK])

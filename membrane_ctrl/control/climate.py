@@ -164,6 +164,7 @@ class Climate:
         return self._make_strain()
 
     def _make_strain(self) -> ClimateStrain:
+        """Strains of film and ring since the reference, and the error of their difference."""
         memory, config = self.memory, self._config
         if math.isnan(memory.film.value.value) and math.isnan(memory.moisture.value.value):
             return ClimateStrain()

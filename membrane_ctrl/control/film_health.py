@@ -106,6 +106,9 @@ class FilmHealth:
         self.memory.pressure_pa_s = 0.0
 
     def _list_changes(self, hour: Hour, first: Hour) -> list[MaintenanceNotice]:
+        """Compare an hour with the first one and with the day; returns new and withdrawn
+        warnings.
+        """
         # Each warning: its name, how far beyond its limit (1 is at the limit), and its sentence
         leak, most = hour.leak_um_per_s, self._flow_max_um_per_s
         creep = self._creep_per_day()

@@ -227,6 +227,7 @@ class HeldOffset:
         memory.reason = reason
 
     def _admit_figure(self, figure: ShapeEstimate, given: HeldFigure) -> None:
+        """Use a figure: for the reference first, then for the tracker."""
         memory, reference = self.memory, self.memory.reference
         if figure.time_s < memory.settled_since_s:
             return

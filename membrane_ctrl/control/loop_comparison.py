@@ -98,6 +98,7 @@ class LoopComparison:
             self._end_block()
 
     def _end_block(self) -> None:
+        """Take the means of a block into the present span, and a full span into the comparison."""
         memory = self.memory
         # Mean errors of the block; differences of successive readings show the noise in them.
         own_um, other_um = memory.own_um / memory.readings, memory.other_um / memory.readings

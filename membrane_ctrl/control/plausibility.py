@@ -301,6 +301,9 @@ class PlausibilityCheck:
         return self._figure_lag_s * abs(self.memory.speed_um_per_s.value)
 
     def _judge_means(self, means: tuple[float, float, float], dt_s: float) -> None:
+        """Compare the three means with their references, which follow while no sensor is found
+        wrong.
+        """
         memory = self.memory
         if not are_means_known(memory.age_s, memory.readings):
             return

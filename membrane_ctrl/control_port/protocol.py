@@ -108,6 +108,7 @@ class Request(Section):
 
     @model_validator(mode="after")
     def _check_fields(self) -> Request:
+        """Refuse a field that the command does not take, and the lack of one that it needs."""
         rule = TABLE.get(self.do)  # type: ignore[arg-type]
         if rule:
             needs, takes = rule.needs, rule.takes

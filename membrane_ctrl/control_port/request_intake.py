@@ -180,6 +180,7 @@ class RequestIntake:
             self._refuse(request.do, request.number, _too_many(_ORDINARY_MOST))
 
     def _accept_safety(self, request: Request) -> None:
+        """Queue a safety command, or add its number to an equal one that waits already."""
         # The same command may already wait: one execution answers both.
         for waiting in self._safety.waiting_of(request.do):
             if (waiting.request.text, waiting.request.take_over) == (

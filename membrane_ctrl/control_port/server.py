@@ -159,6 +159,7 @@ class Port:
         await self._serve(await LineConnection.on(connection), peer)
 
     async def _serve(self, connection: LineConnection, peer: Peer) -> None:
+        """Serve one client until it leaves; a session of command ends with its connection."""
         self._make_room(peer)
         session = PortSession(connection, peer, self.status, self._turns)
         self._sessions.append(session)
@@ -299,6 +300,7 @@ class Port:
     def _run_errand(
         self, session: PortSession, sender: Sender, request: protocol.Request
     ) -> dict[str, Any]:
+        """Execute a request that needs no tick; the answer has status and settings."""
         match request.do:
             case "watch":
                 session.watch(request.period_s)

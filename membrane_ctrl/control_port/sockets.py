@@ -117,6 +117,7 @@ def group_id(name: str) -> int:
 
 
 def _bind_socket(path: Path, group: str | None) -> socket.socket:
+    """Make the socket file, for the user and, if given, a group. Raises OSError, InputError."""
     owner = -1 if group is None else group_id(group)
     listener = socket.socket(socket.AF_UNIX)
     umask = os.umask(0o777 & ~_MODE)  # the file must never have wider permissions

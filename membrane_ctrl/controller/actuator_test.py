@@ -329,6 +329,7 @@ class ActuatorTest:
         self._begin_part(memory.part + 1)
 
     def _judge_vent(self, part: Part) -> None:
+        """Pass once the open vent lowers the mirror clearly faster than before; fail at the end."""
         memory = self.memory
         from_s = max(part.wait_s, memory.part_s - _VENT_WINDOW_MOST_S)
         speed = self._measure(from_s)

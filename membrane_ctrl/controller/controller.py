@@ -403,6 +403,7 @@ class Controller:
         return self._context.observer.figures.explain_unseen().text
 
     def _begin_tick(self, inputs: TickInputs, events: list[Event]) -> None:
+        """Take time, interlocks and commands of a tick, and end a trial of gains that is over."""
         context = self._context
         self.memory.ticks += 1
         nominal_s = 1.0 / self._config.loop.rate_hz
@@ -449,6 +450,9 @@ class Controller:
         return not refused
 
     def _execute_command(self, command: Command, events: list[Event]) -> None:
+        """Carry out an accepted command; the wish of a state goes to its handler
+        (`apply_command`).
+        """
         context = self._context
         match command.kind:
             case "setpoint" if math.isfinite(self.memory.setpoint_back_um):  # it stays
@@ -480,6 +484,7 @@ class Controller:
             events.append(LockSet(**asdict(lock), number=command.number))
 
     def _remove_lock(self, command: Command, events: list[Event]) -> None:
+        """Remove the lock that an accepted `unlock` means, and report by which right."""
         context = self._context
         unlocking = locks.decide_unlock(command, context.locks)
         lock = unlocking.lock
@@ -616,6 +621,7 @@ class Controller:
             self._enter_state(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
 
     def _step_shape(self, inputs: TickInputs, events: list[Event]) -> shape_loop.ShapeOutput:
+        """Run the shape loop, and set the trim; it counts only while the loop moves the mirror."""
         context = self._context
         # May the figure move the setpoint?
         settled = self.state == State.HOLD and context.levels.safe_level == SafeLevel.NONE
@@ -755,6 +761,7 @@ class Controller:
         )
 
     def _enter_state(self, state: State, why: str, events: list[Event]) -> None:
+        """Leave the present state and begin another one; both are reported with the reason."""
         context = self._context
         events.append(StateEntered(state.name.lower(), self.state.name.lower(), why))
         # What ends with the former state: an experiment, gains on trial, a fault.

@@ -136,6 +136,7 @@ def _list_numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
 
 
 def _check_resume(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
+    """Judge which faults may end without a person, how often, and how soon."""
     resume = config.resume
     known = [rule.name for rule in safety.TABLE]
     may = sorted(rule.name for rule in safety.TABLE if rule.may_resume)
@@ -216,6 +217,7 @@ def _check_watchdog(config: Config, findings: cross_check_plant.ConfigFindings) 
 
 
 def _check_stale(config: Config, findings: cross_check_plant.ConfigFindings) -> None:
+    """Judge for how long the loop may be without a new reading, or with one that repeats."""
     # Each window: longer than what a sound sensor shows by chance, shorter than what a mirror may
     # be left to without a reading
     limits, tick_s = config.limits, 1.0 / config.loop.rate_hz

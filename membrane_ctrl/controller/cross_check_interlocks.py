@@ -39,6 +39,9 @@ def judge_interlocks(config: Config, findings: ConfigFindings) -> None:
 
 
 def _check_polled(field: str, interlock: PolledInterlockConfig, findings: ConfigFindings) -> None:
+    """Judge period and age of a source that is asked: neither late answers nor short openings
+    count.
+    """
     period_s, age_max_s = interlock.period_s, interlock.age_max_s
     slowest_s = period_s + (
         interlock.timeout_s if isinstance(interlock, ModbusInputConfig) else 0.0

@@ -329,6 +329,7 @@ def judge_optics(config: Config, findings: ConfigFindings) -> None:
 
 
 def _check_geometry(field: str, optics: OpticsConfig, used: bool, findings: ConfigFindings) -> None:
+    """Judge lengths and poses: camera and screen must see each other in the mirror."""
     geometry = optics.geometry
     # Lengths measured too poorly to be of use.
     for name in ("a", "b"):

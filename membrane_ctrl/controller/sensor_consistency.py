@@ -424,6 +424,7 @@ class SensorConsistency:
         ]
 
     def _judge_sensor(self, faulty: FaultySensor) -> list[Event]:
+        """Keep which sensor is wrong, in words, and report it when that changes."""
         repeats = self.memory.repeats >= _REPEATS
         seen = (
             str(self._plausibility.changes)

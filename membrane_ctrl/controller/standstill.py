@@ -190,6 +190,7 @@ class Standstill:
             memory.runs_on = f"read-back {100.0 * readback:.0f} %, commanded off for {on_s:.1f} s"
 
     def _watch_mirror(self, now_s: float, reading: BenchReading) -> None:
+        """Take a reading into the present block; at the end of the block, look for a rise."""
         memory, block = self.memory, self.memory.open_block
         # Means over a block, of readings without an error code.
         if math.isnan(block.ends_s):

@@ -377,6 +377,9 @@ def _explain_manual_end(context: TickContext) -> str:
 
 
 def _test_actuators(context: TickContext) -> State:
+    """Run a tick of the actuator test; at its end, begin the loop or report why the film is
+    unfit.
+    """
     test = _get_actuator_test(context)
     test.step(context.observer.displacement_um, context.dt_s)
     part = test.part
@@ -503,6 +506,7 @@ def _list_missing_checks(context: TickContext) -> Reason:
 
 
 def _explain_hold(context: TickContext, output: inner_loop.LoopOutput) -> None:
+    """State how the mirror is held: by which sensor, and whether the pump stands at a limit."""
     by_optics = context.config.by_optics
     if context.levels.safe_level == SafeLevel.HOLD_FLOW:
         until = "optics see the film" if by_optics else "laser is back"

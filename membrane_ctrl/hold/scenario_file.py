@@ -56,6 +56,9 @@ class ScenarioStep(Section):
 
     @model_validator(mode="after")
     def _require_one_action(self) -> ScenarioStep:
+        """Refuse a step that does nothing or several things, or has times that do not go with
+        it.
+        """
         # A step does one thing,
         if sum(thing is not None for thing in (self.wrong, self.event, self.command)) != 1:
             raise ValueError("give exactly one of wrong, event and command")
@@ -102,6 +105,9 @@ class Scenario(Section):
 
     @model_validator(mode="after")
     def _require_times_in_run(self) -> Scenario:
+        """Refuse a step that names an unknown interlock, begins after the end, or repeats too
+        often.
+        """
         names = [interlock.name for interlock in self.config.interlocks]
         for number, at in enumerate(self.at):
             if at.interlock is not None and at.interlock not in names:

@@ -83,6 +83,9 @@ class VirtualHold:
         return estimate
 
     def _advance(self, ticks: int, commands: tuple[Command, ...] = ()) -> News:
+        """Run some ticks, the first one with the commands; returns all that they made. Raises
+        HoldError.
+        """
         rows: list[telemetry.TelemetryRow] = []
         found: list[events.Event] = []
         for _ in range(ticks):

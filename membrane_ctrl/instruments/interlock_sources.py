@@ -52,6 +52,7 @@ def _by_device(devices: DevicesConfig) -> dict[Hashable, list[Member]]:
 
 
 def _make_source(members: list[Member], links: ModbusLinks) -> PolledSource:
+    """Make the source that asks one device for all of its circuits. Raises InputError."""
     bits = tuple(bit for bit, _ in members)
     source: roles.InterlockSource
     try:

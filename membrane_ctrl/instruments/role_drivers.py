@@ -42,6 +42,7 @@ def make_role_devices(
 
 
 def _make_driver(role: str, section: settings.AnyDriver, links: modbus_rtu.ModbusLinks) -> Any:
+    """Make the driver that a table names, for its role. Raises ValueError, InputError."""
     match section:
         case settings.ModbusMapConfig():
             return _make_modbus_value(role, section, links)

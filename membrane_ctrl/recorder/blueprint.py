@@ -120,6 +120,7 @@ def _text_log() -> rrb.TextLogView:
 
 
 def _make_overview(config: Config) -> rrb.Vertical:
+    """The first tab: error, means, states and summary of the whole run, and the log."""
     plots = rrb.Vertical(
         _make_error_plot(config),
         _make_means_plot(columns.POSITION),
@@ -174,6 +175,7 @@ def _make_map(kind: str, name: str) -> rrb.Spatial2DView:
 
 
 def _make_shape_tab(config: Config) -> rrb.Vertical:
+    """The tab of the figure: maps, then sag and terms over time, then the quality of the cycles."""
     # The maps on top, from the whole shape to what a cycle's noise leaves uncertain.
     maps = rrb.Horizontal(
         _make_map("height", "Height, mm"),

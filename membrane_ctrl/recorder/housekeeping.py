@@ -82,6 +82,9 @@ class Housekeeping:
             self._errors.report_recovered("disk")
 
     def _delete_old(self) -> None:
+        """Delete runs beyond `recording.keep_gb` and `keep_days`; a failure is reported for each
+        run.
+        """
         config = self._config
         if config.keep_gb is None and config.keep_days is None:
             return

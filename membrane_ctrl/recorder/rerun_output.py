@@ -143,6 +143,7 @@ class RerunOutput:
         self._recording.send_page(summary_page.SUMMARY_PATH, now_s, self._summary())
 
     def _begin_segment(self, now_s: float) -> bool:
+        """Begin a file; returns whether there is one to write to."""
         # After a failure, not in every second: a full disk stays full for a while
         if now_s < self._retry_s:
             return False

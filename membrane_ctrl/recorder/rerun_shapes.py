@@ -205,6 +205,9 @@ class ShapeStreams:
     def _send_maps(
         self, estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate
     ) -> None:
+        """Send the maps that are due: they are large, so that each kind has an interval of its
+        own.
+        """
         time_s = estimate.time_s
         early = time_s - reference.time_s < EARLY_S
         # Height, uncertainty and scatter change slowly.

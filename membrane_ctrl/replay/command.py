@@ -233,6 +233,7 @@ def _replay_ticks(
 def _make_report(
     run: RecordedRun, found: replays.Replay, begin: int, to_s: float
 ) -> dict[str, Any]:
+    """The result of a replay as plain data, for the text and for `--json`."""
     # 1. Decisions. No claim is made about the time after the log or the inputs end. A recorded
     #    decision just behind the end may be one that the replay took just before it: it counts only
     #    if the replay has as many
@@ -441,6 +442,7 @@ def _make_input_rows(records: Records) -> telemetry.Rows:
 def _select_between(
     frames: inputs_file.InputsReader, begin: int, to_s: float
 ) -> Iterator[inputs_file.InputsFrame]:
+    """Yield the inputs from a tick up to a time, with every figure that they refer to."""
     # Whole frames up to the end, of which only the wanted ticks are kept. A figure may be recorded
     # a frame before the tick that used it
     before: dict[float, shape_estimate.ShapeEstimate] = {}

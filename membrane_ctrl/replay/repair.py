@@ -137,6 +137,7 @@ def _make_target(path: Path, in_place: bool) -> Path:
 
 
 def _repair_events(run_dir: Path, in_place: bool) -> list[FileFinding]:
+    """Cut lines that are torn or not intact out of the event log."""
     # What is cut off is kept beside the log: a person may read more from it than a program
     path = run_dir / "events.jsonl"
     if not path.exists():

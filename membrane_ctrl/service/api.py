@@ -366,6 +366,7 @@ def describe_state(hold: str, seen: HoldSeen) -> StateAnswer:
 
 
 def _describe_end(ended: EndedRun) -> RunEndAnswer:
+    """How a run ended, as the interface for programs states it; NaN is null."""
     read_back = None
     if ended.read_utc is not None:
         read_back = Reading(

@@ -220,6 +220,9 @@ def find_newest_run(logs: Path) -> Path | None:
 def _judge_end(
     exit_word: str | None, fault: events.Fault | None, stop: events.CommandTaken | None
 ) -> EndKind:
+    """Which kind of end it is, by the exit, the fault that stood then, and a stop shortly
+    before.
+    """
     # From no record to a regular end. A fault is judged before the exit that it causes.
     if exit_word is None:
         return EndKind.NO_RECORD

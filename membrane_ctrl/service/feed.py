@@ -253,6 +253,9 @@ class HoldFeed:
             self.seen = replace(self.seen, ended=ended, events=ended.events)
 
     def _watch(self, client: PortClient) -> None:
+        """Follow the status stream of a connection until the hold or the feed ends. Raises
+        DeviceError.
+        """
         # 1. Another run than the last one begins with an empty page
         greeting = client.greeting
         if greeting["run"] != self.seen.name or self.seen.ended is not None:
@@ -300,6 +303,7 @@ class HoldFeed:
     def _take_message(
         self, streamed: Message, greeting: Message, rings: dict[str, ring.RingReader]
     ) -> None:
+        """Take one message of the stream: an event, a status, or the answer that begins it."""
         # Events from the run's files and ring if they are here: complete, and with their times
         if self._log is not None:
             for line in self._log.read_new():

@@ -190,6 +190,9 @@ class HoldStarter:
                 self._process = None
 
     def _start_unit(self, chosen: Configuration, options: StartOptions) -> None:
+        """Start the unit of systemd for a configuration, and wait until it is ready; keeps why it
+        failed.
+        """
         unit = f"{UNIT_PREFIX}{chosen.name}.service"
         self.note_failure("")
         words = ["systemctl", "--no-ask-password", "start", unit]
@@ -210,6 +213,7 @@ class HoldStarter:
             self.note_failure(f"{reason} See `journalctl -u {unit}`")
 
     def _start_program(self, chosen: Configuration, options: StartOptions) -> None:
+        """Start the command `hold` in a session of its own, which outlives the service."""
         words = [sys.executable, "-m", "membrane_ctrl", "hold", "--logs", str(self.logs)]
         words += ["--name", chosen.name, *options.words]
         if chosen.file is not None:

@@ -392,6 +392,7 @@ async def _form_body(receive: Receive) -> bytes | Refusal:
 async def _answer(
     scope: Scope, send: Send, status: HTTPStatus, text: str, headers: list[Header] | None = None
 ) -> None:
+    """Send a text with a status, or close a web socket with it as the reason."""
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 4403, "reason": text[:100]})
         return

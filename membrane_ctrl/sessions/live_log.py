@@ -217,6 +217,9 @@ class LiveReader:
         return points
 
     def _apply_entry(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
+        """Take an entry into the progress, or add its points. Raises for one that is not an
+        entry.
+        """
         if "every_s" in entry:
             self._add_points(entry, points)
             return
@@ -239,6 +242,7 @@ class LiveReader:
             self.progress = replace(now, ended=_parse_line(entry["ended"]), asks="", among=())
 
     def _add_points(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
+        """Add the means of an entry, at times that follow those before."""
         every_s = float(entry["every_s"])
         columns = {
             name: [math.nan if v is None else float(v) for v in entry[name]] for name in _COLUMNS

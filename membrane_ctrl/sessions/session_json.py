@@ -68,6 +68,7 @@ def build_value(kind: type[T], data: Any) -> T:
 
 
 def _build_plain(kind: Any, data: Any) -> Any:
+    """Build a value by the annotation of its field, from the outermost type inwards."""
     # Generic types: optional, one of several words, tuples, arrays.
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):

@@ -106,6 +106,8 @@ def make_gains_charts(
 
 
 def _make_nyquist(names: Sequence[str], found: Mapping[str, Curves]) -> Options:
+    """The open loop about -1 in the complex plane; points far from it would hide the distance."""
+
     def near(name: str) -> Points:
         response = found[name].open_loop
         response = response[np.abs(response) < _NYQUIST_NEAR]
@@ -126,6 +128,9 @@ def _make_nyquist(names: Sequence[str], found: Mapping[str, Curves]) -> Options:
 
 
 def _lines(names: Sequence[str], points: Any, panel: int) -> list[Options]:
+    """A line for each set of gains; the last one, that of the sliders, is wider and has its own
+    colour.
+    """
     lines = []
     for place, name in enumerate(names):
         is_yours = place == len(names) - 1

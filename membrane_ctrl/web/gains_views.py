@@ -258,6 +258,9 @@ class GainsViews:
         return await GAINS.run(self._save, hold, name, dict(loop), author)
 
     def _list(self, hold: str) -> list[str]:
+        """The newest sessions that have identified and observed, then the newest runs that are long
+        enough.
+        """
         from tuning.explore.workpiece import SHORTEST_S
 
         logs = self._find_logs(hold)
@@ -277,6 +280,9 @@ class GainsViews:
         return found + [entry.name for entry in runs[:_SOURCES_MOST]]
 
     def _open(self, hold: str, name: str) -> GainsSource:
+        """Read the plant and weather of a session or run, and where its sliders stand for each
+        named gain.
+        """
         from tuning.explore.sliders import (
             DAMPINGS,
             FILTERS_S,
@@ -300,6 +306,9 @@ class GainsViews:
         )
 
     def _explore(self, hold: str, name: str, start: str, setting: Setting | None) -> ExploredGains:
+        """Compute the curves of the sliders' gains, beside the present ones and those of
+        `start`.
+        """
         from tuning.explore.crossings import find_crossings
         from tuning.explore.curves import STEP_UM, compute_curves, find_duration_s
         from tuning.explore.sliders import Sliders
@@ -409,6 +418,9 @@ def _make_rows(found: Sequence[Curves]) -> tuple[tuple[str, ...], ...]:
 
 
 def _format_column(curves: Curves) -> list[str]:
+    """The cells of one set of gains: the gains, then predicted error, margins and response to a
+    load.
+    """
     of, gains, margins = curves.figures, curves.figures.gains, curves.figures.margins
     cells = [f"{gains.kp_per_s:.3f}"]
     cells += [f"{value:.2f}" for value in (gains.ti_s, gains.td_s, gains.filter_s)]

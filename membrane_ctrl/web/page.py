@@ -174,6 +174,7 @@ class WebPage:
         ui.timer(LOOK_S, self._draw)
 
     def _build_header(self) -> None:
+        """The line on top: hold, state, UTC or local time, dark or light, keys, and who views."""
         with ui.header().classes("items-center justify-between q-py-xs"):
             self._name = ui.label().classes("text-h6")
             self._state = ui.badge().classes("text-body1 q-pa-sm").props('aria-label="state"')
@@ -190,6 +191,7 @@ class WebPage:
                 ui.label(f"{self._user.name} ({self._user.role})").classes("text-caption")
 
     def _build_tabs(self) -> None:
+        """The tabs; those that this viewer's role or this hold does not have are hidden."""
         with ui.tabs().classes("w-full") as tabs:
             now, look_back = ui.tab("Now"), ui.tab("Look back")
             alarms, tune = ui.tab("Alarms"), ui.tab("Tune")
@@ -278,6 +280,9 @@ class WebPage:
         )
 
     def _build_now(self) -> None:
+        """The first tab: why, by what and with which alarms the mirror is held; numbers, chart,
+        commands.
+        """
         self._why = ui.label().classes("text-subtitle1").props('role="status"')
         self._holder = ui.label().props('aria-label="what holds the mirror"')
         self._alarm = ui.label().classes("text-negative text-bold").props('role="alert"')
@@ -312,6 +317,7 @@ class WebPage:
         return found
 
     def _build_chart(self) -> None:
+        """The choice of span and signals, the button that marks a clicked moment, and the chart."""
         with ui.row().classes("items-center w-full"):
             ui.toggle(
                 list(SPANS_S), value=self._span, on_change=lambda e: self._set("_span", e.value)
@@ -350,6 +356,7 @@ class WebPage:
                     self._buttons.append((button, action))
 
     def _build_figure(self) -> None:
+        """The choice of a reference and of removed terms, the map, and the bars of the terms."""
         with ui.row().classes("items-center w-full"):
             self._against = ui.select(
                 self._views.list_references(self._hold),
@@ -469,6 +476,7 @@ class WebPage:
             await self._run_script(drawn)
 
     async def _draw_figure(self, time_s: float) -> None:
+        """Show the map of the newest figure; the browser fetches its pixels."""
         try:
             found = await self._views.map(self._hold, self._removed, self._reference, time_s)
         except PoolFullError:
@@ -494,6 +502,9 @@ class WebPage:
             await ui.run_javascript(script, timeout=_FETCH_S)
 
     def _show_status(self) -> None:
+        """Show the newest status: state, reason, alarms and numbers, and which buttons may be
+        used.
+        """
         # 1. The state; grey where nothing moves any more, as after a regular end
         seen = self._feed.seen
         status, row = seen.status, seen.status.get("row") or {}
@@ -556,6 +567,7 @@ class WebPage:
             await self._confirm(action)
 
     async def _show_keys(self) -> None:
+        """Show the keys until the viewer closes the dialog, unless another one is open."""
         if self._asking:
             return
         self._asking = True

@@ -162,6 +162,7 @@ class TuningPanel:
         ui.timer(_LOOK_S, self._show)
 
     async def _show(self) -> None:
+        """Show what has changed in the newest session since the last look."""
         seen, before = await self._look(), self._seen
         for button in self._buttons:
             if button.enabled != self._may():
@@ -214,6 +215,9 @@ class TuningPanel:
                 ui.badge(step, color=colour)
 
     def _show_choice(self, seen: SessionSeen) -> None:
+        """Show the question that the session waits with, its candidates, and a button for each
+        answer.
+        """
         self._choice.clear()
         self._buttons.clear()
         if not seen.progress.among:

@@ -277,7 +277,7 @@ def test_home_assistant_finds_every_name_and_only_the_allowed_commands() -> None
 )
 def test_no_unknown_client_acts_from_another_machine(bridge: dict[str, object]) -> None:
     BridgesConfig(**bridge)  # type: ignore[arg-type]
-    with pytest.raises(ValidationError, match="cannot tell who acts from another machine"):
+    with pytest.raises(ValidationError, match="does not know who acts from another machine"):
         BridgesConfig(role="operate", **bridge)  # type: ignore[arg-type]
     BridgesConfig(role="operate", mqtt=MqttConfig(host="broker.lab"))  # the broker knows its users
 

@@ -65,6 +65,7 @@ class TableFollower:
             yield from self._read_frames(spec.journal_path(self._folder, number))
 
     def _read_frames(self, path: Path) -> Iterator[pa.Table]:
+        """Yield the rows of the frames that a journal has gained since the last call."""
         try:
             with open_plain(path) as file:
                 file.seek(self._place)

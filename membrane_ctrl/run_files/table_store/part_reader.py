@@ -138,6 +138,7 @@ class PartReader:
         return found
 
     def _open_with_footer(self, footer: bytes) -> pq.ParquetFile:
+        """Open the file with this footer, whatever its own end is. Raises like pyarrow."""
         # A file that ends with the footer to use: pyarrow reads the metadata from it alone
         limits = {
             "thrift_string_size_limit": FOOTER_BYTES_MAX,
@@ -158,6 +159,7 @@ class PartReader:
     def _read_group(
         self, number: int, group: pq.RowGroupMetaData, names: Sequence[str]
     ) -> pa.Table:
+        """Read the columns of a row group, after their sizes and checksums were checked."""
         if group.num_rows > GROUP_ROWS_MAX:
             raise ValueError("more rows than a recorder writes")
         # What the wanted columns unpack to, before memory is taken for them

@@ -123,6 +123,7 @@ def _write_groups(
 def _new_writer(
     file: _HashedFile, schema: pa.Schema, first_group: pa.Table, time_name: str
 ) -> pq.ParquetWriter:
+    """A Parquet writer whose encodings suit the first row group."""
     encodings = dict(_choose_encodings(first_group.slice(0, _TRIAL_ROWS)))
     dictionaries = [path for path, encoding in encodings.items() if encoding == _DICTIONARY]
     others = {path: encoding for path, encoding in encodings.items() if encoding != _DICTIONARY}
@@ -169,6 +170,7 @@ def _list_candidates(kind: pa.DataType) -> list[str]:
 
 
 def _trial_bytes(values: pa.ChunkedArray, path: str, encoding: str) -> int:
+    """Size of some rows of a column in an encoding, packed quickly."""
     table = pa.table([values], names=[path.partition(".")[0]])
     sink = pa.BufferOutputStream()
     options: dict[str, Any] = {"use_dictionary": True}

@@ -189,6 +189,7 @@ class TableReader:
         start_s: float,
         end_s: float,
     ) -> Iterator[pa.Table]:
+        """Yield the row groups of a part that may have rows of the time; notes what is lost."""
         path = self._read_part(number)
         try:
             with PartReader(path, entry) as part:
