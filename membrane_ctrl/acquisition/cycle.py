@@ -78,11 +78,26 @@ class CycleFailed:
 
 
 class ShapeCycle:
-    """Takes cycles: a full one first and after losing the fringe orders, else fringes only. A
-    degraded full cycle is repeated until `DEGRADED_IN_A_ROW` of them agree.
+    """Takes cycles: a full one first and after losing the fringe orders, else fringes only.
 
-    `frames` must hold a full cycle. `stopping` is checked before each exposure: True ends the cycle
-    without a result.
+    A degraded full cycle is repeated until `DEGRADED_IN_A_ROW` of them agree.
+
+    Parameters
+    ----------
+    camera, screen : Camera, Screen
+        Open.
+    reconstructor : Reconstructor
+        Makes the figure of the frames.
+    plan : CyclePlan
+        Patterns of the cycles, and the least interval of their frames.
+    frames : FrameWriter
+        Ring that holds a full cycle.
+    clock : CycleClock
+        The run's clock.
+    laser : Laser
+        The displacement at each frame.
+    stopping : callable
+        Checked before each exposure: True ends the cycle without a result.
     """
 
     def __init__(

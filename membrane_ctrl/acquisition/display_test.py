@@ -31,6 +31,15 @@ class DisplayTest:
     """Measures a display with the camera that sees it, both open.
 
     It waits `settle_s` before a still picture; `measure_settling` shortens that.
+
+    Parameters
+    ----------
+    screen, camera : PatternScreen, Camera
+        Open.
+    clock : CycleClock
+        By which it waits.
+    width_px, height_px : int
+        Size of the screen.
     """
 
     def __init__(

@@ -57,10 +57,22 @@ class Laser(Protocol):
 
 
 class Exposures:
-    """Takes the frames of a cycle into the ring of frames, their starts at least `interval_s`
-    apart.
+    """Takes the frames of a cycle into the ring of frames.
 
     A camera or screen with only the plain role is used step by step.
+
+    Parameters
+    ----------
+    camera, screen : Camera, Screen
+        Open.
+    frames : FrameWriter
+        The ring.
+    clock : CycleClock
+        The run's clock.
+    laser : Laser
+        The displacement at each frame, which is stored with it.
+    interval_s : float
+        Least time from the start of one exposure to that of the next.
     """
 
     def __init__(

@@ -78,8 +78,14 @@ class StatementWatch:
 
 
 class GeometryWatch:
-    """Compares residual and ring of each cycle with the calibrated ones; silent without a
-    calibration.
+    """Compares residual and ring of each cycle with the calibrated ones.
+
+    Parameters
+    ----------
+    geometry : RunGeometry
+        Of the run; without a calibration nothing is compared.
+    bin_px : int
+        Side of the bins of a live cycle, whose noise the residual contains.
     """
 
     def __init__(self, geometry: RunGeometry, bin_px: int) -> None:

@@ -19,9 +19,16 @@ _KEPT_S = 60.0  # longer than any full cycle takes
 
 
 class LaserHistory:
-    """The last minute of laser readings, from `TelemetryRow` rows at `rate_hz`.
+    """The last minute of laser readings, from rows of telemetry.
 
     A frame gets the readings within `half_window_s` before and after it.
+
+    Parameters
+    ----------
+    telemetry : RingAddress
+        Ring of `TelemetryRow`s.
+    rate_hz : float
+        Rows a second.
     """
 
     def __init__(self, telemetry: RingAddress, rate_hz: float) -> None:

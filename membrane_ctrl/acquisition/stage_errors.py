@@ -10,7 +10,15 @@ Stage = Literal["screen", "camera", "reconstruction"]
 
 
 class StageError(Exception):
-    """A failure and its stage."""
+    """A failure and its stage.
+
+    Parameters
+    ----------
+    stage : "screen", "camera" or "reconstruction"
+        Where the cycle failed.
+    message : str
+        The type of the error and its text.
+    """
 
     def __init__(self, stage: Stage, message: str) -> None:
         super().__init__(message)

@@ -92,9 +92,10 @@ def find_prestrain() -> float:
 class MeasuredBench(ABC):
     """A bench with one full capture set; everything is computed when first used.
 
-    Attributes
+    Parameters
     ----------
     options : PaperOptions
+        How large the computation is.
     optics : OpticsConfig
         Its geometry is in the short form: a, b and alpha.
     """
@@ -215,8 +216,21 @@ class PaperBench(MeasuredBench):
 class RecordedBench(MeasuredBench):
     """A bench whose sets were recorded: a folder with one folder for each set.
 
-    The first set in the order of their names is full. Raises InputError, also for a set of another
-    mirror.
+    The first set in the order of their names is full.
+
+    Parameters
+    ----------
+    options : PaperOptions
+        How large the computation is.
+    folder : Path
+        The folder of the sets.
+
+    Raises
+    ------
+    InputError
+        There is no set, the first one is not full, or a set is of another mirror.
+    RejectedError
+        The first set is incomplete.
     """
 
     def __init__(self, options: PaperOptions, folder: Path) -> None:

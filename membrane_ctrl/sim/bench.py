@@ -55,14 +55,11 @@ class BenchReport:
 
 
 def serve_bench(spec: BenchSpec, ready: Connection) -> None:
-    """Serve the bench in a spawned process, until `processes.STOP` or until `linger_s` after the
-    parent's end. SIGINT is ignored: Ctrl-C goes to the whole terminal, and the bench must
-    outlive the controller's safe stop.
+    """Serve the bench in a spawned process, until `processes.STOP`, or for `linger_s` after the end
+    of its parent.
 
-    `ready` gets one BenchReport; a bench that cannot be built or cannot listen reports that and
-    ends. SIGINT is
-    ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe
-    stop.
+    SIGINT is ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the
+    controller's safe stop.
 
     Parameters
     ----------
@@ -157,8 +154,14 @@ def _truth_writer(address: ring.RingAddress | None) -> Iterator[ring.RingWriter 
 
 
 class LiveBench:
-    """The plant on the run's clock, sampled by its device every 5 ms of plant time; publishes the
-    truth with each.
+    """The plant on the run's clock, sampled by its device every 5 ms of plant time.
+
+    Parameters
+    ----------
+    spec : BenchSpec
+        Plant, clock and speed.
+    truth : RingWriter or None
+        Receives the true state with each sample.
     """
 
     def __init__(self, spec: BenchSpec, truth: ring.RingWriter | None) -> None:

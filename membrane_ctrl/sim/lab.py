@@ -37,8 +37,21 @@ _READ_INPUT = 4
 
 
 class Lab:
-    """Emulated instruments over a plant; `serial` and `wires`: devices and pseudo-terminals by
-    configured port.
+    """Emulated instruments over a plant.
+
+    Parameters
+    ----------
+    plant : BoardPlant
+        What the instruments measure and drive.
+    devices : DevicesConfig
+        The configured instruments, each of which is emulated.
+
+    Attributes
+    ----------
+    serial : dict of str to SerialDevice
+        Devices by configured port.
+    wires : dict of str to PtyWire
+        Their pseudo-terminals, once started.
     """
 
     def __init__(self, plant: pump_board.BoardPlant, devices: DevicesConfig) -> None:

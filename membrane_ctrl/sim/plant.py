@@ -53,9 +53,18 @@ class Plant:
     """The bench without its protocol; equal seeds and equal calls give equal samples.
 
     It starts inflated, `start_error_um` off its nominal sag, films settled for a day and the pump
-    just holding; or flat and fresh, the pump off (`from_flat`). Events are in plant time. Commands
-    hold until the next `actuate`. Truth does not depend on how often it is sampled, nor on how time
-    is cut into calls of `advance`.
+    just holding; or flat and fresh, the pump off (`from_flat`). Commands hold until the next
+    `actuate`. Truth does not depend on how often it is sampled, nor on how time is cut into calls
+    of `advance`.
+
+    Parameters
+    ----------
+    twin : TwinConfig
+        Weather, climate, sensors, leak, start and seed.
+    pump : PumpConfig
+        The pump's curve; `flow_full_um_per_s` is that of the nominal mirror.
+    events : sequence of BenchEvent
+        What happens to the bench, in plant time.
     """
 
     def __init__(

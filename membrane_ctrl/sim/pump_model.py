@@ -24,11 +24,27 @@ _SHAPES: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 class PumpModel:
-    """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below
-    `stall_fraction`.
+    """A pump with dead zone, lag and transport, advanced in fixed steps.
 
-    Or a curve through the configuration's points, or of `twin.pump_shape`; two branches give the
-    flow play. Raises ValueError if the pump delivers nothing at any command.
+    q = q_full (d - dead) / (1 - dead) once running; it starts at `start_fraction` and stalls below
+    `stall_fraction`. Or a curve through the configuration's points, or of `twin.pump_shape`; two
+    branches give the flow play.
+
+    Parameters
+    ----------
+    config : PumpConfig
+        Fractions and points of the curve.
+    flow_full_ml_per_s : float
+        Flow at full command.
+    step_s : float
+        Length of a step.
+    twin : TwinConfig or None
+        Lag, transport and shape; None: the defaults.
+
+    Raises
+    ------
+    ValueError
+        The pump delivers nothing at any command.
     """
 
     def __init__(

@@ -19,7 +19,15 @@ LASER_NO_LIGHT = 1
 
 
 class Sensors:
-    """Laser, barometer, gauge and thermometers with independent noise in each sample."""
+    """Laser, barometer, gauge and thermometers with independent noise in each sample.
+
+    Parameters
+    ----------
+    config : TwinConfig
+        Noise and resolution of the sensors, and whether there is a laser.
+    rng : Generator
+        Draws the noise; that of the climate's sensors has a generator of its own.
+    """
 
     def __init__(self, config: TwinConfig, rng: np.random.Generator) -> None:
         self._config = config

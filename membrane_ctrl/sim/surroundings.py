@@ -23,6 +23,17 @@ class OrnsteinUhlenbeck:
     """Noise that forgets exponentially, exact at the steps, stationary from the first one.
 
     x' = x exp(-dt/tau) + std sqrt(1 - exp(-2 dt/tau)) N(0, 1).
+
+    Parameters
+    ----------
+    std : float
+        Standard deviation, in the unit of the values.
+    correlation_s : float
+        tau.
+    step_s : float
+        dt.
+    rng : Generator
+        Draws the steps.
     """
 
     def __init__(
@@ -43,8 +54,18 @@ class OrnsteinUhlenbeck:
 
 
 class Disturbance:
-    """The surroundings in blocks of consecutive steps: scenario, drift of the laser's mount,
-    events.
+    """The surroundings in blocks of consecutive steps: scenario, drift of the laser's mount, events.
+
+    Parameters
+    ----------
+    config : TwinConfig
+        Scenario of the weather, and drift of the mount.
+    events : sequence of BenchEvent
+        Each changes the blocks in which it happens.
+    step_s : float
+        Length of a step.
+    rng : Generator
+        Draws the weather.
     """
 
     def __init__(

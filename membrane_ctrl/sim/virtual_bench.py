@@ -53,9 +53,23 @@ class Wrong:
 class VirtualBench:
     """Plant and board, advanced together; the methods of `roles.Bench`, without waiting.
 
-    `stored` are the settings that the board keeps without power, `interlocks` the configured
-    circuits. `wrong` are its switches, `truth` is the true state when the board last took its
-    sample, or would have.
+    Parameters
+    ----------
+    plant : Plant
+        The mirror.
+    watchdog_s : float
+        Time without a command after which the board stops the pump.
+    stored : StoredSettings or None
+        Settings that the board keeps without power; None: those of a new board.
+    interlocks : VirtualInterlocks or None
+        The configured circuits; None: none.
+
+    Attributes
+    ----------
+    wrong : Wrong
+        Switches of what is wrong with the bench.
+    truth : Truth
+        The true state when the board last took its sample, or would have.
     """
 
     def __init__(

@@ -140,7 +140,14 @@ class Checked:
 class RejectedSetError(bin_view.NoFigureError):
     """A set that gives no figure, with the bad frames.
 
-    `saturated_fraction` is the share of bins clipped at white; NaN if it was not determined.
+    Parameters
+    ----------
+    reason : str
+        For people.
+    flags : tuple of Flag
+        Frames that do not belong to the set.
+    saturated_fraction : float
+        Share of bins clipped at white; NaN if it was not determined.
     """
 
     def __init__(

@@ -14,6 +14,15 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 class BinGrid:
     """Bins of `bin_px` x `bin_px` pixels over a sensor, in row order.
 
+    Parameters
+    ----------
+    geometry : Geometry
+        The bench.
+    camera : CameraConfig
+        Size of the sensor.
+    bin_px : int
+        Side of a bin.
+
     Attributes
     ----------
     columns : int

@@ -114,8 +114,10 @@ def _coarser_links(right, down, coarse_right, coarse_down):  # type: ignore[no-u
 class MaskedLaplacian:
     """Links of a grid and of its coarser ones.
 
-    `right` and `down` (rows, columns) are the weights of each cell's links to its right and to its
-    lower neighbour, 0 where there is none.
+    Parameters
+    ----------
+    right, down : (rows, columns) array
+        Weights of each cell's links to its right and to its lower neighbour, 0 where there is none.
     """
 
     def __init__(self, right: FloatArray, down: FloatArray) -> None:

@@ -17,6 +17,13 @@ class WithoutFeedforward:
     here by the bilinear transform. Dead time and pump lag (0.26 s together) are ignored: they
     hardly change the effect of a disturbance of tens of seconds, and make the benefit appear
     slightly too small.
+
+    Parameters
+    ----------
+    kp_per_s, ti_s : float
+        Gains of the run's loop: Kp in 1/s, Ti in s.
+    period_s : float
+        Time from one tick to the next.
     """
 
     def __init__(self, kp_per_s: float, ti_s: float, period_s: float) -> None:

@@ -88,8 +88,16 @@ def _list_overviews() -> tuple[Stream, ...]:
 
 
 class Layer:
-    """Writes runs into one recording, the `.rrd` file `path`; with `overview_only` coarse levels
-    without ticks.
+    """Writes runs into one recording.
+
+    Parameters
+    ----------
+    path : Path
+        The `.rrd` file, replaced if it exists.
+    name : str
+        Name of the recording, and its id: the viewer keeps one recording of an id.
+    overview_only : bool
+        Coarse levels without ticks.
     """
 
     def __init__(self, path: Path, name: str, overview_only: bool = False) -> None:

@@ -479,10 +479,22 @@ class Clock(Protocol):
 class TwinOptics:
     """The optical half of the simulated bench: one film, one `screen`, one `camera`.
 
-    The film is a Hencky bowl with the figure of `typical_film` drawn from the twin's seed, unless
-    `film` is given. Bowl and rim follow the truth; only the sag at displacement 0 is taken from it,
-    once, at the first look. The optics are the configured ones, except for the geometry if `twin`
-    has its own; without a reference displacement the geometry refers to the film at the first look.
+    Bowl and rim follow the truth; only the sag at displacement 0 is taken from it, once, at the
+    first look.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The configured optics; without a reference displacement the geometry refers to the film at
+        the first look.
+    twin : TwinConfig
+        Seed, disturbances, and the true geometry if it differs from the configured one.
+    truth : callable
+        Returns the film's true displacement and sag now.
+    clock : Clock
+        The run's clock: a frame has its time.
+    film : FilmShape or None
+        None: a Hencky bowl with the figure of `typical_film`, drawn from the twin's seed.
     """
 
     def __init__(

@@ -70,8 +70,16 @@ class Nodes:
 
 
 class Disturber:
-    """The disturbances of one bench, picture after picture. Equal seeds and times give equal
-    pictures.
+    """The disturbances of one bench, picture after picture.
+
+    Parameters
+    ----------
+    wanted : DisturbancesConfig
+        Size of each disturbance; 0 is none.
+    nodes : Nodes
+        Where the nodes of a picture are.
+    seed : int
+        Equal seeds and times give equal pictures.
     """
 
     def __init__(self, wanted: DisturbancesConfig, nodes: Nodes, seed: int) -> None:
