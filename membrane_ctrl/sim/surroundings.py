@@ -54,7 +54,7 @@ class OrnsteinUhlenbeck:
 
 
 class Disturbance:
-    """The surroundings in blocks of consecutive steps: scenario, drift of the laser's mount, events.
+    """The surroundings in blocks of steps: scenario, drift of the laser's mount, events.
 
     Parameters
     ----------
