@@ -61,9 +61,9 @@ def calibrate_command(options: CalibrateOptions) -> int:
     if not findings:
         try:
             solution, judged = solve_any_film(problem, _make_progress_line())
-            findings = _judge_sets(judged, bundle)
-        except ValueError as error:
-            findings = (verdict.CalibrationFinding(True, str(error)),)
+        except ValueError as error:  # the equations have no solution, perhaps of mixed benches
+            judged = (verdict.CalibrationFinding(True, str(error)),)
+        findings = _judge_sets(judged, bundle)
     timing = {"read": read_s - begin_s, "solve": time.perf_counter() - read_s}
 
     # The geometry, if it is usable; the picture also of a refused solution, where it helps most.

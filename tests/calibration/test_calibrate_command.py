@@ -300,6 +300,26 @@ def test_a_refusal_of_sets_with_different_references_names_these_first() -> None
     assert [each.description for each in one] == ["camera or screen crept", "no rim"]
 
 
+def test_sets_without_a_solution_name_different_references_first(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle = sets.Bundle((), OpticsConfig(), 0.0, ("no rim",), "the sets state two references")
+
+    def fail(*_: object) -> None:
+        raise ValueError("no solution")
+
+    monkeypatch.setattr(calibrate, "read_sets", lambda *_: bundle)
+    monkeypatch.setattr(calibrate, "problem_of", lambda *_: None)
+    monkeypatch.setattr(calibrate.verdict, "check_before_solving", lambda _: ())
+    monkeypatch.setattr(calibrate, "solve_any_film", fail)
+    assert run(["calibrate", str(tmp_path), "--json", "--out", str(tmp_path / "new.toml")]) == 3
+    findings = json.loads(capsys.readouterr().out)["findings"]
+    assert [finding["description"] for finding in findings] == [
+        "the sets state two references; if it was not: no solution",
+        "no rim",
+    ]
+
+
 def test_a_set_given_twice_is_refused(
     folders: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
