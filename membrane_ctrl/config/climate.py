@@ -10,8 +10,9 @@ PartsPerMillion = Annotated[float, Field(ge=-1000, le=1000)]
 
 
 class ClimateConfig(Section):
-    """Strains of film and ring, of which the change of the figure is predicted. It needs the sensor
-    roles `film_thermometer`, `ring_thermometer` or `hygrometer`, or the air thermometer.
+    """Strains of film and ring, of which the change of the figure is predicted, and by which laser
+    and gauge may differ. It needs the sensor roles `film_thermometer`, `ring_thermometer` or
+    `hygrometer`, or the air thermometer.
     """
 
     film_ppm_per_k: PartsPerMillion = 17.0

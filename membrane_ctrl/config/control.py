@@ -232,12 +232,12 @@ class LimitsConfig(Section):
     Pa. Raise it for a noisier gauge."""
     laser_gauge_apart_max_um: Annotated[float, Field(gt=0, le=10000)] = 20.0
     """Largest contradiction of laser and gauge within minutes. 20 µm are 1 Pa: 30 sigma of a
-    gauge's ten-second mean, 5 times the drift in two minutes of a mount at 2 µm/min. Raise it for a
-    noisier gauge."""
+    gauge's ten-second mean, 5 times the drift in two minutes of a mount at 2 µm/min. Sensors of the
+    climate add what they explain, at most 30 µm. Raise it for a noisier gauge."""
     laser_gauge_drift_max_um: Annotated[float, Field(gt=0, le=10000)] = 120.0
     """The same within an hour: a day of +-2 K and +-10 % relative humidity moves the film by up to
-    99 µm against an hour before (control/film_monitor.py). Raise it for a room that changes
-    faster."""
+    99 µm against an hour before (control/film_monitor.py). Sensors of the climate add what they
+    explain, at most 120 µm. Raise it for a room that changes faster and has none."""
     laser_gauge_day_max_um: Annotated[float, Field(gt=0, le=10000)] = 700.0
     """The same within a day: such a climate moves the film by up to 624 µm. The true centre may be
     off by as much. Lower it for a room with a steady climate; a third of it raises the notice

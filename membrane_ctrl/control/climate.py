@@ -23,8 +23,13 @@ CHANGE_SPHERICAL = 0.012199
 # The same, RMS, for a patch of 0.18 radii (1 sigma) that is strained alone, mean over its places
 # (`sim.warm_patch`: 1.6 to 2.1 µm for 1 K of the paper's film)
 CHANGE_PATCH = 0.0150
-# Noise of a thermometer or hygrometer is no change of the film
-_SMOOTH_S = 30.0
+# Rise of the centre at equal pressure for an excess strain e, by e a^2 / sag (the same law)
+CHANGE_CENTRE = 0.51226
+# Noise of a thermometer or hygrometer is no change of the film. Laser and gauge, whose comparison
+# uses the strains, are smoothed equally (`film_monitor`).
+_SMOOTH_S = 10.0
+# A slow instrument may miss minutes. A state that is unseen for longer is not fresh.
+_FRESH_S = 300.0
 # Without its sensor a state wanders by this, 1 sigma, in the square root of an hour, and by at most
 # a room's daily change (assumed)
 _WANDER_K = 0.5
@@ -35,7 +40,7 @@ _FILM_AS_AIR_K = 0.3
 # A ring without a thermometer is as warm as the air behind its lag (assumed)
 _RING_AS_AIR_K = 0.5
 # The ring's expansion is that of a metal, known to (assumed)
-_RING_SIGMA = 0.03
+RING_SIGMA = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +71,23 @@ class ClimateStrain(StateNode):
     sigma_ppm: float = math.nan
 
 
+@dataclass(frozen=True, slots=True)
+class StrainParts(StateNode):
+    """Strains by their causes, in 1e-6, from an arbitrary zero; NaN for one that no fresh sensor
+    shows.
+
+    Attributes
+    ----------
+    heat_ppm, water_ppm : float
+        Of the film.
+    ring_ppm : float
+    """
+
+    heat_ppm: float = math.nan
+    water_ppm: float = math.nan
+    ring_ppm: float = math.nan
+
+
 @dataclass(slots=True)
 class FollowedState(StateNode):
     """A temperature or the moisture: its value, at the reference, and how long it is unseen."""
@@ -80,6 +102,9 @@ class FollowedState(StateNode):
     def follow(self, reading: float, dt_s: float, lag_s: float) -> None:
         """Follow a reading; NaN leaves the value and counts the time."""
         if math.isfinite(reading):
+            # A temperature that was not seen for long is what the sensor shows now.
+            if self.unseen_s > _FRESH_S and lag_s <= _SMOOTH_S:
+                self.value.reset(reading)
             self.value.update(reading, dt_s, lag_s)
             self.start_share *= 1.0 - lag_step_fraction(dt_s, lag_s)
             self.unseen_s = 0.0
@@ -90,6 +115,13 @@ class FollowedState(StateNode):
         """Count changes from the present value."""
         self.reference = self.value.value
         self.start_share_at_reference = self.start_share
+
+    @property
+    def fresh_value(self) -> float:
+        """The value; NaN if no sensor has shown it for minutes."""
+        if self.unseen_s > _FRESH_S:
+            return math.nan
+        return self.value.value
 
     @property
     def start_error(self) -> float:
@@ -163,6 +195,16 @@ class Climate:
                 state.set_reference()
         return self._make_strain()
 
+    @property
+    def fresh_parts(self) -> StrainParts:
+        """Strains by their causes, as far as fresh sensors show them."""
+        memory, config = self.memory, self._config
+        return StrainParts(
+            config.film_ppm_per_k * memory.film.fresh_value,
+            config.film_ppm_per_percent * memory.moisture.fresh_value,
+            config.ring_ppm_per_k * memory.ring.fresh_value,
+        )
+
     def _make_strain(self) -> ClimateStrain:
         """Strains of film and ring since the reference, and the error of their difference."""
         memory, config = self.memory, self._config
@@ -183,7 +225,7 @@ class Climate:
         parts = (
             config.film_sigma_relative * by_heat_ppm,
             config.film_sigma_relative * by_water_ppm,
-            _RING_SIGMA * ring_ppm,
+            RING_SIGMA * ring_ppm,
             config.film_ppm_per_k * film_k,
             config.ring_ppm_per_k * ring_k,
             config.film_ppm_per_percent * _wander(_WANDER_PERCENT, memory.moisture.unseen_s),

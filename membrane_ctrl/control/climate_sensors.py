@@ -1,6 +1,6 @@
 """Decides which readings of the climate's sensors may be used. Pure.
 
-None of them protects the mirror: a reading that is impossible, missing or frozen is not used, and
+None of them can end a hold: a reading that is impossible, missing or frozen is not used, and
 reported once. The strains then stay, and their errors grow (`climate`).
 """
 

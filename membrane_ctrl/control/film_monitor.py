@@ -7,12 +7,25 @@ gauge     w ~ p^(1/3) (Hencky), so a change of gauge pressure is a change of sag
           comes from a sensor or its mount.
 nominal   the pressure that a mirror of this kind has at the laser's reading, known within a factor:
           units and scale.
+
+Temperature and humidity move the film against the gauge. Where sensors show them, the comparisons
+within minutes and an hour allow for what they explain (`climate_allowance`).
 """
 
 import math
 from dataclasses import dataclass, field
 
+from membrane_ctrl.config.climate import ClimateConfig
 from membrane_ctrl.config.schema import LimitsConfig, MirrorConfig
+from membrane_ctrl.control.climate import StrainParts
+from membrane_ctrl.control.climate_allowance import (
+    DAY_MOST_UM,
+    HOUR_MOST_UM,
+    MINUTES_MOST_UM,
+    ClimateAllowance,
+    StrainAhead,
+    find_gain,
+)
 from membrane_ctrl.control.filters import LowPass, lag_step_fraction
 from membrane_ctrl.model.state_tree import Count, StateNode
 
@@ -52,6 +65,7 @@ NOMINAL_SLACK_PA = 20.0
 NOMINAL_S = 1.0
 # Below this the film is slack, and the gauge's zero is a large part of its reading.
 TAUT_PA = 100.0
+NO_STRAINS = StrainParts()
 
 
 def are_means_known(seen_s: float, readings: int) -> bool:
@@ -77,6 +91,18 @@ class ComparisonState(StateNode):
     trim_um: float = 0.0
     root: float = math.nan  # cube root of the gauge pressure
     share: float = 0.0  # of what may be between them
+    strain: StrainAhead = field(default_factory=StrainAhead)
+
+
+@dataclass(frozen=True, slots=True)
+class _Means:
+    """Smoothed readings of a tick."""
+
+    laser_um: float  # displacement
+    trim_um: float  # what the shape loop has added to the setpoint
+    root: float  # cube root of the gauge pressure, Pa^(1/3), to which the sag is proportional
+    sag_um: float  # of the film
+    gained: StrainParts  # strains of film and ring since the last comparison
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,30 +112,17 @@ class _GaugeComparison:
     sensor: str  # of the displacement
     follow_s: float
     limit_um: float
+    allowance: ClimateAllowance
 
-    def find_contradiction(
-        self,
-        memory: ComparisonState,
-        laser_um: float,
-        trim_um: float,
-        root: float,
-        sag_um: float,
-        dt_s: float,
-    ) -> str:
+    def find_contradiction(self, memory: ComparisonState, means: _Means, dt_s: float) -> str:
         """Both readings, if they contradict each other.
 
         Parameters
         ----------
         memory : ComparisonState
             Readings that these are compared with; they follow slowly.
-        laser_um : float
-            Displacement.
-        trim_um : float
-            What the shape loop has added to the setpoint.
-        root : float
-            Cube root of the gauge pressure, Pa^(1/3), to which the sag is proportional.
-        sag_um : float
-            Sag of the film.
+        means : _Means
+            The present ones.
         dt_s : float
             Time since the last comparison.
 
@@ -120,16 +133,20 @@ class _GaugeComparison:
         """
         # The first readings are the reference
         if math.isnan(memory.laser_um):
-            memory.laser_um = laser_um
-            memory.trim_um = trim_um
-            memory.root = root
+            memory.laser_um = means.laser_um
+            memory.trim_um = means.trim_um
+            memory.root = means.root
         # Changes since the reference; by the gauge, sag is proportional to the root of its pressure
-        by_laser_um = laser_um - memory.laser_um
-        trimmed_um = trim_um - memory.trim_um
-        by_gauge_um = (sag_um - by_laser_um) * (root / memory.root - 1)
+        by_laser_um = means.laser_um - memory.laser_um
+        trimmed_um = means.trim_um - memory.trim_um
+        by_gauge_um = (means.sag_um - by_laser_um) * (means.root / memory.root - 1)
+        # What the climate explains of the difference
+        memory.strain.follow(means.gained, dt_s, self.follow_s)
+        allowed_um = self.allowance.find_range(memory.strain)
         # A laser drift that the shape loop has compensated has not moved the film.
         difference_um = min(
-            abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um)
+            _find_distance(by_laser_um - by_gauge_um, allowed_um),
+            _find_distance(by_laser_um - trimmed_um - by_gauge_um, allowed_um),
         )
         # The limit, and a share of the motion: the law of the film is not exact
         memory.share = difference_um / (
@@ -141,8 +158,13 @@ class _GaugeComparison:
         share = lag_step_fraction(dt_s, self.follow_s)
         memory.laser_um += share * by_laser_um
         memory.trim_um += share * trimmed_um
-        memory.root += share * (root - memory.root)
+        memory.root += share * (means.root - memory.root)
         return ""
+
+
+def _find_distance(value: float, between: tuple[float, float]) -> float:
+    """Distance of a value from the nearest point of a range; 0 inside it."""
+    return max(between[0] - value, value - between[1], 0.0)
 
 
 @dataclass(slots=True)
@@ -158,6 +180,8 @@ class FilmMonitorState(StateNode):
     minutes: ComparisonState = field(default_factory=ComparisonState)
     hour: ComparisonState = field(default_factory=ComparisonState)
     day: ComparisonState = field(default_factory=ComparisonState)
+    strains: StrainParts = NO_STRAINS  # as noted
+    compared_strains: StrainParts = NO_STRAINS  # at the last comparison
     # sensor and gauge have moved apart over hours, as by climate or a slow drift
     drifting: bool = False
 
@@ -176,6 +200,8 @@ class FilmMonitor:
         The displacement's sensor, for the message.
     memory : FilmMonitorState, optional
         From the snapshot of an earlier controller; else the first means are the reference.
+    climate : ClimateConfig, optional
+        The error of the film's expansions.
     """
 
     def __init__(
@@ -184,18 +210,30 @@ class FilmMonitor:
         mirror: MirrorConfig,
         sensor: str = "laser",
         memory: FilmMonitorState | None = None,
+        climate: ClimateConfig | None = None,
     ) -> None:
         self.memory = memory or FilmMonitorState()
         self._limits = limits
         self._sag_um = 1e3 * mirror.sag_mm
         self._pressure_pa = mirror.pressure_pa
-        self._minutes = _GaugeComparison(sensor, SINCE_MINUTES_S, limits.laser_gauge_apart_max_um)
-        self._hour = _GaugeComparison(sensor, SINCE_HOUR_S, limits.laser_gauge_drift_max_um)
-        self._day = _GaugeComparison(sensor, SINCE_DAY_S, limits.laser_gauge_day_max_um)
+        climate = climate or ClimateConfig()
+        minutes, hour, day = (
+            ClimateAllowance.from_config(mirror, climate, most_um)
+            for most_um in (MINUTES_MOST_UM, HOUR_MOST_UM, DAY_MOST_UM)
+        )
+        self._minutes = _GaugeComparison(
+            sensor, SINCE_MINUTES_S, limits.laser_gauge_apart_max_um, minutes
+        )
+        self._hour = _GaugeComparison(sensor, SINCE_HOUR_S, limits.laser_gauge_drift_max_um, hour)
+        self._day = _GaugeComparison(sensor, SINCE_DAY_S, limits.laser_gauge_day_max_um, day)
 
     def reset(self) -> None:
         """Forget everything."""
         self.memory.start_afresh()
+
+    def note_strains(self, strains: StrainParts) -> None:
+        """Note the strains of film and ring, as the climate's sensors show them in this tick."""
+        self.memory.strains = strains
 
     def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
         """Process one tick; return both readings in words if they contradict each other.
@@ -233,20 +271,23 @@ class FilmMonitor:
             self._taut or root**3 > TAUT_PA
         ):
             return ""
+        gained = find_gain(memory.strains, memory.compared_strains)
+        memory.compared_strains = memory.strains
+        means = _Means(laser_um, trim_um, root, sag_um, gained)
         # Within minutes, an hour and a day: a slow drift is small within minutes
         spans = (
             (self._minutes, memory.minutes),
             (self._hour, memory.hour),
             (self._day, memory.day),
         )
-        contradictions = [
-            since.find_contradiction(kept, laser_um, trim_um, root, sag_um, dt_s)
-            for since, kept in spans
-        ]
+        contradictions = [since.find_contradiction(kept, means, dt_s) for since, kept in spans]
         # Hysteresis: a notice ends at a smaller share than it begins
         threshold = DRIFTING_OVER_SHARE if memory.drifting else DRIFTING_SHARE
         memory.drifting = memory.day.share > threshold
-        return next(filter(None, contradictions), "")
+        contradiction = next(filter(None, contradictions), "")
+        if contradiction:
+            return contradiction + self._describe_climate()
+        return ""
 
     @property
     def share_of_minutes(self) -> float:
@@ -267,6 +308,32 @@ class FilmMonitor:
     def drift_um(self) -> float:
         """How far sensor and gauge have moved apart within a day, µm; 0 without a reference."""
         return self.memory.day.share * self._limits.laser_gauge_day_max_um
+
+    @property
+    def explained_um(self) -> float:
+        """What the climate's sensors explain of that, signed; 0 without them."""
+        return self._day.allowance.explain_um(self.memory.day.strain)
+
+    @property
+    def sees_climate(self) -> bool:
+        """Whether a sensor shows a strain of the film or of its ring."""
+        strains = self.memory.strains
+        parts_ppm = (strains.heat_ppm, strains.water_ppm, strains.ring_ppm)
+        return any(map(math.isfinite, parts_ppm))
+
+    def _describe_climate(self) -> str:
+        """What the climate has to do with a contradiction, in words."""
+        if not self.sees_climate:
+            return (
+                "; a room whose temperature or humidity has changed does this too, "
+                "and no sensor shows them"
+            )
+        minutes_um = self._minutes.allowance.explain_um(self.memory.minutes.strain)
+        hour_um = self._hour.allowance.explain_um(self.memory.hour.strain)
+        return (
+            f"; temperature and humidity explain {minutes_um:+.0f} µm within minutes and "
+            f"{hour_um:+.0f} µm within an hour"
+        )
 
     @property
     def _taut(self) -> bool:

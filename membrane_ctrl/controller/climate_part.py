@@ -14,6 +14,7 @@ from membrane_ctrl.control.climate import (
     ClimateReadings,
     ClimateState,
     ClimateStrain,
+    StrainParts,
 )
 from membrane_ctrl.control.climate_sensors import (
     ClimateSensor,
@@ -73,6 +74,20 @@ class ClimatePart:
         by_strain_um = self.memory.strain.sigma_ppm * self._rms_um_per_ppm
         return math.hypot(by_strain_um, self._uneven_um)
 
+    @property
+    def fresh_strains(self) -> StrainParts:
+        """Strains by their causes, as far as fresh sensors show them; all NaN on a bench without
+        climate sensors.
+        """
+        if not self._has_sensors:
+            return StrainParts()
+        return self._climate.fresh_parts
+
+    @property
+    def _has_sensors(self) -> bool:
+        """Whether a film or ring thermometer or a hygrometer has ever given a value."""
+        return any(math.isfinite(watch.value) for watch in self.memory.sensors.watches)
+
     def step(self, reading: BenchReading | None, state: State, dt_s: float) -> list[Event]:
         """Follow one tick; returns the events.
 
@@ -99,7 +114,7 @@ class ClimatePart:
             if news is not None:
                 events.append(_report_sensor(sensor, news))
         # A bench without any of these sensors predicts nothing
-        if all(not math.isfinite(watch.value) for watch in self.memory.sensors.watches):
+        if not self._has_sensors:
             return events
         _, air_c = weather_limits.discard_impossible_weather(math.nan, reading.air_temperature_c)
         readings = ClimateReadings(
@@ -155,5 +170,7 @@ class ClimatePart:
 def _report_sensor(sensor: ClimateSensor, fault: str) -> Event:
     name = _SENSOR_NOTICES[sensor]
     if fault:
-        return Maintenance(name, f"{fault}; the prediction of the figure does without it")
+        return Maintenance(
+            name, f"{fault}; prediction of the figure and comparison with the gauge do without it"
+        )
     return MaintenanceOver(name, "the sensor is back")

@@ -247,9 +247,15 @@ class Controller:
         context, consistency, stand = self._context, self._consistency, self._context.standstill
         # The displacement first: all that follows compares with it
         context.observer.observe_inputs(inputs, self._may_follow_optics())
+        # The climate, which the comparison of laser and gauge allows for
+        events += self._climate.step(inputs.reading, self.state, context.dt_s)
         # Sensors against each other; a faulty one is known in the tick that shows it
         status = hold_status.hold_status(
-            context, last, self._estimation.held_by_optics, self._may_follow_optics()
+            context,
+            last,
+            self._estimation.held_by_optics,
+            self._may_follow_optics(),
+            self._climate.fresh_strains,
         )
         events += consistency.compare_sensors(inputs, self.state, context.dt_s, status)
         # The pump against what was commanded
@@ -277,7 +283,7 @@ class Controller:
             interlock_level=context.interlocks.safe_level,
             interlock_words=context.interlocks.describe_open(context.interlocks.judged_mask),
         )
-        # Notices only; no rule follows from these two
+        # Notices only; no rule follows from them
         if not self._config.by_optics:
             advances = observation.advance_age_s <= self._config.limits.stale_s
             events += self._sample_rate.step(
@@ -285,7 +291,6 @@ class Controller:
                 answered=inputs.reading is not None and advances,
                 fresh=observation.advance_age_s == 0.0,
             )
-        events += self._climate.step(inputs.reading, self.state, context.dt_s)
         return observation
 
     def _judge_safety(self, observation: Observation, events: list[Event]) -> None:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from membrane_ctrl.control import (
     inner_loop,
 )
+from membrane_ctrl.control.climate import StrainParts
+from membrane_ctrl.control.film_monitor import NO_STRAINS
 from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
@@ -31,10 +33,15 @@ class HoldStatus:
     sag_um: float = math.nan  # by the newest figure; NaN without a usable one
     optics_usable: bool = True  # the estimate, or the shape loop, uses the figures
     figure: ShapeEstimate | None = None  # that arrived in this tick and may be used
+    strains: StrainParts = NO_STRAINS  # of film and ring, by the climate's sensors
 
 
 def hold_status(
-    context: TickContext, last: inner_loop.LoopOutput, optics_hold: bool, optics_usable: bool = True
+    context: TickContext,
+    last: inner_loop.LoopOutput,
+    optics_hold: bool,
+    optics_usable: bool,
+    strains: StrainParts,
 ) -> HoldStatus:
     """The mirror after the tick's reading was taken.
 
@@ -48,6 +55,8 @@ def hold_status(
         The mirror is held by its figure, not by the laser.
     optics_usable : bool
         It could be.
+    strains : StrainParts
+        Of film and ring.
     """
     return HoldStatus(
         laser_um=context.observer.moving_laser_um,
@@ -62,4 +71,5 @@ def hold_status(
         sag_um=context.observer.figures.sag_um,
         figure=context.observer.figures.accepted,
         optics_usable=optics_usable,
+        strains=strains,
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control.climate_allowance import HOUR_MOST_UM, MINUTES_MOST_UM
 from membrane_ctrl.controller.duties import Activity, Duty, FilmSensor, Guard, ProcessValue
 from membrane_ctrl.model.telemetry import State
 
@@ -25,6 +26,7 @@ _DRIFT_FACTOR = 3.0
 _DAY_FACTOR = 1.3
 # Until the estimate no longer follows the optics.
 _TRIM_FACTOR = 1.1
+_CLIMATE_ROLES = frozenset(("film_thermometer", "ring_thermometer", "hygrometer"))
 
 
 Protection = str | Guard  # the name of a rule of `safety.TABLE`, or a guard
@@ -167,10 +169,20 @@ def find_bound(
     if failed is FilmSensor.OPTICS and has_laser and drifts:
         return Bound(FilmSensor.LASER, _TRIM_FACTOR * config.shape.trim_max_um)
     limits = config.limits
+    minutes_um, hour_um = _find_climate_allowances(config)
     distances_um = {
         Failure.LOST: _FAST_MOTION_UM,
-        Failure.STEP: limits.laser_gauge_apart_max_um + _FAST_MOTION_UM,
-        Failure.DRIFT: _DRIFT_FACTOR * limits.laser_gauge_drift_max_um,
+        Failure.STEP: limits.laser_gauge_apart_max_um + minutes_um + _FAST_MOTION_UM,
+        Failure.DRIFT: _DRIFT_FACTOR * (limits.laser_gauge_drift_max_um + hour_um),
         Failure.DRIFT_WITHIN_CLIMATE: _DAY_FACTOR * limits.laser_gauge_day_max_um,
     }
     return Bound(FilmSensor.GAUGE, distances_um[failure])
+
+
+def _find_climate_allowances(config: Config) -> tuple[float, float]:
+    """What sensors of the climate may explain of a difference from the gauge, within minutes and
+    an hour, µm; 0 on a bench without them.
+    """
+    if config.devices is None or config.devices.roles().keys().isdisjoint(_CLIMATE_ROLES):
+        return 0.0, 0.0
+    return MINUTES_MOST_UM, HOUR_MOST_UM

@@ -264,7 +264,8 @@ TABLE: tuple[Rule, ...] = (
         states=CONNECTED,
         remedy="find which of them is wrong: laser mount, gauge hose, units; for another film set "
         "[optics.mirror] "
-        "sag_mm and pressure_pa",
+        "sag_mm and pressure_pa; if temperature or humidity of the room have changed, wait until "
+        "they are steady, and connect a film thermometer and a hygrometer",
         seen=lambda o: o.laser_gauge_apart,
         broken=lambda o, c: bool(o.laser_gauge_apart),
     ),

@@ -125,8 +125,12 @@ class SensorConsistency:
         )
         self._pump = pump_health.PumpHealth(config.pump.change_max, memory.pump)
         limits, mirror = config.limits, config.optics.mirror
-        self._laser_film = film_monitor.FilmMonitor(limits, mirror, "laser", memory.laser_film)
-        self._optics_film = film_monitor.FilmMonitor(limits, mirror, "optics", memory.optics_film)
+        self._laser_film = film_monitor.FilmMonitor(
+            limits, mirror, "laser", memory.laser_film, config.climate
+        )
+        self._optics_film = film_monitor.FilmMonitor(
+            limits, mirror, "optics", memory.optics_film, config.climate
+        )
         self._gas = gas_balance.GasBalance(memory.gas)
         self._nominal_sag_um = 1e3 * config.optics.mirror.sag_mm
         self._by_optics = config.by_optics
@@ -307,6 +311,8 @@ class SensorConsistency:
             self.memory.laser_gauge_apart = ""
             return
         gauge_pa = held.gauge_pressure_pa
+        for monitor in (self._laser_film, self._optics_film):
+            monitor.note_strains(held.strains)
         by_laser = self._laser_film.step(dt_s, held.laser_um, held.trim_um, gauge_pa)
         by_optics = self._optics_film.step(dt_s, held.sag_um - self._nominal_sag_um, 0.0, gauge_pa)
         if not self._optics_alone:
@@ -340,9 +346,17 @@ class SensorConsistency:
         message = (
             f"{sensor} and gauge have moved {monitor.drift_um:.0f} µm apart within a day: "
             "humidity and "
-            "temperature of the film do this, and so does a sensor that drifts. Compare the "
-            "laser with a ruler"
+            "temperature of the film do this, and so does a sensor that drifts. "
         )
+        if monitor.sees_climate:
+            message += (
+                f"The climate's sensors explain {monitor.explained_um:+.0f} µm. Compare the "
+                "laser with a ruler if that is not near"
+            )
+        else:
+            message += (
+                "Compare the laser with a ruler, or connect a film thermometer and a hygrometer"
+            )
         return [Maintenance("slow_drift", message)]
 
     def _watch_redundancy(self, now_s: float, state: State, held: HoldStatus) -> list[Event]:

@@ -14,7 +14,7 @@ from membrane_ctrl.metrology.film.climate_figure import compute_climate_sensitiv
 from membrane_ctrl.metrology.film.climate_fit import ClimateFit, Expansion, fit_climate
 from membrane_ctrl.model.events import Maintenance
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.sim.climate import ClimateBlock, Room
+from membrane_ctrl.sim.climate import FILM_PPM_PER_K, RING_PPM_PER_K, ClimateBlock, Room
 from membrane_ctrl.sim.sensors import FILM_NOISE_K, HUMIDITY_NOISE_PERCENT, RING_NOISE_K
 from tests.worlds.climate_terms import compute_figure_change_per_ppm
 
@@ -107,3 +107,50 @@ def test_a_lamp_strains_the_film_by_its_share() -> None:
     block = Room(TwinConfig(climate="lamp")).make_block(time_s)
     assert np.ptp(block.excess_ppm) == pytest.approx(18.5 * 0.065, rel=0.02)
     assert np.ptp(block.ring_c) < 1e-9
+
+
+def _learn_day(hours: float, seed: int) -> ClimateFit:
+    """Expansions from the first hours of the twin's day, with 10 nm of noise a minute."""
+    count = round(60 * hours)
+    time_s = np.arange(count, dtype=np.float64) * MINUTE_S
+    block = Room(TwinConfig(climate="day", seed=seed)).make_block(time_s)
+    rng = np.random.default_rng([seed, 7])
+    film_c, ring_c, humidity = _noisy(block, rng)
+    spherical_um = compute_figure_change_per_ppm()[2] * block.excess_ppm
+    return fit_climate(
+        time_s,
+        spherical_um + 0.01 * rng.standard_normal(count),
+        film_c,
+        ring_c,
+        humidity,
+        float(SENSITIVITY.terms_um[10]),
+        Expansion(23.0, 0.7),
+    )
+
+
+@pytest.mark.parametrize("hours", [10.0, 14.0, 24.0])
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_night_of_any_phase_gives_the_expansion_of_the_film_within_its_error(
+    hours: float, seed: int
+) -> None:
+    """Film and ring are nearly in phase over some hours: noise of the thermometers and the
+    unknown time constant of the moisture must not bias what the ring's prior separates.
+    """
+    fit = _learn_day(hours, seed)
+    assert fit.film_per_k is not None
+    assert fit.ring_per_k is not None
+    assert fit.film_per_k.value == pytest.approx(FILM_PPM_PER_K, rel=0.06)
+    assert fit.film_per_k.sigma < 0.08 * FILM_PPM_PER_K
+    for found, true in (
+        (fit.film_per_k, FILM_PPM_PER_K),
+        (fit.ring_per_k, RING_PPM_PER_K),
+    ):
+        assert abs(found.value - true) < 2.0 * found.sigma
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_five_hours_of_a_day_state_that_they_do_not_give_it(seed: int) -> None:
+    film = _learn_day(5.0, seed).film_per_k
+    assert film is not None
+    assert film.sigma > 0.25 * FILM_PPM_PER_K
+    assert abs(film.value - FILM_PPM_PER_K) < 3.0 * film.sigma

@@ -141,6 +141,7 @@ def test_a_gauge_that_drifts_for_hours_against_the_laser_raises_one_notice_and_i
         mirror.pass_by(100, gauge_pa=600.0 + 0.1 * tenth)
     notices = [event for event in mirror.events if getattr(event, "name", "") == "slow_drift"]
     assert [event.kind for event in notices] == ["maintenance"]
+    assert "connect a film thermometer" in getattr(notices[0], "message", "")
     assert mirror.consistency.laser_gauge_apart == ""
     for tenth in range(130, 60, -1):
         mirror.pass_by(100, gauge_pa=600.0 + 0.1 * tenth)

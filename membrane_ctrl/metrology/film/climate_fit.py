@@ -10,9 +10,14 @@ T_m is searched. A slow drift z_1 is free because creep changes the figure, too.
 Errors are those of a jackknife over blocks of an hour, as the residual is not white; T_m is
 free in it, too, to first order.
 
-Noise of a thermometer would make its expansion too small. Figures and sensors are therefore
-smoothed equally before the fit, which changes no relation between them. What noise is left counts
-as an error.
+Noise of a thermometer would make its expansion too small, most where film and ring are nearly in
+phase. Figures and sensors are therefore smoothed equally before the fit, which changes no relation
+between them, and what is left of the noise is subtracted from the normal equations:
+
+    (A'A - n diag(v)) x = A'y,      v = variance of the noise in each column
+
+(Fuller, Measurement Error Models, 1987, section 2.2). Where noise makes most of a direction, only
+a part is subtracted, and the rest counts as an error.
 """
 
 from dataclasses import dataclass
@@ -31,6 +36,8 @@ _LEAST_CHANGE_PERCENT = 2.0
 _FASTEST_S = 120.0
 _SLOWEST_S = 20_000.0
 _LOG_STEP = 0.01
+_NEWTON_STEPS = 6
+_NEWTON_MOST = 0.2  # of the logarithm, in a step
 # Share by which the spherical term of `climate_figure` is wrong: Foeppl's law against a film with
 # finite rotations
 _LAW_ERROR = 0.02
@@ -39,6 +46,13 @@ _LAW_ERROR = 0.02
 # each cause is used.
 _SMOOTH_S = (900.0, 300.0, 60.0)
 _LEAST_LEFT = 0.5
+# Largest share of a direction of the causes that may be noise: beyond, its inverse is noise itself
+_NOISE_MOST = 0.3
+# Noise of a sensor by fourth differences, in which waves of a quarter of an hour hardly show; the
+# variance of white noise is 70 times as large in them. Steps are few: the median leaves them out.
+_DIFFERENCES = 4
+_DIFFERENCE_GAIN = 70.0
+_MEDIAN_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
@@ -124,36 +138,45 @@ def fit_climate(
 
     # The time constant T_m by a search, all else by least squares.
     follows_s = model.find_time_constant(wanted_um)
-    columns = model.make_columns(follows_s)
-    solution, misfit = _solve(columns, wanted_um)
     measured = wanted_um.size
 
-    # What is known of the ring is one more row; without it the row is 0.
-    noises = model.list_noises()
-    known, known_um = model.make_ring_row(known_ring, solution, misfit, noises)
-    columns = np.vstack([columns, known])
-    wanted_um = np.append(wanted_um, known_um)
-    solution, _ = _solve(columns, wanted_um)
+    # What is known of the ring is one more row; without it the row is 0. It also helps to find T_m,
+    # which in a short record takes up any error of the ring.
+    wanted_um = np.append(wanted_um, 0.0)
+    if known_ring is not None and "ring" in causes:
+        noise = model.find_noise(follows_s)
+        fitted = _solve(model.make_rows(follows_s), wanted_um, noise)
+        scatter = _find_scatter(fitted, noise, filled_um, width, measured)
+        wanted_um[-1] = model.add_known_ring(known_ring, float(np.sqrt(width * scatter)))
+        follows_s = model.find_time_constant(wanted_um[:-1], float(wanted_um[-1]))
+    columns = model.make_rows(follows_s)
+    noise = model.find_noise(follows_s)
+    fitted = _solve(columns, wanted_um, noise)
+    solution = fitted.values
+    scatter = _find_scatter(fitted, noise, filled_um, width, measured)
 
     # The residual itself, by the jackknife; T_m is free in it to first order.
-    free = columns
+    free, free_noise = columns, noise
     if "humidity" in causes:
-        slower = model.make_columns(follows_s * np.exp(_LOG_STEP)) @ solution
-        by_log_time = (slower - columns[:-1] @ solution) / _LOG_STEP
-        free = np.column_stack([columns, np.append(by_log_time, 0.0)])
-    sigmas = _jackknife(free, wanted_um, _smooth(time_s, width))
-
-    # Noise of each sensor makes its expansion too small: the share of the noise in the variance
-    # that this sensor alone shows, beside all other columns.
-    for i, noise in enumerate(noises):
-        own = _solve(np.delete(columns, i, axis=1), columns[:, i])[1]
-        sigmas[i] = np.hypot(sigmas[i], abs(solution[i]) * noise / own)
+        by_log_time = model.differentiate(follows_s, columns, solution)
+        free = np.column_stack([columns, by_log_time])
+        free_noise = np.append(noise, 0.0)
+    found = _solve(free, wanted_um, free_noise)
+    sigmas = _jackknife(free, wanted_um, _smooth(time_s, width), free_noise)
 
     # The error of what is known of the ring enters all expansions.
-    if known_ring is not None and known.any():
-        other_um = np.append(wanted_um[:-1], known_um + np.linalg.norm(known) * known_ring.sigma)
-        shift = _solve(columns, other_um)[0] - solution
-        sigmas[: shift.size] = np.hypot(sigmas[: shift.size], shift)
+    if known_ring is not None and columns[-1].any():
+        other_um = wanted_um.copy()
+        other_um[-1] += np.linalg.norm(columns[-1]) * known_ring.sigma
+        shift = _solve(free, other_um, free_noise).values - found.values
+        sigmas = np.hypot(sigmas, shift)
+
+    # Where causes are nearly in phase the blocks resemble each other too much: white noise of the
+    # same scatter, with the error of what is known, is then the larger error.
+    sigmas = np.maximum(sigmas, np.sqrt(width * scatter) * found.gain)
+
+    # Noise of the sensors that could not be subtracted.
+    sigmas = np.hypot(sigmas, found.attenuation)
 
     # The film's law, from which S follows, scales all expansions.
     sigmas = np.hypot(sigmas, _LAW_ERROR * np.abs(np.append(solution, 0.0)[: sigmas.size]))
@@ -164,7 +187,8 @@ def fit_climate(
     # What remains of the figures, and what would remain with a drift alone.
     residual_um = (wanted_um - columns @ solution)[:measured]
     misfit = float(np.mean(residual_um**2))
-    _, drift_misfit = _solve(model.make_drift(), wanted_um[:measured])
+    drift = model.make_drift()
+    drift_misfit = _solve(drift, wanted_um[:measured], np.zeros(drift.shape[1])).misfit
     explained = 0.0
     if drift_misfit > 0:
         explained = 1.0 - misfit / drift_misfit
@@ -224,6 +248,13 @@ class _ClimateModel:
         self._causes = causes
         self._sensitivity_um_per_ppm = sensitivity_um_per_ppm
         self._width = width
+        self._step_s = float(np.median(np.diff(time_s)))
+        unknowns = len(causes) + 2 + ("humidity" in causes)
+        self._known: FloatArray = np.zeros(unknowns)
+
+    def make_rows(self, follows_s: float) -> FloatArray:
+        """The columns (n - width + 2, unknowns) with the row of what is known of the ring last."""
+        return np.vstack([self.make_columns(follows_s), self._known])
 
     def make_columns(self, follows_s: float) -> FloatArray:
         """Columns (n - width + 1, unknowns), smoothed: the causes', then z_0 and z_1, then m(0).
@@ -250,51 +281,76 @@ class _ClimateModel:
         constant = _smooth(np.ones_like(share), self._width)
         return np.column_stack([constant, _smooth(share, self._width)])
 
-    def find_time_constant(self, wanted_um: FloatArray) -> float:
+    def find_time_constant(self, wanted_um: FloatArray, known_um: float = 0.0) -> float:
         """T_m with the least misfit to the smoothed figures (n - width + 1,), s; NaN without
         humidity.
+
+        `known_um` is the value of the row of what is known of the ring.
         """
         if "humidity" not in self._causes:
             return float("nan")
+        rows_um = np.append(wanted_um, known_um)
 
         def find_misfit(log_follows_s: float) -> float:
             """Mean square of the residual with this time constant."""
-            columns = self.make_columns(float(np.exp(log_follows_s)))
-            return _solve(columns, wanted_um)[1]
+            columns = self.make_rows(float(np.exp(log_follows_s)))
+            return _solve(columns, rows_um, np.zeros(columns.shape[1])).misfit
 
         bounds = (np.log(_FASTEST_S), np.log(_SLOWEST_S))
         found = minimize_scalar(find_misfit, bounds=bounds, method="bounded")
-        return float(np.exp(found.x))
+        log_follows_s = float(found.x)
+        # From there with the noise subtracted, by Gauss and Newton.
+        for _ in range(_NEWTON_STEPS):
+            follows_s = float(np.exp(log_follows_s))
+            columns = self.make_rows(follows_s)
+            noise = self.find_noise(follows_s)
+            solution = _solve(columns, rows_um, noise).values
+            derivative = self.differentiate(follows_s, columns, solution)
+            free = np.column_stack([columns, derivative])
+            step = float(_solve(free, rows_um, np.append(noise, 0.0)).values[-1])
+            log_follows_s += float(np.clip(step, -_NEWTON_MOST, _NEWTON_MOST))
+            log_follows_s = float(np.clip(log_follows_s, *bounds))
+        return float(np.exp(log_follows_s))
 
-    def list_noises(self) -> list[float]:
-        """Variance of each smoothed column of a cause by noise of its sensor, from differences."""
-        scale = self._sensitivity_um_per_ppm**2
-        return [
-            scale * float(np.var(np.diff(values))) / 2 / self._width
-            for values in self._causes.values()
-        ]
+    def differentiate(
+        self, follows_s: float, columns: FloatArray, solution: FloatArray
+    ) -> FloatArray:
+        """The derivative (n - width + 2,) of the fit by the logarithm of T_m."""
+        slower = self.make_rows(follows_s * float(np.exp(_LOG_STEP))) @ solution
+        return np.asarray((slower - columns @ solution) / _LOG_STEP)
 
-    def make_ring_row(
-        self,
-        known_ring: Expansion | None,
-        solution: FloatArray,
-        misfit: float,
-        noises: list[float],
-    ) -> tuple[FloatArray, float]:
-        """The row (unknowns,) and the value of what is known of the ring; 0 without it.
+    def find_noise(self, follows_s: float) -> FloatArray:
+        """Variance (unknowns,) of each smoothed column by noise of its sensor."""
+        variances = np.zeros(self._known.size)
+        for i, (name, values) in enumerate(self._causes.items()):
+            left = 1.0 / self._width
+            if name == "humidity":
+                # Behind the moisture's lag; the running mean is shorter than that.
+                share = -np.expm1(-self._step_s / follows_s)
+                left = share / (2.0 - share)
+            scale = self._sensitivity_um_per_ppm**2
+            variances[i] = scale * _find_noise_variance(values) * left
+        return variances
 
-        Its weight is that of one figure: the standard deviation of a figure by the residual
-        (`misfit`) and by the noise of the sensors, over that of the known expansion.
+    def add_known_ring(self, known_ring: Expansion, sigma_um: float) -> float:
+        """Add the row of what is known of the ring, and return its value.
+
+        Its weight is that of one figure, whose standard deviation is `sigma_um`.
         """
-        row = np.zeros(solution.size)
-        if known_ring is None or "ring" not in self._causes:
-            return row, 0.0
-        hidden = sum(
-            noise * value**2 for noise, value in zip(noises, solution[: len(noises)], strict=True)
-        )
-        weight = float(np.sqrt(self._width * (misfit + hidden)) / known_ring.sigma)
-        row[list(self._causes).index("ring")] = weight
-        return row, weight * known_ring.value
+        weight = sigma_um / known_ring.sigma
+        self._known[list(self._causes).index("ring")] = weight
+        return weight * known_ring.value
+
+
+def _find_scatter(
+    fitted: "_Solution", noise: FloatArray, figures_um: FloatArray, width: int, rows: int
+) -> float:
+    """Variance of a row: as the residual has it, but at least that of the sensors' noise."""
+    independent = rows / width
+    free = max(independent - fitted.values.size, 1.0)
+    by_residual = fitted.misfit * independent / free
+    by_noise = _find_noise_variance(figures_um) / width + float(noise @ fitted.values**2)
+    return max(by_residual, by_noise)
 
 
 def _choose_width(causes: list[FloatArray], step_s: float) -> int:
@@ -326,14 +382,59 @@ def _smooth(values: FloatArray, width: int) -> FloatArray:
     return np.convolve(values, np.full(width, 1.0 / width), mode="valid")
 
 
-def _solve(columns: FloatArray, values: FloatArray) -> tuple[FloatArray, float]:
-    """Least squares: the solution and the mean square of its residual."""
-    solution = np.linalg.lstsq(columns, values, rcond=None)[0]
-    residual = values - columns @ solution
-    return np.asarray(solution), float(np.mean(residual**2))
+def _find_noise_variance(values: FloatArray) -> float:
+    """Variance of white noise in a slow series, by its fourth differences."""
+    differences = np.diff(values, _DIFFERENCES)
+    sigma = _MEDIAN_TO_SIGMA * float(np.median(np.abs(differences)))
+    return sigma**2 / _DIFFERENCE_GAIN
 
 
-def _jackknife(columns: FloatArray, values: FloatArray, time_s: FloatArray) -> FloatArray:
+@dataclass(frozen=True)
+class _Solution:
+    """Least squares with noise in the columns.
+
+    Attributes
+    ----------
+    values : (columns,) array
+    misfit : float
+        Mean square of the residual.
+    attenuation : (columns,) array
+        By how much noise that was not subtracted may have changed the values.
+    gain : (columns,) array
+        Standard deviation of the values for independent errors of 1.
+    """
+
+    values: FloatArray
+    misfit: float
+    attenuation: FloatArray
+    gain: FloatArray
+
+
+def _solve(columns: FloatArray, values: FloatArray, noise: FloatArray) -> _Solution:
+    """Least squares, the noise (columns,) of the columns subtracted from the normal equations."""
+    # Columns of length 1, so that their units do not matter.
+    scale = np.linalg.norm(columns, axis=0)
+    unit = columns / scale
+    normal = unit.T @ unit
+    noisy = np.diag(len(columns) * noise / scale**2)
+    # Largest share of noise in any direction.
+    root = np.linalg.pinv(np.linalg.cholesky(normal + 1e-13 * np.eye(len(scale))))
+    share = float(np.linalg.eigvalsh(root @ noisy @ root.T)[-1])
+    subtracted = 1.0
+    if share > _NOISE_MOST:
+        subtracted = _NOISE_MOST / share
+    inverse = np.linalg.pinv(normal - subtracted * noisy, hermitian=True)
+    found = inverse @ (unit.T @ values)
+    attenuation = (1.0 - subtracted) * (inverse @ (noisy @ found))
+    residual = values - unit @ found
+    misfit = float(np.mean(residual**2))
+    gain = np.sqrt(np.diag(inverse @ normal @ inverse))
+    return _Solution(found / scale, misfit, np.abs(attenuation) / scale, gain / scale)
+
+
+def _jackknife(
+    columns: FloatArray, values: FloatArray, time_s: FloatArray, noise: FloatArray
+) -> FloatArray:
     """Standard deviations of the solution, from records that each miss a block.
 
     The last row, what is known, is in all.
@@ -342,7 +443,7 @@ def _jackknife(columns: FloatArray, values: FloatArray, time_s: FloatArray) -> F
     solutions = []
     for block in range(int(blocks.max()) + 1):
         kept = blocks != block
-        solutions.append(_solve(columns[kept], values[kept])[0])
+        solutions.append(_solve(columns[kept], values[kept], noise).values)
     each = np.array(solutions)
     spread = each - each.mean(axis=0)
     return np.asarray(np.sqrt((len(each) - 1) / len(each) * np.sum(spread**2, axis=0)))

@@ -107,6 +107,12 @@ def format_fit(fit: ClimateFit) -> list[str]:
             lines.append(f"# {key}: not determined, {found.value:.2f} +- {found.sigma:.2f}")
         else:
             lines.append(f"{key} = {found.value:.2f}  # +- {found.sigma:.2f}")
+    film_per_k = fit.film_per_k
+    if film_per_k is not None and film_per_k.sigma > _LEAST_KNOWN * abs(film_per_k.value):
+        lines.append(
+            "# film and ring have moved in phase: 14 hours of a day, or a heating that switches "
+            "within an hour, separate them"
+        )
     film = [
         each
         for each in (fit.film_per_k, fit.film_per_percent)

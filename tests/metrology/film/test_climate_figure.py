@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_bvp
 
-from membrane_ctrl.control.climate import CHANGE_RMS, CHANGE_SPHERICAL
+from membrane_ctrl.control.climate import CHANGE_CENTRE, CHANGE_RMS, CHANGE_SPHERICAL
 from membrane_ctrl.metrology.film.climate_figure import compute_climate_sensitivity
 from membrane_ctrl.metrology.film.climate_fit import Expansion, fit_climate
 from tests.worlds.climate_terms import ROUND_TERMS, compute_figure_change_per_ppm
@@ -108,6 +108,7 @@ def test_the_tick_predicts_by_the_constants_of_the_law() -> None:
         unit_um = 1e-3 * radius_mm**2 / sag_mm
         assert sensitivity.change_rms_um / unit_um == pytest.approx(CHANGE_RMS, rel=1e-3)
         assert sensitivity.terms_um[10] / unit_um == pytest.approx(CHANGE_SPHERICAL, rel=1e-3)
+        assert sensitivity.centre_um / unit_um == pytest.approx(CHANGE_CENTRE, rel=1e-3)
 
 
 def test_the_twin_changes_its_figure_equally_by_another_law() -> None:
