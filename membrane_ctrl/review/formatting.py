@@ -34,7 +34,7 @@ def format_number(value: float | None, digits: int = 3) -> str:
     """
     if value is None or not math.isfinite(value):
         return "–"
-    if abs(value) < 10**digits:
+    if _fits_digits(value, digits):
         return f"{value:.{digits}g}"
     return f"{value:.0f}"
 
@@ -49,9 +49,14 @@ def format_signed(value: float, digits: int = 3) -> str:
     digits : int
         Significant digits; a number with more digits before the point is rounded to an integer.
     """
-    if abs(value) < 10**digits:
+    if _fits_digits(value, digits):
         return f"{value:+.{digits}g}"
     return f"{value:+.0f}"
+
+
+def _fits_digits(value: float, digits: int) -> bool:
+    """Whether a number, rounded to an integer, has so many digits: 999.6 has four, not three."""
+    return abs(value) < 10**digits - 0.5
 
 
 def one_line(text: str) -> str:
