@@ -127,7 +127,7 @@ def figure_table(
     -------
     dict
         Each number with 1 sigma from noise and from the geometry. A number that the surface does
-        not have stands in `not_given`, with the reason.
+        not have is in `not_given`, with the reason.
     """
     numbers = {
         name: make_quantity(

@@ -8,6 +8,7 @@ from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.numbers import parse_number
 
 _SECONDS = {"d": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
+_LONGEST_S = 1e9  # 31.7 years
 _PART = re.compile(r"([0-9]+(?:\.[0-9]+)?)([dhms])")
 
 
@@ -41,6 +42,6 @@ def parse_duration_s(text: str) -> float:
                 f"duration {text!r} is not valid; write it like 90s, 3m or 2h30m"
             ) from None
         seconds = sum(float(number) * _SECONDS[unit] for number, unit in parts)
-    if not 0 < seconds < 1e9:
-        raise InputError(f"duration {text!r} must be more than 0")
+    if not 0 < seconds < _LONGEST_S:
+        raise InputError(f"duration {text!r} must be more than 0 and less than 30 years")
     return seconds

@@ -129,7 +129,7 @@ def _trace(bench: PaperBench, x_mm: FloatArray, y_mm: FloatArray) -> _TrueRays:
     towards = np.sum(incident * normal, axis=1, keepdims=True)
     reflected = incident - 2.0 * towards * normal
 
-    # O' = b (-cos alpha, 0, sin alpha), and the directions on the screen, which stands across O O'.
+    # O' = b (-cos alpha, 0, sin alpha), and the directions on the screen, which is across O O'.
     alpha_rad = bench.geometry.alpha_rad
     to_centre = np.array([-math.cos(alpha_rad), 0.0, math.sin(alpha_rad)])
     centre_mm = bench.geometry.b_mm * to_centre

@@ -84,8 +84,7 @@ def run_series(bench: PaperBench, sets: int, air_um: float = 0.0) -> SetSeries:
     sets : int
         Number of sets, the full one included.
     air_um : float
-        Amplitude of the seeing: how far moving air shifts what the camera sees, in µm of the
-        simulated disturbance `seeing_um`; 0: still air.
+        RMS shift of the rays on the screen by moving air, µm (`seeing_um`); 0: still air.
 
     Returns
     -------

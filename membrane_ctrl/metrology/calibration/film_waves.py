@@ -125,7 +125,7 @@ def _solve_unturned(
             if largest.explained > explained:
                 return freed, (largest.finding,)
 
-        # The angle at which the mirror of each set seems to stand.
+        # The angle by which the mirror of each set seems to be turned.
         findings = []
         for k in group:
             found_deg = turn_tests.find_angle_of_set(freed, k)

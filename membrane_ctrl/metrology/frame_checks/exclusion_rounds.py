@@ -200,7 +200,7 @@ def exchange_order(count: int, a: int, b: int) -> list[int]:
     Returns
     -------
     list of int
-        For each place, the number of the frame that stands there.
+        For each place, the number of the frame there.
     """
     order = list(range(count))
     order[a] = b

@@ -168,7 +168,7 @@ def render_svg(figure: Figure) -> Markup:
 
 
 def draw_panel(draw: Callable[[Figure, Any], None], height_in: float) -> Markup:
-    """Draw one panel as SVG; two or three of them stand side by side on a page.
+    """Draw one panel as SVG; two or three of them are side by side on a page.
 
     Parameters
     ----------
