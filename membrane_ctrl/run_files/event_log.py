@@ -75,9 +75,7 @@ def read_newest_lines(folder: Path) -> list[events.EventLine]:
 
 
 def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:
-    """The intact events of a file; `notes` counts the others. None if the file is missing or too
-    large.
-    """
+    """The intact events of a file; `notes` counts the others. Empty without a readable file."""
     try:
         text = files.read_text(path, EVENTS_BYTES_MAX, errors="replace")
         if plain_json.count_elements(text) > plain_json.ELEMENTS_MAX:
