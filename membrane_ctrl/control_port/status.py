@@ -11,6 +11,7 @@ from membrane_ctrl.model.run_status import RunStatus
 
 def status_table(status: RunStatus) -> dict[str, Any]:
     """The status for people and programs: names instead of codes, None for missing values."""
+    # JSON has neither NaN nor infinity: a missing value is None, here and in the row
     row = status.row
     if row is None:
         return {"state": "starting", "why": "no tick has run yet"}

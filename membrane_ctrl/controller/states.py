@@ -174,6 +174,7 @@ def manual(context: TickContext) -> State:
         context.explain(WhyCode.HOLD_REQUESTED, f"{context.asked_by} requested a hold again")
         context.keep_flowing()
         return State.INFLATE
+    # At its end the pump has its mean flow in this tick, and the loop takes over in the next
     over = _explain_manual_end(context)
     flow_um_per_s = context.mean_flow_um_per_s if over else context.manual_um_per_s
     context.drive_by(

@@ -102,6 +102,7 @@ def make_closing_lines(closing: RunEnd) -> list[str]:
             f"NEVER HELD: the duration was over in the state {state}",
             "  to do:    give a longer --duration; what it waited for is in events.jsonl",
         ]
+    # Without a fault, such an end is one of the program or of a device: the pump's state is open
     if closing.exit not in (errors.Exit.SAFETY_TRIP, errors.Exit.DEVICE_FAILED):
         return []
     fault = closing.fault

@@ -116,6 +116,7 @@ class FailureCounter:
         self._last_failure_s = now_s
         if not self._standing and self._unreported < self._first:
             return
+        # A standing failure is repeated seldom; another message at once, but not without bound
         is_due = now_s - self._reported_s >= self._repeat_s
         is_new = message not in self._messages and len(self._messages) < _MESSAGES_MAX
         if self._standing and not is_due and not is_new:
@@ -130,6 +131,7 @@ class FailureCounter:
 
     def note_success(self, now_s: float) -> None:
         """Everything that was asked was answered."""
+        # A link that fails now and then does not count as good between the failures
         if now_s - self._last_failure_s < _GOOD_S:
             return
         if self._standing:

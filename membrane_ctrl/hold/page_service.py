@@ -130,6 +130,7 @@ def start_page_service(
     PageService or None
         None without a page.
     """
+    # One that follows this folder already shows the new hold, too
     if (link := service_link.find_service(logs)) is not None:
         return PageService(logs, link)
     if (missing := find_missing_page_library()) is not None:

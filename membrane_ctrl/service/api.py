@@ -432,6 +432,8 @@ async def _send(
 
 async def _follow(hold: str, feed: HoldFeed) -> AsyncIterator[str]:
     """Yield what is new of a hold, until the client leaves."""
+    # The feed replaces `seen` as a whole: what differs from the last look is new. A comment line
+    # now and then keeps proxies from closing a silent stream
     shown: HoldSeen | None = None
     events = feed.seen.events
     silent_s = 0.0

@@ -141,6 +141,7 @@ class ConfigurationEditor:
         checked = self.check(name, text)
         if not checked.is_usable:
             raise errors.InputError("; ".join(checked.errors))
+        # Two people may edit one file: only a text that was made from the present file replaces it
         with self._lock:
             former = self.read(name) if path.exists() or path.is_symlink() else None
             if (former.digest if former is not None else "") != digest:
