@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_statement import (
 )
 from membrane_ctrl.model import acquisition_events, errors, events, shape_estimate
 from membrane_ctrl.run_files.run_config import read_config
-from membrane_ctrl.run_files.run_lookup import is_run
+from membrane_ctrl.run_files.run_lookup import is_run, is_run_name
 
 
 def make_geometry_event(
@@ -50,9 +50,7 @@ def make_geometry_event(
 def _find_run_before(run_dir: Path) -> Path | None:
     """The newest run beside a run that is older; None if it is the first."""
     older = [path for path in run_dir.parent.iterdir() if path.name < run_dir.name]
-    runs = (
-        path for path in sorted(older, reverse=True) if path.name[:1].isdigit() and is_run(path)
-    )
+    runs = (path for path in sorted(older, reverse=True) if is_run_name(path.name) and is_run(path))
     return next(runs, None)
 
 
