@@ -38,7 +38,7 @@ class SessionLink(ABC):
 
     @abstractmethod
     def send_line(self, line: str) -> None:
-        """Send a line; a session that has ended hears nothing."""
+        """Send a line; one to a session that has ended is dropped."""
 
     @abstractmethod
     def interrupt(self) -> None:
@@ -76,7 +76,7 @@ class ProgramLink(SessionLink):
         self.source = self._process.stdout
 
     def send_line(self, line: str) -> None:
-        """Send a line; a session that has ended hears nothing."""
+        """Send a line; one to a session that has ended is dropped."""
         with suppress(BrokenPipeError):
             print(line, file=self._target, flush=True)
 
@@ -121,7 +121,7 @@ class UnitLink(SessionLink):
         self.send_line(BeginMessage(session=name).model_dump_json())
 
     def send_line(self, line: str) -> None:
-        """Send a line; a session that has ended hears nothing."""
+        """Send a line; one to a session that has ended is dropped."""
         with suppress(OSError):
             self._socket.sendall(f"{line}\n".encode())
 
