@@ -66,7 +66,7 @@ class InnovationTest:
         if memory.block_s < _BLOCK_S - 1e-9 or memory.count == 0:
             return
         # The variance of a block's sum over n is that of one innovation if they are white, and
-        # larger if neighbours are alike in sign. At first a plain mean, then a fading one
+        # larger if neighbours have one sign. At first a plain mean, then a fading one
         memory.blocks += 1
         share = max(lag_step_fraction(memory.block_s, _MEMORY_S), 1.0 / memory.blocks)
         memory.variance += share * (memory.squares / memory.count - memory.variance)

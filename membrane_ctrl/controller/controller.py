@@ -430,7 +430,7 @@ class Controller:
         for command in command_precedence.sort_commands(inputs.commands):
             if self._handle_command(command, obeyed, events):
                 obeyed.add(command.kind)
-        # Gains on trial that nobody kept go back.
+        # Gains on trial that were not kept in time go back.
         if self._gains.is_overdue(context.now_s):
             self._revert_gains("the trial expired before they were kept", events)
         context.loop.may_probe = not self._gains.on_trial

@@ -79,14 +79,14 @@ class PageService:
         self.link = link
         return self._process is None or service_link.is_answering(link)
 
-    def announce(self, tell: Callable[[str], None]) -> None:
+    def announce(self, print_line: Callable[[str], None]) -> None:
         """State the link as soon as the service is ready, or why it is not, from a thread."""
 
-        def wait_and_tell() -> None:
+        def wait_and_print() -> None:
             problem = self.wait_until_it_serves(_STARTS_S)
-            tell(f"no page: {problem}" if problem else f"page: {self.link}")
+            print_line(f"no page: {problem}" if problem else f"page: {self.link}")
 
-        threading.Thread(target=wait_and_tell, name="page link", daemon=True).start()
+        threading.Thread(target=wait_and_print, name="page link", daemon=True).start()
 
     def forget(self) -> None:
         """Leave the service to itself: it continues."""

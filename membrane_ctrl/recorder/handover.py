@@ -93,7 +93,7 @@ def load_state(run_dir: Path) -> RecorderState | None:
     try:
         data = files.read_bytes(run_dir / _NAME, _BYTES_MAX)
         return decode_state(data, RecorderState, _BYTES_MAX)
-    except (OSError, StateError):  # the recorder starts afresh and reports that
+    except (OSError, StateError):  # the recorder starts without it and reports that
         return None
 
 
