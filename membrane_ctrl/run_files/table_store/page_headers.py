@@ -1,7 +1,7 @@
 """Walks the page headers of a Parquet column chunk, to find its memory before Arrow allocates it.
 
 A page header states the size to which its page unpacks and the number of its values, and Arrow
-takes both unchecked. It is a structure in Thrift's compact protocol (`parquet.thrift`: `PageHeader`,
+trusts both. It is a structure in Thrift's compact protocol (`parquet.thrift`: `PageHeader`,
 `DataPageHeader`, `DictionaryPageHeader`): a field is a byte with its type and the step of its
 number, then its value; numbers are varints, zigzag coded.
 """
