@@ -77,6 +77,9 @@ _SHARE_S = 2.0  # memory of the sensors' weights
 _RUN = 10.0, 8.0
 # a jump that the optics see and the laser's noise hides is the film's, most likely
 _OPTICS_JUMP_SHARE = 0.3
+# Swings of the film behind a door stay below this; if laser and optics are further apart, the gauge
+# decides (shape.disagreement_max_um)
+_SWING_MOST_UM = 10.0
 # a reading's expectation is a sum of states: one of them, as a row
 _ONE: FloatArray = np.eye(_PLANT + CLONES)
 _STATES = _PLANT + CLONES
@@ -629,6 +632,8 @@ class CentreFilter:
         moved = _ONE[_GAS] + self._centre_since(since_s)
         if sensor == Sensor.THERMOMETER:
             self._widen_states(innovation * _ONE[_AIR])
+        elif sensor == Sensor.LASER and self._film_swings(innovation, since_s):
+            self._widen_states(innovation * moved)
         elif sensor == Sensor.LASER and self._judged and self._is_fresh(Sensor.OPTICS, now_s):
             # Three sensors are compared, and the optics show no jump: the laser's mount was knocked
             self._widen_states(innovation * _ONE[_MOUNT])
@@ -642,7 +647,7 @@ class CentreFilter:
             self._widen_states(pressure_gain * innovation * moved)
         elif (
             sensor == Sensor.OPTICS
-            and self._laser_agrees(now_s)
+            and self._laser_agrees(now_s, since_s)
             and not self._is_fresh(sensor, since_s)
         ):
             # The optics return after a gap, in which the mirror followed the laser's mount
@@ -655,11 +660,27 @@ class CentreFilter:
             self._widen_states(innovation * moved)
             if sensor == Sensor.LASER and self._is_fresh(Sensor.OPTICS, now_s):
                 self.relock()  # the optics missed it: their zero is where the laser shows the film
-            elif sensor == Sensor.OPTICS and self._laser_agrees(now_s):
+            elif sensor == Sensor.OPTICS and self._laser_agrees(now_s, since_s):
                 self._widen_states(_OPTICS_JUMP_SHARE * innovation * _ONE[_OPTICS_ZERO])
 
-    def _laser_agrees(self, now_s: float) -> bool:
-        return self._is_fresh(Sensor.LASER, now_s) and not self.memory.watches[Sensor.LASER].far
+    def _laser_agrees(self, now_s: float, since_s: float) -> bool:
+        """Whether no reading of the laser has been far off while the optics were, since a time.
+
+        A film that swings, as behind a door, passes its mean while the optics are far off.
+        """
+        laser = self.memory.watches[Sensor.LASER]
+        was_far = laser.far_since_s >= since_s - self.memory.frame_interval_s
+        return self._is_fresh(Sensor.LASER, now_s) and not laser.far and not was_far
+
+    def _film_swings(self, innovation: float, since_s: float) -> bool:
+        """Whether a jump of the laser is the film's: the optics were far off, too, or just before.
+
+        They may show another part of a swing then. Of a larger jump the gauge decides.
+        """
+        optics = self.memory.watches[Sensor.OPTICS]
+        run_s = _FAR_COUNT * self.memory.frame_interval_s
+        were_far = optics.far > 0 or optics.far_since_s >= since_s - run_s
+        return were_far and abs(innovation) < _SWING_MOST_UM
 
     def _centre_since(self, since_s: float) -> FloatArray:
         """Return a row with 1 for each clone of the centre made at or after a time."""

@@ -64,6 +64,13 @@ class ErrorCorrelation:
         """Forget everything."""
         self.memory.start_afresh()
 
+    def skip(self) -> None:
+        """Leave out a tick: what comes later is not compared with what was before it."""
+        memory = self.memory
+        memory.time_s = memory.total_um = 0.0
+        memory.count = 0
+        memory.means_um.clear()
+
     def step(self, error_um: float, dt_s: float) -> None:
         """Add a tick.
 

@@ -73,6 +73,13 @@ class LoopComparison:
         """Forget everything."""
         self.memory.start_afresh()
 
+    def skip(self) -> None:
+        """Drop the span that has begun: its readings show a disturbance that passes."""
+        memory = self.memory
+        self._begin_block()
+        memory.span_s = memory.own_um2 = memory.difference_um2 = 0.0
+        memory.blocks = 0
+
     def step(self, own_um: float, other_um: float, dt_s: float) -> None:
         """Add a reading.
 
@@ -107,15 +114,19 @@ class LoopComparison:
         memory.difference_um2 += own_um**2 - other_um**2
         memory.blocks += 1
         memory.span_s += memory.block_s
-        memory.block_s = memory.own_um = memory.other_um = memory.steps_um2 = 0.0
-        memory.readings = memory.steps = 0
-        memory.last_um = math.nan
+        self._begin_block()
         # Several blocks are a span, whose mean squares are compared.
         if memory.span_s >= _SPAN_S:
             _append(memory.own_spans_um2, memory.own_um2 / memory.blocks)
             _append(memory.difference_spans_um2, memory.difference_um2 / memory.blocks)
             memory.span_s = memory.own_um2 = memory.difference_um2 = 0.0
             memory.blocks = 0
+
+    def _begin_block(self) -> None:
+        memory = self.memory
+        memory.block_s = memory.own_um = memory.other_um = memory.steps_um2 = 0.0
+        memory.readings = memory.steps = 0
+        memory.last_um = math.nan
 
     @property
     def spans(self) -> int:

@@ -128,9 +128,7 @@ def identify_pump_response(
     freedom = len(time_s) - 4  # y_0, k, d, L
     flow_weight = (_FLOW_SIGMA_SHARE * flow_um_per_s) ** -2
     sums_s, shares = _SUM_S, _DELAY_SHARES
-    response = None
-    shift_sigma_s = 0.0
-    for _ in range(2):
+    for rounds_left in (1, 0):
         sum_s, share = (grid.ravel() for grid in np.meshgrid(sums_s, shares, indexing="ij"))
         delay_s, lag_s = share * sum_s, (1.0 - share) * sum_s
         paths = project @ _simulate_paths(time_s, switches, delay_s, lag_s)
@@ -148,23 +146,23 @@ def identify_pump_response(
         # Each point of the grid stands for an interval of log (d + L)
         interval = np.repeat(np.gradient(np.log(sums_s)), len(shares))
         weight = np.exp(log_weight - log_weight.max()) * interval
-        response = _average_grid(delay_s, lag_s, weight, float(np.diff(sums_s)[-1]))
         best = int(weight.argmax())
-        # A reading's change by a shift in time, less what another flow would change as well
-        later = project @ _simulate_paths(
-            time_s, switches, delay_s[best : best + 1] + _SHIFT_S, lag_s[best : best + 1]
-        )
-        shift = (later[:, 0] - paths[:, best]) / _SHIFT_S
-        shift -= paths[:, best] * (paths[:, best] @ shift) / curvature[best]
-        slope_per_s = abs(overlap[best] / curvature[best]) * float(np.linalg.norm(shift))
-        shift_sigma_s = float(_SUM_S[-1])  # readings that show nothing
-        if slope_per_s * shift_sigma_s > math.sqrt(reduced):
-            shift_sigma_s = math.sqrt(reduced) / slope_per_s
-        sums_s = _refine(sum_s, weight, sum_s[best], _SUM_STEP * sum_s[best], _FINE_SUMS)
-        sums_s = np.maximum(sums_s, 1e-3 * np.arange(1, _FINE_SUMS + 1))
-        shares = np.clip(_refine(share, weight, share[best], _SHARE_STEP, _FINE_SHARES), 0.0, 0.999)
-    if response is None:
-        return None
+        if rounds_left:
+            sums_s = _refine(sum_s, weight, sum_s[best], _SUM_STEP * sum_s[best], _FINE_SUMS)
+            sums_s = np.maximum(sums_s, 1e-3 * np.arange(1, _FINE_SUMS + 1))
+            shares = _refine(share, weight, share[best], _SHARE_STEP, _FINE_SHARES)
+            shares = np.clip(shares, 0.0, 0.999)
+    response = _average_grid(delay_s, lag_s, weight, float(np.diff(sums_s)[-1]))
+    # A reading's change by a shift in time, less what another flow would change as well
+    later = project @ _simulate_paths(
+        time_s, switches, delay_s[best : best + 1] + _SHIFT_S, lag_s[best : best + 1]
+    )
+    shift = (later[:, 0] - paths[:, best]) / _SHIFT_S
+    shift -= paths[:, best] * (paths[:, best] @ shift) / curvature[best]
+    slope_per_s = abs(overlap[best] / curvature[best]) * float(np.linalg.norm(shift))
+    shift_sigma_s = float(_SUM_S[-1])  # readings that show nothing
+    if slope_per_s * shift_sigma_s > math.sqrt(reduced):
+        shift_sigma_s = math.sqrt(reduced) / slope_per_s
     return replace(response, sum_sigma_s=max(response.sum_sigma_s, shift_sigma_s))
 
 
@@ -220,9 +218,13 @@ def apply_response(estimator: EstimatorConfig, response: PumpResponse | None) ->
 
 def _average_readings(readings: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Means of time and height over consecutive readings, and the count of readings in each."""
-    parts = np.array_split(readings, min(len(readings), _INTERVALS_MOST))
-    means = np.array([part.mean(axis=0) for part in parts])
-    counts = np.array([float(len(part)) for part in parts])
+    intervals = min(len(readings), _INTERVALS_MOST)
+    shortest, longer = divmod(len(readings), intervals)
+    # Of intervals that cannot be equal, the first ones have a reading more
+    counts = np.full(intervals, float(shortest))
+    counts[:longer] += 1.0
+    begins = np.concatenate(([0], np.cumsum(counts[:-1]))).astype(np.int64)
+    means = np.add.reduceat(readings, begins, axis=0) / counts[:, None]
     return means[:, 0], means[:, 1], counts
 
 

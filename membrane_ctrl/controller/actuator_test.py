@@ -472,11 +472,11 @@ class ActuatorTest:
                 math.hypot(memory.off_sigma_um_per_s, _STILL_SIGMA_UM_PER_S),
                 self._expected_um_per_s,
             )
-            if memory.response is not None:
-                memory.flow_um_per_s = estimate_flow(
-                    readings, memory.switches, memory.response, memory.off_um_per_s
-                )
             if self._is_response_known() or not self._has_time_to_switch():
+                if memory.response is not None:
+                    memory.flow_um_per_s = estimate_flow(
+                        readings, memory.switches, memory.response, memory.off_um_per_s
+                    )
                 self._begin_part(len(self._parts))
                 return
         memory.switches.append(Switch(memory.part_s, on=not last.on))

@@ -63,6 +63,9 @@ _HIDDEN_SIGMAS = 2.0
 _FALL_BACK_S = 600.0
 _FALL_BACK_MOST_S = 6 * 3600.0
 _DOUBLINGS_MOST = 10
+# A door moves the film under any loop. For so long after the last jump of a sensor, the errors show
+# nothing of the loops: a pump that gives little more than the leak takes that long to return.
+_PASSING_S = 20.0
 # Memory of the mean that shows whether laser and camera move apart
 _APART_S = 60.0
 _BY_ESTIMATE = (ProcessValueReason.RESPONSE_KNOWN, ProcessValueReason.LASER_UNUSABLE)
@@ -138,6 +141,8 @@ class ProcessValueState(StateNode):
         End of the present fall-back; infinite in the past without one.
     trusted_until_s : float
         Until then the PI is not tried again.
+    passing_until_s : float
+        Until then the errors are those of a disturbance that passes.
     trials : int
     estimate_error, estimate_error_by_camera : MeanSquare or None
         Of the estimate's loop before the trial, by the laser and by the camera; None without one.
@@ -156,6 +161,7 @@ class ProcessValueState(StateNode):
     tries_pi: bool = False
     fall_back_until_s: float = -math.inf
     trusted_until_s: float = -math.inf
+    passing_until_s: float = -math.inf
     trials: Count = 0
     estimate_error: MeanSquare | None = None
     estimate_error_by_camera: MeanSquare | None = None
@@ -334,12 +340,18 @@ class ProcessValueChoice:
         # What is compared: innovations, sensors, and the errors of both loops.
         self._innovations.step(laser.innovation, facts.dt_s)
         apart_um = self._compare_sensors(facts, estimate)
-        self._compare_loops(facts)
+        if estimate.jumped_sensors:
+            memory.passing_until_s = facts.now_s + _PASSING_S
+        passing = facts.now_s < memory.passing_until_s
+        self._compare_loops(facts, passing)
         if memory.tries_pi:
             return self._end_trial(facts)
         # The PI is tried if the estimate may be the worse one.
         if memory.follows_estimate:
-            self._correlation.step(facts.setpoint_um - estimate.um, facts.dt_s)
+            if passing:
+                self._correlation.skip()
+            else:
+                self._correlation.step(facts.setpoint_um - estimate.um, facts.dt_s)
             if memory.noticed:
                 return self._end_notice("the estimate is tried again")
             errors = self._comparison.errors
@@ -376,9 +388,12 @@ class ProcessValueChoice:
         errors = self._comparison_by_camera.errors
         return None if errors is None else errors.own
 
-    def _compare_loops(self, facts: ProcessValueFacts) -> None:
-        """Add this tick's reading to the comparison."""
+    def _compare_loops(self, facts: ProcessValueFacts, passing: bool) -> None:
+        """Add this tick's reading to the comparison, unless a disturbance passes."""
         memory = self.memory
+        if passing:
+            self._comparison.skip()
+            self._comparison_by_camera.skip()
         error_um = facts.setpoint_um - facts.laser_um
         # Both loops need some integral times before their errors are comparable.
         if math.isnan(memory.compares_from_s):
@@ -386,13 +401,13 @@ class ProcessValueChoice:
             memory.compares_from_s = facts.now_s + warm_up_s
         if not facts.held_by_optics:
             self._comparison_by_camera.reset()
-        elif facts.now_s >= memory.compares_from_s:
+        elif facts.now_s >= memory.compares_from_s and not passing:
             assert facts.estimate is not None  # the optics hold it
             by_camera_um = facts.setpoint_um - facts.estimate.um
             self._comparison_by_camera.step(by_camera_um, by_camera_um, facts.dt_s)
         # The PI holds the mirror: its error is measured.
         if not memory.follows_estimate:
-            if facts.now_s >= memory.compares_from_s:
+            if facts.now_s >= memory.compares_from_s and not passing:
                 self._comparison.step(error_um, error_um, facts.dt_s)
             return
         # The estimate holds it: what the PI would have done is predicted.
@@ -404,7 +419,7 @@ class ProcessValueChoice:
         seen_um = self._prediction.step(
             facts.laser_um, facts.setpoint_um, facts.weather, facts.flow_um_per_s, facts.dt_s
         )
-        if facts.now_s >= memory.compares_from_s:
+        if facts.now_s >= memory.compares_from_s and not passing:
             self._comparison.step(error_um, facts.setpoint_um - seen_um, facts.dt_s)
 
     def _stop_comparing(self) -> None:

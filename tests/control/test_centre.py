@@ -349,6 +349,54 @@ def test_a_film_that_moves_is_followed_within_a_few_frames(um: float) -> None:
     assert _centres(estimates, 8.0) == pytest.approx(um, abs=0.4)
 
 
+def _swung(hz: float, um: float, laser_um: float, seed: int) -> float:
+    """By how much the estimate is off after a door has made the film swing, at 10 ticks and 5
+    figures a second, without a barometer.
+    """
+    rate_hz, door_s, age_ticks = 10.0, 66.0, 2
+    loop = LOOP.model_copy(
+        update={
+            "rate_hz": rate_hz,
+            "feedforward_barometer": False,
+            "feedforward_temperature": False,
+        }
+    )
+    filtered = CentreFilter(CONFIG, loop)
+    filtered.start(0.0, FLOW, 0.0)
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(round(82.0 * rate_hz)) / rate_hz
+    since_s = np.maximum(time_s - door_s - seed * 0.03, 0.0)
+    film_um = um * np.sin(2 * np.pi * hz * since_s) * np.exp(-since_s * hz / 2)
+    errors_um = []
+    for k, now_s in enumerate(time_s.tolist()):
+        sag = (math.nan, math.nan, math.nan)
+        if k % 2 == 0 and k >= age_ticks:
+            seen_um = film_um[k - age_ticks] + 0.036 * rng.standard_normal()
+            sag = (SAG_UM + seen_um, 0.036, time_s[k - age_ticks])
+        read_um = film_um[k] + laser_um * rng.standard_normal()
+        given = CentreReadings(now_s, FLOW, read_um, math.nan, math.nan, *sag)
+        estimate = filtered.step(given, 1 / rate_hz)
+        errors_um.append(estimate.um - estimate.mount_um - film_um[k])
+    before = slice(round((door_s - 20.0) * rate_hz), round(door_s * rate_hz))
+    return float(np.mean(errors_um[-30:]) - np.mean(errors_um[before]))
+
+
+@pytest.mark.parametrize(
+    ("hz", "um", "laser_um", "seed"),
+    [
+        (0.7, -7.0, 0.8, 1),
+        (0.7, -7.0, 0.4, 7),
+        (1.0, 5.0, 0.4, 1),
+        (1.57, 5.0, 0.8, 5),
+        (1.57, -7.0, 0.8, 11),
+    ],
+)
+def test_a_film_that_swings_behind_a_door_moves_neither_zero_nor_mount(
+    hz: float, um: float, laser_um: float, seed: int
+) -> None:
+    assert _swung(hz, um, laser_um, seed) == pytest.approx(0.0, abs=0.4)
+
+
 def test_a_pressure_step_of_the_barometer_moves_the_estimate_at_once() -> None:
     by_um = 20 * LOOP.barometer_gain_um_per_pa
     estimates = _still(

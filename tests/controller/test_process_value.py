@@ -219,6 +219,25 @@ def test_the_camera_ends_a_trial_that_the_laser_does_not_decide(
     assert (choice.codes[-1] == "response_known") == returns
 
 
+@pytest.mark.parametrize("seen_as_jump", [True, False])
+def test_a_door_is_no_reason_to_try_the_pi(seen_as_jump: bool) -> None:
+    """It moves the film by 7 µm, which the pump takes out within 6 s, under any loop."""
+    choice, rng = Choice(), np.random.default_rng(3)
+    for tick in range(2400):
+        since_s = tick * DT_S - 150.0
+        door_um = 0.0
+        if 0.0 <= since_s < 6.0:
+            door_um = -7.0 * (1.0 - since_s / 6.0)
+        um, noise_um = (rng.standard_normal(2) * (0.05, 0.3)).tolist()
+        jumped: tuple[Sensor, ...] = ()
+        if seen_as_jump and 0.2 < since_s < 0.35:
+            jumped = (Sensor.BAROMETER,)
+        estimate = replace(ESTIMATE, um=um + door_um, jumped_sensors=jumped)
+        choice.run(DT_S, replace(FACTS, estimate=estimate, laser_um=um + door_um + noise_um))
+    expected = ["response_known"] if seen_as_jump else ["response_known", "pi_tried"]
+    assert choice.codes[:2] == expected
+
+
 def test_any_number_of_trials_keeps_the_longest_fall_back() -> None:
     choice = Choice()
     choice.run(20.0, FACTS)

@@ -79,3 +79,14 @@ def test_a_second_with_a_gap_gives_no_mean() -> None:
     found = means.result()
     assert (found["seconds"], found["first_um"], found["last_um"]) == (1, 1.0, 1.0)
     assert np.isnan(SecondMeans(band=1.0, least=9.0).result()["in_band"])
+
+
+@pytest.mark.parametrize("late_ms", [0.05, 0.3, 1.0, 2.1, 4.9])
+def test_a_tenth_of_a_millisecond_more_lateness_is_seen(late_ms: float) -> None:
+    found_ms = []
+    for shift_ms in (0.0, 0.1):
+        histogram = LogHistogram()
+        histogram.add(np.full(100, late_ms + shift_ms))
+        found_ms.append(histogram.find_quantile(0.5))
+    assert found_ms[0] == pytest.approx(late_ms, abs=0.05)
+    assert found_ms[1] > found_ms[0]

@@ -31,6 +31,7 @@ from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import find_newest_session
 from membrane_ctrl.sessions.live_hold import HoldError
+from tests.studies.laboratory_notes import ABOUT_ROWS, describe_causes
 from tests.worlds.drawn_laboratories import DrawnLaboratory, draw_laboratory
 from tests.worlds.foreign_plant import foreign_bench
 from tuning import twin_hold
@@ -333,6 +334,8 @@ def format_page(rows: Sequence[dict[str, Any]]) -> str:
         f"{len(started)} laboratories were started, {len(judged)} held with the defaults, and "
         f"{len(sessions)} tuned, of 200 wanted.",
         "",
+        ABOUT_ROWS,
+        "",
         "| | reached | wanted |",
         "|---|---|---|",
         _format_share("start with the defaults", len(reached), len(started), "97 %"),
@@ -358,6 +361,12 @@ def format_page(rows: Sequence[dict[str, Any]]) -> str:
         ),
         "",
     ]
+    if ratios.size:
+        lines += [
+            f"Std by `auto` over that by the laser: median {np.median(ratios):.2f}, "
+            f"{np.quantile(ratios, 0.1):.2f} at a tenth, worst {ratios.max():.2f}.",
+            "",
+        ]
     if tuned.size:
         lines += [
             f"Std with kept gains over that with the defaults, by laser: median "
@@ -375,6 +384,7 @@ def format_page(rows: Sequence[dict[str, Any]]) -> str:
         "| laboratory | miss |",
         "|---|---|",
         *(f"| {row['seed']} | {miss} |" for row in rows for miss in list_misses(row)),
+        *describe_causes({int(row["seed"]) for row in rows if list_misses(row)}),
     ]
     return "\n".join(lines) + "\n"
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.emulators.pump_board import BoardSample
+from tests.studies.laboratory_notes import describe_causes
 from tests.studies.laboratory_sessions import (
     ended_well,
     format_page,
@@ -160,3 +161,12 @@ def test_a_session_has_the_gains_that_the_start_has_limited() -> None:
     assert link.config.loop.kp_per_s < 0.6 * stated.loop.kp_per_s
     assert link.config.loop.ti_s > stated.loop.ti_s
     assert link.config.model_copy(update={"loop": stated.loop, "pump": stated.pump}) == stated
+
+
+def test_the_page_states_the_cause_of_each_miss_or_that_it_is_not_known() -> None:
+    missed = [make_row(seed=seed, excursion_um=11.0, excursion_s=200.0) for seed in (8, 9)]
+    page = format_page([make_row(seed=7), *missed])
+    causes = page.split("## Misses")[1]
+    assert "\n8: moves by" in causes
+    assert "Not explained: 9." in causes
+    assert describe_causes(set()) == []
