@@ -222,9 +222,9 @@ def make_surroundings(seed: int, days: float) -> tuple[BenchEvent, ...]:
 def draw_upsets(seed: int, days: float) -> list[tuple[float, str, float]]:
     """Which sensor or device fails when, and for how long, in the order of time."""
     rng = np.random.default_rng([32, seed])
-    upsets = []
+    upsets: list[tuple[float, str, float]] = []
     at_s = HOUR_S
-    while at_s < days * DAY_S:
+    while not upsets or at_s < days * DAY_S:
         at_s += float(rng.uniform(2.0, 6.0)) * HOUR_S
         name, lasts_s = _FAULTS[int(rng.integers(len(_FAULTS)))]
         upsets.append((at_s, name, lasts_s))
@@ -308,7 +308,7 @@ class HeldWeek:
         self._now_s = 0.0  # of the week
         self._spent_s = 0.0  # processor time of earlier calls
         self._begun_s = time.process_time()
-        self._hold: _Hold | None = self._begin_hold(1, 0.0, days / 2 * DAY_S)
+        self.hold: _Hold | None = self._begin_hold(1, 0.0, days / 2 * DAY_S)
         self._judge = _Judge(0, 1)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -322,7 +322,7 @@ class HeldWeek:
 
     def run_hour(self) -> HeldHour | None:
         """The next hour, or what is left of a hold; None at the end of the week."""
-        hold = self._hold
+        hold = self.hold
         if hold is None:
             return None
         commands: tuple[Command, ...] = ()
@@ -330,25 +330,32 @@ class HeldWeek:
             commands = (Command("hold", "week"),)
         hour = int(self._now_s // HOUR_S)
         while hold.run.finished is None and int(self._now_s // HOUR_S) == hour:
-            self._now_s = hold.from_s + hold.run.now_s
-            if self._now_s >= hold.until_s and not hold.asked_to_stop:
-                commands, hold.asked_to_stop = (Command("stop", "week"),), True
-            self._switch_faults()
-            tick = hold.run.run_tick(commands)
+            self.run_tick(commands)
             commands = ()
-            if tick is not None:
-                hold.record.add_tick(tick)
-                self._judge.add_tick(tick, self._bench)
         if hold.run.finished is not None:
             hold.record.close()
         found = self._judge.finish(hold.record.measure_mb(), self._count_cpu_s())
         if hold.run.finished is not None:
-            self._hold = self._begin_next(hold.number)
+            self.hold = self._begin_next(hold.number)
         number = hold.number
-        if self._hold is not None:
-            number = self._hold.number
+        if self.hold is not None:
+            number = self.hold.number
         self._judge = _Judge(int(self._now_s // HOUR_S), number)
         return found
+
+    def run_tick(self, commands: tuple[Command, ...]) -> VirtualTick | None:
+        """Run a tick of the present hold; None if the program misses it."""
+        hold = self.hold
+        assert hold is not None
+        self._now_s = hold.from_s + hold.run.now_s
+        if self._now_s >= hold.until_s and not hold.asked_to_stop:
+            commands, hold.asked_to_stop = (*commands, Command("stop", "week")), True
+        self._switch_faults()
+        tick = hold.run.run_tick(commands)
+        if tick is not None:
+            hold.record.add_tick(tick)
+            self._judge.add_tick(tick, self._bench)
+        return tick
 
     def _begin_next(self, ended: int) -> _Hold | None:
         if ended > 1:
