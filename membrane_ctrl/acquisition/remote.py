@@ -68,12 +68,14 @@ class Remote:
 
     def take_full(self) -> bool:
         """Whether a full cycle was requested since the last call."""
-        wanted, self._full = self._full, False
+        wanted = self._full
+        self._full = False
         return wanted
 
     def take_capture(self) -> CaptureRequest | None:
         """The newest request of a full cycle to keep on disk since the last call."""
-        wanted, self._capture = self._capture, None
+        wanted = self._capture
+        self._capture = None
         return wanted
 
     def report_state(

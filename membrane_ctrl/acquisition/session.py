@@ -237,7 +237,8 @@ def _make_raw_frames(
     """The keeper of raw frames, if the run has a folder."""
     if spec.run_dir is None:
         return None
-    folder, recording = spec.run_dir / "raw", spec.config.recording
+    folder = spec.run_dir / "raw"
+    recording = spec.config.recording
     raw = raw_frames.RawFrames(
         folder, optics, plan, recording, spec.frames, spec.telemetry, remote.send_event
     )

@@ -55,7 +55,8 @@ class VirtualCamera:
         self._cycle += 1
         pattern = self._config.optics.pattern
         sequence = full_sequence(pattern) if self._full else fringe_sequence(pattern)
-        frames, readings_um = [], []
+        frames = []
+        readings_um = []
         for shown in sequence:
             self._optics.screen.show(shown)
             pixels = self._optics.camera.grab().pixels

@@ -127,7 +127,8 @@ class GeometryFile:
         """The bench with this geometry instead of its own. Raises InputError for a different
         camera.
         """
-        camera, pattern = optics.camera, optics.pattern
+        camera = optics.camera
+        pattern = optics.pattern
         if self.lens is not None:
             camera = self.lens.apply_to_camera(camera, self.path)
         if self.pitch is not None:
@@ -171,10 +172,8 @@ def read_geometry(path: str | Path) -> GeometryFile:
             "use them anyway"
         )
     origin = GeometryOrigin(hashed, str(path), "" if calibration is None else calibration.date_utc)
-    lens, pitch = (
-        _optional_table(tables, "camera", LensTable, path),
-        _optional_table(tables, "pattern", PitchTable, path),
-    )
+    lens = _optional_table(tables, "camera", LensTable, path)
+    pitch = _optional_table(tables, "pattern", PitchTable, path)
     return GeometryFile(path, geometry, lens, pitch, calibration, origin, text)
 
 

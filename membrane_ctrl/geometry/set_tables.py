@@ -62,7 +62,8 @@ class ArtefactTable(Section):
             return self.form
 
         # A sphere states its radius of curvature, a flat does not.
-        curvature, spread = self.curvature_radius_mm, self.curvature_radius_sigma_mm
+        curvature = self.curvature_radius_mm
+        spread = self.curvature_radius_sigma_mm
         for name, value in (
             ("curvature_radius_mm", curvature),
             ("curvature_radius_sigma_mm", spread),
@@ -128,7 +129,8 @@ def move_screen(
     pinhole, rotation, origin, s_x, s_y = sight.compute_poses(geometry)
     origin = origin + np.array(shift_mm) @ np.stack([s_x, s_y, np.cross(s_x, s_y)])
     if turn is not None:
-        s_x, s_y = turn @ s_x, turn @ s_y
+        s_x = turn @ s_x
+        s_y = turn @ s_y
     vectors = {"origin_mm": origin, "s_x": s_x, "s_y": s_y}
     screen = (geometry.screen or ScreenPoseConfig()).model_copy(
         update={name: tuple(value.tolist()) for name, value in vectors.items()}

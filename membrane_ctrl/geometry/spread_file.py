@@ -72,7 +72,8 @@ def geometry_spread(optics: schema.OpticsConfig, file: Path | None) -> tuple[Geo
     InputError
         The file cannot be read, or its covariance is for the other form of the geometry.
     """
-    geometry, given = optics.geometry, None if file is None else read_spread(file)
+    geometry = optics.geometry
+    given = None if file is None else read_spread(file)
     others = stated_sigmas(optics)
     if given is not None:
         try:

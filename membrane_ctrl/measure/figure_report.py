@@ -61,7 +61,8 @@ def write_report(
 
     # The verdict, in a text that cannot contain control characters.
     quality = result["quality"]
-    verdict, reason = str(quality["verdict"]), escape_controls(str(quality["reason"]))
+    verdict = str(quality["verdict"])
+    reason = escape_controls(str(quality["reason"]))
     stated = PageText(f"{verdict}: {reason}" if reason else verdict, _MARKS[verdict])
     pictures.sort(key=_rank_picture)
 

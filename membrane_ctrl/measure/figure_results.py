@@ -80,7 +80,8 @@ def measured_figure(
     InputError
         No sphere of this radius spans the aperture.
     """
-    full, mirror = measurement.full, measurement.head.optics.mirror
+    full = measurement.full
+    mirror = measurement.head.optics.mirror
     if nominal_radius_mm is not None and not abs(nominal_radius_mm) > mirror.analysis_radius_mm:
         least = f"larger than the aperture's radius, {mirror.analysis_radius_mm:g} mm"
         raise InputError(f"--nominal-radius-mm {nominal_radius_mm:g}: must be {least}")
@@ -144,7 +145,8 @@ def figure_table(
     }
     if found.figure.numbers.best_focus_mm <= 0:  # behind the mirror
         for name in [name for name in numbers if name.startswith(_AT_FOCUS)]:
-            numbers[name], missing[name] = None, "the mirror has no real focus"
+            numbers[name] = None
+            missing[name] = "the mirror has no real focus"
     if found.power_um is None:
         missing["power_um"] = "no nominal radius: give --nominal-radius-mm"
     else:

@@ -126,7 +126,8 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
     reflections = full.reflections
     if reflections is not None and reflections.doubt and verdict != "rejected":
         reasons = [part for part in (reason, reflections.doubt) if part]
-        verdict, reason = "degraded", "; ".join(reasons)
+        verdict = "degraded"
+        reason = "; ".join(reasons)
     timing = {"load": loaded - begin, "phase": middle - loaded, "reconstruct": end - middle}
 
     mean_um = checked.stack.mean_reading_um

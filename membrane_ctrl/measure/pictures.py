@@ -186,9 +186,11 @@ def _draw_star(found: MeasuredFigure) -> Canvas | None:
     # The light around the middle, in a unit that suits it.
     half_um = image.pixel_um * len(image.spread) / 2
     view_um = min(half_um, _STAR_VIEW * image.radius_80_um)
-    unit, per_um = "µm", 1.0
+    unit = "µm"
+    per_um = 1.0
     if view_um > _LARGE_UM:
-        unit, per_um = "mm", 1e-3
+        unit = "mm"
+        per_um = 1e-3
     view = per_um * view_um
     around = max(1, round(view_um / image.pixel_um))
     middle = len(image.spread) // 2

@@ -123,7 +123,8 @@ def _of_film(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.
     shape = mounted
     if not options.figure:
         shape = replace(mounted, zernike_um=())
-    seat, stated_turn = None, {}
+    seat = None
+    stated_turn = {}
     if options.turned_deg is not None:
         # the film is that of --seed; its seat differs from angle to angle
         seat = MirrorSeat.drawn(options.turned_deg, options.seed + round(1e3 * options.turned_deg))

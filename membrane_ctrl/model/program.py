@@ -79,7 +79,8 @@ def stated_program(table: Mapping[str, Any]) -> str:
     """Program and commit stated in a file's members, as `program_identity`; empty if none is
     stated.
     """
-    program, commit = table.get("program"), table.get("commit")
+    program = table.get("program")
+    commit = table.get("commit")
     if not isinstance(program, str) or not program:
         return ""
     if isinstance(commit, str) and commit:

@@ -154,7 +154,8 @@ def decode_state(data: bytes, kind: type[T], most_bytes: int) -> T:
         raise StateError(_describe_first_error(error)) from None
     # 3. No field is missing: it would have got its default. What this program writes for the tree
     # must be what was read
-    found, expected = _parse_json(data), _parse_json(encode_state(node))
+    found = _parse_json(data)
+    expected = _parse_json(encode_state(node))
     if found != expected:
         where = next(_find_missing(found, expected, ""), "not the values that this program writes")
         raise StateError(f"another layout: {where}")
@@ -263,7 +264,8 @@ def _join_place(place: str, key: Any) -> str:
 def _find_differences(one: Any, other: Any, place: str, within: float) -> Iterator[str]:
     """Yield the places that differ: go down into dicts and lists of the same length in step."""
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
-        one, other = one.tolist(), other.tolist()
+        one = one.tolist()
+        other = other.tolist()
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in dict.fromkeys([*one, *other]):
             part = one.get(key, "absent")

@@ -102,7 +102,8 @@ def track_progress(items: Iterable[_T], what: str, total: int | None = None) -> 
     """
     from rich.progress import track
 
-    rich, on = table_console(stderr=True), sys.stderr.isatty()
+    rich = table_console(stderr=True)
+    on = sys.stderr.isatty()
     # while it draws, Rich replaces `_Text`
     rich.file = getattr(sys.stderr, "rich_proxied_file", sys.stderr)
     return track(items, what, total, console=rich, transient=True, disable=not on)

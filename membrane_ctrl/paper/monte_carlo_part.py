@@ -245,9 +245,11 @@ def compare_with_paper(
     trials : int
         Their number.
     """
-    mean_um, max_um = float(np.mean(rmse_um)), float(np.max(rmse_um))
+    mean_um = float(np.mean(rmse_um))
+    max_um = float(np.max(rmse_um))
     expected_mean_um = float(np.mean(expected_um))
-    low, high = PAPER_MEAN_UM * (1 - _WITHIN), PAPER_MEAN_UM * (1 + _WITHIN)
+    low = PAPER_MEAN_UM * (1 - _WITHIN)
+    high = PAPER_MEAN_UM * (1 + _WITHIN)
     return PaperStatement(
         f"RMSE of the height, mean and largest, µm: {reading}",
         "24.8 and about 50",

@@ -188,7 +188,9 @@ class _Path:
     @classmethod
     def of(cls, geometry: PaperGeometry, across_mm: FloatArray, height_mm: FloatArray) -> "_Path":
         """Equations 4 to 7 and 13 of points at x_0 and h."""
-        a_mm, b_mm, alpha = geometry.a_mm, geometry.b_mm, geometry.alpha_rad
+        a_mm = geometry.a_mm
+        b_mm = geometry.b_mm
+        alpha = geometry.alpha_rad
         # eq. 5: mu, the ray's angle above the x axis
         mu = np.arctan2(a_mm * math.sin(alpha) - height_mm, a_mm * math.cos(alpha) - across_mm)
         # eq. 4 and 6: O'B and EB, displacements on the screen by the place and by the height of P

@@ -189,7 +189,8 @@ def resolve_run(run: str | Path, logs_dir: str | Path = "logs") -> Path:
     logs_dir : str or Path
         Folder of the runs.
     """
-    run, logs_dir = Path(run), Path(logs_dir)
+    run = Path(run)
+    logs_dir = Path(logs_dir)
     if run.exists() or not logs_dir.is_dir():
         return run
     known = list_run_folders(logs_dir)

@@ -44,7 +44,8 @@ def average_points(
     weights = RobustWeights.from_residual(phases, residual_mm).weights / phases.sigma_mm**2
 
     # The side of a cell. The mirror is seen as an ellipse: pi / 4 of the rectangle around it.
-    width, height = np.ptp(phases.column_px), np.ptp(phases.row_px)
+    width = np.ptp(phases.column_px)
+    height = np.ptp(phases.row_px)
     cell_px = max(float(np.sqrt(width * height * np.pi / 4 / about)), 1.0)
 
     # The cell of each point, as one number: from the last row to the first, apart for each place of

@@ -267,7 +267,8 @@ def _make_points(aperture_mm: float) -> FloatArray:
     rings = []
     for ring in range(_RINGS):
         # The radius that halves the ring's area
-        inner, outer = (ring / _RINGS) ** 2, ((ring + 1) / _RINGS) ** 2
+        inner = (ring / _RINGS) ** 2
+        outer = ((ring + 1) / _RINGS) ** 2
         radius_mm = aperture_mm * math.sqrt((inner + outer) / 2)
         count = _FIRST_RING_POINTS * (2 * ring + 1)
         # Each ring begins at another angle

@@ -303,7 +303,8 @@ class Bowl:
         nu = float(self.poisson)
 
         # Displacements / a of the film at the ring, outward and upward, by one unit of the cause.
-        outward, upward = 0.0, 0.0
+        outward = 0.0
+        upward = 0.0
         if cause == "prestrain":
             outward = 1.0
         elif cause == "flat":
@@ -315,7 +316,8 @@ class Bowl:
             upward = -rise / a
 
         # The film's stiffnesses U2 and U3 / (E t) by one unit of the cause.
-        two_waves, four_waves = 0.0, 0.0
+        two_waves = 0.0
+        four_waves = 0.0
         if cause == "modulus":
             two_waves = 0.5 / (1 - nu**2)
         elif cause == "shear":

@@ -85,7 +85,8 @@ def find_orthotropy(
     """
     # Each of the film's causes belongs to one order of waves
     by_cause = {wave.cause: wave for wave in waves}
-    moduli, shear = by_cause["modulus"], by_cause["shear"]
+    moduli = by_cause["modulus"]
+    shear = by_cause["shear"]
     if not (moduli.explained and shear.explained):
         return None
     axes = _find_axes(moduli, shear)

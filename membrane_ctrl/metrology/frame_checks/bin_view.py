@@ -75,7 +75,9 @@ def combine_frames(
     used = tuple([k for k in stack.sinusoids(axis) if k not in excluded] for axis in AXES)
 
     # Mean, amplitude and wrapped phase of the fringes of each axis, by least squares.
-    light, swing, phase = [], [], []
+    light = []
+    swing = []
+    phase = []
     saturated = np.zeros(binned.means.shape[1:], bool)
     for axis, frames in zip(AXES, used, strict=True):
         try:

@@ -459,7 +459,9 @@ def _combine_frames(
     frames = np.array(list(found))
     shares, sigmas = np.array(list(found.values())).T
     is_shown = sigmas <= _LEAST_SHOWN * np.median(sigmas)
-    frames, shares, sigmas = frames[is_shown], shares[is_shown], sigmas[is_shown]
+    frames = frames[is_shown]
+    shares = shares[is_shown]
+    sigmas = sigmas[is_shown]
     share = float(np.median(shares))
     noise = float(np.median(sigmas)) / math.sqrt(shares.size)
     scatter = np.zeros(count_frames)

@@ -276,9 +276,11 @@ class CushionBench:
         """
         # 1. Into the film: (3) from the medium before it.
         gas_index = 1 + self.cushion.gas_excess
-        index_before, index_behind = gas_index, 1.0
+        index_before = gas_index
+        index_behind = 1.0
         if goes_in:
-            index_before, index_behind = 1.0, gas_index
+            index_before = 1.0
+            index_behind = gas_index
         first_normal = normal / np.linalg.norm(normal, axis=0)
         in_film = _refract(rays, first_normal, index_before, self.cushion.film_index)
 

@@ -26,7 +26,8 @@ def heights_over_disc(radius: float) -> tuple[FloatArray, FloatArray]:
     axis = np.linspace(-radius, radius, _GRID)
     x, y = (a.ravel() for a in np.meshgrid(axis, axis))
     inside = np.hypot(x, y) <= radius
-    x, y = x[inside], y[inside]
+    x = x[inside]
+    y = y[inside]
     return np.asarray(surface_basis.evaluate_basis(x, y)[0].T), np.stack(
         [np.ones_like(x), x, y], axis=1
     )

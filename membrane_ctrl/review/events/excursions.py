@@ -31,7 +31,8 @@ def find_excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -
     known : sequence of FoundEvent
         Events that were found before.
     """
-    time_s, error_um = level["time_s"], level["mean_error_um"]
+    time_s = level["time_s"]
+    error_um = level["mean_error_um"]
     # Seconds beyond the band, without those that a fault, a pause or a ramp explains
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
     paused = np.isnan(level["mean_leak_um_per_s"])  # a loop that waits has no estimate of the leak

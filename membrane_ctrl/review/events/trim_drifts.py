@@ -28,7 +28,8 @@ def find_trim_drifts(held: found_event.Level) -> list[found_event.FoundEvent]:
     """
     # Minute means of the trim while the mirror was held.
     minutes = levels.coarser_level(held, 60.0)
-    trim_um, time_s = minutes["mean_trim_um"], minutes["time_s"]
+    trim_um = minutes["mean_trim_um"]
+    time_s = minutes["time_s"]
     known = np.flatnonzero(np.isfinite(trim_um))
     if known.size < LEAST_MIN:
         return []

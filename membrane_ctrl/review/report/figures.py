@@ -300,9 +300,11 @@ def _draw_found_events(plot: Any, analysis: Analysis, span_s: float) -> None:
         if isinstance(event := noted.event, (events.Fault, run_events.Mark)):
             at, _ = hours_or_less(noted.mono_s, span_s)
             if isinstance(event, events.Fault):
-                colour, text = RED, event.name
+                colour = RED
+                text = event.name
             else:
-                colour, text = "black", event.text
+                colour = "black"
+                text = event.text
             plot.axvline(at, color=colour, lw=1)
             text = one_line(text)
             if len(text) > _LETTERS_MOST:
@@ -392,7 +394,8 @@ def _draw_columns(
 
 def draw_distributions(analysis: Analysis) -> Markup:
     """Histogram, Allan deviation, spectrum."""
-    reading, true = analysis.reading, analysis.true
+    reading = analysis.reading
+    true = analysis.true
     named = [
         (series, colour, name)
         for series, colour, name in ((reading, BLUE, "reading"), (true, GREEN, "true centre"))
@@ -419,7 +422,8 @@ def draw_distributions(analysis: Analysis) -> Markup:
     def draw_allan(_: Figure, plot: Any) -> None:
         for series, colour, name in named:
             if series.allan.tau_s.size:
-                tau_s, deviation_um = series.allan.tau_s, series.allan.deviation
+                tau_s = series.allan.tau_s
+                deviation_um = series.allan.deviation
                 plot.loglog(tau_s, deviation_um, "o-", ms=3, color=colour, label=name)
         plot.set(title="Overlapping Allan deviation", xlabel="τ, s", ylabel="µm")
         _add_legend(plot)

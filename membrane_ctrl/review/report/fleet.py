@@ -161,7 +161,8 @@ def list_fleet_folders(given: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for each in given:
-        folder, inside = catalogue.resolve_run(each).resolve(), []
+        folder = catalogue.resolve_run(each).resolve()
+        inside = []
         if folder.is_dir() and not catalogue.may_be_run(folder):
             with suppress(OSError):  # its line will show it
                 inside = catalogue.list_run_folders(folder)
@@ -173,7 +174,8 @@ def fleet_command(options: FleetOptions) -> int:
     """Write the fleet's page, its figures as JSON, and each run's report; see `membrane-ctrl report
     --help`.
     """
-    folders, out = list_fleet_folders(options.runs), options.out.resolve()
+    folders = list_fleet_folders(options.runs)
+    out = options.out.resolve()
     # Runs are named by their path below the folder that all have in common.
     common = Path(os.path.commonpath([folder.parent for folder in folders]))
     workers = options.workers or min(os.cpu_count() or 1, len(folders))

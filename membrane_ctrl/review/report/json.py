@@ -32,7 +32,8 @@ SCHEMA = "membrane-report/1"
 
 def make_verdict(analysis: Analysis) -> tuple[Word, str]:
     """A word that selects the colour, and the verdict as a sentence."""
-    run, ticks = analysis.run, analysis.ticks
+    run = analysis.run
+    ticks = analysis.ticks
     # The simulated bench records the true error; a real one has the readings.
     series = analysis.true or analysis.reading
     whole = format_span(ticks.end_s - ticks.start_s)
@@ -76,7 +77,8 @@ def _join_names(names: list[str]) -> str:
 
 def report_table(analysis: Analysis) -> dict[str, Any]:
     """All figures of the report (`membrane-report/1`); NaN where there is none."""
-    run, ticks = analysis.run, analysis.ticks
+    run = analysis.run
+    ticks = analysis.ticks
     word, sentence = make_verdict(analysis)
     late = ticks.lateness_ms
     feedforward = None

@@ -119,7 +119,8 @@ def _compare_pump(
 
 def _last_learned(log: Sequence[LoggedEvent]) -> tuple[events.PumpLearned, dict[str, Any]] | None:
     """The last event on a run's pump, and the gains and curve then set."""
-    status, last = RunStatus(), None
+    status = RunStatus()
+    last = None
     for each in log:
         status = status.after_event(each.event, each.mono_s)
         if isinstance(each.event, events.PumpLearned):

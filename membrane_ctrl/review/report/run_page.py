@@ -197,9 +197,11 @@ def _tabulate_windows(analysis: Analysis) -> PageTable:
 
 def _list_details(analysis: Analysis) -> list[PageBlock]:
     if analysis.true is None:
-        series, name = analysis.reading, READING
+        series = analysis.reading
+        name = READING
     else:
-        series, name = analysis.true, TRUE
+        series = analysis.true
+        name = TRUE
     if series is None:
         return []
     ticks = analysis.ticks
@@ -383,7 +385,8 @@ def _describe_image(series: held_scalars.HeldSeries) -> list[tuple[str, str]]:
     if image is None:
         return [("image of a star", "the mirror has no focus in front of it")]
     wave = f"at {series.wavelength_um:g} µm"
-    radius_80_mm, sigma_mm = 1e-3 * image.radius_80_um, 1e-3 * series.radius_80_sigma_um
+    radius_80_mm = 1e-3 * image.radius_80_um
+    sigma_mm = 1e-3 * series.radius_80_sigma_um
     radii = (
         f"50 % of the light within {format_number(1e-3 * image.radius_50_um)} mm, 80 % within "
         f"{_format_value(radius_80_mm, sigma_mm, 'mm')} (radius)"

@@ -135,7 +135,8 @@ def _of_mean(offset_um: float, tracks: bool) -> str:
 
 
 def _compare_loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
-    ours_ticks, theirs_ticks = ours.ticks, theirs.ticks
+    ours_ticks = ours.ticks
+    theirs_ticks = theirs.ticks
     # Means of the windows in which each run held; lateness is compared by its logarithm, whose
     # distribution is less skewed.
     leak, pump, late = (

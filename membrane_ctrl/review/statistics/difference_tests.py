@@ -135,7 +135,8 @@ def spread_p(a: Column, b: Column, window_s: float = 1.0) -> float:
 
 def _variances_p(a: Column, b: Column) -> float:
     """The test of the whole of `spread_p`."""
-    variances, freedoms = [], []
+    variances = []
+    freedoms = []
     for values in (a[np.isfinite(a)], b[np.isfinite(b)]):
         if values.size < _LEAST_BLOCKS:
             return math.nan
@@ -200,7 +201,8 @@ def welch_p(a: Column, b: Column, offset: float = 0.0, correlated: bool = False)
     if min(a.size, b.size) < _LEAST_TESTED:
         return math.nan
     # The variance of the difference: of both means and of the offset
-    variance, weights = offset**2, 0.0
+    variance = offset**2
+    weights = 0.0
     for part in (a, b):
         size = float(part.size)
         if correlated:

@@ -63,7 +63,8 @@ def describe_error(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
     ErrorSeries or None
         None if no tick has such an error.
     """
-    rate_hz, band_um = run.config.loop.rate_hz, run.config.limits.band_um
+    rate_hz = run.config.loop.rate_hz
+    band_um = run.config.limits.band_um
     second, counts, sums = ticks.seconds[which]
     moments = ticks.raw_reading if which == READING else ticks.raw_true
     if not moments.count:

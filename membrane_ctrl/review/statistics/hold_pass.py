@@ -93,7 +93,8 @@ def hold_pass(
 
 class _Collector:
     def __init__(self, run: Run, span_s: tuple[float, float], from_within: bool) -> None:
-        loop, self._band_um = run.config.loop, run.config.limits.band_um
+        loop = run.config.loop
+        self._band_um = run.config.limits.band_um
         self._period_s = 1 / loop.rate_hz
         self._parts = hold_parts.HoldParts(self._band_um)
         self._without = without_feedforward.WithoutFeedforward(

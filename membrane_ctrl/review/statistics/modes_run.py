@@ -154,7 +154,8 @@ def _read_frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
     # From a run's tables, or from the result of tracking.
     if is_run(folder):
         run = open_run(folder)
-        shapes, origin_s = run.shapes(), run.origin_utc.timestamp()
+        shapes = run.shapes()
+        origin_s = run.origin_utc.timestamp()
         time_s = shapes.time_s
         coeffs_um = shapes.coeffs_um
         verdict = shapes.verdict
@@ -186,10 +187,8 @@ def _read_frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
         & (np.abs(coeffs_um) < _LARGEST_UM).all(axis=1)
     )
     order = np.argsort(time_s[good], kind="stable")
-    time_s, coeffs_um = (
-        np.asarray(time_s[good][order], float),
-        np.asarray(coeffs_um[good][order], float),
-    )
+    time_s = np.asarray(time_s[good][order], float)
+    coeffs_um = np.asarray(coeffs_um[good][order], float)
     if time_s.size < 2:
         raise errors.RejectedError(f"{folder}: no usable figures")
     # Slow figures alias all vibrations.

@@ -210,7 +210,8 @@ def show_live_run(run: Run, web: bool, port: int = 0) -> int:
     DeviceError
         There is no screen, or the viewer or its server does not start.
     """
-    data_port, port = free_port(), port or free_port()
+    data_port = free_port()
+    port = port or free_port()
     if web:
         kind = ["--serve-web", "--web-viewer-port", str(port)]
     else:

@@ -165,7 +165,8 @@ def _undistort_points(
 
     # OpenCV's order; coefficients that are not given are 0.
     k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *[0.0] * 8)[:8]
-    x, y = x_d, y_d
+    x = x_d
+    y = y_d
     for _ in range(_UNDISTORT_STEPS):
         # x <- (x_d - tangential(x, y)) / radial(r^2)
         r2 = x * x + y * y

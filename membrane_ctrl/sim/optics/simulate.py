@@ -489,7 +489,8 @@ def _list_exposures(spec: SimulationSpec) -> list[_Exposure]:
         elif fault.kind == "moved":
             exposures[frame] = replace(this, displacement_um=this.displacement_um + fault.strength)
         elif fault.kind == "swapped":
-            exposures[frame], exposures[frame + 1] = exposures[frame + 1], this
+            exposures[frame] = exposures[frame + 1]
+            exposures[frame + 1] = this
     return exposures
 
 
