@@ -17,8 +17,9 @@ from membrane_ctrl.metrology.frame_checks.phase_drift import PhaseShifts
 from membrane_ctrl.metrology.frame_checks.picture_blur import estimate_blur_px, phase_gradients
 from membrane_ctrl.metrology.rays import bench_motions
 from membrane_ctrl.metrology.rays.bench_motions import group_columns
-from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.geometry import Geometry, project_points
 from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer
+from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
 from membrane_ctrl.metrology.uncertainty.cycle_errors import LiveErrors
@@ -29,6 +30,7 @@ from membrane_ctrl.metrology.uncertainty.pair_motion import PairMotion, motion_c
 from membrane_ctrl.metrology.uncertainty.phase_drift_error import phase_drift_source
 from membrane_ctrl.metrology.uncertainty.residual_patches import Patches
 from membrane_ctrl.metrology.uncertainty.response_wave_error import estimate_response_waves
+from membrane_ctrl.metrology.uncertainty.rim_check import measure_rim_misfit
 from membrane_ctrl.metrology.uncertainty.set_budget import _vertex_source
 from membrane_ctrl.metrology.uncertainty.slope_misfit import measure_curl_urad
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench, moves_mm, predicted_mm
@@ -279,3 +281,23 @@ def test_a_motion_from_x_to_y_is_found_with_the_sigma_of_its_noise(bench: TrialB
     assert abs(found.moved_um - 50.0) < 4 * found.sigma_um
     assert found.noise_um == pytest.approx(found.sigma_um, rel=0.5)
     assert found.is_significant
+
+
+def test_a_misfit_of_the_rim_is_in_sigmas_of_the_stated_geometry(bench: TrialBench) -> None:
+    """The picture may be shifted by 4 px (1 sigma), and the ring is known to 1 mm; its size, to
+    0.17 %.
+    """
+    theta = 2 * np.pi * np.arange(720) / 720
+    height_mm = np.full(theta.size, bench.vertex_z_mm + FILM.sag_mm)
+    rim_mm = np.stack([RADIUS_MM * np.cos(theta), RADIUS_MM * np.sin(theta), height_mm])
+    rim_px = project_points(bench.geometry().geometry, rim_mm)
+    radius_px = np.hypot(*(rim_px - rim_px.mean(axis=1)[:, None])).mean()
+    spread = GeometrySpread(("principal_x_px",), np.array([[4.0**2]]))
+    place_sigma_mm = math.hypot(4.0 * RADIUS_MM / radius_px, 1.0)
+
+    shifted = measure_rim_misfit(bench, spread, Outline(rim_px, (0, 0), (0, 0), 40.0, 1.0))
+    assert shifted.sigmas == pytest.approx(40.0 / place_sigma_mm, rel=1e-3)
+    assert shifted.widening == pytest.approx(max(1.0, shifted.sigmas / 2))
+    larger = measure_rim_misfit(bench, spread, Outline(rim_px, (0, 0), (0, 0), 0.0, 1.01))
+    assert larger.sigmas == pytest.approx(0.01 / 0.0017, rel=0.02)
+    assert larger.contradicts
