@@ -379,6 +379,31 @@ class FrameFitter:
         weights = self.scene.edge * fit.weights
         return waves * (weights * fit.residual_adu), waves**2 * weights
 
+    def explain_residual(self, fit: FrameFit, shifts_rad: Shifts) -> tuple[FloatArray, FloatArray]:
+        """Compare a frame's residual with changes of its light and of its phases.
+
+        Parameters
+        ----------
+        fit : FrameFit
+            A solution of this scene.
+        shifts_rad : (float, float)
+            Phase steps of its frame.
+
+        Returns
+        -------
+        products : (3, N) array
+            Sums over the bins of a cell of the residual times the light, and times the light's
+            derivatives by the phases of x and of y, weighted as in the fit.
+        powers : (3, N) array
+            Sums of the squares of these three, with the same weights.
+        """
+        by_x, by_y, *_, shown = self._compute_light_waves(shifts_rad, fit.surface, fit.light)
+        waves = np.stack([shown, by_x, by_y])
+        weighted = waves * (self.scene.edge * fit.weights)
+        products = self._cells.sum_cells(weighted * fit.residual_adu)
+        powers = self._cells.sum_cells(weighted * waves)
+        return products.astype(float), powers.astype(float)
+
     def average_in_squares(self, slow: Singles, values: AnyArray) -> FloatArray:
         """Sums over squares of the mirror whose errors count as independent.
 

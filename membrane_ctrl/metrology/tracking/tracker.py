@@ -39,6 +39,7 @@ from membrane_ctrl.metrology.tracking.fit_covariance import OTHER_BINS_SHARE, Fi
 from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter, Shifts
 from membrane_ctrl.metrology.tracking.frame_verdict import Finding
 from membrane_ctrl.metrology.tracking.outlier_rejection import RobustFitter
+from membrane_ctrl.metrology.tracking.stains import find_stain
 from membrane_ctrl.metrology.tracking.step_solution import (
     ENOUGH_STEPS,
     are_steps_separable,
@@ -557,11 +558,24 @@ class Tracker:
         """
         tilt_urad = self._watch.tilt_urad(fit.surface)
         reason = find_motion_doubt(motion, covariance_mm2, tilt_urad)
-        if motion.is_proven and reason:
-            self._knocked = reason
         if not reason:
             return None
+        reason = self._compare_with_stain(reason, motion, fit)
+        if motion.is_proven:
+            self._knocked = reason
         return Finding("degraded", reason, True)
+
+    def _compare_with_stain(self, reason: str, motion: MotionFinding, fit: FrameFit) -> str:
+        """The reason by which a motion is doubted, or the stain that explains the frame better;
+        both, if the figure is bent by more than a stain does.
+        """
+        products, powers = self._fitter.explain_residual(fit, self._shown_rad)
+        stain = find_stain(products, powers, self._noise_adu)
+        if stain is None:
+            return reason
+        if stain.explains(max(motion.figure_um, motion.hidden_um)):
+            return stain.describe()
+        return f"{reason}; {stain.describe()}"
 
     def _covariance_mm2(self, fit: FrameFit, shifts_rad: Shifts, time_s: float) -> FloatArray:
         """Covariance (parameters, parameters) of a frame's fit, on a bench that has not moved."""

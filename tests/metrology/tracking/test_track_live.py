@@ -190,6 +190,7 @@ def test_stains_that_come_while_tracking_move_no_figure_that_is_used(bench: Benc
     bench.stains = 1 + 0.04 * np.sin(rows / 2.4) * np.sin(columns / 2.6)
     stained = bench.frames(20)
     assert {e.verdict for e in stained} == {"degraded"}
+    assert {e.reason.partition(":")[0] for e in stained} == {"stained"}
     assert stained[-1].tracking_lost  # a full cycle is asked for
     full = bench.full()
     assert full.verdict == "ok"
