@@ -122,9 +122,8 @@ def _choose_pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) ->
     """The pair nearest to the run's middle, and the RMS of all pairs as far apart (within half a
     cycle).
     """
-    # For each cycle, the one that comes `lag_s` later
+    # For each cycle, the one that comes `lag_s` later, to half a cycle.
     time_s = good.time_s
-    # Each cycle with the one that is nearest to a lag later.
     half_s = 0.5 * float(np.median(np.diff(time_s)))
     other = np.searchsorted(time_s, time_s + lag_s - half_s)
     other = np.minimum(other, time_s.size - 1)
@@ -132,11 +131,13 @@ def _choose_pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) ->
     firsts = np.flatnonzero(is_pair)
     if not firsts.size:
         return None
-    # RMS over the area of the change in each pair
+
+    # RMS over the area of the change in each pair: d^T G d with the mean products G of the basis.
     changes = parameters[other[firsts]] - parameters[firsts]
     mean_squares = np.einsum("ij,jk,ik->i", changes, area.gram, changes)
     all_rms = np.sqrt(np.maximum(mean_squares, 0.0))
-    # The pair nearest to the middle, and its map with a standard deviation
+
+    # The pair nearest to the middle, and its map with a standard deviation.
     middle_s = time_s[[0, -1]].mean()
     distance_s = np.abs(time_s[firsts] + lag_s / 2 - middle_s)
     first = int(firsts[np.argmin(distance_s)])

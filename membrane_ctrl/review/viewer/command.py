@@ -315,10 +315,13 @@ def _find_zero_seconds(runs: Sequence[Run], align: str) -> list[float]:
 
 
 def _hold_s(run: Run) -> float:
-    level = run.level(60.0, names=("state",))
+    """Second in which a run began to hold: by its events, or to a minute by its tables; 0 if it
+    never did.
+    """
     for each in run.log:
         if isinstance(each.event, events.StateEntered) and each.event.state == "hold":
             return each.mono_s
+    level = run.level(60.0, names=("state",))
     held_s = level["time_s"][level["state"] == telemetry.State.HOLD]
     return float(held_s[0]) if held_s.size else 0.0
 
