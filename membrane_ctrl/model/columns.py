@@ -477,6 +477,7 @@ class ColumnValues:
         "temperature of the gas in the mirror",
         TEMPERATURES,
         "/gas/temperature",
+        colour=VIOLET,
         published=True,
     )
     film_temperature_c: float = declare_column(
@@ -491,6 +492,7 @@ class ColumnValues:
         "temperature of the ring; missing without a ring thermometer",
         TEMPERATURES,
         "/ring/temperature",
+        colour=GREY,
         published=True,
     )
     humidity_percent: float = declare_column(
@@ -513,6 +515,7 @@ class ColumnValues:
         "strain of the ring by temperature since the hold began",
         STRAINS,
         "/ring/strain",
+        colour=GREY,
         decimals=1,
     )
     climate_figure_um: float = declare_column(
@@ -527,6 +530,7 @@ class ColumnValues:
         "standard deviation of that prediction",
         CLIMATE_FIGURE,
         "/film/figure_change_sigma",
+        colour=GREY,
     )
     displacement_quality: float = declare_column(
         "displacement quality",

@@ -163,11 +163,10 @@ def _make_loop_tab(config: Config) -> rrb.Vertical:
 
 
 def _make_environment_tab(config: Config) -> rrb.Vertical:
-    return rrb.Vertical(
-        *map(_make_means_plot, plots_of(Group.ENVIRONMENT)),
-        _make_error_plot(config),
-        name="Environment",
-    )
+    # Two plots a row: in one column they are too low for the legend of four temperatures
+    plots = [_make_means_plot(plot) for plot in plots_of(Group.ENVIRONMENT)]
+    rows = [rrb.Horizontal(*plots[first : first + 2]) for first in range(0, len(plots), 2)]
+    return rrb.Vertical(*rows, _make_error_plot(config), name="Environment")
 
 
 def _make_map(kind: str, name: str) -> rrb.Spatial2DView:

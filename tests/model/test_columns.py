@@ -11,8 +11,11 @@ from membrane_ctrl.model.columns import (
     DRAWN,
     TRUE_ERROR_COLUMN,
     Aggregation,
+    Group,
     Kind,
     TelemetryColumn,
+    columns_of,
+    plots_of,
     unit_of,
 )
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
@@ -109,3 +112,12 @@ def test_a_column_without_a_unit_suffix_has_no_unit() -> None:
         TelemetryColumn("gusts", "gusts", "count of gusts", TRUE_ERROR_COLUMN.plot, "/x").title
         == "gusts"
     )
+
+
+def test_lines_of_one_plot_have_different_colours() -> None:
+    for group in Group:
+        if group is Group.RECORD:  # drawn by nobody
+            continue
+        for plot in plots_of(group):
+            colours = [column.colour for column in columns_of(plot)]
+            assert len(set(colours)) == len(colours), plot.title
