@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.model import errors, files, plain_json, program
+from membrane_ctrl.model import errors, files, plain_json, program, terminal
 from membrane_ctrl.sessions import session_json
 from tuning.identification import loop_figures
 
@@ -196,19 +196,25 @@ def format_history(found: list[GainsEntry]) -> str:
         "|---|---|---|---|---:|---:|---:|---|---:|---:|---:|---:|---|",
     ]
     for line in found:
-        loop = line.before if line.what == "rolled_back" else line.after
-        traded = (
-            (line.traded.candidate, *line.traded.words) if line.traded is not None else [""] * 5
-        )
+        # What is in use after the entry: a roll-back brings back what was there before.
+        loop = line.after
+        shape_s = line.shape_s
+        if line.what == "rolled_back":
+            loop = line.before
+            if shape_s is not None:
+                shape_s = shape_s[1], shape_s[0]
+        traded = ("",) * 5
+        if line.traded is not None:
+            traded = (line.traded.candidate, *line.traded.words)
         reason = line.reason
-        if line.shape_s is not None:
-            before_s, after_s = (
-                reversed(line.shape_s) if line.what == "rolled_back" else line.shape_s
-            )
-            reason = f"shape loop {before_s:.0f} -> {after_s:.0f} s: {reason}"
-        lines.append(
-            f"| {line.time_utc} | {line.what} | {line.session} | {line.author} | "
-            f"{loop.kp_per_s:.3f} | {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | "
-            f"{' | '.join(traded)} | {reason} |"
-        )
+        if shape_s is not None:
+            reason = f"shape loop {shape_s[0]:.0f} -> {shape_s[1]:.0f} s: {reason}"
+        gains = (f"{loop.kp_per_s:.3f}", f"{loop.ti_s:.2f}", f"{loop.measurement_filter_s:.2f}")
+        cells = (line.time_utc, line.what, line.session, line.author, *gains, *traded, reason)
+        lines.append(f"| {' | '.join(map(_format_cell, cells))} |")
     return "\n".join(lines)
+
+
+def _format_cell(text: str) -> str:
+    """Text that stays in its cell of a Markdown table: people type reasons with any character."""
+    return terminal.one_line(text).replace("|", r"\|")

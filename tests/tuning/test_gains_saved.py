@@ -16,7 +16,7 @@ from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.sessions import folder as plain
 from tuning import same_bench
 from tuning.identification.pump_map import PumpMap
-from tuning.journal import What, append_entry, make_entry, read_entries
+from tuning.journal import What, append_entry, format_history, make_entry, read_entries
 from tuning.steps.map_pump import MappedPump
 from tuning.steps.verify import Verified
 
@@ -371,3 +371,14 @@ def test_a_session_designs_gains_wherever_a_pi_may_hold_the_mirror() -> None:
     values = ("auto", "laser", "estimate", "optics")
     configs = [Config.model_validate({"estimator": {"process_value": value}}) for value in values]
     assert [config.has_pi for config in configs] == [True, True, False, False]
+
+
+def test_any_reason_stays_in_its_cell_of_the_history(tmp_path: Path) -> None:
+    entry = make_entry("kept", "one", "a|b", "less | noise\nand drift", BEFORE, AFTER)
+    append_entry(tmp_path, entry)
+    rows = format_history(read_entries(tmp_path)).splitlines()
+    assert len(rows) == 3
+    assert r"a\|b" in rows[2]
+    assert rows[2].endswith(r"| less \| noise and drift |")
+    columns = [row.replace(r"\|", "").count("|") for row in rows]
+    assert len(set(columns)) == 1

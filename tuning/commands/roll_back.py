@@ -26,26 +26,25 @@ def roll_back(options: TuneOptions) -> int:
         except HoldError as error:
             raise DeviceError(str(error)) from None
     # Note it, also that a configuration may still have the others.
-    entry_values = (
+    entry = journal.make_entry(
+        "rolled_back",
         kept.session,
         options.author,
         options.reason,
         kept.before,
         kept.after,
-        None,
-        kept.shape_s,
+        shape_s=kept.shape_s,
     )
-    entry = journal.make_entry("rolled_back", *entry_values)
     journal.append_entry(options.logs, entry)
-    progress.print_line(
-        (
-            f"back to the gains before {kept.session}: K {kept.before.kp_per_s:g} 1/s, Ti "
-            f"{kept.before.ti_s:g} s"
-        )
-        + (f", time constant of the shape loop {kept.shape_s[0]:.0f} s" if kept.shape_s else "")
+    found = (
+        f"back to the gains before {kept.session}: K {kept.before.kp_per_s:g} 1/s, Ti "
+        f"{kept.before.ti_s:g} s"
     )
-    for saved in {
-        line.reason for line in journal.read_entries(options.logs) if line.what == "saved"
-    }:
+    if kept.shape_s is not None:
+        found += f", time constant of the shape loop {kept.shape_s[0]:.0f} s"
+    progress.print_line(found)
+    # Each configuration once, in the order in which they were saved.
+    entries = journal.read_entries(options.logs)
+    for saved in dict.fromkeys(entry.reason for entry in entries if entry.what == "saved"):
         progress.print_line(f"{saved} was saved with gains of a session: check its [loop]")
     return Exit.DONE
