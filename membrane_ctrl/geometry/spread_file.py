@@ -93,8 +93,8 @@ def find_known_by(optics: schema.OpticsConfig, file: Path | None) -> KnownBy:
 
     Parameters
     ----------
-    optics, file : as in `geometry_spread`
-        -
+    optics, file
+        As for `geometry_spread`.
 
     Raises
     ------

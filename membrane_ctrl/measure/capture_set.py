@@ -250,8 +250,8 @@ def read_set(folder: str | Path, geometry: GeometryFile | None = None) -> Captur
 
     Parameters
     ----------
-    folder, geometry : as in `read_head`
-        -
+    folder, geometry
+        As for `read_head`.
 
     Returns
     -------

@@ -149,8 +149,8 @@ def read_floats(file: Any, name: str) -> FloatArray:
 
     Parameters
     ----------
-    file, name : as in `read_item`
-        -
+    file, name
+        As for `read_item`.
 
     Returns
     -------

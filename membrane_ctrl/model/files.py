@@ -118,8 +118,8 @@ def read_text(
 
     Parameters
     ----------
-    path, most_bytes, follow : as in `read_bytes`
-        -
+    path, most_bytes, follow
+        As for `read_bytes`.
     errors : str
         As of `bytes.decode`.
 

@@ -90,8 +90,8 @@ class TelemetryRow(ColumnValues):
 
         Parameters
         ----------
-        name, sign, width : as in `format_quantity`
-            -
+        name, sign, width
+            As for `format_quantity`.
         """
         return f"{COLUMNS[name].short_label} {self.format_quantity(name, sign, width)}"
 

@@ -216,8 +216,8 @@ class MemoryLink:
 
         Parameters
         ----------
-        address, count : as in `read_holding`
-            -
+        address, count
+            As for `read_holding`.
         """
         return await self.read_holding(address, count)
 

@@ -47,8 +47,10 @@ class Sliders:
 
         Parameters
         ----------
-        model, dt_s : as in `make_gains`
-            -
+        model : PlantModel
+            Its delay sets the range of time constants.
+        dt_s : float
+            Period of a tick.
         """
         low_s, high_s = find_time_constants_s(model, dt_s)
         return Sliders(
@@ -66,10 +68,13 @@ class Sliders:
         Parameters
         ----------
         gains : Gains
-            The gains.
-        model, dt_s : as in `make_gains`
-            -
+            A derivative term is left out: the sliders have none.
+        model : PlantModel
+            The plant, with its gain and delay.
+        dt_s : float
+            Period of a tick.
         """
+        # The inverse of `make_gains`: tc + d from K, limited to the slider's range, then c from Ti.
         slowed_s = 1 / (model.gain * max(gains.kp_per_s, 1e-9))
         delay_s = tuning_rules.compute_effective_delay_s(model, dt_s, gains.filter_s)
         within = _clip(slowed_s - delay_s, DELAYS[0] * delay_s, DELAYS[1] * delay_s)

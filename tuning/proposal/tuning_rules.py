@@ -47,12 +47,12 @@ def make_amigo_gains(
 ) -> closed_loop.Gains:
     """AMIGO PI for an integrating process: K = 0.35 / (k d), Ti = 13.4 d.
 
-    Astrom and Hagglund 2006, eq. 7.3. Parameters as of `make_simc_gains`.
+    Source: Astrom and Hagglund 2006, eq. 7.3.
 
     Parameters
     ----------
-    model, dt_s, filter_s : as in `make_simc_gains`
-        -
+    model, dt_s, filter_s
+        As for `make_simc_gains`.
     """
     delay_s = compute_effective_delay_s(model, dt_s, filter_s)
     return closed_loop.Gains(0.35 / (model.gain * delay_s), 13.4 * delay_s, 0.0, filter_s)

@@ -68,18 +68,18 @@ def describe_result(session: folder.SessionFolder) -> str:
     found = load_identified(session)
     model = found.identified.model
     sigma = found.identified.sigma
-    reasons = "".join(f"; {reason}" for reason in found.quality.reasons)
-    too_tight = model.leak_um_per_s < TOO_TIGHT_UM_PER_S
-    lossy = describe_losses(load_experiments(session).record, session.config.by_optics)
-    actuator = found.actuator.describe()
-    return (
+    plant = (
         f"k {model.gain:.3f} +- {sigma.gain:.3f}, delay {model.delay_s:.3f} +- {sigma.delay_s:.3f} "
         f"s (dead time {model.dead_time_s:.3f} +- {sigma.dead_time_s:.3f} s), leak "
-        f"{model.leak_um_per_s:.2f} µm/s: {found.quality.verdict}{reasons}"
-        + (f"; {TOO_TIGHT}" if too_tight else "")
-        + (f"; {actuator}" if actuator else "")
-        + (f"; {lossy}" if lossy else "")
+        f"{model.leak_um_per_s:.2f} µm/s: {found.quality.verdict}"
     )
+    # What limits the use of these data, each with its remedy.
+    remarks = list(found.quality.reasons)
+    if model.leak_um_per_s < TOO_TIGHT_UM_PER_S:
+        remarks.append(TOO_TIGHT)
+    remarks.append(found.actuator.describe())
+    remarks.append(describe_losses(load_experiments(session).record, session.config.by_optics))
+    return "; ".join([plant, *(remark for remark in remarks if remark)])
 
 
 def describe_losses(record: Record, by_optics: bool) -> str:

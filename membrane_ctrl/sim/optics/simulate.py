@@ -85,8 +85,8 @@ def write_capture_toml(folder: Path, spec: SimulationSpec, readings_um: FloatArr
     ----------
     folder : Path
         It must exist.
-    spec, readings_um : as in `capture_table`
-        -
+    spec, readings_um
+        As for `capture_table`.
     """
     (folder / "capture.toml").write_bytes(tomli_w.dumps(capture_table(spec, readings_um)).encode())
 
