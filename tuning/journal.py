@@ -203,7 +203,7 @@ def format_history(found: list[GainsEntry]) -> str:
             loop = line.before
             if shape_s is not None:
                 shape_s = shape_s[1], shape_s[0]
-        traded = ("",) * 5
+        traded: tuple[str, ...] = ("",) * 5
         if line.traded is not None:
             traded = (line.traded.candidate, *line.traded.words)
         reason = line.reason
