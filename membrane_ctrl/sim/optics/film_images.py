@@ -143,9 +143,10 @@ def shade_images(
     -------
     AddedLight
     """
-    # The part of the picture between nodes of which one sees the region.
     step = weights.shape[0]
     column_loss, row_loss = loss
+
+    # The part of the picture between nodes of which one sees the region.
     seen = np.zeros(images_mm.shape[2:], bool)
     for image in images_mm:
         seen |= _is_near_region(image, side_mm)
