@@ -44,13 +44,15 @@ kernels: $(STAMP)  # compiled first, so that real-time tests do not wait for it
 	$(BIN)/membrane-ctrl simulate build/kernels --shrink 12
 	$(BIN)/membrane-ctrl measure build/kernels --no-pictures
 
+# a worker takes whole files, the longest first (tests/support/file_order.py)
+BY_FILE := --dist loadfile --no-loadscope-reorder
 # per worker: more threads would only wait for each other
 fast real_time: export OPENBLAS_NUM_THREADS = 1
 fast: $(STAMP)
-	$(BIN)/pytest -m "not campaign and not real_time" -n 2 --dist loadfile
+	$(BIN)/pytest -m "not campaign and not real_time" -n 2 $(BY_FILE)
 
-real_time: $(STAMP)  # named, because collecting the other files takes each worker 15 s
-	$(BIN)/pytest -m "real_time and not campaign" -n 2 --dist loadfile $$(grep -rlw real_time tests --include='test_*.py')
+real_time: $(STAMP)  # named, because collecting the other files takes each worker 15 s; three, because they wait
+	$(BIN)/pytest -m "real_time and not campaign" -n 3 $(BY_FILE) $$(grep -rlw real_time tests --include='test_*.py')
 
 unit: fast real_time
 

@@ -20,6 +20,7 @@ from steady_loop import SteadyLoop
 
 from membrane_ctrl.instruments import lock_store
 from tests.support import real_data
+from tests.support.file_order import sort_items
 from tests.support.undrawn import undrawn_figures
 
 # No test sees or leaves locks on this machine's devices, nor does a program that a module's fixture
@@ -63,7 +64,8 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before cases are left out by their marks
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Refuse names in `fast_cases` that are those of no case."""
+    """Sort the tests, and refuse names in `fast_cases` that are those of no case."""
+    sort_items(items)
     if any("[" in arg for arg in config.args):
         return
     named: dict[str, set[str]] = {}

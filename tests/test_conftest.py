@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support import file_order
+
 pytest_plugins = ["pytester"]
 
 CONFTEST = Path(__file__).with_name("conftest.py").read_text(encoding="utf-8")
@@ -61,3 +63,9 @@ def test_a_named_case_that_does_not_exist_is_refused(pytester: pytest.Pytester) 
     pytester.makepyfile(CASES.format(name="four"))
     result = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-W", "ignore")
     result.stderr.fnmatch_lines(["*names what is no case*four*"])
+
+
+def test_the_longest_files_are_there() -> None:
+    names = file_order.LONGEST_FIRST
+    assert [name for name in names if not (file_order.ROOT / "tests" / name).is_file()] == []
+    assert len(set(names)) == len(names)

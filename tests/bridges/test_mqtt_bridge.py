@@ -43,6 +43,7 @@ pytestmark = [
 BASE = "membrane/mirror"
 ANSWER_S = 1.0
 PATIENCE_S = 30.0
+WATCHED_S = 2.0
 NOT_OURS = "0" * 16
 
 
@@ -147,6 +148,7 @@ def kinds(run: PortRun) -> list[str]:
     return [command.kind for command in run.asked]
 
 
+@pytest.mark.fast_cases("quiet-latch", "quiet-stop", "mark-lower", "mark-vent")
 @pytest.mark.parametrize("kind", sorted(SAFETY))
 @pytest.mark.parametrize("flood", ["quiet", "mark"])
 async def test_a_safety_command_behind_150_others_is_answered_within_a_second(
@@ -213,6 +215,7 @@ async def test_what_a_flood_loses_is_reported(tmp_path: Path) -> None:
         assert done == len(run.asked)
 
 
+@pytest.mark.fast_cases("0-0", "0-1", "150-0", "150-1")
 @pytest.mark.parametrize("qos", [0, 1])
 @pytest.mark.parametrize("before", [0, 4, 150])
 async def test_a_hold_published_before_a_lower_is_not_obeyed_after_it(
@@ -223,7 +226,7 @@ async def test_a_hold_published_before_a_lower_is_not_obeyed_after_it(
         aiomqtt.Client("127.0.0.1", port) as client,
     ):
         run.state = State.STANDBY
-        for round_ in range(5):
+        for round_ in range(2):
             listener.seen.clear()
             run.asked.clear()
             for _ in range(before):
@@ -237,6 +240,7 @@ async def test_a_hold_published_before_a_lower_is_not_obeyed_after_it(
             await listener.answer("hold: done")
 
 
+@pytest.mark.fast_cases("hold", "latch")
 @pytest.mark.parametrize("command", ["hold", "latch", "vent"])
 async def test_a_retained_command_is_never_obeyed(tmp_path: Path, command: str) -> None:
     port = free_port()
@@ -317,7 +321,7 @@ async def test_an_old_will_is_corrected_within_seconds(tmp_path: Path) -> None:
         serving(relay_port, bridge_to(tmp_path)),
     ):
         await listener.until(lambda: "online" in listener.of("availability"))
-        for _ in range(3):
+        for _ in range(2):
             reset()
             listener.seen.clear()
             await listener.until(lambda: "offline" in listener.of("availability"))
@@ -403,7 +407,7 @@ async def test_a_second_bridge_of_the_name_is_refused_and_the_first_continues(
 
 
 async def test_of_two_bridges_that_start_together_one_continues(tmp_path: Path) -> None:
-    for _ in range(3):
+    for _ in range(2):
         port = free_port()
         async with (
             broker(port),
@@ -524,7 +528,7 @@ async def test_a_broker_that_does_not_answer_costs_neither_memory_nor_commands(
     bridge = bridge_to(tmp_path)
     async with port_run(tmp_path) as run, serving(port, bridge) as task:
         begin_s = loop_time_s()
-        while loop_time_s() - begin_s < 4.0:
+        while loop_time_s() - begin_s < WATCHED_S:
             asked_s = loop_time_s()
             assert (await bridge.ask("opcua", "stop")).endswith("stop: done")
             assert loop_time_s() - asked_s < ANSWER_S
@@ -532,7 +536,7 @@ async def test_a_broker_that_does_not_answer_costs_neither_memory_nor_commands(
         assert "stop" in kinds(run)
         assert not task.done()
     server.close()
-    assert connections <= 4.0 / mqtt._AGAIN_S + 2
+    assert connections <= WATCHED_S / mqtt._AGAIN_S + 2
     assert peak_mb() - before_mb < 20
     assert len(capsys.readouterr().err.splitlines()) <= 3, "one line, not one for each attempt"
 

@@ -121,7 +121,7 @@ def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path: Path) -> None:
     camera = f"start_error_um = -2.0\n[optics.camera]\n{SMALL_CAMERA}[shape]\nperiod_s = 1.0\n"
-    words = hold(tmp_path, "--duration", "60s", config=camera)  # kernels may have to be compiled
+    words = hold(tmp_path, "--duration", "45s", config=camera)  # kernels may have to be compiled
     process = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         wait_for(lambda: reached(tmp_path, "hold"))

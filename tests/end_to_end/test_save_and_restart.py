@@ -30,10 +30,14 @@ ROLES = ("read", "operate", "tune")
 
 
 def configuration(kp_per_s: float) -> str:
-    """A simulated bench that is patient with a busy machine, as far as its watchdog admits."""
+    """A simulated bench that is patient with a busy machine, as far as its watchdog admits, and
+    soon holds.
+    """
     return (
         "[limits]\nlateness_max_ms = 450.0\n[twin]\nport = 0\nscenario = 'quiet'\n"
-        f"[shape]\nenabled = false\n[loop]\nkp_per_s = {kp_per_s}\n"
+        "start_error_um = -2.0\n[shape]\nenabled = false\n"
+        "[states]\nactuator_test = false\ncheck_s = 0.5\n"
+        f"[loop]\nkp_per_s = {kp_per_s}\n"
     )
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import experiment, operating_point
@@ -29,6 +32,20 @@ def record_quiet_hold(seed: int = 3) -> Record:
 
 def make_designed_session(logs: Path) -> Path:
     """Make the session in a folder of runs; returns its folder."""
+    made = Path(_designed_logs().name)
+    (session,) = (made / "tuning").iterdir()
+    return Path(shutil.copytree(session, logs / "tuning" / session.name))
+
+
+@cache
+def _designed_logs() -> TemporaryDirectory[str]:
+    """A folder of runs with the session, which is designed once in a process."""
+    logs = TemporaryDirectory(prefix="designed-")
+    _design_session(Path(logs.name))
+    return logs
+
+
+def _design_session(logs: Path) -> None:
     opened = folder.create_session(logs, "made", "tester", "made up", Config(loop=LOOP), LOOP)
     record = synthetic.record(PLANT, samples=6000)
     record_file.save_record(opened.file_path("experiments.npz"), record)
@@ -49,4 +66,3 @@ def make_designed_session(logs: Path) -> Path:
         opened.file_path("disturbance.json"), disturbance.observe_disturbance(quiet, found, LOOP)
     )
     design.run_design(opened)
-    return opened.path
