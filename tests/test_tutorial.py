@@ -154,6 +154,7 @@ def test_a_changed_line_is_noticed() -> None:
     assert missing_lines(("x (22.6 s)",), "x (1.0 s)\n") == []
 
 
+@pytest.mark.fast_cases("simulate set2 --shrink 4 --fault stale:x_sin_2")
 @pytest.mark.parametrize("command", MEASURED)
 def test_images_are_measured(command: str, tmp_path: Path) -> None:
     run_step(step_with(command), tmp_path)

@@ -202,6 +202,7 @@ async def hear_from(feed: HoldFeed) -> None:
             await asyncio.sleep(0.05)
 
 
+@pytest.mark.real_time
 def test_feeds_outlive_every_peer_and_leave_others_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -59,6 +59,7 @@ def test_a_fan_is_recognised_with_its_two_lags() -> None:
     assert "two lags" in found.describe()
 
 
+@pytest.mark.fast_cases("<lambda>1", "<lambda>2")
 @pytest.mark.parametrize(
     "pump",
     [

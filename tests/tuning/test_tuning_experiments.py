@@ -78,6 +78,7 @@ def held_again(rig: Rig, bench: TwinBench) -> bool:
     return max(abs(x) for x in bench.true_um[start:]) < 2.0
 
 
+@pytest.mark.fast_cases("nominal", "leak /3", "pump x3", "delay x3")
 @pytest.mark.parametrize(
     "case",
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,7 @@ def run_virtual(
             yield tick
 
 
+@cache  # several modules look at the same holds
 def kept_ticks(
     duration_s: float, alter: Alter | None = None
 ) -> list[tuple[TickInputs, TickOutputs]]:

@@ -161,6 +161,7 @@ def test_a_ring_that_bends_in_its_seat_is_no_wrong_angle() -> None:
     assert "cause unknown" in finding.description
 
 
+@pytest.mark.campaign  # the finding: test_a_ring_that_bends_in_its_seat_...
 def test_the_figure_of_another_film_is_no_set_of_another_bench() -> None:
     """The turned ring has waves of 0.5 mm: without that figure the sets agree."""
     problem = turned_truth(3, 120.0, SMOOTH, EVEN).problem(EVERY)

@@ -208,6 +208,7 @@ def test_half_a_mirror_is_rejected() -> None:
     assert "of the area" in estimate.reason
 
 
+@pytest.mark.fast_cases("3-8", "4-16")
 @pytest.mark.parametrize(("steps", "bits"), [(3, 8), (7, 12), (4, 16)])
 def test_other_steps_and_depths(steps: int, bits: int) -> None:
     camera = SMALL.model_copy(update={"bits": bits, "noise_adu": 0.4 * 2 ** (bits - 8)})

@@ -52,6 +52,7 @@ def fit_of(seen: CushionPhases) -> ReflectionFit:
     return fit
 
 
+@pytest.mark.fast_cases("None", "1")
 @pytest.mark.parametrize("seed", [None, 1, 2, 3, 4])
 def test_reflections_of_a_mounted_film_are_removed(seed: int | None) -> None:
     """What is left is a hundredth of a micrometre: 1 mm on the screen before, 0.02 mm after."""

@@ -307,6 +307,7 @@ def test_an_isotropic_film_has_no_stiff_direction() -> None:
     assert fit.law.prestrain == pytest.approx(5e-4, abs=1e-5)
 
 
+@pytest.mark.fast_cases("0.005", "0.3")
 @pytest.mark.parametrize("size_mm", [0.005, 0.03, 0.3])
 def test_waves_that_all_sets_share_have_no_cause_in_the_film(size_mm: float) -> None:
     """Astigmatism of a mount, of any size and direction, made the film "stiffer in one direction"

@@ -84,6 +84,7 @@ def at_rest(tmp_path_factory: pytest.TempPathFactory) -> MeasuredErrors:
     return measured(None, tmp_path_factory.mktemp("at-rest"), seed=1)
 
 
+@pytest.mark.fast_cases("linear", "step", "between the axes, before frame 8")
 @pytest.mark.parametrize("name", COURSES | BETWEEN)
 def test_a_change_of_the_sag_is_within_its_bar_whatever_moment_is_meant(
     name: str, tmp_path: Path, at_rest: MeasuredErrors
