@@ -134,20 +134,16 @@ class Viewer:
         """Click, and confirm the dialog that opens."""
         before = set(self.client.elements)
         self.fire(button)
-        await settle()
+        for _ in range(10):
+            await asyncio.sleep(0.01)
         for each in list(self.client.elements.values()):
             if each.id not in before and isinstance(each, ui.input):
                 each.set_value("1")
         for each in self.buttons:
             if each.id not in before and each.text in (*AGREES, "Close"):
                 self.fire(each)
-        await settle()
-
-
-async def settle() -> None:
-    """Let the handlers of a click run, and what they start."""
-    for _ in range(3):
-        await asyncio.sleep(0.01)
+        for _ in range(10):
+            await asyncio.sleep(0.01)
 
 
 def _ignore_script(code: str, **_options: object) -> asyncio.Future[None]:
@@ -237,7 +233,6 @@ async def test_every_button_needs_its_role(
         slider.set_value(slider.value + 0.1)
         for button in shown:
             await viewer.press(button)
-        await asyncio.sleep(0.5)
         # what was sent before has arrived once this has
         asked = {command.kind for command in viewer.run.asked}
         kept = set(viewer.views.list_references("")) - {FIRST_FIGURE, HEIGHT}
