@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import shutil
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import experiment, operating_point
@@ -32,16 +33,16 @@ def record_quiet_hold(seed: int = 3) -> Record:
 
 def make_designed_session(logs: Path) -> Path:
     """Make the session in a folder of runs; returns its folder."""
-    made = Path(_designed_logs().name)
-    (session,) = (made / "tuning").iterdir()
+    (session,) = (_designed_logs() / "tuning").iterdir()
     return Path(shutil.copytree(session, logs / "tuning" / session.name))
 
 
 @cache
-def _designed_logs() -> TemporaryDirectory[str]:
+def _designed_logs() -> Path:
     """A folder of runs with the session, which is designed once in a process."""
-    logs = TemporaryDirectory(prefix="designed-")
-    _design_session(Path(logs.name))
+    logs = Path(mkdtemp(prefix="designed-"))
+    atexit.register(shutil.rmtree, logs, ignore_errors=True)
+    _design_session(logs)
     return logs
 
 
