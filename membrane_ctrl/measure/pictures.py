@@ -205,9 +205,8 @@ def _draw_star(found: MeasuredFigure) -> Canvas | None:
     picture.draw_frame(f"image of a star {wave}, log10; Strehl {strehl:.3g}", f"x ({unit})")
 
     # Its energy by radius.
-    radius_um, share = image.energy_curve()
     energy = PlotAxes(sheet.canvas, sheet.box(0, 1), AxisScale(0, view), _PERCENT)
-    energy.draw_line(per_um * radius_um, 100 * share)
+    energy.draw_line(per_um * image.curve_um, 100 * image.curve_share)
     for percent, at_um in ((50, image.radius_50_um), (80, image.radius_80_um)):
         at = per_um * at_um
         energy.draw_dots(at, percent)

@@ -18,6 +18,7 @@ from membrane_ctrl.metrology.figure.set_quality import set_quality
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.frame_checks import pixel_noise
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
+from membrane_ctrl.metrology.numerics.vectors import vector_lengths
 from membrane_ctrl.metrology.phase import full_decoder, pattern_sequence, phase_steps, screen_scale
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.phase.pixel_phases import PixelPhases, pixel_phases
@@ -472,7 +473,7 @@ def _slope_residual(
     surface's.
     """
     field = tracer.slope_field(points, surface)
-    return field, np.hypot(field[2] - field[4], field[3] - field[5])
+    return field, vector_lengths(field[2:4] - field[4:6])
 
 
 def tukey_weights(residual: FloatArray) -> FloatArray:
