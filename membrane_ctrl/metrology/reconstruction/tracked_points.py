@@ -132,17 +132,16 @@ def select_points(
     tracer.intersect(points, surface, newton=3)
 
     # Without bins outside the analysed radius, then without outliers of the surface through all:
-    # one through some would be bent by wrinkles that it happens to meet.
-    for select in (_inside_radius, _without_outliers):
-        keep = np.flatnonzero(select(tracer, points, surface, analysis_radius_mm))
-        points = points.subset(keep)
-        index = index[keep]
-        phase_rad = np.take(phase_rad, keep, axis=1)
-        if index.size < _MIN_POINTS:
-            raise ValueError(f"only {index.size} bins see the pattern inside the analysis radius")
-        fit = surface_fit.fit_surface(tracer, points, surface)
-        surface = fit.surface
-    tracer.intersect(points, surface)
+    # one through some would be bent by wrinkles that it happens to meet. Mostly there are none.
+    chosen = np.flatnonzero(_inside_radius(tracer, points, analysis_radius_mm))
+    fit, points = _fit_chosen(tracer, points, chosen, surface)
+    sound = np.flatnonzero(_without_outliers(tracer, points, fit.surface))
+    if sound.size < chosen.size:
+        chosen = chosen[sound]
+        fit, points = _fit_chosen(tracer, points, sound, fit.surface)
+    index = index[chosen]
+    phase_rad = np.take(phase_rad, chosen, axis=1)
+    tracer.intersect(points, fit.surface)
 
     # From phase to place on the screen; the effect of the film's displacement; the bins' areas.
     mm_per_rad = screen_scale.mm_per_rad(pattern)
@@ -189,8 +188,18 @@ def _fit_some(tracer: ray_tracing.Tracer, points: ray_tracing.Points) -> Surface
     return surface_fit.fit_surface(tracer, some, start).surface
 
 
+def _fit_chosen(
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, chosen: IntArray, start: Surface
+) -> tuple[surface_fit.Fit, ray_tracing.Points]:
+    """Fit the chosen points, which are returned. Raises ValueError if there are too few."""
+    if chosen.size < _MIN_POINTS:
+        raise ValueError(f"only {chosen.size} bins see the pattern inside the analysis radius")
+    points = points.subset(chosen)
+    return surface_fit.fit_surface(tracer, points, start), points
+
+
 def _inside_radius(
-    tracer: ray_tracing.Tracer, points: ray_tracing.Points, _surface: Surface, radius_mm: float
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, radius_mm: float
 ) -> BoolArray:
     """Points within a radius."""
     x, y = tracer.position_mm(points)
@@ -198,7 +207,7 @@ def _inside_radius(
 
 
 def _without_outliers(
-    tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface, _radius_mm: float
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface
 ) -> BoolArray:
     """Slopes within some robust sigmas of the fit, in both directions."""
     field = tracer.slope_field(points, surface)
