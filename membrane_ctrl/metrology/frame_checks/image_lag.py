@@ -415,20 +415,24 @@ def _fit_previous(
     columns = np.compress(usable, columns, axis=1)
     seen = seen[usable]
 
-    # The frame's own pattern alone. Normal equations: the columns have length 1 and are far from
+    # The frame's own pattern alone. Normal equations of columns of length 1, which are far from
     # dependent; where one is empty, the small diagonal leaves it out.
-    lengths = np.sqrt(np.einsum("pn,pn->p", columns, columns))
-    columns = columns / np.maximum(lengths, 1e-30)[:, None]
     normal = columns @ columns.T
-    normal[np.diag_indices_from(normal)] += _REGULAR
-    solve = np.linalg.inv(normal) @ columns
-    own = (solve @ seen) @ columns
+    lengths = np.maximum(np.sqrt(np.diag(normal)), 1e-30)
+    scale = np.outer(lengths, lengths)
+    inverse = np.linalg.inv(normal / scale + _REGULAR * np.eye(lengths.size)) / scale
+
+    def explain(light: FloatArray) -> FloatArray:
+        """The part of light (..., n) that the columns can show."""
+        return np.asarray((light @ columns.T) @ inverse @ columns)
+
+    own = explain(seen)
 
     # The change from the previous frame, where this frame is brighter, and where it is darker; each
     # less what the own pattern explains of it.
     change = previous[usable] - own
     ways = np.stack([np.minimum(change, 0.0), np.maximum(change, 0.0)])
-    free = ways - (ways @ solve.T) @ columns
+    free = ways - explain(ways)
     power = np.sum(free**2, axis=1)
     least_power = _LEAST_DETERMINED * np.sum(ways**2, axis=1) + 1e-12 * float(own @ own)
     is_determined = power > least_power
@@ -437,10 +441,10 @@ def _fit_previous(
 
     # Least squares for the shares; the rest gives their noise.
     free = free[is_determined]
-    inverse = np.linalg.inv(free @ free.T)
-    shares = inverse @ (free @ (seen - own))
+    covariance = np.linalg.inv(free @ free.T)
+    shares = covariance @ (free @ (seen - own))
     rest = seen - own - shares @ free
-    sigmas = np.sqrt(np.mean(rest**2) * np.diag(inverse))
+    sigmas = np.sqrt(np.mean(rest**2) * np.diag(covariance))
     determined = list(zip(shares.tolist(), sigmas.tolist(), strict=True))
     rise_is_determined, fall_is_determined = is_determined
     rise = determined[0] if rise_is_determined else None
