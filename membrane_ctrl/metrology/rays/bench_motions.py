@@ -13,6 +13,7 @@ turns about axes of the moved body:
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -49,10 +50,12 @@ GROUPS = (
 COMPONENTS = sum(group.components for group in GROUPS)
 
 
-def group_columns() -> list[slice]:
+@cache
+def group_columns() -> tuple[slice, ...]:
     """Columns of each group among all components."""
     ends = np.cumsum([group.components for group in GROUPS]).tolist()
-    return [slice(end - group.components, end) for group, end in zip(GROUPS, ends, strict=True)]
+    begins = [0, *ends[:-1]]
+    return tuple(slice(begin, end) for begin, end in zip(begins, ends, strict=True))
 
 
 def describe_hidden_allowance() -> str:

@@ -64,10 +64,12 @@ class Surface:
         """
         return cls(sag_mm * hencky_bowl.zernike_projection(), sag_mm, radius_mm)
 
-    @property
+    @cached_property
     def parameters(self) -> FloatArray:
-        """[a_2, a_3, ..., excess with unit RMS] in mm."""
-        return np.append(self.coeffs_mm[1:], self.hencky_mm * hencky_bowl.excess_rms())
+        """[a_2, a_3, ..., excess with unit RMS] in mm; read only."""
+        values = np.append(self.coeffs_mm[1:], self.hencky_mm * hencky_bowl.excess_rms())
+        values.setflags(write=False)
+        return values
 
     @cached_property
     def polynomial(self) -> FloatArray:
