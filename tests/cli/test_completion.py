@@ -31,6 +31,11 @@ def complete(words: str, folder: Path) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.fast_cases(
+    "membrane-ctrl ho-expected0",
+    "membrane-ctrl twin play laser_k-expected4",
+    "membrane-ctrl check lab-expected6",
+)
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

@@ -366,6 +366,7 @@ SLOW_PUMPS = {
 }
 
 
+@pytest.mark.fast_cases("0.3 + 0.5 s", "s-shaped, 0.5 + 1 s")
 @pytest.mark.parametrize("name", SLOW_PUMPS)
 def test_a_hold_starts_with_a_slow_pump_of_another_world(name: str) -> None:
     for seed in range(2):

@@ -60,6 +60,7 @@ def test_coarse_steps_count_as_noise(step_um: float, noise_um: float) -> None:
     assert 0.5 * true_um < found_um < 1.5 * true_um
 
 
+@pytest.mark.fast_cases("0.0-0.05", "0.15-0.15")
 @pytest.mark.parametrize(
     ("pace_s", "dt_s"),
     [(0.0, 0.05), pytest.param(0.06, 0.05, marks=pytest.mark.campaign), (0.1, 0.1), (0.15, 0.15)],

@@ -88,6 +88,7 @@ def test_a_hencky_bowl_with_millimetres_of_figure() -> None:
     assert np.max(np.abs(error)) <= 0.5
 
 
+@pytest.mark.fast_cases("deep", "V-fold")
 @pytest.mark.parametrize(
     "start",
     [

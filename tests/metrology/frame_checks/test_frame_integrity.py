@@ -220,6 +220,7 @@ def test_no_alarm_for_any_depth_and_noise(bits: int, noise_adu: float) -> None:
     assert check_set(good_set(optics), optics).flags == ()
 
 
+@pytest.mark.fast_cases("3-True", "4-False", "8-True")
 @pytest.mark.parametrize("is_reported", [True, False])
 @pytest.mark.parametrize("steps", [3, 4, 8])
 def test_no_alarm_for_a_film_that_moves(steps: int, is_reported: bool) -> None:

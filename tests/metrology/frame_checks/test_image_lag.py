@@ -92,6 +92,7 @@ OTHER_EFFECTS = {
 }
 
 
+@pytest.mark.fast_cases("nothing", "gamma", "second reflection", "camera response")
 @pytest.mark.parametrize("name", OTHER_EFFECTS)
 def test_other_effects_are_not_taken_for_held_light(name: str) -> None:
     checked = check_set(render_set(OPTICS, OTHER_EFFECTS[name], seed=4), OPTICS)
