@@ -6,7 +6,8 @@ docs/measurements/second-world.md from all answers that there are. The answers g
 resolution, a line of JSON a bench: a stopped run continues where it was. `second_world 20 full`
 measures at full size, `second_world 500 eighth` at an eighth; a second number is the first seed
 (`second_world 200 500`: seeds 500 to 699). `second_world page` writes the page from the answers
-that are there.
+that are there. Answers of a later program to some of its benches, in the file `quarter_again`,
+have a section of their own.
 """
 
 from __future__ import annotations
@@ -103,7 +104,8 @@ def main(arguments: list[str]) -> None:
             print(f"{figure.name}: {figure.value:.1f} {figure.unit} {figure.reference_value or ''}")
     given = {name: read_answers(answers_file(name)) for name in RESOLUTIONS}
     by_size = dict(sorted(given.items(), key=lambda item: -len(item[1])))
-    PAGE.write_text(page(by_size), encoding="utf-8")
+    again = read_answers(answers_file("quarter_again"))
+    PAGE.write_text(page(by_size, again), encoding="utf-8")
 
 
 if __name__ == "__main__":
