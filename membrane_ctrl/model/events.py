@@ -395,7 +395,7 @@ class ProcessValueChosen(
     Event, kind="process_value", sentence="The loop follows the {value}: {reason}"
 ):
     """What the inner loop follows with `process_value = "auto"`; `code` names the reason
-    (`process_value.ProcessValueReason`).
+    (`process_value_reason.ProcessValueReason`).
     """
 
     value: str

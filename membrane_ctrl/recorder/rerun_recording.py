@@ -285,7 +285,10 @@ class Recording:
         self._stream.disconnect()
         path, self.path = self.path, None
         if path is not None and not is_whole(path):
-            raise RecordingError(f"{path}: closed without its footer; run `membrane-ctrl repair`")
+            raise RecordingError(
+                f"{path}: closed without its footer, so it opens slowly; "
+                "`membrane-ctrl review` makes a whole recording from the tables"
+            )
 
 
 def is_whole(path: Path) -> bool:
