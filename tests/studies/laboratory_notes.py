@@ -53,7 +53,7 @@ CAUSES: tuple[tuple[tuple[int, ...], str], ...] = (
         (60,),
         "has a diaphragm pump that gives 1.9 µm/s at the least, against a leak of 2.2 µm/s: the "
         "experiments below the holding flow stop it. The refusal asks for `tune pump`, which the "
-        "session has run. An open bleed was not tried.",
+        "session has run; with the bleed open by 0.01 it is refused as well.",
     ),
     (
         (196,),
