@@ -113,6 +113,11 @@ class ClimateAllowance:
         return low_um, high_um
 
 
+def find_distance(value: float, between: tuple[float, float]) -> float:
+    """Return the distance of a value from the nearest point of a range; 0 inside it."""
+    return max(between[0] - value, value - between[1], 0.0)
+
+
 def find_gain(now: StrainParts, before: StrainParts) -> StrainParts:
     """Return by how much each part has grown; 0 for a part that is not known at both times."""
     return StrainParts(

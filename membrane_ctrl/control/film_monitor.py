@@ -24,6 +24,7 @@ from membrane_ctrl.control.climate_allowance import (
     MINUTES_MOST_UM,
     ClimateAllowance,
     StrainAhead,
+    find_distance,
     find_gain,
 )
 from membrane_ctrl.control.filters import LowPass, lag_step_fraction
@@ -145,8 +146,8 @@ class _GaugeComparison:
         allowed_um = self.allowance.find_range(memory.strain)
         # A laser drift that the shape loop has compensated has not moved the film.
         difference_um = min(
-            _find_distance(by_laser_um - by_gauge_um, allowed_um),
-            _find_distance(by_laser_um - trimmed_um - by_gauge_um, allowed_um),
+            find_distance(by_laser_um - by_gauge_um, allowed_um),
+            find_distance(by_laser_um - trimmed_um - by_gauge_um, allowed_um),
         )
         # The limit, and a share of the motion: the law of the film is not exact
         memory.share = difference_um / (
@@ -160,11 +161,6 @@ class _GaugeComparison:
         memory.trim_um += share * trimmed_um
         memory.root += share * (means.root - memory.root)
         return ""
-
-
-def _find_distance(value: float, between: tuple[float, float]) -> float:
-    """Distance of a value from the nearest point of a range; 0 inside it."""
-    return max(between[0] - value, value - between[1], 0.0)
 
 
 @dataclass(slots=True)

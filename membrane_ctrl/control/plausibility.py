@@ -5,6 +5,10 @@ pressure, which for a Hencky film (w ~ p^(1/3)) is dw = w / (3 p) dp. The gauge 
 hold a mirror with (0.5 Pa are 10 µm), but its mean over ten seconds is good to about a micrometre,
 and does not depend on mounts and cameras.
 
+Temperature and humidity move the film against the gauge. Where sensors show them, the gauge's
+change is a range, with what they explain (`climate_allowance`); it decides only where the whole
+range does.
+
 Changes are compared with references that follow slowly while all agree, so that slow drift (a
 laser's mount, a gauge's zero, creep) does not count as a contradiction; the shape loop corrects
 it.
@@ -13,7 +17,14 @@ it.
 import math
 from dataclasses import dataclass, field
 
-from membrane_ctrl.control.film_monitor import SMOOTH_S, are_means_known
+from membrane_ctrl.control.climate import StrainParts
+from membrane_ctrl.control.climate_allowance import (
+    ClimateAllowance,
+    StrainAhead,
+    find_distance,
+    find_gain,
+)
+from membrane_ctrl.control.film_monitor import NO_STRAINS, SMOOTH_S, are_means_known
 from membrane_ctrl.control.filters import LowPass, lag_step_fraction
 from membrane_ctrl.model.events import FaultySensor
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
@@ -33,6 +44,7 @@ CLEARER = 2.0
 # A laser without a reading for this long is not compared; its mean then begins with its next
 # reading.
 LASER_GAP_S = 2.0
+_NO_GAIN = StrainParts(0.0, 0.0, 0.0)
 # While the film moves, optics lag behind the laser by a figure or a cycle; the speed is a mean over
 # this.
 SPEED_S = 2.0
@@ -45,6 +57,9 @@ class SagChanges(StateNode):
     laser_um: float
     optics_um: float
     gauge_um: float
+    # Range of what the climate adds to the gauge's change; 0 is in it
+    climate_low_um: float = 0.0
+    climate_high_um: float = 0.0
 
     def __str__(self) -> str:
         """Format the changes as one line."""
@@ -57,8 +72,13 @@ class SagChanges(StateNode):
         """Which of laser and optics the gauge contradicts: it must be clearly nearer to the other
         one.
         """
-        to_laser_um = abs(self.gauge_um - self.laser_um)
-        to_optics_um = abs(self.gauge_um - self.optics_um)
+        climate_um = (self.climate_low_um, self.climate_high_um)
+        to_laser_um = find_distance(self.laser_um - self.gauge_um, climate_um)
+        to_optics_um = find_distance(self.optics_um - self.gauge_um, climate_um)
+        # A range that reaches between them is not clear; a single value is judged by the factor
+        least_um = abs(self.laser_um - self.optics_um) / CLEARER
+        if max(to_laser_um, to_optics_um) < least_um:
+            return FaultySensor.UNKNOWN
         if to_optics_um * CLEARER < to_laser_um:
             return FaultySensor.LASER
         if to_laser_um * CLEARER < to_optics_um:
@@ -75,6 +95,7 @@ class ReferenceMeans(StateNode):
     laser_um: float = math.nan
     optics_um: float = math.nan
     gauge_pa: float = math.nan
+    strain: StrainAhead = field(default_factory=StrainAhead)
 
     @property
     def known(self) -> bool:
@@ -84,6 +105,11 @@ class ReferenceMeans(StateNode):
     def begin(self, means: tuple[float, float, float]) -> None:
         """Place it at the present means of laser (µm), optics (µm) and gauge (Pa)."""
         self.laser_um, self.optics_um, self.gauge_pa = means
+        self.strain = StrainAhead()
+
+    def note_strains(self, gained: StrainParts) -> None:
+        """Note what the strains of film and ring have gained since the last tick."""
+        self.strain.follow(gained, 0.0, math.inf)
 
     def follow(
         self, means: tuple[float, float, float], dt_s: float, time_constant_s: float
@@ -103,8 +129,14 @@ class ReferenceMeans(StateNode):
         self.laser_um += share * (means[0] - self.laser_um)
         self.optics_um += share * (means[1] - self.optics_um)
         self.gauge_pa += share * (means[2] - self.gauge_pa)
+        self.strain.follow(_NO_GAIN, dt_s, time_constant_s)
 
-    def changes(self, means: tuple[float, float, float], sag_um: float) -> SagChanges:
+    def changes(
+        self,
+        means: tuple[float, float, float],
+        sag_um: float,
+        allowance: ClimateAllowance | None = None,
+    ) -> SagChanges:
         """Return the changes of sag since the reference.
 
         The gauge's follows by Hencky's law: the sag goes with the cube root of the pressure.
@@ -115,9 +147,16 @@ class ReferenceMeans(StateNode):
             The present ones of laser in µm, optics in µm and gauge in Pa.
         sag_um : float
             Sag of the mirror at displacement 0.
+        allowance : ClimateAllowance, optional
+            What the climate may add to the gauge's change.
         """
         gauge_um = (sag_um + self.laser_um) * (math.cbrt(means[2] / self.gauge_pa) - 1)
-        return SagChanges(means[0] - self.laser_um, means[1] - self.optics_um, gauge_um)
+        climate_um = (0.0, 0.0)
+        if allowance is not None:
+            climate_um = allowance.find_range(self.strain)
+        return SagChanges(
+            means[0] - self.laser_um, means[1] - self.optics_um, gauge_um, *climate_um
+        )
 
 
 @dataclass(slots=True)
@@ -138,6 +177,8 @@ class PlausibilityState(StateNode):
     laser_gap_s: float = 0.0
     slow_wrong: bool = False  # the verdict is the slow reference's
     faulty: FaultySensor = FaultySensor.NONE
+    strains: StrainParts = NO_STRAINS  # as noted
+    compared_strains: StrainParts = NO_STRAINS  # at the last comparison
     changes: SagChanges = SagChanges(math.nan, math.nan, math.nan)
 
 
@@ -160,6 +201,8 @@ class PlausibilityCheck:
         By how much a figure may be older than the laser's reading of the same tick.
     memory : PlausibilityState, optional
         From the snapshot of an earlier controller; else nothing has been compared yet.
+    allowance : ClimateAllowance, optional
+        What the climate may add to a change by the gauge; nothing without it.
     """
 
     def __init__(
@@ -168,7 +211,9 @@ class PlausibilityCheck:
         sag_um: float,
         figure_lag_s: float = 0.0,
         memory: PlausibilityState | None = None,
+        allowance: ClimateAllowance | None = None,
     ) -> None:
+        self._allowance = allowance
         self._limit_um = limit_um
         self._sag_um = sag_um
         self._figure_lag_s = figure_lag_s
@@ -281,6 +326,10 @@ class PlausibilityCheck:
             self._judge_means(means, dt_s)
         return memory.faulty
 
+    def note_strains(self, strains: StrainParts) -> None:
+        """Note the strains of film and ring, as the climate's sensors show them in this tick."""
+        self.memory.strains = strains
+
     def _average_laser(self, displacement_um: float, dt_s: float) -> None:
         """Update the laser's mean; after a gap it begins with the first reading, for the film may
         have moved.
@@ -307,7 +356,10 @@ class PlausibilityCheck:
         memory = self.memory
         if not are_means_known(memory.age_s, memory.readings):
             return
+        gained = find_gain(memory.strains, memory.compared_strains)
+        memory.compared_strains = memory.strains
         for reference in (memory.fast, memory.slow):
+            reference.note_strains(gained)
             if not reference.known:
                 reference.begin(means)
         if memory.faulty in (FaultySensor.LASER, FaultySensor.OPTICS):
@@ -318,7 +370,7 @@ class PlausibilityCheck:
                 limit_um = self._slow_limit_um
             else:
                 limit_um = self._limit_um
-            memory.changes = changes = judged.changes(means, self._sag_um)
+            memory.changes = changes = judged.changes(means, self._sag_um, self._allowance)
             if abs(changes.laser_um - changes.optics_um) <= limit_um / 2 + self._lag_um:
                 self._clear_verdict()
         else:
@@ -331,7 +383,7 @@ class PlausibilityCheck:
 
     def _judge_fast(self, means: tuple[float, float, float]) -> None:
         memory = self.memory
-        memory.changes = changes = memory.fast.changes(means, self._sag_um)
+        memory.changes = changes = memory.fast.changes(means, self._sag_um, self._allowance)
         # and back only when clearly so
         if memory.faulty == FaultySensor.NONE:
             limit_um = self._limit_um
@@ -345,7 +397,7 @@ class PlausibilityCheck:
         and is corrected.
         """
         memory = self.memory
-        changes = memory.slow.changes(means, self._sag_um)
+        changes = memory.slow.changes(means, self._sag_um, self._allowance)
         apart = abs(changes.laser_um - changes.optics_um) > self._slow_limit_um + self._lag_um
         if apart and changes.judge() == FaultySensor.OPTICS:
             memory.faulty = FaultySensor.OPTICS

@@ -14,6 +14,7 @@ from membrane_ctrl.control import (
     pump_health,
     weather_limits,
 )
+from membrane_ctrl.control.climate_allowance import MINUTES_MOST_UM, ClimateAllowance
 from membrane_ctrl.control.plausibility import (
     LASER_GAP_S,
     PlausibilityCheck,
@@ -118,6 +119,7 @@ class SensorConsistency:
             1e3 * config.optics.mirror.sag_mm,
             _find_figure_lag_s(config),
             memory.plausibility,
+            ClimateAllowance.from_config(config.optics.mirror, config.climate, MINUTES_MOST_UM),
         )
         self._far_um = config.shape.disagreement_max_um
         self._health = film_health.FilmHealth(
@@ -216,6 +218,7 @@ class SensorConsistency:
         events += self._judge_weather(inputs, dt_s)
         # Three sensors: which one do the other two contradict?
         blind = not inputs.now_s - self.memory.camera_s <= self._fresh_s
+        self._plausibility.note_strains(held.strains)
         faulty = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
         self.memory.laser_fault_s = (
             self.memory.laser_fault_s + dt_s

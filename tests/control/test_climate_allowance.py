@@ -29,8 +29,11 @@ from membrane_ctrl.control.film_monitor import (
     SMOOTH_S,
     FilmMonitor,
 )
+from membrane_ctrl.control.plausibility import PlausibilityCheck
+from membrane_ctrl.model.events import FaultySensor
 from membrane_ctrl.sim.climate import Room
 from membrane_ctrl.sim.sensors import FILM_NOISE_K, HUMIDITY_NOISE_PERCENT, RING_NOISE_K
+from tests.worlds.sound_figure import SOUND_FIGURE
 
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
 LIMITS = LimitsConfig()
@@ -245,3 +248,54 @@ def test_a_change_during_a_gap_of_the_sensor_is_not_explained() -> None:
     back = climate.fresh_parts
     assert back.heat_ppm == pytest.approx(17.0 * 24.0)
     assert find_gain(back, NO_STRAINS).heat_ppm == 0.0
+
+
+def _judge_knock(
+    start_s: float, laser_um: float, camera_um: float, has_sensors: bool
+) -> set[FaultySensor]:
+    """Verdicts within 90 s after a knock of laser or camera in the air conditioner's room; the loop
+    keeps the laser's reading. Two ticks and half a figure a second.
+    """
+    times_s = np.arange(round(2 * (start_s + 90.0)), dtype=np.float64) / 2
+    block = Room(TwinConfig(climate="hvac", seed=1)).make_block(times_s)
+    noise = np.random.default_rng(1).standard_normal((times_s.size, 6))
+    allowance = ClimateAllowance(UM_PER_PPM, 0.15, MINUTES_MOST_UM)
+    check = PlausibilityCheck(10.0, SAG_UM, allowance=allowance)
+    climate = Climate(ClimateConfig())
+    verdicts: set[FaultySensor] = set()
+    for k, time_s in enumerate(times_s.tolist()):
+        readings = ClimateReadings(
+            float(block.film_c[k] + FILM_NOISE_K * noise[k, 0]),
+            float(block.ring_c[k] + RING_NOISE_K * noise[k, 1]),
+            float(block.humidity_percent[k] + HUMIDITY_NOISE_PERCENT * noise[k, 2]),
+            21.0,
+        )
+        climate.step(readings, 0.5)
+        if has_sensors:
+            check.note_strains(climate.fresh_parts)
+        knocked = time_s >= start_s
+        film_um = -laser_um * knocked
+        share = (1 + film_um / SAG_UM) / float(block.mirror_factor[k])
+        sag_um = SAG_UM + film_um + camera_um * knocked + 0.1 * float(noise[k, 4])
+        figure = replace(SOUND_FIGURE, time_s=time_s, sag_um=sag_um) if k % 4 == 0 else None
+        gauge_pa = PRESSURE_PA * share**3 + 0.2 * float(noise[k, 5])
+        verdict = check.step(0.5, float(noise[k, 3]), gauge_pa, figure)
+        if knocked:
+            verdicts.add(verdict)
+    return verdicts
+
+
+@pytest.mark.parametrize("size_um", [-15.0, 15.0, 25.0])
+@pytest.mark.parametrize("right", [FaultySensor.LASER, FaultySensor.OPTICS])
+def test_a_gauge_that_climate_moves_sides_with_no_wrong_sensor(
+    size_um: float, right: FaultySensor
+) -> None:
+    knocks_um = {FaultySensor.LASER: (size_um, 0.0), FaultySensor.OPTICS: (0.0, size_um)}[right]
+    (wrong,) = {FaultySensor.LASER, FaultySensor.OPTICS} - {right}
+    starts_s = (200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+    found = [_judge_knock(start_s, *knocks_um, has_sensors=True) for start_s in starts_s]
+    assert not any(wrong in verdicts for verdicts in found)
+    assert sum(right in verdicts for verdicts in found) >= 4
+    # Without sensors the gauge, 18 µm off, misleads it
+    blind = [_judge_knock(start_s, *knocks_um, has_sensors=False) for start_s in starts_s]
+    assert any(wrong in verdicts for verdicts in blind)
