@@ -123,10 +123,12 @@ def assemble_budget(
     slopes = replace(slopes, harmonics=find_response_harmonics(bench, used, taken, exponent))
 
     # Blur. It follows from the contrast and the slopes of the fitted surface: if these are not
-    # those of a surface, the contrast shows no blur.
+    # those of a surface, the contrast shows no blur; nor if it has waves of the response, because a
+    # frame is left out.
     blur = image_blur.blur_source(bench, checked.blur_px)
     is_blurred = budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM
-    if is_blurred and not slopes.contradicts:
+    shows_blur = not slopes.contradicts and slopes.harmonics is None
+    if is_blurred and shows_blur:
         doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
 
     # What is left of a front film's reflections. Where they could not be fitted, the middle is left

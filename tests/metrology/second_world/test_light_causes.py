@@ -115,7 +115,19 @@ def test_the_cause_of_wrong_light_is_reported_and_no_other(name: str, tmp_path: 
 def test_a_second_image_is_placed(tmp_path: Path) -> None:
     """Where it comes from on the screen helps to find the surface."""
     found = measured(Effects(panel=Panel(ghost=Ghost(0.02, (30.0, -18.0)))), tmp_path / "set")
-    assert "1.9% of the light (+30 mm along x and -18 mm along y)" in found.reason
+    share, _, place = found.reason.partition("% of the light (")
+    assert place.startswith("+30 mm along x and -18 mm along y)")
+    assert float(share.rpartition(" ")[2]) == pytest.approx(2.0, abs=0.25)
     assert found.budget is not None
     row = next(row for row in found.budget.rows() if row["name"] == "second_image")
     assert row["height_rms_um"] > 1.0
+
+
+def test_waves_of_a_gamma_are_no_blur_where_a_frame_is_left_out(tmp_path: Path) -> None:
+    """Three steps do not cancel the harmonics, which the contrast then has, too."""
+    effects = Effects(panel=Panel(gamma=1.6), stale_frame=2)
+    world = World(mirror(), effects=effects, stated=Stated(), seed=5)
+    truth = world.write_set(tmp_path)
+    found = measured_errors(tmp_path, world.mirror, truth, POINTS_MM)
+    assert found.flagged
+    assert "focus" not in found.reason
