@@ -125,8 +125,9 @@ class FigureTrials:
             aperture_mm = self._evaluate.aperture_mm
             found = self._found
             for change in _propagate_white_noise(self._seen, aperture_mm, cell_slope, random):
-                disturbed = self._evaluate(self._seen.add_change(change), found.sphere)
-                moved = np.subtract(astuple(disturbed.numbers), astuple(found.numbers))
+                # Only the numbers are kept: the maps of a figure are large.
+                numbers = self._evaluate(self._seen.add_change(change), found.sphere).numbers
+                moved = np.subtract(astuple(numbers), astuple(found.numbers))
                 squares += moved**2 / _WHITE_TRIALS
 
         # The sums of squares of the Fringe terms over the modes.

@@ -131,7 +131,8 @@ class FigureOf:
         deviation_um = 1e3 * (deviation_mm - deviation_mm.mean())
         normals = np.stack([-seen.slope_x[mask], -seen.slope_y[mask], np.ones(points.shape[1])])
         normals /= vector_lengths(normals)
-        angle_rms = _compute_rms(vector_lengths(normals - sphere_normals))
+        sphere_normals -= normals
+        angle_rms = _compute_rms(vector_lengths(sphere_normals))
         del sphere_normals
 
         # The spot, and the image of a star.
