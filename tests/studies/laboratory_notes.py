@@ -46,8 +46,8 @@ CAUSES: tuple[tuple[tuple[int, ...], str], ...] = (
         (59,),
         "is a tight mirror (leak 0.3 µm/s) behind a laser of 2 µm: its delay is known to 0.10 s, "
         "and to 0.13 and 0.15 s with the larger limits that the refusals ask for, as the "
-        "experiments stay within 8 µm anyway. The session states as well that the mirror is too "
-        "tight and asks for an open bleed, which was not tried.",
+        "experiments stay within 8 µm anyway. With the bleed open by 0.01 the session "
+        "keeps gains: 0.362 µm, predicted 0.367.",
     ),
     (
         (60,),

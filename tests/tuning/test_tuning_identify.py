@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic import record, way_um
 
-from tuning.identification.fit_quality import judge_fit, validate_fit
+from tuning.identification.fit_quality import choose_remedy, judge_fit, validate_fit
 from tuning.identification.plant_fit import identify_plant
 from tuning.identification.plant_model import PlantModel
 from tuning.identification.record import Record
@@ -130,3 +130,9 @@ def test_a_pump_that_saturates_is_distinguished_from_a_straight_one() -> None:
     straight, bent = gains[10.0], gains[2.2]
     assert abs(straight.above - straight.below) < 4 * straight.difference_sigma
     assert bent.below - bent.above > 5 * bent.difference_sigma
+
+
+def test_a_tight_mirror_needs_a_bleed_and_not_a_larger_limit() -> None:
+    assert "loop.bleed_fraction larger by 0.01" in choose_remedy(0.26)
+    assert "--limit-um" not in choose_remedy(0.26)
+    assert "a larger --limit-um" in choose_remedy(1.2)
