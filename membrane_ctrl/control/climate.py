@@ -95,21 +95,32 @@ class FollowedState(StateNode):
     value: LowPass = field(default_factory=LowPass)
     reference: float = math.nan
     unseen_s: float = 0.0
+    shift: float = 0.0  # steps of the value that another sensor made, not the climate
     # Share of the error of the first value that remains, now and at the reference
     start_share: float = 1.0
     start_share_at_reference: float = 1.0
 
     def follow(self, reading: float, dt_s: float, lag_s: float) -> None:
         """Follow a reading; NaN leaves the value and counts the time."""
-        if math.isfinite(reading):
-            # A temperature that was not seen for long is what the sensor shows now.
-            if self.unseen_s > _FRESH_S and lag_s <= _SMOOTH_S:
-                self.value.reset(reading)
-            self.value.update(reading, dt_s, lag_s)
-            self.start_share *= 1.0 - lag_step_fraction(dt_s, lag_s)
-            self.unseen_s = 0.0
-        else:
+        if not math.isfinite(reading):
             self.unseen_s += dt_s
+            return
+        # A reading stands for the time since the last one: a slow instrument is smoothed no more
+        # than a fast one, and the film has followed the humidity in a gap.
+        if math.isfinite(self.value.value):
+            dt_s += self.unseen_s
+        self.value.update(reading, dt_s, lag_s)
+        self.start_share *= 1.0 - lag_step_fraction(dt_s, lag_s)
+        self.unseen_s = 0.0
+
+    def change_source(self, reading: float) -> None:
+        """Go on with another sensor: by how much the two differ is no change of the climate."""
+        if math.isnan(self.value.value):
+            return
+        step = reading - self.value.value
+        self.value.reset(reading)
+        self.reference += step
+        self.shift += step
 
     def set_reference(self) -> None:
         """Count changes from the present value."""
@@ -118,10 +129,10 @@ class FollowedState(StateNode):
 
     @property
     def fresh_value(self) -> float:
-        """The value; NaN if no sensor has shown it for minutes."""
+        """The value, from an arbitrary zero; NaN if no sensor has shown it for minutes."""
         if self.unseen_s > _FRESH_S:
             return math.nan
-        return self.value.value
+        return self.value.value - self.shift
 
     @property
     def start_error(self) -> float:
@@ -144,7 +155,8 @@ class ClimateState(StateNode):
     ring: FollowedState = field(default_factory=FollowedState)
     moisture: FollowedState = field(default_factory=FollowedState)
     has_film_sensor: bool = False
-    sees_ring: bool = False  # by its own sensor
+    has_ring_sensor: bool = False
+    ring_unseen_s: float = 0.0  # by its own sensor
 
 
 class Climate:
@@ -174,20 +186,9 @@ class Climate:
         -------
         ClimateStrain
         """
-        # A film without a sensor of its own has the air's temperature at once, a ring without one
-        # follows the air slowly. A bench that ever had a film sensor does not fall back to the air:
-        # that would be a step
         memory, config = self.memory, self._config
-        memory.has_film_sensor |= math.isfinite(given.film_c)
-        film_c = given.film_c
-        if not memory.has_film_sensor:
-            film_c = given.air_c
-        memory.film.follow(film_c, dt_s, _SMOOTH_S)
-        memory.sees_ring = math.isfinite(given.ring_c)
-        if memory.sees_ring:
-            memory.ring.follow(given.ring_c, dt_s, _SMOOTH_S)
-        else:
-            memory.ring.follow(given.air_c, dt_s, config.ring_follows_air_s)
+        self._follow_film(given, dt_s)
+        self._follow_ring(given, dt_s)
         memory.moisture.follow(given.humidity_percent, dt_s, config.film_follows_humidity_s)
         # A state that is seen for the first time is its own reference
         for state in (memory.film, memory.ring, memory.moisture):
@@ -195,14 +196,55 @@ class Climate:
                 state.set_reference()
         return self._make_strain()
 
+    def _follow_film(self, given: ClimateReadings, dt_s: float) -> None:
+        """Follow the film's sensor; a film that never had one has the air's temperature at once."""
+        # A bench that ever had a film sensor does not fall back to the air: that would be a step
+        memory = self.memory
+        film_c = given.film_c
+        if math.isfinite(film_c) and not memory.has_film_sensor:
+            memory.film.change_source(film_c)
+            memory.has_film_sensor = True
+        if not memory.has_film_sensor:
+            film_c = given.air_c
+        memory.film.follow(film_c, dt_s, _SMOOTH_S)
+
+    def _follow_ring(self, given: ClimateReadings, dt_s: float) -> None:
+        """Follow the ring's sensor; a ring that no sensor has shown for minutes follows the air
+        slowly.
+        """
+        memory = self.memory
+        if math.isfinite(given.ring_c):
+            if not memory.has_ring_sensor:
+                memory.ring.change_source(given.ring_c)
+                memory.has_ring_sensor = True
+            elif not self._sees_ring:
+                memory.ring.value.reset(given.ring_c)
+            memory.ring_unseen_s = 0.0
+            memory.ring.follow(given.ring_c, dt_s, _SMOOTH_S)
+            return
+        memory.ring_unseen_s += dt_s
+        if self._sees_ring:
+            memory.ring.follow(math.nan, dt_s, _SMOOTH_S)
+        else:
+            memory.ring.follow(given.air_c, dt_s, self._config.ring_follows_air_s)
+
+    @property
+    def _sees_ring(self) -> bool:
+        """Whether the ring's own sensor has shown it within minutes."""
+        return self.memory.has_ring_sensor and self.memory.ring_unseen_s <= _FRESH_S
+
     @property
     def fresh_parts(self) -> StrainParts:
         """Strains by their causes, as far as fresh sensors show them."""
         memory, config = self.memory, self._config
+        ring_c = memory.ring.fresh_value
+        # The air predicts the ring of a bench that has lost its sensor, but excuses nothing
+        if memory.has_ring_sensor and not self._sees_ring:
+            ring_c = math.nan
         return StrainParts(
             config.film_ppm_per_k * memory.film.fresh_value,
             config.film_ppm_per_percent * memory.moisture.fresh_value,
-            config.ring_ppm_per_k * memory.ring.fresh_value,
+            config.ring_ppm_per_k * ring_c,
         )
 
     def _make_strain(self) -> ClimateStrain:
@@ -219,7 +261,7 @@ class Climate:
         if not memory.has_film_sensor:
             film_k = math.hypot(film_k, _FILM_AS_AIR_K)
         ring_k = _wander(_WANDER_K, memory.ring.unseen_s)
-        if not memory.sees_ring:
+        if not self._sees_ring:
             ring_k = math.hypot(ring_k, _RING_AS_AIR_K)
         # Independent errors: of the expansions, of unseen changes, of the start.
         parts = (

@@ -33,7 +33,8 @@ NAMES = {
 _POSSIBLE = {
     ClimateSensor.FILM: (-20.0, 60.0),
     ClimateSensor.RING: (-20.0, 60.0),
-    ClimateSensor.HUMIDITY: (0.0, 100.0),
+    # No laboratory is as dry as 1 %: that is a fraction for per cent, or an input without current
+    ClimateSensor.HUMIDITY: (1.0, 100.0),
 }
 
 
@@ -62,6 +63,11 @@ class ClimateSensors:
 
     def __init__(self, memory: ClimateSensorsState | None = None) -> None:
         self.memory = memory or ClimateSensorsState()
+
+    @property
+    def any_fresh(self) -> bool:
+        """Whether a sensor has given a usable reading within minutes."""
+        return any(watch.unusable_s <= _MISSING_S for watch in self.memory.watches)
 
     def judge(self, sensor: ClimateSensor, value: float, dt_s: float) -> tuple[float, str | None]:
         """Judge a reading.

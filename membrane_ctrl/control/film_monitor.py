@@ -327,8 +327,9 @@ class FilmMonitor:
         minutes_um = self._minutes.allowance.explain_um(self.memory.minutes.strain)
         hour_um = self._hour.allowance.explain_um(self.memory.hour.strain)
         return (
-            f"; temperature and humidity explain {minutes_um:+.0f} µm within minutes and "
-            f"{hour_um:+.0f} µm within an hour"
+            f"; temperature and humidity explain {minutes_um:+.0f} µm within minutes, of which "
+            f"{MINUTES_MOST_UM:.0f} count, and {hour_um:+.0f} µm within an hour, of which "
+            f"{HOUR_MOST_UM:.0f} count"
         )
 
     @property

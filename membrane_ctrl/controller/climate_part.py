@@ -76,10 +76,10 @@ class ClimatePart:
 
     @property
     def fresh_strains(self) -> StrainParts:
-        """Strains by their causes, as far as fresh sensors show them; all NaN on a bench without
-        climate sensors.
+        """Strains by their causes, as far as fresh sensors show them; all NaN while no climate
+        sensor does: the air thermometer alone explains nothing.
         """
-        if not self._has_sensors:
+        if not self._sensors.any_fresh:
             return StrainParts()
         return self._climate.fresh_parts
 

@@ -23,7 +23,9 @@ from membrane_ctrl.control.climate_allowance import (
     find_gain,
 )
 from membrane_ctrl.control.film_monitor import (
+    LAW_SHARE,
     NO_STRAINS,
+    SINCE_DAY_S,
     SINCE_HOUR_S,
     SINCE_MINUTES_S,
     SMOOTH_S,
@@ -299,3 +301,74 @@ def test_a_gauge_that_climate_moves_sides_with_no_wrong_sensor(
     # Without sensors the gauge, 18 µm off, misleads it
     blind = [_judge_knock(start_s, *knocks_um, has_sensors=False) for start_s in starts_s]
     assert any(wrong in verdicts for verdicts in blind)
+
+
+SOUND = ClimateReadings(21.0, 21.0, 45.0, 21.0)
+
+
+def _step_for(climate: Climate, readings: ClimateReadings, seconds: int) -> StrainParts:
+    """Strains after a while of the same readings."""
+    for _ in range(seconds):
+        climate.step(readings, 1.0)
+    return climate.fresh_parts
+
+
+def test_a_sensor_of_film_or_ring_that_comes_late_explains_nothing_by_its_coming() -> None:
+    """Until then the air stood for it, which is 4 K colder: 234 µm of the centre."""
+    climate = Climate(ClimateConfig())
+    before = _step_for(climate, replace(SOUND, film_c=math.nan, ring_c=math.nan), 100)
+    after = _step_for(climate, replace(SOUND, film_c=25.0, ring_c=25.0), 100)
+    gain = find_gain(after, before)
+    assert (gain.heat_ppm, gain.ring_ppm) == pytest.approx((0.0, 0.0))
+    # Nor does it change the predicted figure
+    assert climate.step(SOUND, 1e-6).excess_ppm == pytest.approx(0.0, abs=1e-3)
+    # From then on it counts
+    warmer = _step_for(climate, replace(SOUND, film_c=26.0, ring_c=25.0), 100)
+    assert find_gain(warmer, after).heat_ppm == pytest.approx(17.0, rel=0.01)
+
+
+def test_a_ring_whose_thermometer_is_lost_explains_nothing_until_it_is_back() -> None:
+    climate = Climate(ClimateConfig())
+    _step_for(climate, SOUND, 100)
+    # The air, by which the figure is predicted meanwhile, is 5 K warmer
+    lost = replace(SOUND, ring_c=math.nan, air_c=26.0)
+    assert _step_for(climate, lost, 290).ring_ppm == pytest.approx(23.0 * 21.0)
+    assert math.isnan(_step_for(climate, lost, 20).ring_ppm)
+    back = replace(SOUND, ring_c=24.0)
+    assert _step_for(climate, back, 1).ring_ppm == pytest.approx(23.0 * 24.0)
+
+
+def test_a_film_has_followed_the_humidity_in_a_gap_of_the_hygrometer() -> None:
+    """What it has gained there must not excuse a difference after it."""
+    climate = Climate(ClimateConfig(film_follows_humidity_s=2000.0))
+    _step_for(climate, SOUND, 100)
+    assert math.isnan(_step_for(climate, replace(SOUND, humidity_percent=math.nan), 8000).water_ppm)
+    humid = replace(SOUND, humidity_percent=55.0)
+    back = _step_for(climate, humid, 1)
+    later = _step_for(climate, humid, 4000)
+    assert find_gain(later, back).water_ppm < 0.02 * 60.0
+
+
+def test_a_slow_instrument_explains_as_soon_as_a_fast_one() -> None:
+    """It gives a value each minute, and none between."""
+    climate = Climate(ClimateConfig())
+    before = _step_for(climate, SOUND, 100)
+    for _ in range(2):
+        climate.step(replace(SOUND, film_c=23.0), 1.0)
+        _step_for(climate, replace(SOUND, film_c=math.nan), 59)
+    assert find_gain(climate.fresh_parts, before).heat_ppm == pytest.approx(34.0, rel=0.01)
+
+
+def test_within_a_day_the_climate_explains_nothing() -> None:
+    """A laser of 0.04 µm/s: minutes and an hour do not show it, whatever thermometers say."""
+
+    def lie(time_s: float, readings: ClimateReadings) -> ClimateReadings:
+        drift_k = 0.04 * time_s / (17.0 * UM_PER_PPM)
+        return replace(readings, film_c=readings.film_c + drift_k)
+
+    creep_um = ramp(0.04)
+    found, at_s = find_contradiction("lamp", 30_000.0, 10.0, creep_um=creep_um, alter=lie)
+    assert found
+    ahead_um = 0.04 * SINCE_DAY_S
+    limit_um = LIMITS.laser_gauge_day_max_um + LAW_SHARE * 10.0
+    assert creep_um(at_s) < -ahead_um * math.log(1 - limit_um / ahead_um) + 40.0

@@ -117,3 +117,22 @@ def test_without_a_ring_thermometer_the_ring_follows_the_air_with_its_lag() -> N
         part.step(warm, State.HOLD, MINUTE_S)
     share = 1 - math.exp(-2.0)
     assert part.memory.strain.ring_ppm == pytest.approx(23.0 * 2 * share, rel=0.02)
+
+
+@pytest.mark.parametrize("humidity", [0.0, 0.45], ids=["no current", "a fraction"])
+def test_a_hygrometer_below_one_per_cent_is_not_used(humidity: float) -> None:
+    part = ClimatePart(CONFIG)
+    (notice,) = _run(part, 20, film_c=21.0, ring_c=21.0, humidity=humidity)
+    assert isinstance(notice, Maintenance)
+    assert "check its unit" in notice.message
+    assert math.isnan(part.fresh_strains.water_ppm)
+
+
+def test_the_air_thermometer_alone_explains_nothing() -> None:
+    """It stands for film and ring only beside a sensor of the climate."""
+    part = ClimatePart(CONFIG)
+    _run(part, 20, humidity=45.0)
+    assert math.isfinite(part.fresh_strains.heat_ppm)
+    _run(part, 6)
+    strains = part.fresh_strains
+    assert all(map(math.isnan, (strains.heat_ppm, strains.water_ppm, strains.ring_ppm)))
