@@ -403,7 +403,8 @@ AGAIN_TEXT = """Mended since the first answers:
 - The bar of a change contained the worst motion of any one body that explains the tilt of the ring,
   and not two bodies that tilt it in opposite directions. On the bench of seed 523 a camera had
   turned by 12 µrad (4 sigma of what was drawn) and two shifts had hidden its tilt: Z7 was off by
-  3.7 sigma.
+  3.7 sigma. The rows of changes below have the bar of all causes by their weight; the program
+  states the wider of both, because that one misses a single camera that turned by 20 to 50 µrad.
 - Drifts of the phases counted as motions of the bench from 1 sigma of their scatter on, and from 2
   sigma on now.
 """

@@ -80,10 +80,15 @@ class PairMotion:
         moved_mm = self.parameters_mm - earlier.parameters_mm
         none = np.zeros(bench_motions.COMPONENTS)
         finding = test.find_motions(ring @ moved_mm, np.zeros(2), none)
-        # The bar of the change: the causes of the tilt, weighted by how likely they are.
+        # The bar of the change is the wider of two. The worst body alone covers a knock along a
+        # direction that hardly tilts the ring (a camera's yaw of 30 µrad); the weighted causes
+        # cover two bodies that tilt it in opposite directions.
         causes = find_tilt_causes(
             self.effects.figure_mm, ring, ring @ moved_mm, ring @ covariance_mm2 @ ring.T
         )
+        by_causes_mm2 = causes.knocked_mm2 + causes.allowed_mm2
+        if np.trace(by_causes_mm2) <= np.trace(finding.covariance_mm2):
+            return finding
         return replace(finding, found_mm2=causes.knocked_mm2, allowed_mm2=causes.allowed_mm2)
 
 

@@ -43,7 +43,7 @@ def change_um(before: MeasuredErrors, after: MeasuredErrors) -> FloatArray:
     return np.asarray(after.error_um - before.error_um)[:9]
 
 
-@pytest.mark.parametrize("urad", [3.0, 150.0])
+@pytest.mark.parametrize("urad", [3.0, 30.0, 150.0])
 def test_a_camera_that_turned_is_within_the_bar_of_the_change(
     before: MeasuredErrors, tmp_path: Path, urad: float
 ) -> None:
