@@ -56,7 +56,8 @@ def format_signed(value: float, digits: int = 3) -> str:
 
 def _fits_digits(value: float, digits: int) -> bool:
     """Whether a number, rounded to an integer, has so many digits: 999.6 has four, not three."""
-    return abs(value) < 10**digits - 0.5
+    smallest_of_more = 10.0**digits - 0.5
+    return abs(value) < smallest_of_more
 
 
 def one_line(text: str) -> str:
