@@ -79,12 +79,15 @@ def figure(**changed: object) -> ShapeEstimate:
 
 
 def bridge_with(
-    role: str = "read", seen: HoldSeen | None = None, port: Path | None = None
+    role: str = "read",
+    seen: HoldSeen | None = None,
+    port: Path | None = None,
+    name: str = "mirror",
 ) -> Bridge:
     where = Where(socket=port)
     feed = HoldFeed(where)
     feed.seen = seen or seen_hold()
-    return Bridge(feed, Config(bridges=BridgesConfig(role=role)))  # type: ignore[arg-type]
+    return Bridge(feed, Config(bridges=BridgesConfig(role=role, name=name)))  # type: ignore[arg-type]
 
 
 def test_names_are_unique_and_short_enough() -> None:
@@ -304,7 +307,8 @@ def test_a_missing_library_is_named(
 def test_a_taken_port_is_named(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        (tmp_path / "lab.toml").write_text(f"[bridges.epics]\nca_port = {port}\n")
+        bridges = f'bridges.name = "taken_port"\nbridges.epics.ca_port = {port}\n'
+        (tmp_path / "lab.toml").write_text(bridges)
         done = CliRunner().invoke(
             app, ["--logs", str(tmp_path), "--config", str(tmp_path / "lab.toml")]
         )

@@ -24,10 +24,12 @@ from tests.worlds.port_run import port_run
 
 async def test_a_second_bridge_of_the_same_records_on_this_machine_is_refused() -> None:
     with (
-        device_claim.claim_devices(["EPICS records mirror:*"]),
-        pytest.raises(DeviceError, match=r"EPICS records mirror:\*: in use by"),
+        # a name of its own: claims are of the whole machine, where other tests run meanwhile
+        device_claim.claim_devices(["EPICS records claimed:*"]),
+        pytest.raises(DeviceError, match=r"EPICS records claimed:\*: in use by"),
     ):
-        await epics.serve(EpicsConfig(ca_port=free_port(), pva_port=free_port()), bridge_with())
+        config = EpicsConfig(ca_port=free_port(), pva_port=free_port())
+        await epics.serve(config, bridge_with(name="claimed"))
 
 
 @pytest.mark.campaign
