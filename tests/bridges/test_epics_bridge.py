@@ -23,13 +23,14 @@ from tests.worlds.port_run import port_run
 
 
 async def test_a_second_bridge_of_the_same_records_on_this_machine_is_refused() -> None:
+    # A name of its own: claims are of the whole machine, where other tests run meanwhile
+    config = EpicsConfig(ca_port=free_port(), pva_port=free_port())
+    bridge = bridge_with(name="claimed")
     with (
-        # a name of its own: claims are of the whole machine, where other tests run meanwhile
         device_claim.claim_devices(["EPICS records claimed:*"]),
         pytest.raises(DeviceError, match=r"EPICS records claimed:\*: in use by"),
     ):
-        config = EpicsConfig(ca_port=free_port(), pva_port=free_port())
-        await epics.serve(config, bridge_with(name="claimed"))
+        await epics.serve(config, bridge)
 
 
 @pytest.mark.campaign

@@ -23,7 +23,7 @@ def delivered(flows_um_per_s: list[float]) -> np.ndarray:
     curve, pump, out = PumpCurve(PUMP), PumpModel(PUMP, PUMP.flow_full_um_per_s, 0.005), []
     for flow in flows_um_per_s:
         command = curve.command(flow, DT_S)
-        out.append(np.mean([pump.step(command) for _ in range(4)]))
+        out.append(np.mean(pump.run_steps(command, 4)))
     return np.array(out)
 
 
