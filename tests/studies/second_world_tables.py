@@ -407,6 +407,8 @@ AGAIN_TEXT = """Mended since the first answers:
   states the wider of both, because that one misses a single camera that turned by 20 to 50 µrad.
 - Drifts of the phases counted as motions of the bench from 1 sigma of their scatter on, and from 2
   sigma on now.
+- Overexposed pictures of which 2 % of the bins were left were named rotated by 180 degrees (bench
+  716); they are named saturated.
 """
 
 WORST_TEXT = """`tests.studies.second_benches.bench_answer(seed)` repeats a bench. First sets: `ok`

@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.phase import screen_scale
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, make_parabola
 from membrane_ctrl.metrology.reconstruction import surface_fit
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # RMS of the slopes that a fit leaves: 2 to 5 µrad of a sound film, tens of µrad of wrinkles and
 # gamma, hundreds of a wrong orientation.
@@ -33,6 +33,9 @@ _TOLERANCE_MM = 1e-3  # of the height: slopes are then known to a microradian
 # Least bins on the mirror in another orientation, over those in the stated one; a picture turned by
 # 90 degrees keeps the middle.
 _LEAST_SEEN = 0.5
+# Least share of the mirror's bins whose phase is known. Overexposed pictures leave a few per cent,
+# at the edges, where another orientation may fit by chance.
+_LEAST_KNOWN = 0.25
 
 # How pictures and the pattern may be turned (what to print of each), and the matrix that turns
 # columns and rows, or x and y of the pattern, back about the middle.
@@ -98,15 +101,16 @@ def find_orientation(
         None if the stated one is not suspicious, or if no other is clearly better.
     """
     # Bins with a phase, about as many as change the answer.
+    tracer = Tracer(Geometry.from_config(optics), optics.mirror.radius_mm, vertex_z_mm)
+    of_mirror = np.count_nonzero(_find_on_mirror(optics, tracer, tracer.geometry.rays(*places_px)))
     known = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
-    if known.size < _LEAST_BINS:
+    if known.size < max(_LEAST_BINS, _LEAST_KNOWN * of_mirror):
         return None
     known = known[:: max(1, known.size // _BINS)]
     places_px = places_px[:, known]
     screen_mm = screen_scale.screen_mm(phase_rad[:, known], optics.pattern)
 
     # The stated orientation.
-    tracer = Tracer(Geometry.from_config(optics), optics.mirror.radius_mm, vertex_z_mm)
     stated_urad, stated_count = _residual_urad(optics, tracer, places_px, screen_mm)
     if stated_urad <= SUSPICIOUS_URAD:
         return None
@@ -142,11 +146,8 @@ def _residual_urad(
 
     `places_px` (2, n) are columns and rows of the bins, `screen_mm` (2, n) their screen points.
     """
-    # Bins whose rays meet the plane through the vertex inside the analysed radius.
     rays = tracer.geometry.rays(*places_px)
-    path_mm = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / rays[2]
-    x_mm, y_mm = (tracer.geometry.pinhole_mm[:, None] + path_mm * rays)[:2]
-    inside = np.hypot(x_mm, y_mm) <= optics.mirror.analysis_radius_mm
+    inside = _find_on_mirror(optics, tracer, rays)
     count = int(np.count_nonzero(inside))
     if count < _LEAST_BINS:
         return math.inf, count
@@ -161,3 +162,10 @@ def _residual_urad(
     if not fit.converged:
         return math.inf, count
     return 1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2), count
+
+
+def _find_on_mirror(optics: OpticsConfig, tracer: Tracer, rays: FloatArray) -> BoolArray:
+    """Whether rays (3, n) meet the plane through the vertex inside the analysed radius."""
+    path_mm = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / rays[2]
+    x_mm, y_mm = (tracer.geometry.pinhole_mm[:, None] + path_mm * rays)[:2]
+    return np.asarray(np.hypot(x_mm, y_mm) <= optics.mirror.analysis_radius_mm)

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
+from membrane_ctrl.metrology.frame_checks import picture_orientation
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError
 from membrane_ctrl.metrology.frame_checks.picture_orientation import (
     SUSPICIOUS_URAD,
@@ -125,3 +126,22 @@ def test_pictures_without_a_phase_show_no_orientation(distortion: tuple[float, .
     lens = optics.model_copy(update={"camera": camera})
     unknown = np.full((2, 50), np.nan)
     assert find_orientation(lens, 0.0, np.zeros((2, 50)), unknown) is None
+
+
+@pytest.mark.parametrize(("share", "is_named"), [(0.02, False), (1.0, True)])
+def test_few_bins_at_the_edges_show_no_orientation(
+    monkeypatch: pytest.MonkeyPatch, share: float, is_named: bool
+) -> None:
+    """Overexposed pictures, of which 2 % of the bins were left, were named rotated: the stated
+    orientation could not be fitted to the few on the mirror, and another one could.
+    """
+    optics = bench(4)
+    rows, columns = np.indices((optics.camera.height_px // 2, optics.camera.width_px // 2))
+    places_px = 2.0 * np.stack([columns.ravel(), rows.ravel()])
+    phase_rad = np.zeros(places_px.shape)
+    phase_rad[:, int(share * places_px.shape[1]) :] = np.nan
+    found = iter([(np.inf, 145)])
+    monkeypatch.setattr(
+        picture_orientation, "_residual_urad", lambda *given: next(found, (17.0, 436))
+    )
+    assert (find_orientation(optics, 37.0, places_px, phase_rad) is not None) == is_named
