@@ -51,8 +51,8 @@ fast real_time: export OPENBLAS_NUM_THREADS = 1
 fast: $(STAMP)
 	$(BIN)/pytest -m "not campaign and not real_time" -n 2 $(BY_FILE)
 
-real_time: $(STAMP)  # named, because collecting the other files takes each worker 15 s; three, because they wait
-	$(BIN)/pytest -m "real_time and not campaign" -n 3 $(BY_FILE) $$(grep -rlw real_time tests --include='test_*.py')
+real_time: $(STAMP)  # named, because collecting the other files takes each worker 15 s
+	$(BIN)/pytest -m "real_time and not campaign" -n 2 $(BY_FILE) $$(grep -rlw real_time tests --include='test_*.py')
 
 unit: fast real_time
 
